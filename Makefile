@@ -1,0 +1,38 @@
+# make demo | make test are all that a bare clone needs. What they do first is in tools/setup.sh.
+
+SHELL := /bin/sh
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test bench bags clean
+.NOTPARALLEL:
+
+RUN := .venv/bin/python
+
+help:
+	@echo 'make demo    calibrate the recorded rig in bags/, with real ROS 2 nodes (sets up first)'
+	@echo 'make test    run all tests (sets up first)'
+	@echo 'make setup   make or refresh .venv: packages, ROS 2, messages; nothing is done twice'
+	@echo 'make bench   run the benchmarks'
+	@echo 'make bags    write the bags in bags/ anew'
+	@echo 'make clean   delete .venv, .build and caches'
+	@echo
+	@echo 'PYTHON=python3.12 make setup   chooses the Python (3.10 to 3.13)'
+	@echo 'make test ARGS="-k simulation" hands arguments on (also to demo, bench, bags)'
+
+setup:
+	@sh tools/setup.sh
+
+demo: setup
+	@.venv/bin/fluoro_calib_demo $(ARGS)
+
+test: setup
+	@$(RUN) -m pytest tests $(ARGS)
+
+bench: setup
+	@$(RUN) -m benchmarks $(ARGS)
+
+bags: setup
+	@$(RUN) -m fluoro_calib_ros.simulation.make_bags $(ARGS)
+
+clean:
+	rm -rf .venv .build .pytest_cache *.egg-info
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

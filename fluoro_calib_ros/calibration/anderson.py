@@ -1,0 +1,31 @@
+"""Anderson acceleration of a fixed-point iteration (Walker and Ni, SIAM J. Numer. Anal. 49, 2011)."""
+
+import numpy as np
+
+
+class Anderson:
+    """Mixes the last iterates of x -> f(x) so that the residual f(x) - x becomes smallest.
+
+    depth: number of earlier iterates used. The iterates are flat arrays of one length.
+    """
+
+    def __init__(self, depth=8):
+        self._depth = depth
+        self.restart()
+
+    def restart(self):
+        """Forget the earlier iterates: the map has changed."""
+        self._x, self._f = [], []
+
+    def next(self, x, f):
+        """Next iterate from the present one x and its image f."""
+        self._x, self._f = (self._x + [x])[-self._depth - 1:], (self._f + [f])[-self._depth - 1:]
+        if len(self._x) == 1:
+            return f
+        residual = [b - a for a, b in zip(self._x, self._f)]
+        d_residual = np.stack([b - a for a, b in zip(residual, residual[1:])], axis=1)
+        d_f = np.stack([b - a for a, b in zip(self._f, self._f[1:])], axis=1)
+        # Columns are scaled and small singular values left out: late differences are nearly parallel.
+        scale = np.maximum(np.linalg.norm(d_residual, axis=0), 1e-300)
+        gamma, *_ = np.linalg.lstsq(d_residual / scale, residual[-1], rcond=1e-6)
+        return f - d_f @ (gamma / scale)

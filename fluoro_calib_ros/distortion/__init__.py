@@ -1,0 +1,1 @@
+"""Correction models: what they are fitted to, how they predict, and how their size is chosen."""

@@ -1,0 +1,27 @@
+"""The gauge between a free correction and the orientation of the sensor.
+
+A correction that can reproduce what a change of interior and exterior orientation does to the image
+competes with them. To first order these changes move an image point (x, y) = (u - xp, v - yp) by
+  (1, 0), (0, 1)                        principal point,
+  (x, y)                                principal distance,
+  (-y, x)                               turn of the sensor about its axis,
+  (x x, x y)/c, (x y, y y)/c            turn of the sensor about its rows and columns, less a shift
+(derivatives of the collinearity condition; the last three are common to all exposures and leave sources and
+object points where they are). The fitted correction is kept orthogonal to them.
+"""
+
+import numpy as np
+
+
+def gauge_basis(uv, interior):
+    """Basis (n, 2, 6) of the gauge at pixels uv (n, 2), scaled to about one; interior (3,) [px]."""
+    x, y = (np.asarray(uv) - interior[:2]).T / 512.0   # any fixed length would do
+    one, zero = np.ones_like(x), np.zeros_like(x)
+    columns = [(one, zero), (zero, one), (x, y), (-y, x), (x * x, x * y), (x * y, y * y)]
+    return np.stack([np.stack(column, axis=1) for column in columns], axis=2)
+
+
+def gauge_coefficients(uv, fitted, interior):
+    """Coefficients (6,) of the part of fitted corrections (n, 2) at pixels uv (n, 2) that lies in the gauge."""
+    basis = gauge_basis(uv, interior)
+    return np.linalg.lstsq(basis.reshape(-1, basis.shape[2]), fitted.reshape(-1), rcond=None)[0]

@@ -1,0 +1,106 @@
+"""The regression step of the self-calibration for one fluoroscope."""
+
+import numpy as np
+
+from ..photogrammetry.noise import INLIER_Q
+from .gauge import gauge_basis, gauge_coefficients
+from .models import CorrectionModel, neighbours_and_weights, no_correction
+from .selection import CrossValidation, candidate_k, exposure_folds
+from .trend import least_squares_map
+
+KEEP_K = 1e-3   # relative gain in G below which k stays as it is
+SMALLEST_TRAINING = 60   # inliers
+
+
+class Regressor:
+    """Correction model of one fluoroscope through the rounds of a self-calibration.
+
+    kind of the model; uv (N, 2) observed pixels of all image points and exposure (N,) of each: they stay
+    where they are, so neighbours are looked up again only when the inliers change. gauge_held: whether the
+    fitted correction is kept orthogonal to the gauge. k: neighbours, None: chosen by cross-validation.
+    """
+
+    def __init__(self, kind, uv, exposure, gauge_held, k=None):
+        self.kind, self.uv, self.exposure, self.gauge_held = kind, uv, exposure, gauge_held
+        self.k, self.score, self.changed = 0 if kind == 'none' else k, 0.0, False
+        self._wanted_k = k
+        self.inliers = None
+
+    def choose(self, values, q, information):
+        """Take over the inliers of a round and choose k by its score G.
+
+        values (N, 2) to be fitted [px], q (N,) normalised squared residuals, information (N, 2, 2) = C_r^-1.
+        Sets inliers, k, score, and changed, which tells whether inliers or k differ from the last round.
+        Raises ValueError for too few inliers.
+        """
+        before = self.k
+        inliers = q <= INLIER_Q
+        if self.inliers is not None:
+            # Who has gone out comes back only when well inside: no flicker at the border.
+            inliers &= self.inliers | (q <= INLIER_Q / 2)
+        self.changed = self.inliers is None or not np.array_equal(inliers, self.inliers)
+        if self.kind == 'none':
+            self.inliers = inliers
+            self.score = float(np.einsum('na,nab,nb', values[inliers], information[inliers], values[inliers]))
+            return
+        if self.changed:
+            self._take_inliers(inliers)
+        scores = self._validation.scores(values[inliers], information[inliers])
+        best = int(np.argmin(scores))
+        now = np.flatnonzero(self._validation.candidates == self.k)
+        if len(now) and scores[now[0]] <= scores[best] * (1 + KEEP_K):
+            best = int(now[0])
+        self.k, self.score = int(self._validation.candidates[best]), float(scores[best])
+        self.changed = self.changed or before != self.k
+        if self.changed:
+            tree_of = CorrectionModel(self.kind, self.k, self.uv[inliers], np.zeros((int(inliers.sum()), 2)))
+            index, self._weights = neighbours_and_weights(tree_of.tree, self.kind, self.uv, self.k)
+            self._index = np.flatnonzero(inliers)[index]
+            self._basis = tree_of.trend.basis(self.uv)
+            self._trend_fit = least_squares_map(self._basis[inliers])
+
+    def _take_inliers(self, inliers):
+        count = int(inliers.sum())
+        if count < SMALLEST_TRAINING:
+            raise ValueError(f'{count} inliers are too few for the correction model, {SMALLEST_TRAINING} are needed')
+        self.inliers = inliers
+        candidates = candidate_k(self.kind, count) if self._wanted_k is None else [self._wanted_k]
+        self._validation = CrossValidation(self.kind, self.uv[inliers], exposure_folds(self.exposure[inliers]),
+                                           candidates)
+
+    def smooth(self, values):
+        """Fitted corrections (N, 2) at all image points of values (N, 2) [px]."""
+        if self.kind == 'none':
+            return np.zeros_like(values)
+        trend = self._basis @ (self._trend_fit @ values[self.inliers])
+        left = values - trend
+        return trend + np.stack([np.einsum('nk,nk->n', self._weights, left[:, axis][self._index])
+                                 for axis in (0, 1)], axis=1)
+
+    def without_gauge(self, values, interior):
+        """values (N, 2) changed so that their fitted correction is orthogonal to the gauge at the inliers."""
+        if not self.gauge_held or self.kind == 'none':
+            return values
+        basis = gauge_basis(self.uv, interior)
+        for _ in range(3 if self.kind == 'knn' else 1):   # a mean of neighbours repeats a plane only nearly
+            fitted = self.smooth(values)[self.inliers]
+            values = values - basis @ gauge_coefficients(self.uv[self.inliers], fitted, interior)
+        return values
+
+    def model(self, values):
+        """The correction model of values (N, 2), with noise and bias as residuals and cross-validation show them."""
+        if self.kind == 'none':
+            return no_correction()
+        inside = self.inliers
+        error2 = np.mean((values[inside] - self.smooth(values)[inside]) ** 2)
+        norm2 = np.mean(np.sum(self._weights[inside] ** 2, axis=1))
+        own = self._index == np.arange(len(self._index))[:, None]
+        trace = np.mean(np.sum(self._weights * own, axis=1)[inside])
+        # E|y - S y|^2 = s^2 (1 - 2 tr(S)/N + tr(S S')/N) for a linear smoother without bias (Hastie,
+        # Tibshirani and Friedman, "The Elements of Statistical Learning", 2009, 5.5); held out, the noise
+        # of the point itself and of the prediction add up, and what is more is bias.
+        noise2 = error2 / max(1 - 2 * trace + norm2, 0.1)
+        held_out = self._validation.predictions_for(self.k, values[inside])
+        bias2 = np.mean((values[inside] - held_out) ** 2) - noise2 * (1 + norm2)
+        return CorrectionModel(self.kind, self.k, self.uv[inside], values[inside],
+                               float(np.sqrt(noise2)), float(np.sqrt(max(bias2, 0.0))))

@@ -1,0 +1,1 @@
+"""Photogrammetry: collinearity, resection, robust bundle adjustment and precision. Arrays in, arrays out."""

@@ -1,0 +1,48 @@
+from glob import glob
+
+from setuptools import find_packages, setup
+
+package_name = 'fluoro_calib_ros'
+
+setup(
+    name=package_name,
+    version='0.1.0',
+    packages=find_packages(include=[package_name, package_name + '.*']),
+    package_data={package_name + '.bags': ['msg/*.msg']},
+    data_files=[
+        ('share/ament_index/resource_index/packages', ['resource/' + package_name]),
+        ('share/' + package_name, ['package.xml']),
+        ('share/' + package_name + '/launch', sorted(glob('launch/*.launch.py'))),
+        ('share/' + package_name + '/config', sorted(glob('config/*.yaml'))),
+    ],
+    python_requires='>=3.10',
+    install_requires=[
+        'setuptools',
+        'numpy',
+        'scipy',
+        'scikit-learn',
+        'matplotlib',
+        'mcap',
+        'zstandard',
+        'rosbags',
+        'threadpoolctl',
+        'PyYAML',
+    ],
+    extras_require={'test': ['pytest', 'pytest-timeout']},
+    zip_safe=False,
+    maintainer='fluoro_calib_ros maintainers',
+    maintainer_email='maintainers@fluoro-calib.example',
+    description='Self-calibration of dual fluoroscopes for ROS 2: robust bundle adjustment and '
+                'nonparametric distortion correction.',
+    license='Apache-2.0',
+    entry_points={
+        'console_scripts': [
+            'calibration_node = fluoro_calib_ros.nodes.calibration_node:main',
+            'correction_node = fluoro_calib_ros.nodes.correction_node:main',
+            'player_node = fluoro_calib_ros.nodes.player_node:main',
+            'simulator_node = fluoro_calib_ros.nodes.simulator_node:main',
+            'fluoro_calib_demo = fluoro_calib_ros.nodes.demo:main',
+            'fluoro-calib = fluoro_calib_ros.cli:main',
+        ],
+    },
+)

@@ -1,0 +1,111 @@
+"""The two packages, their metadata and the set-up agree with each other."""
+
+import configparser
+import importlib.metadata
+import importlib.util
+import pathlib
+import re
+import subprocess
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+MSG_DEFS = ROOT / 'msg_defs'
+INTERFACES = sorted(path for kind in ('msg', 'srv', 'action') for path in MSG_DEFS.glob(f'{kind}/*.{kind}'))
+
+
+def package_xml(folder):
+    """Return the text of the fields of a package.xml that both packages share, and its dependencies."""
+    root = ElementTree.parse(folder / 'package.xml').getroot()
+    fields = {tag: root.findtext(tag) for tag in ('name', 'version', 'license', 'maintainer')}
+    fields['email'] = root.find('maintainer').get('email')
+    return fields, {element.text for element in root.iter() if element.tag.endswith('depend')}
+
+
+def test_metadata_agree():
+    """Name, version, licence and maintainer are the same wherever they are written."""
+    ours, depends = package_xml(ROOT)
+    messages, _ = package_xml(MSG_DEFS)
+    assert ours['name'] == 'fluoro_calib_ros' and messages['name'] == 'fluoro_calib_msgs'
+    assert messages['name'] in depends
+    assert {**messages, 'name': ours['name']} == ours
+
+    setup = (ROOT / 'setup.py').read_text()
+    written = dict(re.findall(r"^    (\w+)='([^']*)'", setup, re.MULTILINE))
+    assert written['version'] == ours['version']
+    assert written['license'] == ours['license']
+    assert (written['maintainer'], written['maintainer_email']) == (ours['maintainer'], ours['email'])
+    assert (ROOT / 'resource' / ours['name']).is_file()
+    assert (ROOT / 'LICENSE').read_bytes() == (MSG_DEFS / 'LICENSE').read_bytes()
+    assert f"project({messages['name']})" in (MSG_DEFS / 'CMakeLists.txt').read_text()
+
+
+def test_scripts_go_where_ros2_run_looks():
+    """On a colcon install the scripts go into lib/<package>."""
+    config = configparser.ConfigParser()
+    config.read(ROOT / 'setup.cfg')
+    assert config['develop']['script_dir'] == config['install']['install_scripts'] == '$base/lib/fluoro_calib_ros'
+
+
+@pytest.mark.parametrize(
+    'entry', importlib.metadata.distribution('fluoro_calib_ros').entry_points, ids=lambda entry: entry.name)
+def test_console_script_has_its_module(entry):
+    """Every console script names a module that exists and defines its function."""
+    spec = importlib.util.find_spec(entry.module)
+    assert spec is not None, f'{entry.name}: there is no module {entry.module}'
+    assert re.search(rf'^def {entry.attr}\(', pathlib.Path(spec.origin).read_text(), re.MULTILINE)
+
+
+def test_every_interface_is_built():
+    """CMakeLists.txt lists just the interface files that are there."""
+    listed = re.findall(r'"((?:msg|srv|action)/\w+\.\w+)"', (MSG_DEFS / 'CMakeLists.txt').read_text())
+    assert sorted(listed) == sorted(str(path.relative_to(MSG_DEFS)) for path in INTERFACES)
+
+
+@pytest.mark.parametrize('path', INTERFACES, ids=lambda path: path.name)
+def test_every_field_says_what_it_is(path):
+    """Every field and constant has a comment, and every number in it a unit."""
+    for number, line in enumerate(path.read_text().splitlines(), 1):
+        field, _, comment = line.partition('#')
+        if field.strip() in ('', '---'):
+            continue
+        where = f'{path.name}:{number}: {line}'
+        assert comment.strip(), where
+        kind = field.split()[0].rstrip('[]0123456789')
+        if re.fullmatch(r'float\d+|u?int\d+', kind) and '=' not in field and 'target_id' not in field:
+            assert re.search(r'\[[^\]]+\]', comment) or 'the same' in comment, where
+
+
+def test_messages_without_ros():
+    """The bag writer reads the message definitions from inside the package, where ROS need not be."""
+    folder = ROOT / 'fluoro_calib_ros' / 'bags' / 'msg'
+    assert sorted(path.name for path in folder.glob('*.msg')) == sorted(
+        path.name for path in INTERFACES if path.suffix == '.msg')
+
+
+def test_lock_is_exact():
+    """The lock file pins every package to one version, and has every package of requirements.in."""
+    pins = [line for line in (ROOT / 'requirements.lock').read_text().splitlines() if not line.startswith('#')]
+    assert all(re.fullmatch(r'[\w.-]+==[\w.]+( ; python_version .*)?', pin) for pin in pins)
+    wanted = [re.split(r'[\[<=>]', line)[0].strip() for line in (ROOT / 'requirements.in').read_text().splitlines()
+              if line.strip() and not line.startswith('#')]
+    locked = {pin.split('==')[0] for pin in pins}
+    assert not {name.lower().replace('_', '-') for name in wanted} - locked
+
+
+def test_no_path_of_a_machine():
+    """No file of the project names a folder of the machine on which it was written."""
+    listing = subprocess.run(['git', 'ls-files', '--cached', '--others', '--exclude-standard', '-z'],
+                             cwd=ROOT, capture_output=True, check=False)
+    if listing.returncode:
+        pytest.skip('not a git checkout')
+    foreign = re.compile(rb'(?<![\w.])/(?:home|root|Users|work)/[\w.]')
+    for name in filter(None, listing.stdout.split(b'\0')):
+        path = ROOT / name.decode()
+        if path.is_file() and not path.is_symlink():
+            content = path.read_bytes()
+            if b'\0' in content[:8192]:
+                continue
+            found = foreign.search(content)
+            assert not found, f'{path}: {content[found.start():found.start() + 60]!r}'

@@ -1,0 +1,73 @@
+#!/usr/bin/env python3
+"""Resolve requirements.in into requirements.lock for several Pythons.
+
+    tools/lock.py python3.10 python3.11 python3.12 python3.13
+
+Each interpreter resolves in a throw-away venv (nothing is installed); the answers are merged, with a
+marker wherever the Pythons differ. Run it with ALL supported Pythons, then `make setup && make test`.
+"""
+
+import json
+import pathlib
+import subprocess
+import sys
+import tempfile
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+HEAD = """\
+# Made by tools/lock.py from requirements.in: do not edit. Every package, exactly, for Python {pythons}.
+"""
+
+
+def resolve(python):
+    """Return (minor version, {name: version}) as this interpreter's pip resolves requirements.in."""
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run([python, '-m', 'venv', folder], check=True)
+        pip = [folder + '/bin/python', '-m', 'pip', 'install', '--quiet', '--quiet']
+        subprocess.run(pip + ['--upgrade', 'pip'], check=True)
+        report = folder + '/report.json'
+        subprocess.run(
+            pip + ['--dry-run', '--ignore-installed', '--report', report, '-r', str(ROOT / 'requirements.in')],
+            check=True)
+        with open(report) as stream:
+            data = json.load(stream)
+    pins = {item['metadata']['name'].lower().replace('_', '-').replace('.', '-'): item['metadata']['version']
+            for item in data['install']}
+    return data['environment']['python_version'], pins
+
+
+def marker(pythons, known):
+    """Return the environment marker that picks these Python versions out of the known ones."""
+    if pythons == known[-len(pythons):]:
+        return f'python_version >= "{pythons[0]}"'
+    if pythons == known[:len(pythons)]:
+        return f'python_version <= "{pythons[-1]}"'
+    return ' or '.join(f'python_version == "{python}"' for python in pythons)
+
+
+def merge(answers):
+    """Return the lines of the lock for {python version: {name: version}}."""
+    lines = []
+    for name in sorted({name for pins in answers.values() for name in pins}):
+        by_version = {}
+        for python, pins in answers.items():
+            if name in pins:
+                by_version.setdefault(pins[name], []).append(python)
+        for version, pythons in sorted(by_version.items()):
+            line = f'{name}=={version}'
+            if len(pythons) < len(answers):
+                line += ' ; ' + marker(pythons, list(answers))
+            lines.append(line)
+    return lines
+
+
+def main():
+    if len(sys.argv) < 2:
+        sys.exit(__doc__)
+    answers = dict(sorted((resolve(python) for python in sys.argv[1:]), key=lambda item: int(item[0].split('.')[1])))
+    text = HEAD.format(pythons=', '.join(answers)) + '\n'.join(merge(answers)) + '\n'
+    (ROOT / 'requirements.lock').write_text(text)
+
+
+if __name__ == '__main__':
+    main()

@@ -2,6 +2,7 @@
 
 import hashlib
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -63,6 +64,14 @@ class FluoroscopeCalibration:
         digest.update(f'{self.fluoroscope}/{self.model.kind}/{self.source_digest}'.encode())
         object.__setattr__(self, 'calibration_id', f'{self.fluoroscope}-{digest.hexdigest()[:16]}')
 
+    @cached_property
+    def _frame_model(self):
+        return self.model.at_frame_rate(self.image_size)
+
+    def prepare(self):
+        """Build what the first correction needs, so that no frame waits for it."""
+        self._frame_model
+
     def correct(self, uv, sigma=None):
         """Corrected image points of observed pixels uv (n, 2); sigma (n,) of them, None: that of the calibration.
 
@@ -74,7 +83,7 @@ class FluoroscopeCalibration:
                               np.full(len(uv), INVALID, dtype=np.uint8))
         if not good.any():
             return out
-        correction = self.model.evaluate(uv[good])
+        correction = self._frame_model.evaluate(uv[good])
         observed = self.sigma0 if sigma is None else np.asarray(sigma, dtype=float)[good]
         out.uv[good] = uv[good] - correction.duv
         out.sigma[good] = np.sqrt(observed ** 2 + correction.sd ** 2)

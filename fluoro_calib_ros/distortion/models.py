@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
+from .cells import CellPredictor
 from .smoothers import KINDS, SMALLEST_K, Neighbourhoods
 from .trend import Trend, least_squares_map
 
@@ -39,7 +40,7 @@ class CorrectionModel:
     tree: cKDTree = field(init=False, repr=False, compare=False)
     trend: Trend = field(init=False, repr=False, compare=False)
     trend_coefficients: np.ndarray = field(init=False, repr=False, compare=False)
-    _left: np.ndarray = field(init=False, repr=False, compare=False)
+    left: np.ndarray = field(init=False, repr=False, compare=False)
     _hull: np.ndarray = field(init=False, repr=False, compare=False)
 
     def __post_init__(self):
@@ -61,8 +62,12 @@ class CorrectionModel:
         coefficients = least_squares_map(basis) @ duv
         object.__setattr__(self, 'trend', trend)
         object.__setattr__(self, 'trend_coefficients', coefficients)
-        object.__setattr__(self, '_left', duv - basis @ coefficients)
+        object.__setattr__(self, 'left', duv - basis @ coefficients)
         object.__setattr__(self, '_hull', _half_planes(uv))
+
+    def at_frame_rate(self, image_size):
+        """The same model prepared for frames of an image of image_size (width, height): FrameModel."""
+        return FrameModel(self, image_size)
 
     def predict(self, uv):
         """Corrections (n, 2) [px] at pixels uv (n, 2)."""
@@ -71,7 +76,11 @@ class CorrectionModel:
     def evaluate(self, uv):
         """Correction at pixels uv (n, 2), with standard deviations and what lies outside."""
         duv, norm2 = self._evaluate(uv, with_sd=True)
-        return Correction(duv, np.sqrt(self.noise_px ** 2 * norm2 + self.bias_px ** 2), self.outside(uv))
+        return Correction(duv, self.sd(norm2), self.outside(uv))
+
+    def sd(self, norm2):
+        """Standard deviations (n,) [px] of predictions from the squared norms (n,) of their weights."""
+        return np.sqrt(self.noise_px ** 2 * norm2 + self.bias_px ** 2)
 
     def outside(self, uv):
         """True (n,) where a pixel (n, 2) lies beyond the convex hull of the training points."""
@@ -89,10 +98,30 @@ class CorrectionModel:
         for start in range(0, len(uv), size):
             part = slice(start, start + size)
             index, weights = neighbours_and_weights(self.tree, self.kind, uv[part], self.k)
-            duv[part] = np.einsum('nk,nkc->nc', weights, self._left[index])
+            duv[part] = np.einsum('nk,nkc->nc', weights, self.left[index])
             if with_sd:
                 norm2[part] = np.einsum('nk,nk->n', weights, weights)
         return duv + self.trend.basis(uv) @ self.trend_coefficients, norm2
+
+
+class FrameModel:
+    """A correction model with the neighbours of every part of the image looked up beforehand.
+
+    Predictions are those of the model but for rounding. Built once per calibration, in tenths of a second.
+    """
+
+    def __init__(self, model, image_size):
+        self._model = model
+        self._predictor = None if model.kind == 'none' else CellPredictor(
+            model.kind, model.k, model.tree, model.left, image_size)
+
+    def evaluate(self, uv):
+        """Correction at pixels uv (n, 2) of the image, with standard deviations and what lies outside."""
+        if self._predictor is None:
+            return self._model.evaluate(uv)
+        duv, norm2 = self._predictor(uv)
+        duv += self._model.trend.basis(uv) @ self._model.trend_coefficients
+        return Correction(duv, self._model.sd(norm2), self._model.outside(uv))
 
 
 def neighbours_and_weights(tree, kind, uv, k):

@@ -29,7 +29,13 @@ class Trend:
         x, y = ((np.asarray(uv) - self._centre) / self._scale).T
         out = np.empty((len(x), len(self._powers)))
         for column, (i, j) in enumerate(self._powers):
-            out[:, column] = x ** i * y ** j
+            # Each is an earlier one times x or y.
+            if i:
+                np.multiply(out[:, self._powers.index((i - 1, j))], x, out=out[:, column])
+            elif j:
+                np.multiply(out[:, self._powers.index((i, j - 1))], y, out=out[:, column])
+            else:
+                out[:, column] = 1.0
         return out
 
 

@@ -18,6 +18,7 @@ CUBE_MM = 260.0
 BEADS = 503
 SURVEY_SD_MM = 0.1
 DECIMALS = 4   # of an observed pixel, as target extraction writes it; also hides last-bit differences of CPUs
+START_NS = 1_767_225_600_000_000_000   # stamp of the first frame [ns]
 FRAME_ID = '{}_optical'
 
 
@@ -113,7 +114,7 @@ def phantom_poses(rng, count):
 
 
 def simulate_exposures(rig, count, seed=0, noise_px=0.25, false_matches=0.01, matched=(130, 160),
-                       interval_s=0.5, start_s=0.0, first_number=1):
+                       interval_s=0.5, start_ns=START_NS, first_number=1):
     """Exposures of the phantom in count poses: SimulatedExposures.
 
     matched: range of the number of beads found in an exposure; false_matches: part of them that bear the
@@ -124,10 +125,10 @@ def simulate_exposures(rig, count, seed=0, noise_px=0.25, false_matches=0.01, ma
     frames = {f.name: [] for f in rig.fluoroscopes}
     undistorted = {f.name: [] for f in rig.fluoroscopes}
     for j, (rotation, shift) in enumerate(poses):
-        stamp = round((start_s + j * interval_s) * 1e9)
+        stamp = start_ns + round(j * interval_s * 1e9)
         points = rig.true_mm @ rotation.T + shift
         for fluoroscope in rig.fluoroscopes:
-            ids, observed = _seen_beads(rng, fluoroscope, points, rig.phantom.target_id, noise_px,
+            ids, observed = seen_beads(rng, fluoroscope, points, rig.phantom.target_id, noise_px,
                                         false_matches, matched)
             frames[fluoroscope.name].append(Frame(fluoroscope.name, first_number + j, ids, observed,
                                                   fluoroscope.image_size, None, stamp,
@@ -136,7 +137,7 @@ def simulate_exposures(rig, count, seed=0, noise_px=0.25, false_matches=0.01, ma
     return SimulatedExposures(frames, poses, undistorted)
 
 
-def _seen_beads(rng, fluoroscope, points, target_id, noise_px, false_matches, matched):
+def seen_beads(rng, fluoroscope, points, target_id, noise_px, false_matches, matched):
     """Ids (n,) and observed pixels (n, 2) of the beads that are found in one exposure."""
     ideal = fluoroscope.ideal(points)
     observed = fluoroscope.distortion.distort(ideal) + rng.normal(0, noise_px, ideal.shape)
@@ -161,7 +162,7 @@ class SimulatedTracking:
     ideal: dict
 
 
-def simulate_tracking(rig, seconds=4.0, rate_hz=120.0, seed=0, noise_px=0.25, start_s=0.0, first_number=1):
+def simulate_tracking(rig, seconds=4.0, rate_hz=120.0, seed=0, noise_px=0.25, start_ns=START_NS, first_number=1):
     """Markers on the two bones of a joint that bends and straightens: four rigid clusters of six."""
     rng = np.random.default_rng([seed, 3])
     clusters = [rng.uniform(-22, 22, (6, 3)) for _ in range(4)]
@@ -184,5 +185,5 @@ def simulate_tracking(rig, seconds=4.0, rate_hz=120.0, seed=0, noise_px=0.25, st
         ideal[fluoroscope.name] = uv
         frames[fluoroscope.name] = [
             Frame(fluoroscope.name, first_number + k, ids, observed[k], fluoroscope.image_size, None,
-                  round((start_s + k / rate_hz) * 1e9), FRAME_ID.format(fluoroscope.name)) for k in range(count)]
+                  start_ns + round(k / rate_hz * 1e9), FRAME_ID.format(fluoroscope.name)) for k in range(count)]
     return SimulatedTracking(frames, ids, points, ideal)

@@ -1,0 +1,1 @@
+"""Bags: MCAP as rosbag2 (Jazzy) writes it, written and read without ROS."""

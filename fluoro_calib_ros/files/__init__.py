@@ -1,0 +1,1 @@
+"""Files: phantom, observations, calibration, image points and results, read with care and written whole."""

@@ -1,0 +1,14 @@
+"""Quality of service of the topics, in one place."""
+
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+
+# A fluoroscope at 1000 frames a second and a reader that is busy for a tenth of one.
+OBSERVATIONS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
+LATCHED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
+                     durability=DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def overridable():
+    """Options that let a user override history, depth and reliability of a topic by parameters."""
+    return QoSOverridingOptions.with_default_policies()

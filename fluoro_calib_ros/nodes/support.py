@@ -1,0 +1,90 @@
+"""What the nodes share: parameters with descriptions, diagnostics, logging that does not flood, start and end."""
+
+import sys
+import time
+
+import rclpy
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.executors import ExternalShutdownException
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+def declare(node, name, default, description, low=None, high=None):
+    """Declare a read-only parameter with description and range; returns its value."""
+    descriptor = ParameterDescriptor(description=description, read_only=True)
+    if low is not None and isinstance(default, int):
+        descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
+    elif low is not None:
+        descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
+    return node.declare_parameter(name, default, descriptor).value
+
+
+class Sentences:
+    """Logs sentences as they come, but at most a burst of them and then one a second; the rest is counted."""
+
+    def __init__(self, logger, burst=20):
+        self._logger, self._allowance, self._burst = logger, float(burst), burst
+        self._last, self._hidden = time.monotonic(), 0
+
+    def warn(self, sentence):
+        """Log a sentence as a warning, unless there have been too many."""
+        now = time.monotonic()
+        self._allowance = min(self._burst, self._allowance + now - self._last)
+        self._last = now
+        if self._allowance < 1:
+            self._hidden += 1
+            return
+        more = f' ({self._hidden} more like this were not shown)' if self._hidden else ''
+        self._logger.warning(sentence + more)
+        self._allowance, self._hidden = self._allowance - 1, 0
+
+
+class Diagnostics:
+    """Publishes the state of a node on /diagnostics."""
+
+    def __init__(self, node):
+        self._node = node
+        self._publisher = node.create_publisher(DiagnosticArray, '/diagnostics', 10)
+
+    def publish(self, parts):
+        """Publish one status for every (name, level, message, {key: value}) of parts."""
+        array = DiagnosticArray()
+        array.header.stamp = self._node.get_clock().now().to_msg()
+        full_name = self._node.get_fully_qualified_name()
+        for name, level, message, values in parts:
+            status = DiagnosticStatus(level=level, name=f'{full_name}: {name}', message=message,
+                                      hardware_id=name)
+            status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
+            array.status.append(status)
+        self._publisher.publish(array)
+
+
+def run(make_node, executor_type, args=None):
+    """Run a node until it is interrupted; exit status 1 and one sentence where it cannot start."""
+    rclpy.init(args=args)
+    node, code = None, 0
+    try:
+        node = make_node()
+        executor = executor_type()
+        executor.add_node(node)
+        try:
+            executor.spin()
+        finally:
+            getattr(node, 'stop', lambda: None)()
+            executor.shutdown(timeout_sec=2.0)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        pass
+    except StartError as error:
+        rclpy.logging.get_logger('fluoro_calib').fatal(str(error))
+        code = 1
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    sys.exit(code)
+
+
+class StartError(RuntimeError):
+    """Why a node cannot start, in one sentence."""

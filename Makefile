@@ -2,7 +2,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench bags clean
+.PHONY: help setup demo test bench validation bags clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
@@ -12,6 +12,7 @@ help:
 	@echo 'make test    run all tests (sets up first)'
 	@echo 'make setup   make or refresh .venv: packages, ROS 2, messages; nothing is done twice'
 	@echo 'make bench   run the benchmarks'
+	@echo 'make validation  out-of-sample accuracy against the truth, written to docs/validation.md'
 	@echo 'make bags    write the bags in bags/ anew'
 	@echo 'make clean   delete .venv, .build and caches'
 	@echo
@@ -30,9 +31,12 @@ test: setup
 bench: setup
 	@$(RUN) -m benchmarks $(ARGS)
 
+validation: setup
+	@$(RUN) -m benchmarks.validation $(ARGS)
+
 bags: setup
-	@$(RUN) -m fluoro_calib_ros.simulation.make_bags $(ARGS)
+	@.venv/bin/fluoro-calib simulate --out bags $(ARGS)
 
 clean:
-	rm -rf .venv .build .pytest_cache *.egg-info
+	rm -rf .venv .build demo_result .pytest_cache *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

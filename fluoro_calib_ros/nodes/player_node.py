@@ -5,6 +5,7 @@ import time
 from importlib import import_module
 
 import rclpy
+from rclpy._rclpy_pybind11 import RCLError
 from rclpy.duration import Duration
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -62,6 +63,9 @@ class PlayerNode(Node):
                     break
         except DataError as error:
             self.get_logger().fatal(str(error))
+        except RCLError:
+            if rclpy.ok():   # else the node has been ended between two messages
+                raise
         finally:
             if rclpy.ok():
                 rclpy.shutdown()

@@ -181,6 +181,8 @@ def histogram_figure(run, name, rows, redundancy):
                  xlabel=f'{"uv"[axis]} residual / its standard deviation from image noise [-]')
         axes.legend(loc='upper center', bbox_to_anchor=(0.5, -0.12))
     figure.axes[0].set_ylabel('probability density [-]')
+    figure.supxlabel(f'Inliers only: {len(before)} of the {len(rows)} image points before, {len(after)} after.',
+                     fontsize=11)
     return figure
 
 

@@ -173,7 +173,7 @@ def simulate_tracking(rig, seconds=4.0, rate_hz=120.0, seed=0, noise_px=0.25, st
     for k in range(count):
         t = k / rate_hz
         bend = np.deg2rad(25) * np.sin(2 * np.pi * 0.5 * t)
-        sway = 30 * np.array([np.sin(2 * np.pi * 0.31 * t), np.cos(2 * np.pi * 0.23 * t), 0.6 * np.sin(t)])
+        sway = 70 * np.array([np.sin(2 * np.pi * 0.31 * t), np.cos(2 * np.pi * 0.23 * t), 0.6 * np.sin(t)])
         for number, (cluster, place) in enumerate(zip(clusters, places)):
             turn = matrix_from_vector([bend if number < 2 else -bend, 0.3 * np.sin(1.1 * t + number), 0])
             points[k, 6 * number:6 * number + 6] = (cluster + place) @ turn.T + sway

@@ -1,0 +1,1 @@
+"""Measurements: speed (python -m benchmarks) and accuracy against the truth (python -m benchmarks.validation)."""

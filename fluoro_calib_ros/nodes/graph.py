@@ -1,0 +1,53 @@
+"""Starting and ending the nodes of a graph as processes, where there is no launch."""
+
+import os
+import signal
+import subprocess
+import sys
+
+
+class Graph:
+    """Node processes that end together; a context manager.
+
+    log_directory: what each node prints goes to NAME.log there.
+    """
+
+    def __init__(self, log_directory):
+        self._directory = log_directory
+        self._processes = []
+
+    def start(self, name, parameters=None):
+        """Start fluoro_calib_ros.nodes.NAME with {parameter: value}; returns the process."""
+        command = [sys.executable, '-m', f'fluoro_calib_ros.nodes.{name}', '--ros-args']
+        for key, value in (parameters or {}).items():
+            command += ['-p', f'{key}:={value}']
+        log = open(self._directory / f'{name}.log', 'ab')
+        with log:
+            # A session of its own: an interrupt from the keyboard reaches the nodes from here, in order.
+            process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
+        self._processes.append(process)
+        return process
+
+    def ended(self):
+        """Processes that have ended by themselves with a fault."""
+        return [p for p in self._processes if p.poll() not in (None, 0)]
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        running = [p for p in self._processes if p.poll() is None]
+        for process in running:
+            process.send_signal(signal.SIGINT)
+        for process in running:
+            try:
+                process.wait(timeout=5)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def isolate():
+    """Keep this process and its children on this machine and off the graph of others, unless told otherwise."""
+    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
+    os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')

@@ -1,0 +1,158 @@
+"""Figures and tables of a calibration: what is written, and that it tells the result's numbers."""
+
+import dataclasses
+import os
+
+import matplotlib
+import numpy as np
+import pytest
+from PIL import Image
+
+from fluoro_calib_ros.calibration.job import adjust_with, calibrate
+from fluoro_calib_ros.calibration.self_calibration import Options
+from fluoro_calib_ros.photogrammetry.observations import DataError
+from fluoro_calib_ros.report.figures import normalised_residuals, relative_costs, write_figures
+from fluoro_calib_ros.report.tables import markdown_table, summary_table
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+
+OF_FLUOROSCOPE = ('residuals_histogram', 'residuals_position', 'distortion')
+QUICK = {'k': 30, 'max_iterations': 3}
+
+
+@pytest.fixture(scope='module')
+def scene():
+    """A virtual rig and six exposures of it."""
+    rig = virtual_rig(1)
+    return rig.phantom, simulate_exposures(rig, 6, 1, matched=(90, 110)).frames
+
+
+@pytest.fixture(scope='module')
+def job(scene):
+    """Two fluoroscopes, calibrated one after the other."""
+    phantom, frames = scene
+    return calibrate(frames, phantom, Options(**QUICK))
+
+
+def test_figures_are_whole_pictures(job, tmp_path):
+    """Every figure is there under its name, can be read, is no empty sheet, and nothing else is left."""
+    paths = write_figures(job, tmp_path / 'new' / 'folder')
+    names = [f'cost_{n}.png' for n in 'ab'] + [f'{kind}_{n}.png' for kind in OF_FLUOROSCOPE for n in 'ab']
+    assert sorted(os.path.basename(p) for p in paths) == sorted(names)
+    assert sorted(os.listdir(tmp_path / 'new' / 'folder')) == sorted(names)
+    for path in paths:
+        with Image.open(path) as picture:
+            assert picture.format == 'PNG' and all(600 <= side <= 2400 for side in picture.size)
+            assert picture.info['dpi'][0] == pytest.approx(120, abs=0.1)
+            assert np.asarray(picture.convert('L')).std() > 10
+
+
+def test_figures_are_the_same_again(job, tmp_path, monkeypatch):
+    """The same job gives the same bytes over the old files, whatever matplotlib's settings, which stay."""
+    first = {path: open(path, 'rb').read() for path in write_figures(job, tmp_path)}
+    monkeypatch.setitem(matplotlib.rcParams, 'axes.facecolor', 'black')
+    settings = matplotlib.rcParams.copy()
+    assert write_figures(job, tmp_path) == list(first)
+    assert all(open(path, 'rb').read() == content for path, content in first.items())
+    assert matplotlib.rcParams == settings
+
+
+def test_figures_of_joint_run_with_interior_held(scene, tmp_path):
+    """A joint run has one cost figure; a name cannot lead out of the folder."""
+    phantom, frames = scene
+    joint = calibrate(frames, phantom, Options(model='knn', interior='fixed', k=5, max_iterations=2), joint=True)
+    names = {os.path.basename(path) for path in write_figures(joint, tmp_path)}
+    assert names == {'cost_a+b.png'} | {f'{kind}_{n}.png' for kind in OF_FLUOROSCOPE for n in 'ab'}
+    run = joint.runs['a+b']
+    run = dataclasses.replace(run, measured=dataclasses.replace(run.measured, fluoroscopes=('../a', 'b')))
+    with pytest.raises(DataError, match='name'):
+        write_figures(dataclasses.replace(joint, runs={'../a+b': run}), tmp_path / 'other')
+    assert os.listdir(tmp_path / 'other') == []
+
+
+def test_figures_without_model_or_runs(scene, job, tmp_path):
+    """Without a correction model neither loop nor field is shown; a job without runs has no figures."""
+    phantom, frames = scene
+    plain = calibrate({'a': frames['a']}, phantom, Options(model='none'))
+    names = {os.path.basename(path) for path in write_figures(plain, tmp_path)}
+    assert names == {'residuals_histogram_a.png', 'residuals_position_a.png'}
+    adjusted = adjust_with({'a': frames['a'][:2]}, phantom, job.calibrations)
+    assert write_figures(adjusted, tmp_path) == []
+    text = summary_table(adjusted)
+    assert any(line.split() == ['iterations', '-'] for line in text.splitlines())
+    assert 'median sd of the correction [px]                   -' in summary_table(plain)
+
+
+def test_folder_that_cannot_be_written(job, tmp_path):
+    """A file in the folder's place, or a folder in a figure's place, is told, and leaves no temporary file."""
+    (tmp_path / 'file').write_text('mine')
+    with pytest.raises(DataError, match='file'):
+        write_figures(job, tmp_path / 'file')
+    assert (tmp_path / 'file').read_text() == 'mine'
+    (tmp_path / 'out' / 'cost_b.png').mkdir(parents=True)
+    with pytest.raises(DataError, match='cost_b.png'):
+        write_figures(job, tmp_path / 'out')
+    assert not [name for name in os.listdir(tmp_path / 'out') if name.endswith('.tmp')]
+
+
+def test_what_the_figures_show(job):
+    """Costs in percent of the adjustment without correction; residuals in units of the noise."""
+    run = job.runs['a']
+    f, g, recorded = relative_costs(run)
+    assert len(f) == len(run.history) + 1 and len(g) == len(recorded) == len(run.history)
+    assert f[0] == g[0] == recorded[0] == pytest.approx(100)
+    assert f[-1] < 50 and g[-1] < 50
+    np.testing.assert_allclose(recorded / 100, [r.G / run.history[0].G for r in run.history])
+    rows = np.arange(len(run.correction))
+    redundancy = np.full(len(rows), 0.7)
+    before, after = normalised_residuals(run, rows, redundancy)
+    assert len(before) == run.before.inliers.sum() and len(after) == run.after.inliers.sum()
+    assert np.mean(after ** 2) == pytest.approx(1) and before.std() > 2
+
+
+def test_summary_holds_the_numbers(job):
+    """Each fluoroscope's figures are in its column, in pixels, and the text fits a terminal."""
+    text = summary_table(job, {'p50': 0.1234, 'p99': 0.5, 'max': 2.25, 'frames': 480})
+    line = {row[:36].strip(): row[36:].split() for row in text.splitlines()}
+    a, b = job.fluoroscopes['a'], job.fluoroscopes['b']
+    assert line['Fluoroscope'] == ['a', 'b']
+    for axis, coordinate in enumerate('uv'):
+        assert line[f'RMSE {coordinate} before [px]'] == [f'{x.rmse_before[axis]:.3f}' for x in (a, b)]
+        assert line[f'RMSE {coordinate} after [px]'] == [f'{x.rmse_after[axis]:.3f}' for x in (a, b)]
+        gain = 100 * (1 - a.rmse_after[axis] / a.rmse_before[axis])
+        assert line[f'improvement {coordinate} [%]'][0] == f'{gain:.1f}'
+    for quantity, i in (('xp', 0), ('yp', 1), ('c', 2)):
+        assert line[f'{quantity} [px]'] == [f'{x.interior[i]:.2f}' for x in (a, b)]
+        assert line[f'{quantity} standard deviation [px]'] == [f'{x.interior_sd[i]:.2f}' for x in (a, b)]
+    assert line['correction model'] == ['local_linear'] * 2 and line['neighbours k'] == ['30', '30']
+    assert line['iterations'] == [str(len(job.history[name])) for name in 'ab']
+    assert line['converged'] == [{True: 'yes', False: 'NO'}[job.runs[name].converged] for name in 'ab']
+    assert line['observations'] == [str(x.observations) for x in (a, b)]
+    assert line['inliers'][::3] == [str(x.inliers) for x in (a, b)]
+    model = job.calibrations['a'].model
+    assert float(line['median sd of the correction [px]'][0]) == pytest.approx(
+        np.median(model.evaluate(model.train_uv).sd), abs=5e-4)
+    assert 'median 0.123 ms, 99 % below 0.5 ms, largest 2.25 ms (480 frames)' in text
+    assert 'Latency' not in summary_table(job)
+
+
+def test_summary_fits_a_terminal(job):
+    """Many fluoroscopes, long names and long sentences stay within 100 columns."""
+    names = [f'a_very_long_name_of_a_fluoroscope_{i}' for i in range(5)]
+    many = dataclasses.replace(job, fluoroscopes={n: job.fluoroscopes['a'] for n in names},
+                               calibrations={n: job.calibrations['a'] for n in names}, runs={},
+                               left_out=('fluoroscope a, exposure 7: ' + 'too few targets ' * 10,))
+    text = summary_table(many)
+    assert max(map(len, text.splitlines())) <= 100
+    assert text.count('a_very_long_name') == 5 and 'Not used: fluoroscope a, exposure 7' in text
+
+
+def test_markdown_table():
+    """Cells are aligned, numbers to the right, bars and line ends cannot break the table."""
+    assert markdown_table(['model', 'RMSE [px]'], [['knn', 0.31], ['a|b\nc', '-']]) == (
+        '| model  | RMSE [px] |\n'
+        '| ------ | --------: |\n'
+        '| knn    |      0.31 |\n'
+        '| a\\|b c |         - |\n')
+    assert markdown_table(['x'], []) == '| x   |\n| --- |\n'
+    with pytest.raises(ValueError, match='2 cells'):
+        markdown_table(['x'], [[1, 2]])

@@ -4,11 +4,13 @@ import numpy as np
 
 from ..photogrammetry.noise import INLIER_Q
 from .gauge import gauge_basis, gauge_coefficients
-from .models import CorrectionModel, neighbours_and_weights, no_correction
-from .selection import CrossValidation, candidate_k, exposure_folds
-from .trend import least_squares_map
+from .models import CorrectionModel, no_correction
+from .selection import CrossValidation, NearestTable, candidate_k, exposure_folds
+from .smoothers import Neighbourhoods
+from .trend import Trend, least_squares_map
 
 KEEP_K = 1e-3   # relative gain in G below which k stays as it is
+STAY_IN = 1.5   # five sigma of each coordinate
 SMALLEST_TRAINING = 60   # inliers
 
 
@@ -24,7 +26,7 @@ class Regressor:
         self.kind, self.uv, self.exposure, self.gauge_held = kind, uv, exposure, gauge_held
         self.k, self.score, self.changed = 0 if kind == 'none' else k, 0.0, False
         self._wanted_k = k
-        self.inliers = None
+        self.inliers = self._near = None
 
     def choose(self, values, q, information):
         """Take over the inliers of a round and choose k by its score G.
@@ -36,8 +38,9 @@ class Regressor:
         before = self.k
         inliers = q <= INLIER_Q
         if self.inliers is not None:
-            # Who has gone out comes back only when well inside: no flicker at the border.
-            inliers &= self.inliers | (q <= INLIER_Q / 2)
+            # Who is in goes out when well outside, who is out comes back when well inside: a point that
+            # moves about the border would have the neighbours looked up, and the acceleration begin, anew.
+            inliers = np.where(self.inliers, q <= STAY_IN * INLIER_Q, q <= INLIER_Q / 2)
         self.changed = self.inliers is None or not np.array_equal(inliers, self.inliers)
         if self.kind == 'none':
             self.inliers = inliers
@@ -53,10 +56,9 @@ class Regressor:
         self.k, self.score = int(self._validation.candidates[best]), float(scores[best])
         self.changed = self.changed or before != self.k
         if self.changed:
-            tree_of = CorrectionModel(self.kind, self.k, self.uv[inliers], np.zeros((int(inliers.sum()), 2)))
-            index, self._weights = neighbours_and_weights(tree_of.tree, self.kind, self.uv, self.k)
-            self._index = np.flatnonzero(inliers)[index]
-            self._basis = tree_of.trend.basis(self.uv)
+            self._index = self._near.nearest(np.arange(len(self.uv)), inliers, self.k)
+            self._weights = Neighbourhoods(self.uv[self._index], self.uv).weights(self.kind, self.k)
+            self._basis = Trend(self.kind, self.uv[inliers]).basis(self.uv)
             self._trend_fit = least_squares_map(self._basis[inliers])
 
     def _take_inliers(self, inliers):
@@ -65,8 +67,10 @@ class Regressor:
             raise ValueError(f'{count} inliers are too few for the correction model, {SMALLEST_TRAINING} are needed')
         self.inliers = inliers
         candidates = candidate_k(self.kind, count) if self._wanted_k is None else [self._wanted_k]
+        if self._near is None:
+            self._near = NearestTable(self.uv, candidates[-1])
         self._validation = CrossValidation(self.kind, self.uv[inliers], exposure_folds(self.exposure[inliers]),
-                                           candidates)
+                                           candidates, self._near.restricted(inliers))
 
     def smooth(self, values):
         """Fitted corrections (N, 2) at all image points of values (N, 2) [px]."""

@@ -26,15 +26,51 @@ def exposure_folds(exposure, folds=FOLDS):
     return number % min(folds, number.max() + 1)
 
 
+class NearestTable:
+    """The nearest among points (N, 2) to each of themselves, in order, for choosing among them again and again.
+
+    count: how many of them will be asked for; a few more are looked up, for those that are not allowed.
+    """
+
+    def __init__(self, uv, count):
+        self._uv = uv
+        _, self._near = cKDTree(uv).query(uv, k=np.arange(1, min(len(uv), int(1.3 * count) + 30) + 1))
+
+    def nearest(self, rows, allowed, count):
+        """The count nearest allowed (N, True or False) points (n, count) of the points rows (n,), in order."""
+        near = self._near[rows]
+        good = allowed[near]
+        rank = np.cumsum(good, axis=1)
+        out = np.empty((len(rows), count), dtype=np.intp)
+        taken = good & (rank <= count)
+        full = rank[:, -1] >= count
+        out[full] = near[full][taken[full]].reshape(-1, count)
+        if not full.all():
+            # Near a border of the image, or where a whole exposure is held out: search once more.
+            points = np.flatnonzero(allowed)
+            _, found = cKDTree(self._uv[points]).query(self._uv[rows[~full]], k=np.arange(1, count + 1))
+            out[~full] = points[found]
+        return out
+
+    def restricted(self, kept):
+        """The table of the points kept (N, True or False) alone, numbered anew."""
+        other = NearestTable.__new__(NearestTable)
+        other._uv = self._uv[kept]
+        number = np.cumsum(kept) - 1
+        count = int(np.min(np.sum(kept[self._near[kept]], axis=1)))
+        other._near = number[self.nearest(np.flatnonzero(kept), kept, count)]
+        return other
+
+
 class CrossValidation:
     """Cross-validation of one kind of model over training points that stay where they are.
 
-    uv (N, 2) [px]; fold (N,) fold of each point; candidates: values of k, ascending. Neighbours are looked
-    up once, and weights kept while they are few: between the rounds only the values change. Raises
-    ValueError for too few points.
+    uv (N, 2) [px]; fold (N,) fold of each point; candidates: values of k, ascending; near: a
+    NearestTable of uv where there is one already. Neighbours are looked up once, and weights kept while they
+    are few: between the rounds only the values change. Raises ValueError for too few points.
     """
 
-    def __init__(self, kind, uv, fold, candidates):
+    def __init__(self, kind, uv, fold, candidates, near=None):
         folds = [np.flatnonzero(fold == f) for f in np.unique(fold)]
         trains = [np.flatnonzero(fold != f) for f in np.unique(fold)]
         candidates = np.asarray(candidates)
@@ -42,10 +78,12 @@ class CrossValidation:
         if not len(self.candidates):
             raise ValueError(f'{len(uv)} image points are too few for a cross-validation of {kind}')
         self._index, self._trend = np.empty((len(uv), self.candidates[-1]), dtype=np.intp), []
+        near = NearestTable(uv, self.candidates[-1]) if near is None else near
         basis = Trend(kind, uv).basis(uv)
         for held_out, train in zip(folds, trains):
-            _, near = cKDTree(uv[train]).query(uv[held_out], k=np.arange(1, self.candidates[-1] + 1))
-            self._index[held_out] = train[near]
+            allowed = np.ones(len(uv), dtype=bool)
+            allowed[held_out] = False
+            self._index[held_out] = near.nearest(held_out, allowed, self.candidates[-1])
             self._trend.append((held_out, train, least_squares_map(basis[train])))
         self._basis, self._near = basis, Neighbourhoods(uv[self._index], uv)
         keep = len(uv) * int(np.sum(self.candidates)) <= CACHE and kind != 'knn'

@@ -11,7 +11,6 @@ from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration, Tar
 from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Reset, SaveCalibration
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
-from rclpy.executors import MultiThreadedExecutor
 from rclpy.node import Node
 
 from ..bags.reader import frame_from_message
@@ -425,7 +424,7 @@ def _fill_result(result, job, calibrations):
 
 def main(args=None):
     """Entry point."""
-    support.run(CalibrationNode, lambda: MultiThreadedExecutor(num_threads=8), args)
+    support.run(CalibrationNode, lambda: support.ThreadedExecutor(num_threads=8), args)
 
 
 if __name__ == '__main__':

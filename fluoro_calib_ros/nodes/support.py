@@ -1,12 +1,18 @@
 """What the nodes share: parameters with descriptions, diagnostics, logging that does not flood, start and end."""
 
+import os
+import signal
 import sys
+import threading
 import time
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
-from rclpy.executors import ExternalShutdownException
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.signals import SignalHandlerOptions
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -18,7 +24,10 @@ def declare(node, name, default, description, low=None, high=None):
         descriptor.integer_range = [IntegerRange(from_value=low, to_value=high)]
     elif low is not None:
         descriptor.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
-    return node.declare_parameter(name, default, descriptor).value
+    try:
+        return node.declare_parameter(name, default, descriptor).value
+    except ParameterException as error:
+        raise StartError(f'parameter {name}: {error}') from None
 
 
 class Sentences:
@@ -61,21 +70,67 @@ class Diagnostics:
         self._publisher.publish(array)
 
 
-def run(make_node, executor_type, args=None):
-    """Run a node until it is interrupted; exit status 1 and one sentence where it cannot start."""
-    rclpy.init(args=args)
-    node, code = None, 0
+class ThreadedExecutor(MultiThreadedExecutor):
+    """MultiThreadedExecutor whose shutdown waits for the running callbacks, as promised but not done in Jazzy."""
+
+    def shutdown(self, timeout_sec=None):
+        """Wait for the callbacks, then shut down."""
+        self._executor.shutdown(wait=True)
+        return super().shutdown(timeout_sec)
+
+
+def _on_interrupt(end):
+    """Call end() from a thread at SIGINT or SIGTERM, whatever the main thread waits for; a second one exits at once."""
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    signal.set_wakeup_fd(writing)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
+
+    def watch():
+        os.read(reading, 1)
+        end()
+        os.read(reading, 1)
+        os._exit(130)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _init(args):
     try:
-        node = make_node()
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RCLError as error:   # arguments after --ros-args that are none
+        raise StartError(str(error).partition(', at /')[0]) from None
+
+
+def run(make_node, executor_type, args=None):
+    """Run a node until it is interrupted, or has ended by rclpy.shutdown(); exit status 1 and one sentence where it
+    cannot start, exit status 1 where its flag `failed` is set.
+
+    stop() of a node ends what its callbacks wait for. They end before the context does, which rclpy's own signal
+    handlers would take away from under them.
+    """
+    ended, node, code = threading.Event(), None, 0
+    try:
+        _init(args)
         executor = executor_type()
+
+        def end():
+            ended.set()
+            executor.create_task(lambda: None)   # something to do, so that spin_once returns
+
+        _on_interrupt(end)
+        node = make_node()
         executor.add_node(node)
         try:
-            executor.spin()
+            while rclpy.ok() and not ended.is_set():
+                executor.spin_once()
+        except ExternalShutdownException:
+            pass
         finally:
             getattr(node, 'stop', lambda: None)()
-            executor.shutdown(timeout_sec=2.0)
-    except (KeyboardInterrupt, ExternalShutdownException):
-        pass
+            executor.shutdown()
+        code = int(getattr(node, 'failed', False))
     except StartError as error:
         rclpy.logging.get_logger('fluoro_calib').fatal(str(error))
         code = 1

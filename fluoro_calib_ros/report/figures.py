@@ -27,6 +27,7 @@ BEFORE, AFTER = RED, BLUE
 WIDEST_HISTOGRAM = 15.0   # standard deviations to either side
 STRIPES = 16   # of the image, for the running median
 FIELD_CELLS, FIELD_ARROWS = 160, 17   # along the longer side of the image
+MARGIN = 0.09   # of the longer side, about the image for the arrows of its rim, and twice that below it
 
 
 def write_figures(job, directory):
@@ -128,6 +129,9 @@ def cost_figure(run):
     right.set(title='What is still moving', ylabel='RMS change of the correction [px]')
     for axes in (left, middle, right):
         axes.set(yscale='log', xlabel='iteration (0: without correction)', xlim=(-0.03 * n, 1.03 * n))
+        if axes is not right:   # a small gain is not to look like a large one
+            low, high = axes.get_ylim()
+            axes.set_ylim(min(low, 9), max(high, 120))
         axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
         axes.yaxis.set_major_formatter('{x:g}')
         axes.yaxis.set_minor_formatter('')
@@ -230,7 +234,9 @@ def _residual_panel(axes, position, residual, inside, limit, size, colour):
 
 def distortion_figure(model, name, image_size, interior_estimated):
     """The learned distortion as arrows over its magnitude, and its standard deviation with the training points."""
-    figure = _figure(15, 7.6, f'Fluoroscope {name}: learned distortion ({_described(model)})', 'compressed')
+    width, height = np.asarray(image_size) + np.array([2, 3]) * MARGIN * max(image_size)
+    figure = _figure(15, min(2 + 5.3 * height / width, 15), f'Fluoroscope {name}: learned distortion '
+                     f'({_described(model)})', 'compressed')
     left, right = figure.subplots(1, 2)
     centres, field = _field_on_grid(model, image_size, FIELD_CELLS)
     for axes, values, colours, bar in ((left, np.hypot(*field.duv.T), 'YlOrRd', 'magnitude [px]'),
@@ -261,7 +267,7 @@ def _field_on_grid(model, image_size, cells):
 def _image_frame(axes, image_size):
     """The image as a hatched area with a frame, v pointing down."""
     width, height = image_size
-    margin = 0.07 * max(image_size)   # for the arrows of the rim
+    margin = MARGIN * max(image_size)
     image = {'xy': (-0.5, -0.5), 'width': width, 'height': height}
     axes.add_patch(Rectangle(**image, facecolor='white', edgecolor='#AAAAAA', hatch='///', zorder=0.5))
     axes.add_patch(Rectangle(**image, fill=False, edgecolor=BLACK, linewidth=1.2, zorder=3))
@@ -276,9 +282,9 @@ def _draw_arrows(axes, model, image_size):
     u, v = (grid.ravel()[~field.outside] for grid in np.meshgrid(*centres))
     duv = field.duv[~field.outside]
     largest = max(float(np.max(np.hypot(*duv.T), initial=0.0)), 1e-6)
-    # Little more than two cells long at most: arrows hardly overlap, and small ones can be seen.
-    factor, reference = _round_down(2.3 * max(image_size) / FIELD_ARROWS / largest), _round_down(largest)
-    below = image_size[1] + 0.1 * max(image_size)
+    # Two cells long at most: arrows hardly overlap, and small ones can be seen.
+    factor, reference = _round_down(2 * max(image_size) / FIELD_ARROWS / largest), _round_down(largest)
+    below = image_size[1] + 0.13 * max(image_size)
     axes.quiver(np.append(u, 0), np.append(v, below), np.append(duv[:, 0], reference), np.append(duv[:, 1], 0),
                 angles='xy', scale_units='xy', scale=1 / factor, width=0.0045, color=BLACK, edgecolor='white',
                 linewidth=0.5, zorder=4)

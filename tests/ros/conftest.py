@@ -1,0 +1,88 @@
+"""Fixtures of the tests with real nodes: a ROS domain for the session, graphs, and a calibration to start from."""
+
+import shutil
+import subprocess
+
+import pytest
+from ros_graph import BAGS, ROOT, Graph, entry_point, free_domain
+
+from fluoro_calib_ros.bags.reader import read_frames
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if 'tests/ros' in item.path.as_posix():
+            item.add_marker(pytest.mark.ros)
+
+
+@pytest.fixture(scope='session')
+def ros(tmp_path_factory):
+    """rclpy in a ROS domain of this session's own; nodes inherit it by the environment."""
+    import rclpy
+    domain, lock = free_domain()
+    with pytest.MonkeyPatch.context() as patch, lock:
+        patch.setenv('ROS_DOMAIN_ID', str(domain))
+        patch.setenv('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+        patch.setenv('ROS_LOG_DIR', str(tmp_path_factory.mktemp('ros_log')))
+        rclpy.init(args=[])
+        yield
+        rclpy.shutdown()
+
+
+def _graph(request, directory):
+    graph = Graph(directory)
+    request.node.graphs = [*getattr(request.node, 'graphs', ()), graph]
+    yield graph
+    graph.close()
+
+
+@pytest.fixture
+def graph(ros, request, tmp_path):
+    """Graph of one test."""
+    yield from _graph(request, tmp_path)
+
+
+@pytest.fixture(scope='module')
+def module_graph(ros, request, tmp_path_factory):
+    """Graph of all tests of a file."""
+    yield from _graph(request, tmp_path_factory.mktemp('graph'))
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_runtest_makereport(item):
+    """Show what the nodes printed when a test fails."""
+    report = (yield).get_result()
+    if report.failed:
+        for node in item.listchain():
+            for graph in getattr(node, 'graphs', ()):
+                for name, log in graph.logs():
+                    report.sections.append((f'log of {name}', log))
+
+
+@pytest.fixture(scope='session')
+def exposures():
+    """Frames {fluoroscope: [Frame, ...]} of bags/calibration."""
+    return read_frames(BAGS / 'calibration').frames
+
+
+@pytest.fixture(scope='session')
+def tracking():
+    """Frames {fluoroscope: [Frame, ...]} of bags/tracking."""
+    return read_frames(BAGS / 'tracking').frames
+
+
+@pytest.fixture(scope='session')
+def by_command(tmp_path_factory):
+    """Two folders into which the command line has calibrated bags/calibration, one as the other."""
+    folders = [tmp_path_factory.mktemp('by_command') for _ in range(2)]
+    commands = [subprocess.Popen([*entry_point('cli'), 'calibrate', BAGS / 'calibration', '--phantom',
+                                  BAGS / 'phantom.csv', '--out', folder], cwd=ROOT, stdout=subprocess.DEVNULL)
+                for folder in folders]
+    assert [command.wait(240) for command in commands] == [0, 0]
+    return folders
+
+
+@pytest.fixture
+def calibrated(by_command, tmp_path):
+    """Folder with a calibration of a and b, of which a test may do what it likes."""
+    return shutil.copytree(by_command[0], tmp_path / 'calibrated')

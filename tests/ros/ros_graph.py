@@ -1,0 +1,283 @@
+"""Real nodes as processes, and a client that listens, publishes, calls and waits for conditions with a deadline."""
+
+import fcntl
+import itertools
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from fluoro_calib_msgs.action import SelfCalibrate
+from fluoro_calib_msgs.msg import (CalibrationStatus, CorrectedObservations, FluoroscopeCalibration,
+                                   TargetObservations)
+from rclpy.action import ActionClient
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo
+
+from fluoro_calib_ros.nodes.conversion import message_from_frame
+from fluoro_calib_ros.nodes.qos import LATCHED, OBSERVATIONS
+from fluoro_calib_ros.photogrammetry.observations import Frame
+
+ROOT = Path(__file__).parents[2]
+BAGS = ROOT / 'bags'
+DEADLINE = 60.0   # seconds; nothing takes a tenth of it on an idle machine
+NAMES = ('a', 'b')
+SUCCEEDED, CANCELED, ABORTED = GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED
+TOPICS = {'target_observations': (TargetObservations, OBSERVATIONS),
+          'corrected_observations': (CorrectedObservations, OBSERVATIONS),
+          'calibration': (FluoroscopeCalibration, LATCHED), 'camera_info': (CameraInfo, LATCHED),
+          'calibration_status': (CalibrationStatus, 10)}
+
+
+def free_domain():
+    """A ROS domain that nobody on this machine uses, and the open file that keeps it for this session."""
+    for domain in (1 + (os.getpid() + i) % 100 for i in range(100)):
+        lock = open(Path(tempfile.gettempdir()) / f'fluoro_calib_test_domain_{domain}.lock', 'a')
+        try:
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)   # other sessions of these tests
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+                port.bind(('', 7400 + 250 * domain + 10))   # any other first participant of the domain
+            return domain, lock
+        except OSError:
+            lock.close()
+    raise RuntimeError('all ROS domains from 1 to 100 are in use on this machine')
+
+
+def entry_point(node):
+    """Command that runs a node, or the command line fluoro-calib."""
+    module = 'fluoro_calib_ros.cli' if node == 'cli' else f'fluoro_calib_ros.nodes.{node}'
+    return [sys.executable, '-m', module]
+
+
+class Process:
+    """A node as a process of its own; what it prints is in .log."""
+
+    def __init__(self, command, path):
+        self.path = path
+        with open(path, 'wb') as out:
+            self._process = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=out, start_new_session=True)
+
+    @property
+    def log(self):
+        return self.path.read_text(errors='replace')
+
+    @property
+    def running(self):
+        return self._process.poll() is None
+
+    def wait(self, seconds=DEADLINE):
+        """Exit status of the process once it has ended."""
+        return self._process.wait(seconds)
+
+    def interrupt(self):
+        self._process.send_signal(signal.SIGINT)
+
+    def end(self, seconds=10.0):
+        """Interrupt the process, and kill it if that is not enough; returns its exit status."""
+        if self.running:
+            self.interrupt()
+        try:
+            return self.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            return self.wait()
+
+
+class Graph:
+    """Nodes and a client in a namespace of their own."""
+
+    _numbers = itertools.count(1)
+
+    def __init__(self, directory):
+        self.namespace = f'/rig{next(self._numbers)}'
+        self.directory, self.processes = directory, []
+        self.client = Client(self.namespace)
+
+    def start(self, node, parameters=None, remaps=None, wait=True):
+        """Start a node with {parameter: value} and {from: to}; returns its Process once the client is connected."""
+        number = len(self.processes)
+        arguments = ['--ros-args', '-r', f'__ns:={self.namespace}']
+        for key, value in (parameters or {}).items():
+            arguments += ['-p', f'{key}:={value}']
+        for key, value in (remaps or {}).items():
+            arguments += ['-r', f'{key}:={value}']
+        process = Process(entry_point(node) + arguments, self.directory / f'{number}_{node}.log')
+        self.processes.append(process)
+        if wait:
+            self.client.connect(node, process)
+        return process
+
+    def calibration_node(self, directory, **parameters):
+        return self.start('calibration_node', {'phantom': BAGS / 'phantom.csv', 'calibration_directory': directory,
+                                               **parameters})
+
+    def play(self, bag, readers, rate=10.0):
+        """Play a bag to the end."""
+        player = self.start('player_node', {'bag': bag, 'rate': rate, 'wait_for_readers': readers}, wait=False)
+        self.client.wait_until(lambda: not player.running, what='the end of the player')
+        assert player.wait() == 0, player.log
+
+    def logs(self):
+        """What the nodes printed, by node."""
+        return [(p.path.name, p.log) for p in self.processes]
+
+    def close(self):
+        running = [p for p in self.processes if p.running]
+        for process in running:
+            process.interrupt()
+        for process in running:
+            process.end()
+        self.client.close()
+
+
+class Client(Node):
+    """A user of the graph. What comes on a topic is in messages[topic], from the time at which it is listened to."""
+
+    def __init__(self, namespace):
+        super().__init__('client', namespace=namespace)
+        self.messages, self.statuses, self.feedback = {}, {}, []
+        self._spinner = SingleThreadedExecutor()
+        self._spinner.add_node(self)
+        self._callers = {}
+        self._outputs = {n: self.create_publisher(TargetObservations, f'{n}/target_observations', OBSERVATIONS)
+                         for n in NAMES}
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
+        for name in NAMES:
+            self.listen(f'{name}/calibration_status')
+        self.published = 0
+        self._action = ActionClient(self, SelfCalibrate, 'self_calibrate')
+
+    # -- waiting
+
+    def wait_until(self, condition, seconds=DEADLINE, what='the condition'):
+        """Spin until condition() is true; returns its value. Fails when the time is up."""
+        end = time.monotonic() + seconds
+        while True:
+            value = condition()
+            if value:
+                return value
+            assert time.monotonic() < end, f'waited {seconds:g} s for {what}'
+            self._spinner.spin_once(timeout_sec=0.1)
+
+    def result_of(self, future, seconds=DEADLINE, what='an answer'):
+        """Result of a future."""
+        self.wait_until(future.done, seconds, what)
+        return future.result()
+
+    def connect(self, node, process):
+        """Wait until everything of a node that has just been started is connected with the client."""
+        def connected():
+            assert process.running, f'{node} ended: {process.log}'
+            if node == 'calibration_node':
+                return (self.subscriptions_matched('calibration_node') and self._action.server_is_ready()
+                        and all(self.count_publishers(f'{n}/calibration_status') for n in NAMES))
+            if node == 'correction_node':
+                return self.subscriptions_matched('correction_node') and all(
+                    self.count_publishers(f'{n}/corrected_observations') for n in NAMES)
+            return any(name == node for name, _ in self.get_node_names_and_namespaces())
+        self.wait_until(connected, what=f'{node} to come up')
+
+    def subscriptions_matched(self, node):
+        """Whether a node listens to the observations, and what is published now reaches all who listen."""
+        for name, output in self._outputs.items():
+            readers = self.get_subscriptions_info_by_topic(f'{self.get_namespace()}/{name}/target_observations')
+            if node not in [r.node_name for r in readers] or output.get_subscription_count() < len(readers):
+                return False
+        return True
+
+    # -- topics
+
+    def listen(self, topic):
+        """Collect the messages of a topic; returns the list they come into."""
+        kind, qos = TOPICS[topic.rpartition('/')[2]]
+        collected = self.messages[topic] = []
+        self.create_subscription(kind, topic, collected.append, qos)
+        return collected
+
+    def _on_diagnostics(self, array):
+        for status in array.status:
+            if status.name.startswith(self.get_namespace() + '/'):
+                self.statuses[status.name.removeprefix(self.get_namespace() + '/')] = status
+
+    def status(self, name='a'):
+        """Newest CalibrationStatus of a fluoroscope, None before the first."""
+        return self.messages[f'{name}/calibration_status'][-1] if self.messages[f'{name}/calibration_status'] else None
+
+    def wait_for_status(self, condition, name='a', what='a status'):
+        """Newest CalibrationStatus once it fulfils condition(status)."""
+        self.wait_until(lambda: self.status(name) and condition(self.status(name)), what=what)
+        return self.status(name)
+
+    def wait_for_diagnostics(self, node, condition, name='a', what='a diagnostic'):
+        """Newest DiagnosticStatus of a node about a fluoroscope once it fulfils condition(status)."""
+        key = f'{node}: {name}'
+        self.wait_until(lambda: key in self.statuses and condition(self.statuses[key]), what=f'{what} of {node}')
+        return self.statuses[key]
+
+    def publish(self, frame):
+        """Publish a Frame, or a TargetObservations message as it is, of a fluoroscope."""
+        self._outputs[frame.fluoroscope].publish(message_from_frame(frame))
+
+    def publish_message(self, name, message):
+        self._outputs[name].publish(message)
+
+    def stream(self, pairs, rate):
+        """Publish pairs of frames at a rate from a timer, while the client spins; returns the timer."""
+        pairs = iter(pairs)
+        self.published = 0
+
+        def publish():
+            try:
+                for frame in next(pairs):
+                    self.publish(frame)
+            except StopIteration:
+                timer.cancel()
+            else:
+                self.published += 1
+
+        timer = self.create_timer(1 / rate, publish)
+        return timer
+
+    # -- services and action
+
+    def call_async(self, kind, service, **fields):
+        """Future of the answer of a service."""
+        if service not in self._callers:
+            self._callers[service] = self.create_client(kind, service)
+        self.wait_until(self._callers[service].service_is_ready, what=f'the service {service}')
+        return self._callers[service].call_async(kind.Request(**fields))
+
+    def call(self, kind, service, **fields):
+        """Answer of a service."""
+        return self.result_of(self.call_async(kind, service, **fields), what=f'the answer of {service}')
+
+    def goal(self, **fields):
+        """Handle of a goal that has been accepted; its feedback comes into .feedback."""
+        self.feedback = []
+        feedback = self.feedback
+        handle = self.result_of(self._action.send_goal_async(
+            SelfCalibrate.Goal(**fields), feedback_callback=lambda m: feedback.append(m.feedback)))
+        assert handle.accepted
+        return handle
+
+    def close(self):
+        self._spinner.shutdown()
+        self.destroy_node()
+
+
+def standing(frame, count, first=1, rate=60.0, shift=0.0, noise=0.02, start_ns=10 ** 18):
+    """Frames of a phantom that stands as in frame, in a stream of rate; shift moves it by that many px a frame."""
+    rng = np.random.default_rng(0)
+    for i in range(count):
+        uv = frame.uv + rng.normal(0, noise, frame.uv.shape) + [shift * i, 0]
+        keep = (uv < np.array(frame.image_size) - 1).all(axis=1)
+        yield Frame(frame.fluoroscope, first + i, frame.target_id[keep], uv[keep], frame.image_size, None,
+                    start_ns + round(i / rate * 1e9), frame.frame_id)

@@ -1,0 +1,330 @@
+"""The bundle adjustment and its precision, against dense matrices, scipy and Monte Carlo."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+import rigs
+from fluoro_calib_ros.calibration.self_calibration import adjusted_with_precision
+from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
+from fluoro_calib_ros.photogrammetry import precision as precision_module
+from fluoro_calib_ros.photogrammetry.adjustment import adjust, eliminates_points, residuals_and_q, total_cost
+from fluoro_calib_ros.photogrammetry.collinearity import project
+from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
+from fluoro_calib_ros.photogrammetry.observations import DataError
+from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy, precision
+from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
+
+MANY_TARGETS = dict(exposures=4, targets=30)   # the points are eliminated
+MANY_EXPOSURES = dict(exposures=14, targets=20)   # the exposures are eliminated
+
+
+def cost_at(network, result, x=None, correction=0.0):
+    """F at a solution moved by x, its noise model held."""
+    parameters = result.parameters if x is None else rigs.moved(network, result.parameters, x)
+    _, q = residuals_and_q(network, parameters, correction, result.noise)
+    return total_cost(network, parameters, q, result.noise)
+
+
+def standard_deviations(network, result):
+    """Of all unknowns, in the order of rigs.moved, by the dense weighted normal matrix."""
+    return np.sqrt(np.diagonal(np.linalg.inv(rigs.dense_normal_matrix(network, result))))
+
+
+def assert_same_solution(one, other, position_mm=1e-5, angle=1e-8, points_mm=1e-6, interior=1e-4):
+    np.testing.assert_allclose(one.parameters.position_mm, other.parameters.position_mm, rtol=0, atol=position_mm)
+    assert np.max(rotation_angle(one.parameters.rotation @ other.parameters.rotation.transpose(0, 2, 1))) < angle
+    np.testing.assert_allclose(one.parameters.points_mm, other.parameters.points_mm, rtol=0, atol=points_mm)
+    np.testing.assert_allclose(one.parameters.interior, other.parameters.interior, rtol=0, atol=interior)
+
+
+@pytest.mark.parametrize('shape', [MANY_TARGETS, MANY_EXPOSURES])
+@pytest.mark.parametrize('loss', LOSSES)
+def test_gradient_of_the_cost_is_zero_at_the_solution(loss, shape):
+    """Central differences of F in as many directions as there are unknowns, each of one standard deviation."""
+    network, truth = rigs.small_network(**shape, nu=4.0)
+    result = adjust(network, rigs.disturbed(truth), noise=Noise(loss))
+    assert result.converged
+    directions = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, result))).T
+    step = 1e-3
+    slope = [(cost_at(network, result, step * d) - cost_at(network, result, -step * d)) / (2 * step)
+             for d in directions]
+    assert np.linalg.norm(slope) < 2e-4   # a decrease of less than 2e-8 is left
+    assert result.cost == pytest.approx(cost_at(network, result), rel=1e-12)
+
+
+def test_gaussian_adjustment_equals_scipy_least_squares():
+    network, truth = rigs.small_network(**MANY_TARGETS)
+    result = adjust(network, rigs.disturbed(truth), noise=Noise('gaussian'), tolerance=1e-12)
+    assert len(set(network.sigma)) > 1
+
+    def residuals(x):
+        parameters = rigs.moved(network, truth, x)
+        image = (network.uv - project(*parameters.per_image_point(network))) / (
+            result.noise.scale * network.sigma)[:, None]
+        survey = (parameters.points_mm - network.survey_mm) / network.survey_sd_mm[:, None]
+        return np.concatenate([image.ravel(), survey.ravel()])
+
+    sd = standard_deviations(network, result)
+    theirs = optimize.least_squares(residuals, np.zeros(network.unknowns), x_scale=sd, xtol=1e-13, ftol=1e-15,
+                                    gtol=1e-12, jac='3-point')
+    parameters = rigs.moved(network, truth, theirs.x)
+    assert_same_solution(result, replace(result, parameters=parameters), 2e-3, 1e-6, 1e-5, 5e-3)
+    constant = np.sum(np.log(2 * np.pi * (result.noise.scale * network.sigma) ** 2))
+    assert result.cost - constant == pytest.approx(theirs.cost, rel=1e-9)
+
+
+@pytest.mark.parametrize('loss', ['student_t', 'huber'])
+def test_no_better_solution_is_found_by_direct_minimisation(loss):
+    """With the noise model held, scipy gains nothing from our solution, and from elsewhere comes back to it."""
+    network, truth = rigs.small_network(exposures=3, targets=14, nu=4.0)
+    result = adjust(network, rigs.disturbed(truth), noise=Noise(loss), tolerance=1e-12)
+    root = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, result)))
+    ours = cost_at(network, result)
+    for start in (np.zeros(network.unknowns), np.random.default_rng(1).normal(0, 0.5, network.unknowns)):
+        theirs = optimize.minimize(lambda z: cost_at(network, result, root @ z), start, method='BFGS',
+                                   options={'gtol': 1e-5})
+        assert ours - theirs.fun < 1e-5
+        assert np.max(np.abs(theirs.x)) < 0.02   # in standard deviations
+
+
+@pytest.mark.parametrize('loss', LOSSES)
+@pytest.mark.parametrize('shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)])
+def test_both_eliminations_give_the_same_solution_and_covariances(monkeypatch, shape, loss):
+    network, truth = rigs.small_network(**shape, nu=5.0)
+    assert eliminates_points(network) == (shape is not MANY_EXPOSURES)
+    found = []
+    for points in (True, False):
+        monkeypatch.setattr(adjustment_module, 'eliminates_points', lambda network, points=points: points)
+        monkeypatch.setattr(precision_module, 'eliminates_points', lambda network, points=points: points)
+        result = adjust(network, rigs.disturbed(truth), noise=Noise(loss))
+        found.append((result, precision(network, result)))
+    (one, one_precise), (other, other_precise) = found
+    assert one.steps == other.steps
+    assert one.cost == pytest.approx(other.cost, rel=1e-10)
+    assert_same_solution(one, other)
+    for name in ('interior', 'exterior', 'points', 'residual', 'redundancy', 'survey_redundancy'):
+        a, b = getattr(one_precise, name), getattr(other_precise, name)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-7 * np.max(np.abs(b)), err_msg=name)
+
+
+@pytest.mark.parametrize('free', [True, False])
+@pytest.mark.parametrize('loss', LOSSES)
+@pytest.mark.parametrize('shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)])
+def test_covariances_equal_the_dense_inverse(shape, loss, free):
+    """Those of the unknowns under the Fisher information, those of the residuals under the weighted problem."""
+    network, truth = rigs.small_network(**shape, nu=5.0, free=free)
+    result = adjust(network, truth, noise=Noise(loss))
+    precise = precision(network, result)
+    _, m, n, _ = network.shape
+    honest = np.linalg.inv(rigs.dense_normal_matrix(network, result, result.noise.information_factor(result.q)))
+    for j in range(m):
+        part = slice(6 * j, 6 * j + 6)
+        np.testing.assert_allclose(precise.exterior[j], honest[part, part], rtol=1e-5, atol=1e-9)
+    for i in range(n):
+        part = slice(6 * m + 3 * i, 6 * m + 3 * i + 3)
+        np.testing.assert_allclose(precise.points[i], honest[part, part], rtol=1e-5, atol=1e-9)
+    for f, own in enumerate(precise.interior):
+        part = slice(6 * m + 3 * n + 3 * f, 6 * m + 3 * n + 3 * f + 3)
+        np.testing.assert_allclose(own, honest[part, part] if free else np.zeros((3, 3)), rtol=1e-5, atol=1e-6)
+
+    a = rigs.design_matrix(network, result.parameters)
+    weighted = a @ np.linalg.inv(rigs.dense_normal_matrix(network, result)) @ a.T
+    variance = np.repeat((result.noise.scale * network.sigma) ** 2 / result.noise.weight(result.q), 2)
+    residual = np.diag(variance) - weighted
+    for row, own in enumerate(precise.residual):
+        part = slice(2 * row, 2 * row + 2)
+        np.testing.assert_allclose(own, residual[part, part], rtol=0, atol=1e-6 * variance[2 * row])
+    np.testing.assert_allclose(precise.redundancy.ravel(), 1 - np.diagonal(weighted) / variance, atol=1e-6)
+
+
+@pytest.mark.parametrize('free', [True, False])
+@pytest.mark.parametrize('loss', LOSSES)
+@pytest.mark.parametrize('shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)])
+def test_redundancy_numbers_sum_to_observations_less_unknowns(shape, loss, free):
+    network, truth = rigs.small_network(**shape, nu=4.0, free=free)
+    m, n, fluoroscopes = network.shape[1:]
+    assert network.unknowns == 6 * m + 3 * n + 3 * free * fluoroscopes
+    result = adjust(network, truth, noise=Noise(loss))
+    precise = precision(network, result)
+    total = precise.redundancy.sum() + precise.survey_redundancy.sum()
+    assert total == pytest.approx(2 * len(network.uv) + 3 * n - network.unknowns, rel=1e-8)
+    for numbers in (precise.redundancy, precise.survey_redundancy):
+        assert numbers.min() > -1e-9 and numbers.max() < 1 + 1e-9
+
+
+def test_geometric_redundancy_is_that_of_equal_weights():
+    """It does not follow the residuals: the same as the redundancy numbers of a Gaussian adjustment."""
+    network, truth = rigs.small_network(**MANY_TARGETS)
+    result = adjust(network, truth, noise=Noise('gaussian'))
+    numbers = precision(network, result).redundancy.mean(axis=1)
+    noise = Noise('student_t', result.noise.scale, 3.0)
+    np.testing.assert_allclose(geometric_redundancy(network, result.parameters, noise), numbers, atol=1e-9)
+
+
+def normalised_errors(count, loss, **network):
+    """Squared errors in units of their covariances, of `count` simulated adjustments: {unknowns: (n,)}, scales."""
+    out, scales = {'interior': [], 'exterior': [], 'points': []}, []
+    for seed in range(count):
+        net, truth = rigs.small_network(seed=seed, **network)
+        result, precise = adjusted_with_precision(net, truth, np.zeros_like(net.uv), Noise(loss))
+        found = result.parameters
+        turn = small_vectors(found.rotation @ truth.rotation.transpose(0, 2, 1))
+        errors = {'interior': found.interior - truth.interior, 'points': found.points_mm - truth.points_mm,
+                  'exterior': np.concatenate([found.position_mm - truth.position_mm, turn], axis=1)}
+        for name, error in errors.items():
+            out[name].append(normalised(error, getattr(precise, name)))
+        scales.append(result.noise.scale)
+    return {name: np.concatenate(values) for name, values in out.items()}, scales
+
+
+def test_standard_deviations_of_gaussian_noise_against_monte_carlo():
+    """60 simulated adjustments: errors have the size that their covariances claim."""
+    errors, scales = normalised_errors(60, 'gaussian', exposures=6, targets=40)
+    assert np.mean(scales) == pytest.approx(0.3, rel=0.02)
+    # Means of 180, of 2160 correlated and of 7200 hardly correlated squares of unit variance.
+    assert np.mean(errors['interior']) == pytest.approx(1, abs=0.3)
+    assert np.mean(errors['exterior']) == pytest.approx(1, abs=0.2)
+    assert np.mean(errors['points']) == pytest.approx(1, abs=0.05)
+
+
+def test_standard_deviations_of_heavy_tailed_noise_against_monte_carlo():
+    """The same under a true t of four degrees of freedom; without (nu+4)/(nu+2) the squares would be 1.3."""
+    errors, scales = normalised_errors(60, 'student_t', exposures=5, targets=80, nu=4.0, survey_sd_mm=0.02)
+    assert np.mean(scales) == pytest.approx(0.3, rel=0.05)
+    assert np.mean(errors['exterior']) == pytest.approx(1, abs=0.2)
+    assert np.mean(errors['interior']) == pytest.approx(1, abs=0.3)
+
+
+def normalised(error, covariance):
+    """Squared errors (n,) in units of their covariances, divided by the number of unknowns."""
+    return np.einsum('na,nab,nb->n', error, np.linalg.inv(covariance), error) / error.shape[1]
+
+
+def small_vectors(turn):
+    """Rotation vectors of small turns."""
+    return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]],
+                    axis=1) / 2
+
+
+def test_false_matches_do_not_move_the_solution():
+    """With 5 % of them the Student-t solution is that of the others within a part of its standard deviation."""
+    network, truth = rigs.small_network(exposures=6, targets=40)
+    false = np.random.default_rng(1).permutation(len(network.uv))[:len(network.uv) // 20]
+    uv = network.uv.copy()
+    uv[false] += np.random.default_rng(2).choice([-60, 60], (len(false), 2))
+    keep = np.setdiff1d(np.arange(len(uv)), false)
+    clean = replace(network, uv=uv[keep], sigma=network.sigma[keep], exposure=network.exposure[keep],
+                    point=network.point[keep])
+    wanted = adjust(clean, truth)
+    sd = np.sqrt(np.diagonal(precision(clean, wanted).exterior, axis1=1, axis2=2)[:, :3])
+
+    def shift(loss):
+        found = adjust(replace(network, uv=uv), rigs.disturbed(truth), noise=Noise(loss))
+        assert found.converged
+        return np.max(np.abs(found.parameters.position_mm - wanted.parameters.position_mm) / sd), found
+
+    moved, found = shift('student_t')
+    assert moved < 0.6 and not found.inliers[false].any() and found.inliers[keep].mean() > 0.98
+    assert shift('gaussian')[0] > 5, 'the false matches are no test of anything'
+
+
+def test_the_order_of_image_points_does_not_matter():
+    network, truth = rigs.small_network(exposures=5, targets=30, nu=4.0)
+    order = np.lexsort((np.random.default_rng(1).random(len(network.uv)), network.exposure))
+    assert (order != np.arange(len(order))).any()
+    shuffled = replace(network, uv=network.uv[order], sigma=network.sigma[order], point=network.point[order])
+    one, other = adjust(network, rigs.disturbed(truth)), adjust(shuffled, rigs.disturbed(truth))
+    assert_same_solution(one, other)
+    np.testing.assert_allclose(one.residuals[order], other.residuals, atol=1e-6)
+
+
+def test_sigma_has_a_unit_of_its_own():
+    """Ten times the sigma gives a tenth of the scale, and nothing else changes."""
+    network, truth = rigs.small_network(**MANY_TARGETS)
+    one = adjust(network, rigs.disturbed(truth))
+    other = adjust(replace(network, sigma=10 * network.sigma), rigs.disturbed(truth), noise=Noise(scale=0.1))
+    assert other.noise.scale == pytest.approx(one.noise.scale / 10, rel=1e-6)
+    assert_same_solution(one, other)
+
+
+def test_image_points_of_small_sigma_decide():
+    """Where two exposures contradict each other on a point, it goes where the more precise one sees it."""
+    network, truth = rigs.small_network(exposures=6, targets=40, noise_px=0.3, survey_sd_mm=50.0, seen=1.0)
+    rough = network.exposure % 2 == 1
+    sigma = np.where(rough, 50.0, 1.0)
+    uv = project(*truth.per_image_point(network))
+    uv += np.where(rough[:, None], 5.0, 0.0) * np.random.default_rng(1).normal(size=uv.shape)
+    uv += 0.01 * np.random.default_rng(2).normal(size=uv.shape)
+    interior_held = replace(network, uv=uv, survey_mm=truth.points_mm, survey_sd_mm=np.full(40, 0.5),
+                            interior_free=np.array([False]))
+    error = [np.sqrt(np.mean((adjust(replace(interior_held, sigma=s), truth).parameters.points_mm
+                              - truth.points_mm) ** 2)) for s in (sigma, np.ones(len(uv)))]
+    assert error[0] < 0.2 * error[1]
+
+
+def test_a_held_interior_orientation_stays_to_the_last_bit():
+    """Also where that of the other fluoroscope is estimated."""
+    network, truth = rigs.small_network(exposures=4, targets=30, fluoroscopes=2)
+    network = replace(network, interior_free=np.array([False, True]))
+    start = rigs.disturbed(truth)
+    result = adjust(network, start)
+    assert result.converged
+    np.testing.assert_array_equal(result.parameters.interior[0], start.interior[0])
+    assert np.all(result.parameters.interior[1] != start.interior[1])
+    precise = precision(network, result)
+    assert not precise.interior[0].any() and np.all(np.diagonal(precise.interior[1]) > 0)
+
+
+def test_a_correction_is_taken_off_the_observed_points():
+    """undistorted = observed - correction: adjusting distorted points with their correction is as before."""
+    network, truth = rigs.small_network(**MANY_TARGETS)
+    correction = np.random.default_rng(1).normal(0, 5, network.uv.shape)
+    one = adjust(network, rigs.disturbed(truth))
+    distorted = replace(network, uv=network.uv + correction)
+    other = adjust(distorted, rigs.disturbed(truth), correction)
+    assert_same_solution(one, other)
+    np.testing.assert_allclose(one.residuals, other.residuals, atol=1e-6)
+    np.testing.assert_allclose(precision(distorted, other, correction).residual, precision(network, one).residual,
+                               rtol=1e-4, atol=1e-7)
+
+
+def test_a_far_start_ends_in_the_same_place():
+    network, truth = rigs.small_network(exposures=6, targets=40, nu=5.0)
+    near, far = adjust(network, truth), adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0))
+    assert near.converged and far.converged
+    assert near.cost == pytest.approx(far.cost, abs=1e-3)
+    sd = standard_deviations(network, near)[:3]
+    assert np.max(np.abs(near.parameters.position_mm[0] - far.parameters.position_mm[0]) / sd) < 1e-2
+
+
+def test_steps_that_run_out_are_told():
+    network, truth = rigs.small_network(**MANY_TARGETS)
+    result = adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0), max_steps=2)
+    assert not result.converged and result.steps == 2
+
+
+def test_check_stops_an_adjustment_before_its_next_step():
+    network, truth = rigs.small_network(**MANY_TARGETS)
+    calls = []
+
+    def check():
+        calls.append(1)
+        if len(calls) == 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0), check=check)
+    assert len(calls) == 3
+
+
+def test_a_network_that_leaves_unknowns_open_is_refused():
+    """Two targets do not give an exposure's orientation."""
+    network, truth = rigs.small_network(**MANY_TARGETS, seen=1.0)
+    keep = (network.exposure != 1) | (network.point < 2)
+    open_one = replace(network, uv=network.uv[keep], sigma=network.sigma[keep], exposure=network.exposure[keep],
+                       point=network.point[keep])
+    with pytest.raises(DataError, match='do not determine the unknowns'):
+        adjusted_with_precision(open_one, truth, np.zeros_like(open_one.uv), Noise())

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import optimize
+from threadpoolctl import threadpool_limits
 
 import rigs
 from fluoro_calib_ros.calibration.self_calibration import adjusted_with_precision
@@ -19,6 +20,13 @@ from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 
 MANY_TARGETS = dict(exposures=4, targets=30)   # the points are eliminated
 MANY_EXPOSURES = dict(exposures=14, targets=20)   # the exposures are eliminated
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    """As the calibration runs: two threads are slower for matrices of this size."""
+    with threadpool_limits(1):
+        yield
 
 
 def cost_at(network, result, x=None, correction=0.0):
@@ -191,8 +199,8 @@ def test_standard_deviations_of_gaussian_noise_against_monte_carlo():
 
 
 def test_standard_deviations_of_heavy_tailed_noise_against_monte_carlo():
-    """The same under a true t of four degrees of freedom; without (nu+4)/(nu+2) the squares would be 1.3."""
-    errors, scales = normalised_errors(60, 'student_t', exposures=5, targets=80, nu=4.0, survey_sd_mm=0.02)
+    """The same under a true t of four degrees of freedom; without (nu+4)/(nu+2) the squares would be 1.4."""
+    errors, scales = normalised_errors(40, 'student_t', exposures=5, targets=80, nu=4.0, survey_sd_mm=0.02)
     assert np.mean(scales) == pytest.approx(0.3, rel=0.05)
     assert np.mean(errors['exterior']) == pytest.approx(1, abs=0.2)
     assert np.mean(errors['interior']) == pytest.approx(1, abs=0.3)

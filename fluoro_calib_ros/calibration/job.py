@@ -12,6 +12,8 @@ from .network import measured_network
 from .result import FluoroscopeCalibration, digest_of_sources
 from .self_calibration import Options, adjusted_with_precision, rmse_of_inliers, self_calibrate
 
+SEEN_FOR_NOISE = 3   # mean number of image points of a target from which an adjustment estimates the noise itself
+
 
 @dataclass(frozen=True)
 class ExposureResult:
@@ -116,8 +118,12 @@ def adjust_with(frames, phantom, calibrations, loss='student_t', check=None):
         correction = np.zeros_like(network.uv)
         for f, name in enumerate(frames):
             correction[of_point == f] = calibrations[name].model.predict(network.uv[of_point == f])
-        scale = float(np.median([c.sigma0 for c in calibrations.values()]))
-        after, precise = adjusted_with_precision(network, measured.start, correction, Noise(loss, scale), check=check)
+        # Few exposures do not tell noise from errors of the survey; then it is that of the calibration.
+        held = len(network.uv) < SEEN_FOR_NOISE * len(network.survey_mm)
+        noise = Noise(loss, float(np.median([c.sigma0 for c in calibrations.values()])),
+                      float(np.median([c.nu for c in calibrations.values()])))
+        after, precise = adjusted_with_precision(network, measured.start, correction, noise, check=check,
+                                                 noise_held=held)
         before, _ = adjusted_with_precision(network, after.parameters, np.zeros_like(correction),
                                             after.noise, tolerance=1e-4, check=check)
     figures = {name: _figures(measured, before, after, precise, f, calibrations[name].model)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..distortion.regressor import Regressor
 from ..distortion.smoothers import KINDS
-from ..photogrammetry.adjustment import Adjustment, adjust
+from ..photogrammetry.adjustment import Adjustment, adjust, residuals_and_q
 from ..photogrammetry.noise import LOSSES, Noise
 from ..photogrammetry.observations import DataError
 from ..photogrammetry.precision import Precision, geometric_redundancy, precision
@@ -21,6 +21,7 @@ from .network import Measured
 
 INTERIORS = ('estimated', 'fixed')
 ROUND_TOLERANCE = 1e-4   # decrease of F that a round may leave to the next: a hundredth of a sigma
+RESCALINGS = 6   # times that the redundancy numbers are renewed before the first adjustment counts
 SETTLED_PX = 2e-3   # RMS change of the correction below which a round is taken as the last
 
 
@@ -134,20 +135,43 @@ def rmse_of_inliers(adjustment, rows):
     return np.sqrt(np.mean(r * r, axis=0)) if len(r) else np.full(2, np.nan)
 
 
-def adjusted_with_precision(network, start, correction, noise, redundancy=None, tolerance=1e-8, check=None):
-    """Adjustment and Precision of a network; redundancy (N,) or None: from its geometry.
+def adjusted_with_precision(network, start, correction, noise, redundancy=None, tolerance=1e-8, check=None,
+                            noise_held=False):
+    """Adjustment and Precision of a network; redundancy (N,) or None: from its geometry; noise_held: as given.
 
     Raises DataError where the network does not determine the unknowns.
     """
     try:
-        result = adjust(network, start, correction, noise, redundancy, tolerance, check=check)
-        if redundancy is None:
-            redundancy = geometric_redundancy(network, result.parameters, result.noise)
-            result = adjust(network, result.parameters, correction, result.noise, redundancy, tolerance, check=check)
+        if redundancy is not None or noise_held:
+            result = adjust(network, start, correction, noise, redundancy, tolerance, check=check,
+                            noise_held=noise_held)
+        else:
+            result = _adjusted_from_afar(network, start, correction, noise, tolerance, check)
         return result, precision(network, result, correction)
     except np.linalg.LinAlgError:
         raise DataError('the exposures do not determine the unknowns: the normal matrix is singular; '
                         'add exposures with the phantom turned and moved') from None
+
+
+def _adjusted_from_afar(network, start, correction, noise, tolerance, check):
+    """Adjustment from start values, with redundancy numbers that belong to the noise scale it finds.
+
+    Image points and survey share the redundancy according to their precision, so the numbers depend on the
+    scale. The residuals at the start hold the errors of the survey too and give a scale that is rather too
+    large: from there it comes down to its place, while from too small a one it could fall for ever.
+    """
+    _, q = residuals_and_q(network, start, correction, noise)
+    if np.isfinite(q).all():
+        noise = noise.estimated(q * noise.scale ** 2)
+    parameters = start
+    for _ in range(RESCALINGS):
+        redundancy = geometric_redundancy(network, parameters, noise)
+        result = adjust(network, parameters, correction, noise, redundancy, tolerance, check=check)
+        settled = abs(result.noise.scale - noise.scale) <= 0.02 * noise.scale
+        parameters, noise = result.parameters, result.noise
+        if settled:
+            break
+    return result
 
 
 def self_calibrate(measured, options=Options(), progress=None, check=None):

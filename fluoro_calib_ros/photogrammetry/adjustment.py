@@ -16,6 +16,9 @@ from .collinearity import project, project_with_jacobian
 from .noise import Noise
 from .rotations import matrix_from_vector
 
+# No target is measured better than this; where there is hardly any redundancy the scale could vanish.
+SMALLEST_NOISE_PX = 0.01
+
 
 @dataclass(frozen=True)
 class Network:
@@ -230,20 +233,21 @@ def _moved(network, parameters, x_b, x_r):
 
 
 def adjust(network, start, correction=None, noise=Noise(), redundancy=None, tolerance=1e-8, max_steps=100,
-           check=None):
+           check=None, noise_held=False):
     """Adjust a network with the corrections held.
 
     start: Parameters; correction (N, 2) [px] or None; noise: start values, scale and nu are estimated along
     the way (redundancy: redundancy numbers (N,) of the image points, None: their mean by the count of unknowns);
-    tolerance: largest decrease of F still to be had at the end; check(): called before every step, may
-    raise to stop. Returns Adjustment; converged is False after max_steps.
+    noise_held: scale and nu stay as they are; tolerance: largest decrease of F still to be had at the end;
+    check(): called before every step, may raise to stop. Returns Adjustment; converged is False after max_steps.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
     if redundancy is None:
         redundancy = max(0.1, 1 - network.unknowns / (2 * len(network.uv) + network.survey_mm.size))
     parameters, mu, growth, converged, step = start, 1e-6, 2.0, False, 0
     r, q = residuals_and_q(network, parameters, correction, noise)
-    noise, q = _renewed(noise, q, redundancy)
+    if not noise_held:
+        noise, q = _renewed(network, noise, q, redundancy)
     cost = total_cost(network, parameters, q, noise)
     blocks = None
     for step in range(1, max_steps + 1):
@@ -272,7 +276,9 @@ def adjust(network, start, correction=None, noise=Noise(), redundancy=None, tole
             gain = (cost - cost_new) / max(predicted, 1e-300)
             mu, growth = max(mu * max(1 / 3, 1 - (2 * gain - 1) ** 3), 1e-15), 2.0
             old = noise
-            noise, q = _renewed(noise, q_new, redundancy)
+            q = q_new
+            if not noise_held:
+                noise, q = _renewed(network, noise, q_new, redundancy)
             parameters, r, blocks = moved, r_new, None
             cost = total_cost(network, parameters, q, noise)
             settled = abs(noise.scale - old.scale) <= 1e-4 * old.scale
@@ -289,10 +295,10 @@ def adjust(network, start, correction=None, noise=Noise(), redundancy=None, tole
     return Adjustment(parameters, r, q, noise, float(cost), step, converged)
 
 
-def _renewed(noise, q, redundancy):
+def _renewed(network, noise, q, redundancy):
     """Noise model estimated anew from q, and q under it."""
     if not np.isfinite(q).all():
         return noise, q
     new = noise.estimated(q * noise.scale ** 2, redundancy)
-    new = replace(new, scale=max(new.scale, 1e-9))
+    new = replace(new, scale=max(new.scale, SMALLEST_NOISE_PX / float(np.median(network.sigma))))
     return new, q * (noise.scale / new.scale) ** 2

@@ -39,6 +39,8 @@ class Noise:
             raise ValueError(f'loss is one of {", ".join(LOSSES)}, not {self.loss!r}')
         if self.loss != 'student_t':
             object.__setattr__(self, 'nu', np.inf)
+        elif not np.isfinite(self.nu):   # of a calibration with another loss
+            object.__setattr__(self, 'nu', NU_RANGE[1])
 
     def weight(self, q):
         """Weights (n,) of iteratively reweighted least squares at normalised squared residuals q (n,)."""

@@ -230,21 +230,20 @@ class Client(Node):
         self._outputs[name].publish(message)
 
     def stream(self, pairs, rate):
-        """Publish pairs of frames at a rate from a timer, while the client spins; returns the timer."""
-        pairs = iter(pairs)
+        """Publish pairs of frames at a rate while the client spins, until end_stream(); .published counts them."""
         self.published = 0
 
         def publish():
-            try:
-                for frame in next(pairs):
+            pair = next(pairs, None)
+            if pair is not None:
+                for frame in pair:
                     self.publish(frame)
-            except StopIteration:
-                timer.cancel()
-            else:
                 self.published += 1
 
-        timer = self.create_timer(1 / rate, publish)
-        return timer
+        self._stream = self.create_timer(1 / rate, publish)
+
+    def end_stream(self):
+        self.destroy_timer(self._stream)
 
     # -- services and action
 

@@ -120,8 +120,8 @@ def test_every_frame_is_corrected_with_its_header(tracked, tracking, by_service,
     status = np.concatenate([m.status for m in tracked[name]])
     assert (status == CorrectedObservations.OK).mean() > 0.99
     sigma = np.concatenate([m.sigma for m in tracked[name]])[status == CorrectedObservations.OK]
-    # of the observation, and a little more for the correction
-    assert 0.7 * NOISE_PX < sigma.min() and 0.9 * NOISE_PX < np.median(sigma) < 1.3 * NOISE_PX
+    # The scale of the Student-t noise, which is less than a standard deviation, and that of the correction
+    assert 0.6 * NOISE_PX < sigma.min() and sigma.max() < 1.5 * NOISE_PX
 
 
 @pytest.mark.parametrize('name', NAMES)

@@ -58,7 +58,8 @@ def main():
     frames = simulate_exposures(rig, 15, 1, matched=(130, 134)).frames['a']
     with threadpool_limits(1):
         rows = list(self_calibrations(rig, frames))
-        fitted = {m: calibrate({'a': frames}, rig.phantom, Options(m)).calibrations['a'] for m in ('local_linear', 'knn')}
+        fitted = {model: calibrate({'a': frames}, rig.phantom, Options(model)).calibrations['a']
+                  for model in ('local_linear', 'knn')}
         rows += corrections(fitted['local_linear'], fitted['knn'])
     header = ['what', 'size', 'median time', 'beside it']
     lines = ['| ' + ' | '.join(row) + ' |' for row in [header, ['---'] * 4, *rows]]

@@ -336,3 +336,14 @@ def test_a_network_that_leaves_unknowns_open_is_refused():
                        point=network.point[keep])
     with pytest.raises(DataError, match='do not determine the unknowns'):
         adjusted_with_precision(open_one, truth, np.zeros_like(open_one.uv), Noise())
+
+
+def test_a_held_noise_model_stays():
+    """Scale and degrees of freedom as given; the solution is that of the cost under them."""
+    network, truth = rigs.small_network(**MANY_TARGETS)
+    held = adjust(network, rigs.disturbed(truth), noise=Noise(scale=0.7, nu=9.0), noise_held=True, tolerance=1e-12)
+    assert (held.noise.scale, held.noise.nu) == (0.7, 9.0) and held.converged
+    directions = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, held))).T
+    slope = [cost_at(network, held, 1e-3 * d) - cost_at(network, held, -1e-3 * d) for d in directions]
+    assert np.linalg.norm(slope) / 2e-3 < 1e-5
+    assert adjust(network, truth).noise.scale == pytest.approx(0.3, rel=0.3)

@@ -12,7 +12,7 @@ import rigs
 from fluoro_calib_ros.distortion.gauge import gauge_basis, gauge_coefficients
 from fluoro_calib_ros.distortion.models import CorrectionModel, no_correction
 from fluoro_calib_ros.distortion.regressor import Regressor
-from fluoro_calib_ros.distortion.selection import CrossValidation, candidate_k, exposure_folds
+from fluoro_calib_ros.distortion.selection import CrossValidation, NearestTable, candidate_k, exposure_folds
 from fluoro_calib_ros.distortion.smoothers import Neighbourhoods
 from fluoro_calib_ros.distortion.trend import DEGREE, Trend, least_squares_map
 from fluoro_calib_ros.photogrammetry.collinearity import project
@@ -454,3 +454,25 @@ def test_a_model_equals_its_copy_with_other_quality_figures():
     query = pixels(50)
     np.testing.assert_array_equal(twice.predict(query), model.predict(query))
     np.testing.assert_allclose(twice.evaluate(query).sd, 2 * model.evaluate(query).sd, rtol=1e-12)
+
+
+def test_neighbours_among_changing_points_are_those_of_a_search():
+    """NearestTable: the nearest allowed, in order, also where most are not allowed, and after a restriction."""
+    uv, _ = training(400)
+    rng = np.random.default_rng(14)
+    table = NearestTable(uv, 12)
+    for share in (1.0, 0.8, 0.1):
+        allowed = rng.random(400) < share
+        rows = rng.permutation(400)[:90]
+        near = np.argsort(np.where(allowed, np.linalg.norm(uv[rows, None] - uv[None], axis=2), np.inf), axis=1)[:, :12]
+        np.testing.assert_array_equal(table.nearest(rows, allowed, 12), near)
+    kept = rng.random(400) < 0.7
+    smaller, all_of_it = table.restricted(kept), np.ones(int(kept.sum()), dtype=bool)
+    near = np.argsort(np.linalg.norm(uv[kept][:, None] - uv[kept][None], axis=2), axis=1)[:, :30]
+    np.testing.assert_array_equal(smaller.nearest(np.arange(kept.sum()), all_of_it, 30), near)
+
+
+def test_a_wanted_k_that_cannot_be_had_is_refused():
+    for kind, k in (('local_linear', 5), ('knn', 581)):
+        with pytest.raises(ValueError, match=f'{kind} with k = {k} cannot be had from 580 inliers'):
+            chosen(kind, k=k)

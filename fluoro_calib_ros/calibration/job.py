@@ -7,6 +7,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..photogrammetry.noise import Noise
+from ..photogrammetry.observations import check_frame
 from ..photogrammetry.rotations import quaternion_from_matrix
 from .network import measured_network
 from .result import FluoroscopeCalibration, digest_of_sources
@@ -106,9 +107,13 @@ def adjust_with(frames, phantom, calibrations, loss='student_t', check=None):
     """Adjust frames with calibrations held: interior orientations and corrections are not changed.
 
     frames {fluoroscope: [Frame, ...]}, calibrations {fluoroscope: FluoroscopeCalibration}. All fluoroscopes
-    share the object points. Returns JobResult. Raises DataError for wrong frames.
+    share the object points. Returns JobResult. Raises DataError for wrong frames, also those of another image
+    size than the calibration's.
     """
     began = time.perf_counter()
+    for name, of_fluoroscope in frames.items():
+        for frame in of_fluoroscope:
+            check_frame(frame, phantom, calibrations[name].image_size)
     interior = {name: calibrations[name].interior for name in frames}
     with threadpool_limits(1):
         measured = measured_network(frames, phantom, interior=interior, interior_free=False, min_exposures=1,

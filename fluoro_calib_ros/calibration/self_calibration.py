@@ -207,12 +207,15 @@ def self_calibrate(measured, options=Options(), progress=None, check=None):
         if options.model == 'none' or (not changed and _settled(history, options.tolerance)):
             converged = after.converged
             break
-        # Outliers take no part in the fit: they follow, but do not steer the acceleration.
-        mixed = accelerated.next(values[core].ravel(), image[core].ravel())
-        values = image.copy()
-        values[core] = mixed.reshape(-1, 2)
+        if iteration < options.max_iterations:
+            # Outliers follow, but do not steer the acceleration.
+            values = accelerated.next(values, image, core)
+    # The correction of the last round stays; what its adjustment left to a next one is done here.
+    after, precise = adjusted_with_precision(network, after.parameters, correction, after.noise, redundancy,
+                                             check=check)
     models = {name: state.regressors[name].model(values[rows]) for name, rows in state.rows.items()}
-    return SelfCalibration(measured, before, after, precise, correction, state.inliers(), models, tuple(history), converged)
+    return SelfCalibration(measured, before, after, precise, correction, state.inliers(), models, tuple(history),
+                           converged)
 
 
 def _round(iteration, adjustment, g_cost, state, change):

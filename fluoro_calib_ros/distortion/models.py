@@ -28,7 +28,8 @@ class CorrectionModel:
 
     kind 'none', 'knn' or 'local_linear'; k neighbours; train_uv (N, 2) observed pixels and train_duv (N, 2)
     corrections there [px]; noise_px: standard deviation of one training correction; bias_px: systematic
-    error of a prediction. The trend of the kind, if it has one, is fitted to the training corrections here. Raises ValueError for an unknown kind or a k that the training points do not allow.
+    error of a prediction. The trend of the kind, if it has one, is fitted to the training corrections here.
+    Raises ValueError for an unknown kind or a k that the training points do not allow.
     """
 
     kind: str

@@ -6,7 +6,7 @@ from ..photogrammetry.noise import INLIER_Q
 from .gauge import gauge_basis, gauge_coefficients
 from .models import CorrectionModel, no_correction
 from .selection import CrossValidation, NearestTable, candidate_k, exposure_folds
-from .smoothers import Neighbourhoods
+from .smoothers import SMALLEST_K, Neighbourhoods
 from .trend import Trend, least_squares_map
 
 KEEP_K = 1e-3   # relative gain in G below which k stays as it is
@@ -65,8 +65,11 @@ class Regressor:
         count = int(inliers.sum())
         if count < SMALLEST_TRAINING:
             raise ValueError(f'{count} inliers are too few for the correction model, {SMALLEST_TRAINING} are needed')
+        wanted = self._wanted_k
+        if wanted is not None and not SMALLEST_K[self.kind] <= wanted <= count:
+            raise ValueError(f'{self.kind} with k = {wanted} cannot be had from {count} inliers')
         self.inliers = inliers
-        candidates = candidate_k(self.kind, count) if self._wanted_k is None else [self._wanted_k]
+        candidates = candidate_k(self.kind, count) if wanted is None else [wanted]
         if self._near is None:
             self._near = NearestTable(self.uv, candidates[-1])
         self._validation = CrossValidation(self.kind, self.uv[inliers], exposure_folds(self.exposure[inliers]),

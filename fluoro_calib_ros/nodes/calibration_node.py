@@ -1,7 +1,13 @@
-"""Node that collects exposures of the phantom and self-calibrates the fluoroscopes on request."""
+"""Node that collects exposures of the phantom and self-calibrates the fluoroscopes on request.
+
+One thread runs all callbacks. Those that take long (calibrate, capture) are coroutines that await what they wait
+for, and the calibration itself is a process of its own. rclpy's MultiThreadedExecutor would be the other way, but
+it hands a callback out again until it has started, which on a busy machine costs so much that frames are lost.
+"""
 
 import threading
 import time
+from collections import deque
 from dataclasses import replace
 from pathlib import Path
 
@@ -10,15 +16,17 @@ from fluoro_calib_msgs.action import SelfCalibrate
 from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration, TargetObservations
 from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Reset, SaveCalibration
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.callback_groups import MutuallyExclusiveCallbackGroup, ReentrantCallbackGroup
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
+from rclpy.task import Future
 
 from ..bags.reader import frame_from_message
+from ..calibration.beside import calibrate_beside
 from ..calibration.collector import ExposureCollector, FramePairer, StillOptions
-from ..calibration.job import calibrate
 from ..calibration.network import MIN_TARGETS_OF_EXPOSURE
 from ..calibration.self_calibration import Options
-from ..files.calibration import load_calibrations, save_calibration
+from ..files.calibration import SUFFIX, load_calibrations, save_calibration
 from ..files.phantom import read_phantom
 from ..photogrammetry.observations import DataError, check_frame
 from . import support
@@ -40,18 +48,17 @@ class CalibrationNode(Node):
         super().__init__('calibration_node')
         self._read_parameters()
         self._sentences = support.Sentences(self.get_logger())
-        self._lock = threading.Lock()   # collector, pairer and counters
-        self._captured = threading.Condition(self._lock)
-        self._capture_wanted = 0
+        self._captures = deque()   # a Future for every capture that waits for its pair
+        self._not_captured = ''   # why the last pair was none
         self._new_collection()
         self._image_size, self._not_phantom = {}, set()
         self._received = dict.fromkeys(self._names, 0)
         self._rejected = dict.fromkeys(self._names, 0)
         self._last_fault = dict.fromkeys(self._names, '')
-        self._job_lock = threading.Lock()   # held by the running job
+        self._load_fault = ''
         self._stopping = threading.Event()
         self._rounds, self._calibrations, self._made_at = {}, {}, {}
-        self._busy = ()
+        self._busy, self._job = (), None   # fluoroscopes of the running job, and the thread that waits for it
         self._make_interfaces()
         self._load_at_start()
 
@@ -94,16 +101,15 @@ class CalibrationNode(Node):
             raise StartError(f'parameter {error}') from None
 
     def _make_interfaces(self):
-        streams, timers = MutuallyExclusiveCallbackGroup(), MutuallyExclusiveCallbackGroup()
-        # Services that wait (calibrate, capture) must not keep others from being answered.
-        services = ReentrantCallbackGroup()
+        services = ReentrantCallbackGroup()   # those that await must not keep others from being answered
         self._calibration_outputs, self._status = {}, {}
         for name in self._names:
-            self._calibration_outputs[name] = self.create_publisher(FluoroscopeCalibration, f'{name}/calibration', LATCHED)
+            self._calibration_outputs[name] = self.create_publisher(FluoroscopeCalibration, f'{name}/calibration',
+                                                                    LATCHED)
             self._status[name] = self.create_publisher(CalibrationStatus, f'{name}/calibration_status', 10)
             self.create_subscription(TargetObservations, f'{name}/target_observations',
                                      lambda message, name=name: self._on_frame(name, message), OBSERVATIONS,
-                                     callback_group=streams, qos_overriding_options=overridable())
+                                     qos_overriding_options=overridable())
         for kind, name, callback in ((Calibrate, 'calibrate', self._on_calibrate),
                                      (Capture, 'capture', self._on_capture), (Reset, 'reset', self._on_reset),
                                      (SaveCalibration, 'save_calibration', self._on_save),
@@ -113,7 +119,7 @@ class CalibrationNode(Node):
                                     goal_callback=lambda _: GoalResponse.ACCEPT,
                                     cancel_callback=lambda _: CancelResponse.ACCEPT, callback_group=services)
         self._diagnostics = support.Diagnostics(self)
-        self.create_timer(1.0, self._on_timer, callback_group=timers)
+        self.create_timer(1.0, self._on_timer)
 
     def _new_collection(self):
         self._pairer = FramePairer(self._names, *self._pairing)
@@ -123,22 +129,17 @@ class CalibrationNode(Node):
 
     def _on_frame(self, name, message):
         """Check a frame, pair it, and collect the pair where it is wanted."""
+        self._received[name] += 1
         try:
-            with self._lock:
-                self._received[name] += 1
             frame = self._checked(name, message)
         except DataError as error:
-            with self._lock:
-                self._rejected[name] += 1
-                self._last_fault[name] = str(error)
+            self._rejected[name] += 1
+            self._last_fault[name] = str(error)
             self._sentences.warn(f'frame refused: {error}')
             return
-        if frame is None:
-            return
-        with self._lock:
-            pair = self._pairer.add(frame)
-            if pair is not None:
-                self._collect_pair(pair)
+        pair = None if frame is None else self._pairer.add(frame)
+        if pair is not None:
+            self._collect_pair(pair)
 
     def _checked(self, name, message):
         """Frame of a message, None for one that does not show the phantom. Raises DataError for a wrong one."""
@@ -158,12 +159,11 @@ class CalibrationNode(Node):
         return frame
 
     def _collect_pair(self, pair):
-        """Collect a pair; the lock is held."""
-        if self._capture_wanted:
-            refused = self._collector.take(pair)
+        """Collect a pair, for the capture that has waited longest or because the phantom stands still."""
+        if self._captures:
+            refused = self._not_captured = self._collector.take(pair)
             if not refused:
-                self._capture_wanted -= 1
-                self._captured.notify_all()
+                self._captures.popleft().set_result(pair)
         elif self._collect == 'still':
             refused = self._collector.offer(pair)
         else:
@@ -175,29 +175,33 @@ class CalibrationNode(Node):
 
     # -- services
 
-    def _on_capture(self, request, response):
-        timeout = request.timeout_sec or self._capture_timeout
-        with self._lock:
-            before = len(self._collector.exposures)
-            self._capture_wanted += 1
-            done = self._captured.wait_for(
-                lambda: len(self._collector.exposures) > before or self._stopping.is_set(), timeout)
-            response.exposures = len(self._collector.exposures)
-            response.success = done and response.exposures > before
-            if response.success:
-                number = self._collector.exposures[-1][self._names[0]].number
-                response.message = f'frame {number} captured, {response.exposures} exposures now'
-            else:
-                self._capture_wanted -= 1
-                response.message = (f'no frame of all fluoroscopes ({", ".join(self._names)}) came within '
-                                    f'{timeout:g} s; frames received: {self._received}')
+    async def _on_capture(self, request, response):
+        timeout, captured = request.timeout_sec or self._capture_timeout, Future()
+        if not 0 < timeout < np.inf:
+            response.message = f'timeout_sec is a time in seconds, not {timeout}'
+            return response
+        self._not_captured = ''
+        self._captures.append(captured)
+        timer = self.create_timer(timeout, lambda: captured.done() or captured.set_result(None),
+                                  clock=Clock(clock_type=ClockType.STEADY_TIME))
+        pair = await captured
+        self.destroy_timer(timer)
+        response.exposures = len(self._collector.exposures)
+        response.success = pair is not None
+        if pair is not None:
+            number = pair[self._names[0]].number
+            response.message = f'frame {number} captured, {response.exposures} exposures now'
+        else:
+            self._captures.remove(captured)
+            response.message = self._not_captured or (
+                f'no frame of all fluoroscopes ({", ".join(self._names)}) came within {timeout:g} s; '
+                f'frames received: {", ".join(f"{n} {count}" for n, count in self._received.items())}')
         return response
 
     def _on_reset(self, _, response):
-        with self._lock:
-            count = len(self._collector.exposures)
-            self._new_collection()
-            self._image_size.clear()
+        count = len(self._collector.exposures)
+        self._new_collection()
+        self._image_size.clear()
         response.success, response.message = True, f'{count} exposures forgotten, the calibration stays'
         return response
 
@@ -234,12 +238,12 @@ class CalibrationNode(Node):
         return {n: c for n, c in load_calibrations(directory).items() if n in self._names}
 
     def _load_at_start(self):
-        if not self._directory.is_dir():
+        if not any(self._directory.glob('*' + SUFFIX)):
             return
         try:
             found = self._read_calibrations(self._directory)
         except (DataError, OSError) as error:
-            self._last_fault[self._names[0]] = str(error)
+            self._load_fault = str(error)
             self.get_logger().error(f'no calibration loaded: {error}')
             return
         if found:
@@ -248,11 +252,11 @@ class CalibrationNode(Node):
 
     # -- self-calibration
 
-    def _on_calibrate(self, request, response):
-        self._run_job(request, response, lambda *_: None, lambda: False)
+    async def _on_calibrate(self, request, response):
+        await self._run_job(request, response, lambda *_: None, lambda: False)
         return response
 
-    def _on_action(self, goal):
+    async def _on_action(self, goal):
         result, feedback = SelfCalibrate.Result(), SelfCalibrate.Feedback()
 
         def progress(label, this):
@@ -263,7 +267,7 @@ class CalibrationNode(Node):
                 np.mean([np.square(r) for r in this.rmse.values()], axis=0)))
             goal.publish_feedback(feedback)
 
-        cancelled = self._run_job(goal.request, result, progress, lambda: goal.is_cancel_requested)
+        cancelled = await self._run_job(goal.request, result, progress, lambda: goal.is_cancel_requested)
         if result.success:
             goal.succeed()
         elif cancelled:
@@ -272,49 +276,14 @@ class CalibrationNode(Node):
             goal.abort()
         return result
 
-    def _run_job(self, request, result, progress, cancel_requested):
-        """Run a job in a thread of its own and fill in result; returns whether it was cancelled."""
-        if not self._job_lock.acquire(blocking=False):
+    async def _run_job(self, request, result, progress, cancel_requested):
+        """Run a job and fill in result; returns whether it was cancelled. Without success nothing is changed."""
+        if self._job is not None:
             result.message = 'refused: a self-calibration is running already'
             self.get_logger().warning(result.message)
             return False
-        cancelled = threading.Event()
-        outcome = {}
-
-        def check():
-            if cancel_requested() or self._stopping.is_set():
-                cancelled.set()
-                raise Cancelled
-
-        # The thread keeps the work out of the executor; this callback only waits for it.
-        worker = threading.Thread(target=self._work, args=(request, result, progress, check, outcome), daemon=True)
         try:
-            worker.start()
-            worker.join()
-        finally:
-            self._busy = ()
-            self._job_lock.release()
-        if cancelled.is_set():
-            result.message = 'cancelled, nothing was changed'
-        elif 'fault' in outcome:
-            result.message = outcome['fault']
-        (self.get_logger().info if result.success else self.get_logger().error)(result.message)
-        return cancelled.is_set()
-
-    def _work(self, request, result, progress, check, outcome):
-        """The job itself: calibrate, save, publish. Whatever goes wrong, nothing has been changed."""
-        def on_round(label, this):
-            for name in label.split('+'):
-                self._rounds[name] = this
-            progress(label, this)
-
-        try:
-            with self._lock:
-                frames = self._collector.frames(list(request.fluoroscopes))
-            self._busy = tuple(frames)
-            job = calibrate(frames, self._phantom, self._options_of(request), self._joint and len(frames) > 1,
-                            request.principal_distance or None, on_round, check)
-            check()
+            job = await self._start_job(request, progress, cancel_requested)
             calibrations = {n: replace(c, seconds=job.seconds) for n, c in job.calibrations.items()}
             for calibration in calibrations.values():
                 save_calibration(self._directory, calibration)
@@ -322,13 +291,47 @@ class CalibrationNode(Node):
             _fill_result(result, job, calibrations)
             for sentence in job.left_out:
                 self.get_logger().warning(f'not used: {sentence}')
+            self.get_logger().info(result.message)
         except Cancelled:
-            pass
+            result.message = 'cancelled, nothing was changed'
+            self.get_logger().info(result.message)
+            return True
         except (DataError, ValueError, OSError) as error:
-            outcome['fault'] = str(error)
+            result.message = str(error)
+            self.get_logger().error(result.message)
         except Exception as error:   # a fault of ours must reach the caller, and must not end the node
-            self.get_logger().error(f'self-calibration failed: {error!r}')
-            outcome['fault'] = f'the self-calibration failed unexpectedly: {error!r}'
+            result.message = f'the self-calibration failed unexpectedly: {error}'
+            self.get_logger().error(result.message)
+        finally:
+            self._busy, self._job = (), None
+        return False
+
+    def _start_job(self, request, progress, cancel_requested):
+        """Start a calibration; returns the Future of its JobResult. Raises DataError and ValueError."""
+        frames = self._collector.frames(list(request.fluoroscopes))
+        options, done = self._options_of(request), Future()
+
+        def on_round(label, this):
+            for name in label.split('+'):
+                self._rounds[name] = this
+            progress(label, this)
+
+        def check():
+            if cancel_requested() or self._stopping.is_set():
+                raise Cancelled
+
+        def wait():
+            try:
+                done.set_result(calibrate_beside(frames, self._phantom, options, self._joint and len(frames) > 1,
+                                                 request.principal_distance or None, on_round, check))
+            except Exception as error:
+                done.set_exception(error)
+            if self.executor is not None:
+                self.executor.wake()   # to look at what has been awaited
+
+        self._busy, self._job = tuple(frames), threading.Thread(target=wait, daemon=True)
+        self._job.start()
+        return done
 
     def _options_of(self, request):
         """Options of a request, with the node's parameters where it leaves them open. Raises ValueError."""
@@ -340,14 +343,13 @@ class CalibrationNode(Node):
         """Take calibrations over and publish them."""
         for name, calibration in calibrations.items():
             self._calibrations[name], self._made_at[name] = calibration, time.monotonic()
+            self._load_fault = ''
             self._calibration_outputs[name].publish(message_from_calibration(calibration))
 
     # -- status
 
     def _on_timer(self):
-        with self._lock:
-            parts = [self._report(name) for name in self._names]
-        self._diagnostics.publish(parts)
+        self._diagnostics.publish([self._report(name) for name in self._names])
 
     def _report(self, name):
         """Publish the status of a fluoroscope; returns its diagnostics."""
@@ -378,6 +380,8 @@ class CalibrationNode(Node):
 
     def _verdict(self, name, status):
         """Level and message of the diagnostics of a fluoroscope."""
+        if self._load_fault:
+            return support.ERROR, f'no calibration loaded: {self._load_fault}'
         if self.count_publishers(f'{name}/target_observations') == 0 and status.frames_received == 0:
             return support.WARN, 'nobody publishes target observations'
         if status.frames_unpaired:
@@ -389,10 +393,10 @@ class CalibrationNode(Node):
         return support.OK, 'calibrated' if name in self._calibrations else 'collecting exposures'
 
     def stop(self):
-        """End what callbacks are waiting for: the node is to go."""
+        """End the running job: the node is to go."""
         self._stopping.set()
-        with self._captured:
-            self._captured.notify_all()
+        if self._job is not None:
+            self._job.join()
 
     def destroy_node(self):
         """Take the action server down with the node."""
@@ -424,7 +428,7 @@ def _fill_result(result, job, calibrations):
 
 def main(args=None):
     """Entry point."""
-    support.run(CalibrationNode, lambda: support.ThreadedExecutor(num_threads=8), args)
+    support.run(CalibrationNode, args)
 
 
 if __name__ == '__main__':

@@ -6,7 +6,6 @@ from collections import deque
 
 import numpy as np
 from fluoro_calib_msgs.msg import CorrectedObservations, FluoroscopeCalibration, TargetObservations
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 
@@ -23,6 +22,7 @@ class _Stream:
 
     def __init__(self):
         self.newest = 0   # number of the last calibration that arrived
+        self.preparing = None   # thread that prepares it
         self.calibration = None   # replaced as a whole: a frame sees one or the other, never half of each
         self.received = self.corrected = self.waiting = self.refused = self.invalid_points = 0
         self.last_fault = ''
@@ -57,7 +57,9 @@ class CorrectionNode(Node):
     def _on_calibration(self, name, message):
         """Prepare a calibration beside the stream, and take it over when it is ready."""
         self._streams[name].newest += 1
-        threading.Thread(target=self._prepare, args=(name, message, self._streams[name].newest), daemon=True).start()
+        stream = self._streams[name]
+        stream.preparing = threading.Thread(target=self._prepare, args=(name, message, stream.newest), daemon=True)
+        stream.preparing.start()
 
     def _prepare(self, name, message, number):
         try:
@@ -144,6 +146,12 @@ class CorrectionNode(Node):
             return support.WARN, f'{stream.refused} frames refused: {stream.last_fault}'
         return support.OK, 'correcting'
 
+    def stop(self):
+        """Wait for what is being prepared: it needs the node."""
+        for stream in self._streams.values():
+            if stream.preparing is not None:
+                stream.preparing.join()
+
 
 def _check(frame, calibration):
     """Raise DataError for a frame that cannot be corrected as a whole."""
@@ -154,14 +162,15 @@ def _check(frame, calibration):
     values, counts = np.unique(frame.target_id, return_counts=True)
     if len(values) < len(frame.target_id):
         raise DataError(f'{where}: target {values[counts > 1][0]} is there {counts.max()} times')
-    if frame.sigma is not None and not (frame.sigma > 0).all():
-        bad = frame.target_id[~(frame.sigma > 0)][0]
-        raise DataError(f'{where}: sigma of target {bad} is not a positive number')
+    if frame.sigma is not None:
+        wrong = ~(np.isfinite(frame.sigma) & (frame.sigma > 0))
+        if wrong.any():
+            raise DataError(f'{where}: sigma of target {frame.target_id[wrong][0]} is not a positive number')
 
 
 def main(args=None):
     """Entry point."""
-    support.run(CorrectionNode, SingleThreadedExecutor, args)
+    support.run(CorrectionNode, args)
 
 
 if __name__ == '__main__':

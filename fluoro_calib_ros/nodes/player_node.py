@@ -7,7 +7,6 @@ from importlib import import_module
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.duration import Duration
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 
 from ..bags.reader import iterate_messages, topics_of
@@ -23,7 +22,7 @@ class PlayerNode(Node):
     def __init__(self):
         super().__init__('player_node')
         self._bag = declare(self, 'bag', '', 'bag to play: an .mcap file or a folder of rosbag2')
-        self._rate = declare(self, 'rate', 1.0, 'speed against the recording; 0: as fast as readers take it', 0.0, 1e6)
+        self._rate = declare(self, 'rate', 1.0, 'speed against the recording', 0.001, 1e6)
         self._loop = declare(self, 'loop', False, 'play over and over')
         self._readers = declare(self, 'wait_for_readers', 1, 'subscriptions of every topic to wait for', 0, 100)
         self._namespace = declare(self, 'strip_prefix', '', 'beginning of the recorded topics that is left out')
@@ -39,6 +38,7 @@ class PlayerNode(Node):
         self._outputs = {topic: output for topic, output in self._outputs.items() if output is not None}
         if not self._outputs:
             raise StartError(f'{self._bag}: there is nothing to play among its topics {", ".join(found) or "(none)"}')
+        self.failed = False
         self._stopping = threading.Event()
         self._worker = threading.Thread(target=self._play, daemon=True)
         self._worker.start()
@@ -61,8 +61,10 @@ class PlayerNode(Node):
                 self._play_once()
                 if not self._loop:
                     break
+            self._wait_until_taken()
         except DataError as error:
             self.get_logger().fatal(str(error))
+            self.failed = True
         except RCLError:
             if rclpy.ok():   # else the node has been ended between two messages
                 raise
@@ -80,22 +82,19 @@ class PlayerNode(Node):
             self._stopping.wait(0.05)
 
     def _play_once(self):
-        """Publish every message at its time, and wait until it has been taken."""
+        """Publish every message at its time."""
         start, first, count = time.monotonic(), None, 0
         for message in iterate_messages(self._bag, list(self._outputs)):
             first = message.log_time_ns if first is None else first
-            if self._rate:
-                due = start + (message.log_time_ns - first) * 1e-9 / self._rate
-                if self._stopping.wait(max(0.0, due - time.monotonic())):
-                    return
+            due = start + (message.log_time_ns - first) * 1e-9 / self._rate
+            if self._stopping.wait(max(0.0, due - time.monotonic())):
+                return
             self._outputs[message.topic].publish(message.data)
             count += 1
-            if not self._rate and count % 50 == 0:   # half of what a reader's queue holds
-                self._wait_until_taken()
-        self._wait_until_taken()
         self.get_logger().info(f'{count} messages played in {time.monotonic() - start:.1f} s')
 
     def _wait_until_taken(self):
+        """Wait until all messages have arrived; what is not acknowledged is lost when the node goes."""
         for output in self._outputs.values():
             output.wait_for_all_acked(Duration(seconds=10))
 
@@ -107,7 +106,7 @@ class PlayerNode(Node):
 
 def main(args=None):
     """Entry point."""
-    support.run(PlayerNode, SingleThreadedExecutor, args)
+    support.run(PlayerNode, args)
 
 
 if __name__ == '__main__':

@@ -2,7 +2,6 @@
 
 import numpy as np
 from fluoro_calib_msgs.msg import TargetObservations
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 
@@ -72,7 +71,8 @@ class SimulatorNode(Node):
         if time <= self._stand:
             return start
         end, part = self._poses[(int(turn) + 1) % len(self._poses)], (time - self._stand) / self._move
-        return matrix_from_vector(part * Rotation.from_matrix(end[0] @ start[0].T).as_rotvec()) @ start[0], start[1] + part * (end[1] - start[1])
+        turn = matrix_from_vector(part * Rotation.from_matrix(end[0] @ start[0].T).as_rotvec())
+        return turn @ start[0], start[1] + part * (end[1] - start[1])
 
     def _markers(self):
         frames = self._tracking.frames
@@ -81,7 +81,7 @@ class SimulatorNode(Node):
 
 def main(args=None):
     """Entry point."""
-    support.run(SimulatorNode, SingleThreadedExecutor, args)
+    support.run(SimulatorNode, args)
 
 
 if __name__ == '__main__':

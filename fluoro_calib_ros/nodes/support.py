@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.exceptions import ParameterException
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.signals import SignalHandlerOptions
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -70,15 +70,6 @@ class Diagnostics:
         self._publisher.publish(array)
 
 
-class ThreadedExecutor(MultiThreadedExecutor):
-    """MultiThreadedExecutor whose shutdown waits for the running callbacks, as promised but not done in Jazzy."""
-
-    def shutdown(self, timeout_sec=None):
-        """Wait for the callbacks, then shut down."""
-        self._executor.shutdown(wait=True)
-        return super().shutdown(timeout_sec)
-
-
 def _on_interrupt(end):
     """Call end() from a thread at SIGINT or SIGTERM, whatever the main thread waits for; a second one exits at once."""
     reading, writing = os.pipe()
@@ -103,7 +94,7 @@ def _init(args):
         raise StartError(str(error).partition(', at /')[0]) from None
 
 
-def run(make_node, executor_type, args=None):
+def run(make_node, args=None):
     """Run a node until it is interrupted, or has ended by rclpy.shutdown(); exit status 1 and one sentence where it
     cannot start, exit status 1 where its flag `failed` is set.
 
@@ -113,7 +104,7 @@ def run(make_node, executor_type, args=None):
     ended, node, code = threading.Event(), None, 0
     try:
         _init(args)
-        executor = executor_type()
+        executor = SingleThreadedExecutor()
 
         def end():
             ended.set()

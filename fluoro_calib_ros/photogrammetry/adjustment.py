@@ -244,55 +244,70 @@ def adjust(network, start, correction=None, noise=Noise(), redundancy=None, tole
     correction = np.zeros_like(network.uv) if correction is None else correction
     if redundancy is None:
         redundancy = max(0.1, 1 - network.unknowns / (2 * len(network.uv) + network.survey_mm.size))
-    parameters, mu, growth, converged, step = start, 1e-6, 2.0, False, 0
+
+    def renewed(noise, q):
+        return (noise, q) if noise_held else _renewed(network, noise, q, redundancy)
+
+    parameters, damping, converged, step, blocks = start, _Damping(), False, 0, None
     r, q = residuals_and_q(network, parameters, correction, noise)
-    if not noise_held:
-        noise, q = _renewed(network, noise, q, redundancy)
+    noise, q = renewed(noise, q)
     cost = total_cost(network, parameters, q, noise)
-    blocks = None
     for step in range(1, max_steps + 1):
         if check is not None:
             check()
         if blocks is None:
             blocks = bordered_blocks(network, normal_equations(network, parameters, correction, noise))
         try:
-            x_b, x_r = _damped_step(blocks, mu)
+            moved, predicted = _trial(network, parameters, blocks, damping.mu, 1 / noise.information_factor(q))
         except (np.linalg.LinAlgError, ValueError):
-            mu, growth = max(mu, 1e-10) * growth, 2 * growth
-            if mu > 1e12:
+            if damping.refuse():
                 break
             continue
-        bb, _, rr, b, right = blocks
-        undamped = np.sum(x_b * b) + np.sum(x_r * right)
-        damping = mu * (np.einsum('ki,kii,ki', x_b, bb, x_b) + np.sum(x_r * x_r * np.diag(rr)))
-        predicted = (undamped + damping) / 2
-        # The weighted normal matrix is larger than the information by this factor: a longer step converges
-        # in a third of the steps where the tails are heavy.
-        stretch = 1 / noise.information_factor(q)
-        moved = _moved(network, parameters, stretch * x_b, stretch * x_r)
         r_new, q_new = residuals_and_q(network, moved, correction, noise)
         cost_new = total_cost(network, moved, q_new, noise)
-        if cost_new <= cost + 1e-12 * abs(cost):
-            gain = (cost - cost_new) / max(predicted, 1e-300)
-            mu, growth = max(mu * max(1 / 3, 1 - (2 * gain - 1) ** 3), 1e-15), 2.0
-            old = noise
-            q = q_new
-            if not noise_held:
-                noise, q = _renewed(network, noise, q_new, redundancy)
-            parameters, r, blocks = moved, r_new, None
-            cost = total_cost(network, parameters, q, noise)
-            settled = abs(noise.scale - old.scale) <= 1e-4 * old.scale
-            if predicted <= tolerance and settled:
-                converged = True
+        if cost_new > cost + 1e-12 * abs(cost):
+            converged = predicted <= 1e-3 * tolerance   # no decrease is left that rounding does not hide
+            if converged or damping.refuse():
                 break
-        else:
-            if predicted <= 1e-3 * tolerance:
-                converged = True   # no decrease left that rounding does not hide
-                break
-            mu, growth = mu * growth, 2 * growth
-            if mu > 1e12:
-                break
+            continue
+        damping.accept((cost - cost_new) / max(predicted, 1e-300))
+        last_scale = noise.scale
+        parameters, r, blocks = moved, r_new, None
+        noise, q = renewed(noise, q_new)
+        cost = total_cost(network, parameters, q, noise)
+        if predicted <= tolerance and abs(noise.scale - last_scale) <= 1e-4 * last_scale:
+            converged = True
+            break
     return Adjustment(parameters, r, q, noise, float(cost), step, converged)
+
+
+class _Damping:
+    """Nielsen's damping: mu follows the gain ratio, and grows ever faster while steps are refused."""
+
+    def __init__(self):
+        self.mu, self._growth = 1e-6, 2.0
+
+    def accept(self, gain):
+        """A step was taken; gain: its decrease over the predicted one."""
+        self.mu, self._growth = max(self.mu * max(1 / 3, 1 - (2 * gain - 1) ** 3), 1e-15), 2.0
+
+    def refuse(self):
+        """A step was not taken; returns True when there is no use in going on."""
+        self.mu, self._growth = max(self.mu, 1e-10) * self._growth, 2 * self._growth
+        return self.mu > 1e12
+
+
+def _trial(network, parameters, blocks, mu, stretch):
+    """Parameters after a damped step, and the decrease of F that the linearised problem predicts.
+
+    stretch: the weighted normal matrix is larger than the information by this factor; a longer step converges
+    in a third of the steps where the tails are heavy. Raises numpy.linalg.LinAlgError, or ValueError for NaN.
+    """
+    bb, _, rr, b, right = blocks
+    x_b, x_r = _damped_step(blocks, mu)
+    undamped = np.sum(x_b * b) + np.sum(x_r * right)
+    damping = mu * (np.einsum('ki,kii,ki', x_b, bb, x_b) + np.sum(x_r * x_r * np.diag(rr)))
+    return _moved(network, parameters, stretch * x_b, stretch * x_r), (undamped + damping) / 2
 
 
 def _renewed(network, noise, q, redundancy):

@@ -18,7 +18,7 @@ from .rotations import matrix_from_vector
 MIN_TARGETS = 8
 SAMPLE_SIZE = 6   # the DLT has 11 unknowns, a target gives two equations
 SAMPLES = 200   # with 20 % false matches 1 - (1 - 0.8^6)^200: a good sample is certain
-FLATNESS = 1e-3   # smallest over largest extent of the targets below which they lie in one plane
+FLATNESS = 1e-2   # smallest over largest extent of the targets below which they lie in one plane, but for the survey
 
 
 @dataclass(frozen=True)
@@ -123,7 +123,7 @@ def resect(xyz, uv, interior, projection=None, max_steps=100):
     centre = xyz.mean(axis=0)
     position = centre + (position - centre) * interior[2] / np.sqrt(k[0, 0] * k[1, 1])
     rotation, position = _pointed_at(rotation, position, centre, np.median(uv, axis=0), interior)
-    mu, noise, cost = 1e-4, Noise(nu=3.0), np.inf
+    mu = 1e-4
     for _ in range(max_steps):
         predicted, jacobian, _, _ = project_with_jacobian(
             np.broadcast_to(rotation, (len(xyz), 3, 3)), np.broadcast_to(position, (len(xyz), 3)), xyz, interior)

@@ -1,0 +1,90 @@
+"""The published calibration: latched, read again after a restart, and taken up by the correction in mid-stream."""
+
+import shutil
+from dataclasses import replace
+
+import numpy as np
+from fluoro_calib_msgs.srv import Calibrate, LoadCalibration, SaveCalibration
+from ros_graph import BAGS, NAMES
+
+from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
+
+
+def ids_in(folder):
+    return {name: c.calibration_id for name, c in load_calibrations(folder).items()}
+
+
+def test_late_joiner_and_restart(graph, calibrated):
+    client, ids = graph.client, ids_in(calibrated)
+    for _ in range(2):   # the second time it is a new node
+        node = graph.calibration_node(calibrated)
+        for name in NAMES:
+            late = client.listen(f'{name}/calibration')
+            client.wait_until(lambda: late, what='the latched calibration')
+            assert [m.calibration_id for m in late] == [ids[name]]
+            assert client.wait_for_status(lambda s: s.calibration_id, name).calibration_id == ids[name]
+            client.messages[f'{name}/calibration_status'].clear()
+        assert node.end() == 0, node.log
+        client.wait_until(lambda: not client.count_publishers('a/calibration'), what='the node to be gone')
+
+
+def test_damaged_file_is_reported_and_kept(graph, calibrated):
+    file, client = calibrated / 'a.calibration.npz', graph.client
+    damaged = file.read_bytes()[:5000]
+    file.write_bytes(damaged)
+    node = graph.calibration_node(calibrated)
+    status = client.wait_for_diagnostics('calibration_node', lambda s: True)
+    assert status.level == b'\2' and str(file) in status.message and 'damaged' in status.message
+    assert f'no calibration loaded: {file}' in node.log
+    assert client.wait_for_status(lambda s: True).calibration_id == ''
+    answer = client.call(LoadCalibration, 'load_calibration')
+    assert not answer.success and str(file) in answer.message
+    assert file.read_bytes() == damaged
+
+
+def test_save_and_load(graph, calibrated, tmp_path):
+    client, ids = graph.client, ids_in(calibrated)
+    graph.calibration_node(tmp_path / 'none')
+    published = client.listen('a/calibration')
+    answer = client.call(SaveCalibration, 'save_calibration')
+    assert not answer.success and answer.message == 'not saved: there is no calibration to save'
+    answer = client.call(LoadCalibration, 'load_calibration')
+    assert not answer.success and str(tmp_path / 'none') in answer.message
+    assert client.call(LoadCalibration, 'load_calibration', directory=str(calibrated)).success
+    client.wait_until(lambda: published, what='the loaded calibration')
+    assert published[0].calibration_id == ids['a']
+    assert client.call(SaveCalibration, 'save_calibration', directory=str(tmp_path / 'copy')).success
+    assert ids_in(tmp_path / 'copy') == ids
+
+
+def test_correction_before_and_after_a_calibration_in_mid_stream(graph, calibrated, tmp_path, tracking):
+    client, first = graph.client, ids_in(calibrated)['a']
+    other = tmp_path / 'other'
+    shutil.copytree(calibrated, other)
+    a = load_calibrations(other)['a']
+    save_calibration(other, replace(a, interior=a.interior + [0, 0, 1.0]))
+    second = ids_in(other)['a']
+    graph.start('correction_node')
+    corrected = client.listen('a/corrected_observations')
+    pairs = [tuple(replace(tracking[n][i], number=i + 1) for n in NAMES) for i in range(300)]
+
+    for pair in pairs[:10]:   # there is no calibration
+        client.publish(pair[0])
+    status = client.wait_for_diagnostics('correction_node', lambda s: '10 frames' in s.message)
+    assert status.level == b'\1' and status.message == 'no calibration yet: 10 frames were not corrected'
+    assert corrected == []
+
+    graph.calibration_node(calibrated)
+    client.wait_for_diagnostics('correction_node', lambda s: first in [v.value for v in s.values])
+    stream = iter(pairs[10:] + [None])   # the calibration changes somewhere in it
+    client.stream(stream, 100.0)
+    client.wait_until(lambda: len(corrected) > 20, what='frames corrected with the first calibration')
+    answer = client.call_async(LoadCalibration, 'load_calibration', directory=str(other))
+    client.wait_until(lambda: client.published == 290, what='the end of the stream')
+    client.end_stream()
+    assert client.result_of(answer).success
+    client.wait_until(lambda: len(corrected) >= 290, what='all corrected frames')
+    assert [m.frame_number for m in corrected] == list(range(11, 301)), 'no frame lost, none twice, in order'
+    ids = [m.calibration_id for m in corrected]
+    assert set(ids) == {first, second} and sum(x != y for x, y in zip(ids, ids[1:])) == 1
+    assert all(np.isfinite(m.u).all() for m in corrected)

@@ -1,0 +1,106 @@
+"""Starting and ending of the nodes: a sentence where a node cannot start, and nothing but 0 at an interrupt."""
+
+import shutil
+
+import pytest
+from fluoro_calib_msgs.srv import Capture
+from ros_graph import BAGS, NAMES, standing
+
+TROUBLE = ('Traceback', 'Exception', 'exception', 'Error:', 'never retrieved', 'never awaited')
+
+
+def bad_phantom(folder):
+    lines = (BAGS / 'phantom.csv').read_text().splitlines()
+    lines[4] = lines[4].replace(',', ',x', 1)
+    (folder / 'phantom.csv').write_text('\n'.join(lines))
+    return {'phantom': folder / 'phantom.csv'}
+
+
+def damaged_bag(folder):
+    shutil.copytree(BAGS / 'tracking', folder / 'bag')
+    file = folder / 'bag' / 'tracking_0.mcap'
+    content = bytearray(file.read_bytes())
+    content[len(content) // 3] ^= 0xff   # within a chunk: it shows only while playing
+    file.write_bytes(content)
+    return {'bag': folder / 'bag', 'wait_for_readers': 0, 'rate': 1000.0}
+
+
+def foreign_bag(folder):
+    from fluoro_calib_ros.bags.writer import BagWriter
+    with BagWriter(folder / 'bag'):
+        pass
+    return {'bag': folder / 'bag'}
+
+
+@pytest.mark.parametrize('node, parameters, sentence', [
+    ('calibration_node', {}, 'parameter phantom is not set'),
+    ('calibration_node', {'phantom': '/nowhere/phantom.csv'}, '/nowhere/phantom.csv: '),
+    ('calibration_node', bad_phantom, 'phantom.csv, row 5'),
+    ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'model': 'spline'}, 'model is one of'),
+    ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'pair_by': 'luck'}, 'pair_by is'),
+    ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'still_px': -1.0}, 'parameter still_px: '),
+    ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'fluoroscopes': '[a, a]'}, 'parameter fluoroscopes: '),
+    ('correction_node', {'fluoroscopes': '[a, a]'}, 'parameter fluoroscopes: '),
+    ('simulator_node', {'scene': 'cat'}, 'parameter scene is'),
+    ('player_node', {}, 'parameter bag is not set'),
+    ('player_node', {'bag': '/nowhere/bag'}, '/nowhere/bag: there is no such bag'),
+    ('player_node', {'bag': BAGS / 'calibration', 'topics': '[/c/target_observations]'}, 'there is nothing to play'),
+    ('player_node', {'bag': BAGS / 'calibration', 'rate': 5}, 'parameter rate: '),   # an integer, not 5.0
+    ('player_node', foreign_bag, 'there is nothing to play'),
+    ('player_node', damaged_bag, 'is damaged')],
+    ids=lambda value: value.__name__ if callable(value) else None)
+def test_node_that_cannot_start_says_why(graph, tmp_path, node, parameters, sentence):
+    process = graph.start(node, parameters(tmp_path) if callable(parameters) else parameters, wait=False)
+    assert process.wait() == 1
+    lines = [line for line in process.log.splitlines() if '[FATAL]' in line]
+    assert len(lines) == 1 and sentence in lines[0]
+    assert not any(word in process.log for word in TROUBLE), process.log
+
+
+def test_interrupt_in_the_stream_ends_every_node_cleanly(graph, by_command, exposures):
+    client = graph.client
+    client.listen('a/corrected_observations')
+    nodes = [graph.calibration_node(by_command[0]), graph.start('correction_node'),
+             graph.start('simulator_node', {'scene': 'markers', 'rate': 120.0}),
+             graph.start('player_node', {'bag': BAGS / 'tracking', 'loop': True, 'wait_for_readers': 1})]
+    client.wait_until(lambda: len(client.messages['a/corrected_observations']) > 100, what='corrected frames')
+    for node in reversed(nodes):
+        node.interrupt()
+    client.wait_until(lambda: not any(n.running for n in nodes), 15, 'the nodes to end')
+    for node in nodes:
+        assert node.wait() == 0
+        assert not any(word in node.log for word in TROUBLE), node.log
+
+
+def test_interrupt_ends_a_running_job_and_a_waiting_capture(graph, exposures, tmp_path):
+    client = graph.client
+    node = graph.calibration_node(tmp_path / 'none')
+    for pair in zip(*exposures.values()):
+        for frame in pair:
+            client.publish(frame)
+    client.wait_for_status(lambda s: s.exposures == 15)
+    client.call_async(Capture, 'capture', timeout_sec=600.0)
+    handle = client.goal()
+    handle.get_result_async()
+    client.wait_until(lambda: client.feedback, what='the first feedback')
+    node.interrupt()
+    client.wait_until(lambda: not node.running, 15, 'the node to end')
+    assert node.wait() == 0 and not any(word in node.log for word in TROUBLE), node.log
+    assert not (tmp_path / 'none').exists()
+
+
+def test_two_rigs_in_namespaces_do_not_meet(graph, exposures, tmp_path):
+    """A node of another namespace gets nothing of this one, remapped it does."""
+    client = graph.client
+    graph.calibration_node(tmp_path / 'none')
+    other = graph.start('correction_node', remaps={'__ns': '/elsewhere'}, wait=False)
+    remapped = graph.start('correction_node', remaps={
+        '__node': 'second', '__ns': '/elsewhere', **{f'{n}/target_observations': f'{graph.namespace}/{n}/target_observations'
+                                                     for n in NAMES}}, wait=False)
+    client.wait_until(lambda: client.subscriptions_matched('second'), what='the remapped node')
+    for frame in standing(exposures['a'][0], 3):
+        client.publish(frame)
+    client.wait_for_status(lambda s: s.frames_received == 3)
+    assert not any(r.node_namespace == '/elsewhere' and r.node_name == 'correction_node'
+                   for r in client.get_subscriptions_info_by_topic(f'{graph.namespace}/a/target_observations'))
+    assert other.end() == 0 and remapped.end() == 0

@@ -1,0 +1,218 @@
+"""Pairing of frames, collecting of still exposures, and coverage of the image."""
+
+import itertools
+
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.calibration.collector import (
+    ExposureCollector, FramePairer, StillOptions, collect_recorded, displacement)
+from fluoro_calib_ros.calibration.coverage import Coverage
+from fluoro_calib_ros.photogrammetry.observations import DataError, Frame
+
+SIZE = (1000, 800)
+MS = 1_000_000
+
+
+def frame(name='a', number=1, stamp_ms=0.0, shift=0.0, ids=range(20)):
+    """A frame of 20 targets, displaced by shift [px] along u."""
+    ids = np.array(ids)
+    uv = np.column_stack([100 + 20.0 * ids + shift, 200 + 10.0 * ids])
+    return Frame(name, number, ids, uv, SIZE, None, round(stamp_ms * MS))
+
+
+def pair(number=1, stamp_ms=0.0, shift=0.0, shift_b=None):
+    return {'a': frame('a', number, stamp_ms, shift),
+            'b': frame('b', number, stamp_ms, shift if shift_b is None else shift_b)}
+
+
+# ---- pairing
+
+def test_frames_pair_by_number_in_any_order():
+    pairer = FramePairer('ab')
+    assert pairer.add(frame('a', 1, 0)) is None and pairer.add(frame('a', 2, 5)) is None
+    found = pairer.add(frame('b', 2, 900))
+    assert (found['a'].stamp_ns, found['b'].stamp_ns) == (5 * MS, 900 * MS)
+    assert pairer.add(frame('b', 1, 901))['a'].number == 1
+    pairer.flush()
+    assert pairer.unpaired == {'a': 0, 'b': 0}
+
+
+def test_frames_pair_by_stamp_within_the_tolerance():
+    """The nearest partner; the pair is numbered anew, as the frames need not be numbered alike."""
+    pairer = FramePairer('ab', 'stamp', tolerance_ns=2 * MS)
+    for number, stamp in ((70, 0), (71, 3), (72, 50)):
+        assert pairer.add(frame('a', number, stamp)) is None
+    found = pairer.add(frame('b', 5, 2.5))
+    assert (found['a'].stamp_ns, found['a'].number, found['b'].number) == (3 * MS, 1, 1)
+    assert pairer.add(frame('b', 6, 52.1)) is None, 'beyond the tolerance'
+    assert pairer.add(frame('b', 7, 48.0))['b'].number == 2
+    pairer.flush()
+    assert pairer.unpaired == {'a': 1, 'b': 1}
+
+
+def test_only_the_last_frames_wait():
+    """What drops out alone is counted, and finds no partner any more."""
+    pairer = FramePairer('ab', waiting=3)
+    for number in range(1, 6):
+        assert pairer.add(frame('a', number)) is None
+    assert pairer.unpaired == {'a': 2, 'b': 0}
+    assert pairer.add(frame('b', 2)) is None
+    assert pairer.add(frame('b', 3)) is not None
+    pairer.flush()
+    assert pairer.unpaired == {'a': 4, 'b': 1}
+    assert pairer.add(frame('b', 4)) is None, 'flush gives all up'
+
+
+def test_a_number_that_comes_again_replaces_the_frame_that_waits():
+    pairer = FramePairer('ab')
+    pairer.add(frame('a', 1, 0))
+    pairer.add(frame('a', 1, 7))
+    assert pairer.unpaired == {'a': 1, 'b': 0}
+    assert pairer.add(frame('b', 1))['a'].stamp_ns == 7 * MS
+
+
+def test_one_fluoroscope_alone_needs_no_partner():
+    assert FramePairer(['a']).add(frame('a', 4))['a'].number == 4
+
+
+def test_pairing_of_another_kind_is_refused():
+    with pytest.raises(ValueError, match="not 'id'"):
+        FramePairer('ab', 'id')
+
+
+# ---- still exposures
+
+def test_displacement_is_the_median_of_common_targets():
+    """Some false matches do not count; with too few targets in common two frames are different."""
+    one, other = frame(), frame(shift=3.0)
+    other.uv[:5] += 400
+    assert displacement(one, other) == pytest.approx(3)
+    assert displacement(frame(ids=range(8)), frame(shift=2.0)) == pytest.approx(2)
+    assert displacement(frame(ids=range(7)), frame()) == np.inf
+    reordered = frame(ids=range(19, -1, -1), shift=1.0)
+    assert displacement(frame(), reordered) == pytest.approx(1)
+
+
+def test_the_phantom_is_taken_where_it_stands_still_in_a_new_pose():
+    """A stream of 50 frames a second: standing, moving, standing elsewhere, and back again."""
+    collector, taken = ExposureCollector('ab'), []
+    shifts = [0] * 20 + list(np.linspace(0, 100, 20)) + [100] * 20 + list(np.linspace(100, 0, 20)) + [0] * 20
+    said = []
+    for number, shift in enumerate(shifts, 1):
+        said.append(collector.offer(pair(number, 20.0 * number, shift)))
+        if not said[-1]:
+            taken.append(number)
+    # Frame 40 is the first at rest: taken 100 ms after it, and never again in a pose that is there already.
+    assert taken == [1, 45], said
+    assert [e['a'].number for e in collector.exposures] == taken
+    assert said[10] == 'the phantom stands in a pose that is collected already'
+    assert said[30] == 'the phantom moves' and said[-1] == said[10]
+
+
+def test_a_movement_that_only_one_fluoroscope_sees_counts():
+    """Along the axis of the other: neither still nor the same pose."""
+    collector = ExposureCollector('ab')
+    assert collector.offer(pair(1, 0)) == ''
+    assert collector.offer(pair(2, 20, 0, 50)) == 'the phantom moves'
+    assert collector.offer(pair(3, 1000, 0, 50)) == ''
+    assert len(collector.exposures) == 2
+
+
+def test_single_shots_count_each_in_a_new_pose():
+    """Frames further apart than the still time have nothing to be compared with but the collected poses."""
+    collector = ExposureCollector('ab', StillOptions(still_time_s=0.1, new_px=10))
+    assert collector.offer(pair(1, 0, 0)) == ''
+    assert collector.offer(pair(2, 500, 9.9)) == 'the phantom stands in a pose that is collected already'
+    assert collector.offer(pair(3, 1000, 10.1)) == ''
+
+
+def test_take_asks_for_nothing_but_a_new_number():
+    collector = ExposureCollector('ab')
+    assert collector.take(pair(1)) == '' and collector.take(pair(2)) == ''
+    assert collector.take(pair(2, 99)) == 'frame 2 is collected already'
+    assert [e['b'].number for e in collector.exposures] == [1, 2]
+
+
+def test_reset_forgets_everything():
+    collector = ExposureCollector('ab')
+    collector.offer(pair(1, 0, 0))
+    collector.offer(pair(2, 10, 50))
+    collector.reset()
+    assert collector.exposures == [] and collector.coverage == {} and collector.frames() == {'a': [], 'b': []}
+    assert collector.offer(pair(1, 20, 100)) == ''
+
+
+def test_frames_are_handed_out_by_fluoroscope():
+    collector = ExposureCollector('ab')
+    collector.take(pair(1))
+    collector.take(pair(2))
+    assert {n: [f.number for f in fs] for n, fs in collector.frames().items()} == {'a': [1, 2], 'b': [1, 2]}
+    assert list(collector.frames(['b'])) == ['b']
+    with pytest.raises(DataError, match='fluoroscope c is unknown, there are a, b'):
+        collector.frames(['c'])
+
+
+# ---- recordings
+
+def recording(shifts, interval_ms):
+    return {name: [frame(name, n, interval_ms * n, shift) for n, shift in enumerate(shifts, 1)] for name in 'ab'}
+
+
+def test_single_shots_of_a_recording_are_all_taken():
+    frames, unpaired = collect_recorded(recording([0, 0, 50], 500.0))
+    assert [f.number for f in frames['a']] == [1, 2, 3] and unpaired == {'a': 0, 'b': 0}
+    frames, _ = collect_recorded(recording([0, 0, 50], 500.0), 'still')
+    assert [f.number for f in frames['a']] == [1, 3]
+
+
+def test_of_a_stream_the_still_exposures_are_taken():
+    shifts = [0] * 20 + list(np.linspace(0, 100, 20)) + [100] * 20
+    frames, _ = collect_recorded(recording(shifts, 20.0))
+    assert [f.number for f in frames['b']] == [1, 45]
+    frames, _ = collect_recorded(recording(shifts, 20.0), 'all')
+    assert len(frames['b']) == 60
+
+
+def test_frames_without_partner_are_left_out_and_counted():
+    recorded = recording([0] * 5, 500.0)
+    del recorded['a'][1], recorded['b'][3]
+    recorded['b'].reverse()
+    frames, unpaired = collect_recorded(recorded)
+    assert [f.number for f in frames['a']] == [1, 3, 5] == [f.number for f in frames['b']]
+    assert unpaired == {'a': 1, 'b': 1}
+
+
+def test_a_recording_of_nothing_is_nothing():
+    assert collect_recorded({'a': [], 'b': []}) == ({'a': [], 'b': []}, {'a': 0, 'b': 0})
+
+
+# ---- coverage
+
+def test_coverage_grows_from_nothing_to_the_whole_image():
+    coverage, rng, seen = Coverage(SIZE), np.random.default_rng(1), []
+    assert coverage.fraction == 0
+    for _ in range(40):
+        coverage.add(rng.uniform(-0.5, np.array(SIZE) - 0.5, (60, 2)))
+        seen.append(coverage.fraction)
+    assert all(a <= b for a, b in itertools.pairwise(seen)) and 0.2 < seen[0] < 0.5 and seen[-1] == 1
+    coverage.add(np.zeros((0, 2)))
+    assert coverage.fraction == 1
+
+
+def test_an_image_point_covers_its_surroundings_within_the_image():
+    """Its cell of 32 x 32 and the eight around it: in a corner there are three."""
+    middle, corner, far_corner = Coverage(SIZE), Coverage(SIZE), Coverage(SIZE)
+    middle.add([[500.0, 400.0]])
+    corner.add([[-0.5, -0.5]])
+    far_corner.add([[999.5, 799.5]])
+    assert (middle.fraction, corner.fraction, far_corner.fraction) == (9 / 1024, 4 / 1024, 4 / 1024)
+    half = Coverage(SIZE)
+    half.add(np.stack(np.meshgrid(np.arange(0, 480.0), np.arange(0, 800.0)), axis=2).reshape(-1, 2))
+    assert half.fraction == pytest.approx(17 / 32)   # the left half and the column beside it
+
+
+def test_coverage_is_kept_for_each_fluoroscope():
+    collector = ExposureCollector('ab')
+    collector.take({'a': frame('a', 1), 'b': frame('b', 1, ids=range(3))})
+    assert collector.coverage['a'].fraction > collector.coverage['b'].fraction > 0

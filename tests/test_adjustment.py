@@ -347,3 +347,12 @@ def test_a_held_noise_model_stays():
     slope = [cost_at(network, held, 1e-3 * d) - cost_at(network, held, -1e-3 * d) for d in directions]
     assert np.linalg.norm(slope) / 2e-3 < 1e-5
     assert adjust(network, truth).noise.scale == pytest.approx(0.3, rel=0.3)
+
+
+def test_exact_observations_give_the_exact_solution():
+    """The noise scale stops at a hundredth of a pixel instead of vanishing."""
+    network, truth = rigs.small_network(**MANY_TARGETS, noise_px=0.0, survey_sd_mm=1e-9)
+    network = replace(network, survey_sd_mm=np.full(30, 0.1))
+    result = adjust(network, rigs.disturbed(truth))
+    assert result.converged and result.noise.scale * np.median(network.sigma) == pytest.approx(0.01)
+    assert_same_solution(result, replace(result, parameters=truth), 1e-2, 1e-5, 1e-4, 1e-2)

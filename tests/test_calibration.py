@@ -14,8 +14,8 @@ from fluoro_calib_ros.calibration.result import INVALID, OK, OUTSIDE, digest_of_
 from fluoro_calib_ros.calibration.self_calibration import Options, self_calibrate
 from fluoro_calib_ros.distortion.gauge import gauge_basis, gauge_coefficients
 from fluoro_calib_ros.photogrammetry.observations import DataError
-from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion, matrix_from_vector, rotation_angle
+from fluoro_calib_ros.simulation.rig import seen_beads, simulate_exposures, virtual_rig
 
 PHANTOM = rigs.rig().phantom
 NOISE_PX = 0.25
@@ -117,6 +117,8 @@ def test_a_single_exposure_can_be_adjusted():
     test = simulate_exposures(rigs.rig(), 1, seed=78).frames['a']
     job = adjust_with({'a': test}, PHANTOM, {'a': rigs.calibrated().calibrations['a']})
     assert job.converged and len(job.fluoroscopes['a'].exposures) == 1
+    # With one ray to a target the survey could take up all residuals: the noise is that of the calibration.
+    assert 0.05 < job.fluoroscopes['a'].rmse_after.min() and target_error(job.targets) < 0.1
 
 
 def test_frames_of_another_image_size_are_not_adjusted_with_a_calibration():
@@ -267,6 +269,18 @@ def test_start_values_are_near_the_truth():
         assert np.linalg.norm(measured.start.position_mm[row] - position) < 100
 
 
+def test_exterior_orientations_are_those_of_the_rig():
+    """Quaternion phantom -> sensor and source in the phantom's frame [mm], exposure by exposure."""
+    fluoroscope = rigs.rig().fluoroscopes[0]
+    poses = simulate_exposures(rigs.rig(), 15, 1).poses
+    for found, pose in zip(rigs.calibrated().fluoroscopes['a'].exposures, poses, strict=True):
+        rotation, position = fluoroscope.exterior(pose)
+        # The principal point, and with it the attitude, is known to the gauge only.
+        assert rotation_angle(matrix_from_quaternion(found.quaternion_wxyz) @ rotation.T) < np.deg2rad(2)
+        assert np.linalg.norm(found.position_mm - position) < 40
+        assert (found.sd_mm > 0).all() and found.sd_mm.max() < 5 and 0 < found.sd_rad.max() < 1e-2
+
+
 # ---- repeatability
 
 def test_the_same_observations_give_the_same_bits():
@@ -371,6 +385,22 @@ def test_observations_that_do_not_suffice_are_refused_by_name(spoil, said):
     with pytest.raises(DataError, match=said) as caught:
         calibrate({'a': spoil(frames_of()['a'])}, PHANTOM, rounds(1))
     assert '\n' not in str(caught.value)
+
+
+@pytest.mark.parametrize('degrees, mm, accepted', [(5.0, 0.0, True), (0.0, 30.0, True), (1.0, 10.0, False)])
+def test_turns_and_shifts_are_poses_of_their_own(degrees, mm, accepted):
+    """Either is enough for a calibration to begin with; too little of both is one pose."""
+    fluoroscope, rng, frames = rigs.rig().fluoroscopes[0], np.random.default_rng(8), []
+    for n in range(3):
+        turn = matrix_from_vector([0, 0, np.deg2rad(degrees) * n / 2])
+        points = rigs.rig().true_mm @ turn.T + [0, 0, mm * n / 2]
+        ids, uv = seen_beads(rng, fluoroscope, points, PHANTOM.target_id, NOISE_PX, 0.0, (130, 160))
+        frames.append(replace(rigs.exposures()['a'][n], target_id=ids, uv=uv))
+    if accepted:
+        assert len(measured_network({'a': frames}, PHANTOM).frames) == 3
+    else:
+        with pytest.raises(DataError, match='all 3 exposures show the phantom in one pose'):
+            measured_network({'a': frames}, PHANTOM)
 
 
 def test_a_frame_that_does_not_fit_the_phantom_is_left_out_with_a_sentence():

@@ -207,6 +207,8 @@ def test_an_image_point_covers_its_surroundings_within_the_image():
     corner.add([[-0.5, -0.5]])
     far_corner.add([[999.5, 799.5]])
     assert (middle.fraction, corner.fraction, far_corner.fraction) == (9 / 1024, 4 / 1024, 4 / 1024)
+    far_corner.add([[-0.5, -0.5]])
+    assert far_corner.fraction == 8 / 1024
     half = Coverage(SIZE)
     half.add(np.stack(np.meshgrid(np.arange(0, 480.0), np.arange(0, 800.0)), axis=2).reshape(-1, 2))
     assert half.fraction == pytest.approx(17 / 32)   # the left half and the column beside it

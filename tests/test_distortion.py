@@ -223,6 +223,18 @@ def test_the_frame_rate_form_predicts_as_the_model_everywhere(kind, k, points):
     np.testing.assert_array_equal(other.outside, one.outside)
 
 
+@pytest.mark.parametrize('kind', ['knn', 'local_linear'])
+@pytest.mark.parametrize('k', [9, 14, 33])
+def test_the_frame_rate_form_finds_the_farthest_candidates(kind, k):
+    """Training points in a grid as fine as the cells, hardly disturbed: every cell needs all its candidates."""
+    rng = np.random.default_rng(15)
+    grid = np.stack(np.meshgrid(np.arange(-60.5, 700, 8.0), np.arange(-60.5, 540, 8.0)), axis=2).reshape(-1, 2)
+    uv = grid + rng.uniform(-0.3, 0.3, grid.shape)
+    model = CorrectionModel(kind, k, uv, rng.normal(size=uv.shape))
+    query = pixels()
+    np.testing.assert_allclose(model.at_frame_rate(SIZE).evaluate(query).duv, model.predict(query), rtol=0, atol=1e-10)
+
+
 @pytest.mark.parametrize('k', [6, 20, 59])
 def test_the_frame_rate_form_bears_duplicates_of_training_points(k):
     """The same pixel in several exposures: equally distant neighbours, at the pixel itself and elsewhere."""

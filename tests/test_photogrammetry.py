@@ -155,6 +155,7 @@ def test_resection_withstands_false_matches_and_distortion(seed):
     uv = uv + 10 * np.sum(x * x, axis=1, keepdims=True) * x + rng.normal(0, 0.3, uv.shape)
     false = rng.permutation(100)[:20]
     uv[false] = uv[np.roll(false, 1)]
+    assert principal_distance_of(robust_dlt(xyz, uv)) == pytest.approx(interior[2], rel=0.04)
     found = resect(xyz, uv, interior)
     assert rotation_angle(found.rotation @ rotation.T) < np.deg2rad(0.3)
     assert np.linalg.norm(found.position_mm - position) < 15   # of 1500 mm; what the distortion does

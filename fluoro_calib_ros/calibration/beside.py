@@ -21,7 +21,9 @@ def calibrate_beside(frames, phantom, options, joint, principal_distance, progre
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=_work, daemon=True, args=(
         there, frames, phantom, options, joint, principal_distance))
-    process.start()
+    masked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])   # is inherited
+    process.start()   # without the interrupt from the keyboard, which comes to all: the caller ends it
+    signal.pthread_sigmask(signal.SIG_SETMASK, masked)
     there.close()
     try:
         while True:
@@ -46,7 +48,6 @@ def calibrate_beside(frames, phantom, options, joint, principal_distance, progre
 
 def _work(there, *arguments):
     """Calibrate, and send ('round', (fluoroscope, Round)), then ('done', JobResult) or ('fault', exception)."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)   # from the keyboard it comes to all: the caller ends this one
     os.nice(NICE)
     try:
         job = calibrate(*arguments, progress=lambda *content: there.send(('round', content)))

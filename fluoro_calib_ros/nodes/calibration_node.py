@@ -55,6 +55,7 @@ class CalibrationNode(Node):
         self._received = dict.fromkeys(self._names, 0)
         self._rejected = dict.fromkeys(self._names, 0)
         self._last_fault = dict.fromkeys(self._names, '')
+        self._deaf = dict.fromkeys(self._names, '')   # what keeps a publisher from being heard
         self._load_fault = ''
         self._stopping = threading.Event()
         self._rounds, self._calibrations, self._made_at = {}, {}, {}
@@ -109,6 +110,9 @@ class CalibrationNode(Node):
             self._status[name] = self.create_publisher(CalibrationStatus, f'{name}/calibration_status', 10)
             self.create_subscription(TargetObservations, f'{name}/target_observations',
                                      lambda message, name=name: self._on_frame(name, message), OBSERVATIONS,
+                                     event_callbacks=support.on_incompatible_qos(
+                                         f'{name}/target_observations',
+                                         lambda fault, name=name: self._on_deaf(name, fault)),
                                      qos_overriding_options=overridable())
         for kind, name, callback in ((Calibrate, 'calibrate', self._on_calibrate),
                                      (Capture, 'capture', self._on_capture), (Reset, 'reset', self._on_reset),
@@ -126,6 +130,11 @@ class CalibrationNode(Node):
         self._collector = ExposureCollector(self._names, self._still)
 
     # -- observations
+
+    def _on_deaf(self, name, fault):
+        """Say that nothing can come from a publisher."""
+        self._deaf[name] = fault
+        self._sentences.warn(fault)
 
     def _on_frame(self, name, message):
         """Check a frame, pair it, and collect the pair where it is wanted."""
@@ -380,6 +389,8 @@ class CalibrationNode(Node):
 
     def _verdict(self, name, status):
         """Level and message of the diagnostics of a fluoroscope."""
+        if self._deaf[name]:
+            return support.WARN, self._deaf[name]
         if self._load_fault:
             return support.ERROR, f'no calibration loaded: {self._load_fault}'
         if self.count_publishers(f'{name}/target_observations') == 0 and status.frames_received == 0:

@@ -26,6 +26,7 @@ class _Stream:
         self.calibration = None   # replaced as a whole: a frame sees one or the other, never half of each
         self.received = self.corrected = self.waiting = self.refused = self.invalid_points = 0
         self.last_fault = ''
+        self.deaf = ''   # what keeps a publisher from being heard
         self.latencies = deque(maxlen=2000)   # seconds from the arrival of a frame to its publication
         self.stamp = None
 
@@ -50,9 +51,17 @@ class CorrectionNode(Node):
                                      lambda message, name=name: self._on_calibration(name, message), LATCHED)
             self.create_subscription(TargetObservations, f'{name}/target_observations',
                                      lambda message, name=name: self._on_frame(name, message), OBSERVATIONS,
+                                     event_callbacks=support.on_incompatible_qos(
+                                         f'{name}/target_observations',
+                                         lambda fault, name=name: self._on_deaf(name, fault)),
                                      qos_overriding_options=overridable())
         self._diagnostics = support.Diagnostics(self)
         self.create_timer(1.0, self._on_timer)
+
+    def _on_deaf(self, name, fault):
+        """Say that nothing can come from a publisher."""
+        self._streams[name].deaf = fault
+        self._sentences.warn(fault)
 
     def _on_calibration(self, name, message):
         """Prepare a calibration beside the stream, and take it over when it is ready."""
@@ -138,6 +147,8 @@ class CorrectionNode(Node):
 
     def _verdict(self, name, stream):
         """Level and message of the diagnostics of a fluoroscope."""
+        if stream.deaf:
+            return support.WARN, stream.deaf
         if stream.calibration is None:
             return support.WARN, f'no calibration yet: {stream.waiting} frames were not corrected'
         if self.count_publishers(f'{name}/target_observations') == 0:

@@ -10,8 +10,10 @@ import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy._rclpy_pybind11 import RCLError
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.qos import qos_policy_name_from_kind
 from rclpy.signals import SignalHandlerOptions
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
@@ -130,6 +132,14 @@ def run(make_node, args=None):
             node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(code)
+
+
+def on_incompatible_qos(topic, say):
+    """Event callbacks of a subscription that say, in a sentence, that a publisher offers less than is asked for."""
+    def callback(event):
+        policy = qos_policy_name_from_kind(event.last_policy_kind)
+        say(f'topic {topic}: a publisher offers an incompatible quality of service ({policy}), nothing comes from it')
+    return SubscriptionEventCallbacks(incompatible_qos=callback)
 
 
 class StartError(RuntimeError):

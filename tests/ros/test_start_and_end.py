@@ -3,7 +3,9 @@
 import shutil
 
 import pytest
+from fluoro_calib_msgs.msg import TargetObservations
 from fluoro_calib_msgs.srv import Capture
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from ros_graph import BAGS, NAMES, standing
 
 TROUBLE = ('Traceback', 'Exception', 'exception', 'Error:', 'never retrieved', 'never awaited')
@@ -95,12 +97,29 @@ def test_two_rigs_in_namespaces_do_not_meet(graph, exposures, tmp_path):
     graph.calibration_node(tmp_path / 'none')
     other = graph.start('correction_node', remaps={'__ns': '/elsewhere'}, wait=False)
     remapped = graph.start('correction_node', remaps={
-        '__node': 'second', '__ns': '/elsewhere', **{f'{n}/target_observations': f'{graph.namespace}/{n}/target_observations'
-                                                     for n in NAMES}}, wait=False)
+        '__node': 'second', '__ns': '/elsewhere',
+        **{f'{n}/target_observations': f'{graph.namespace}/{n}/target_observations' for n in NAMES}}, wait=False)
     client.wait_until(lambda: client.subscriptions_matched('second'), what='the remapped node')
+    # An interrupt that comes while a process still loads its modules would end it with another status.
+    client.wait_until(lambda: ('correction_node', '/elsewhere') in client.get_node_names_and_namespaces(),
+                      what='the other node')
     for frame in standing(exposures['a'][0], 3):
         client.publish(frame)
     client.wait_for_status(lambda s: s.frames_received == 3)
     assert not any(r.node_namespace == '/elsewhere' and r.node_name == 'correction_node'
                    for r in client.get_subscriptions_info_by_topic(f'{graph.namespace}/a/target_observations'))
     assert other.end() == 0 and remapped.end() == 0
+
+
+def test_incompatible_publisher_is_reported(graph, tmp_path):
+    """A best-effort publisher is not heard by a reliable subscription: the diagnostics say so."""
+    client = graph.client
+    graph.calibration_node(tmp_path)
+    graph.start('correction_node')
+    publisher = client.create_publisher(TargetObservations, 'a/target_observations',
+                                        QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+    for node in ('calibration_node', 'correction_node'):
+        status = client.wait_for_diagnostics(node, lambda s: 'incompatible' in s.message)
+        assert status.level == b'\1'
+        assert 'a/target_observations' in status.message and 'RELIABILITY' in status.message
+    client.destroy_publisher(publisher)

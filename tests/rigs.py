@@ -25,9 +25,9 @@ def exposures(count=15, seed=1):
 
 
 @functools.lru_cache(maxsize=None)
-def calibrated(name='a', **options):
-    """JobResult of fluoroscope name of the rig with 15 exposures."""
-    return calibrate({name: exposures()[name]}, rig().phantom, Options(**options))
+def calibrated(name='a', count=15, **options):
+    """JobResult of fluoroscope name of the rig with the first exposures of 15."""
+    return calibrate({name: exposures()[name][:count]}, rig().phantom, Options(**options))
 
 
 def small_network(exposures=4, targets=30, fluoroscopes=1, noise_px=0.3, nu=np.inf, seed=0, survey_sd_mm=0.1,

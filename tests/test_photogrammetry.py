@@ -95,7 +95,8 @@ def test_analytic_derivatives_equal_central_differences():
         return np.stack([(image(h * e) - image(-h * e)) / (2 * h) for e in np.eye(3)], axis=2)
 
     numeric = {
-        'source': (d_exterior[:, :, :3], differences(lambda d: project(rotation, position + d, points, interior), 1e-2)),
+        'source': (d_exterior[:, :, :3],
+                   differences(lambda d: project(rotation, position + d, points, interior), 1e-2)),
         'turn': (d_exterior[:, :, 3:],
                  differences(lambda d: project(matrix_from_vector(d) @ rotation, position, points, interior), 1e-5)),
         'point': (d_point, differences(lambda d: project(rotation, position, points + d, interior), 1e-2)),
@@ -216,9 +217,9 @@ def test_weight_is_twice_the_slope_of_the_cost(loss):
 @pytest.mark.parametrize('loss, nu', [('student_t', 3.0), ('student_t', 10.0), ('huber', np.inf), ('huber', 3.0),
                                       ('gaussian', np.inf)])
 def test_information_factor_against_monte_carlo(loss, nu):
-    """Variance of 3000 location estimates of 100 points is 1 / (factor * sum of weights)."""
+    """Variance of 1500 location estimates of 100 points is 1 / (factor * sum of weights)."""
     rng = np.random.default_rng(5)
-    runs, n = 3000, 100
+    runs, n = 1500, 100
     x = rng.normal(size=(runs, n, 2))
     if np.isfinite(nu):
         x /= np.sqrt(rng.chisquare(nu, (runs, n, 1)) / nu)
@@ -229,8 +230,8 @@ def test_information_factor_against_monte_carlo(loss, nu):
         place = np.sum(w * x, axis=1, keepdims=True) / np.sum(w, axis=1, keepdims=True)
     q = np.sum((x - place) ** 2, axis=2).ravel()
     expected = 1 / (noise.information_factor(q) * n * np.mean(noise.weight(q)))
-    # 6000 estimates: their variance is known to 1.8 %.
-    assert np.mean(place ** 2) == pytest.approx(expected, rel=0.06)
+    # 3000 estimates: their variance is known to 2.6 %.
+    assert np.mean(place ** 2) == pytest.approx(expected, rel=0.08)
 
 
 def test_information_factor_of_student_t_follows_from_its_definition():
@@ -244,8 +245,8 @@ def test_information_factor_of_student_t_follows_from_its_definition():
 
 @pytest.mark.parametrize('nu', [4.0, 12.0])
 def test_scale_and_degrees_of_freedom_equal_direct_maximum_likelihood(nu):
-    """ECME finds the maximum of the likelihood, and in 40,000 points it is the truth."""
-    squared = np.sum(bivariate_t(np.random.default_rng(7), 40_000, nu, 0.3) ** 2, axis=1)
+    """ECME finds the maximum of the likelihood, and in 20,000 points it is the truth."""
+    squared = np.sum(bivariate_t(np.random.default_rng(7), 20_000, nu, 0.3) ** 2, axis=1)
     ones = np.ones(len(squared))
 
     def cost(x):
@@ -257,8 +258,8 @@ def test_scale_and_degrees_of_freedom_equal_direct_maximum_likelihood(nu):
     assert cost(np.log([found.scale, found.nu])) - best.fun < 0.05
     assert found.scale == pytest.approx(np.exp(best.x[0]), rel=2e-3)
     assert found.nu == pytest.approx(np.exp(best.x[1]), rel=2e-2)
-    assert found.scale == pytest.approx(0.3, rel=0.015)
-    assert found.nu == pytest.approx(nu, rel=0.1)
+    assert found.scale == pytest.approx(0.3, rel=0.02)
+    assert found.nu == pytest.approx(nu, rel=0.15)
 
 
 @pytest.mark.parametrize('loss', LOSSES)

@@ -8,6 +8,7 @@ from threadpoolctl import threadpool_limits
 
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.observations import check_frame
+from ..photogrammetry.precision import geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
 from .network import measured_network
 from .result import FluoroscopeCalibration, digest_of_sources
@@ -183,6 +184,17 @@ def _figures(measured, before, after, precise, f, model):
                              tuple(exposures))
 
 
+def _image_sd(run, rows):
+    """Standard deviation [px] of an image coordinate, from the inlier residuals of the image points rows.
+
+    A residual is smaller than the noise by the root of its redundancy number. The scale of a Student-t will not
+    do: where the tails are heavy it is smaller than the standard deviation of what is in its core.
+    """
+    redundancy = geometric_redundancy(run.measured.network, run.after.parameters, run.after.noise)
+    rows = rows[run.after.inliers[rows]]
+    return float(np.sqrt(np.sum(run.after.residuals[rows] ** 2) / np.sum(2 * redundancy[rows])))
+
+
 def _calibration(run, f, name, options, digest, seconds):
     """FluoroscopeCalibration of fluoroscope number f of a self-calibration."""
     rows, last = _rows_of(run.measured, f), run.history[-1]
@@ -193,7 +205,7 @@ def _calibration(run, f, name, options, digest, seconds):
         fluoroscope=name, image_size=run.measured.image_size[f], interior=run.after.parameters.interior[f],
         interior_covariance=run.precision.interior[f], interior_estimated=options.interior == 'estimated',
         model=run.models[name], train_exposure=numbers[run.measured.network.exposure[rows[trained]]],
-        sigma0=run.after.noise.scale, nu=run.after.noise.nu, exposures=len(frames), observations=len(rows),
+        image_sd=_image_sd(run, rows), sigma0=run.after.noise.scale, nu=run.after.noise.nu, exposures=len(frames), observations=len(rows),
         inliers=int(run.after.inliers[rows].sum()), rmse_before=rmse_of_inliers(run.before, rows),
         rmse_after=rmse_of_inliers(run.after, rows), cost_adjustment=last.F, cost_regression=last.G,
         iterations=last.iteration, converged=run.converged, stamp_ns=max(frame.stamp_ns for frame in frames),

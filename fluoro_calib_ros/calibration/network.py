@@ -6,7 +6,7 @@ import numpy as np
 
 from ..photogrammetry.adjustment import Network, Parameters
 from ..photogrammetry.observations import DataError, check_frame
-from ..photogrammetry.resection import MIN_TARGETS, principal_distance_of, resect, robust_dlt
+from ..photogrammetry.resection import principal_distance_of, resect, robust_dlt
 from ..photogrammetry.rotations import rotation_angle
 
 MIN_EXPOSURES = 3
@@ -148,4 +148,4 @@ def _index(frames, fluoroscope, phantom, n_fluoroscopes, interior_free):
     return network, phantom.target_id[used]
 
 
-__all__ = ['MIN_TARGETS', 'Measured', 'measured_network', 'nominal_interior']
+__all__ = ['Measured', 'measured_network', 'nominal_interior']

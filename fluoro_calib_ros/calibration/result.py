@@ -26,8 +26,9 @@ class CorrectedPoints:
 class FluoroscopeCalibration:
     """Interior orientation and correction model of one fluoroscope, with the figures of their quality.
 
-    interior (3,) xp, yp, c and interior_covariance (3, 3) [px]; image_size (width, height) [px]; sigma0 and nu
-    of the image noise; rmse_before and rmse_after (2,) of the inlier residuals [px]; cost_adjustment F and
+    interior (3,) xp, yp, c and interior_covariance (3, 3) [px]; image_size (width, height) [px]; image_sd:
+    standard deviation of an image coordinate of an inlier [px]; sigma0 and nu: scale and degrees of freedom of
+    the Student-t noise, sigma0 a factor of sigma where that was given; rmse_before and rmse_after (2,) of the inlier residuals [px]; cost_adjustment F and
     cost_regression G; stamp_ns of the last exposure used; seconds the calibration took, NaN where it was
     read from a file; source_digest of observations and phantom. calibration_id follows from the content.
     """
@@ -39,6 +40,7 @@ class FluoroscopeCalibration:
     interior_estimated: bool
     model: CorrectionModel
     train_exposure: np.ndarray
+    image_sd: float
     sigma0: float
     nu: float
     exposures: int
@@ -59,7 +61,7 @@ class FluoroscopeCalibration:
     def __post_init__(self):
         digest = hashlib.sha256()
         for array in (self.interior, self.image_size, self.model.train_uv, self.model.train_duv,
-                      [self.model.k, self.model.noise_px, self.model.bias_px, self.sigma0]):
+                      [self.model.k, self.model.noise_px, self.model.bias_px, self.image_sd, self.sigma0]):
             digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
         digest.update(f'{self.fluoroscope}/{self.model.kind}/{self.source_digest}'.encode())
         object.__setattr__(self, 'calibration_id', f'{self.fluoroscope}-{digest.hexdigest()[:16]}')
@@ -84,7 +86,7 @@ class FluoroscopeCalibration:
         if not good.any():
             return out
         correction = self._frame_model.evaluate(uv[good])
-        observed = self.sigma0 if sigma is None else np.asarray(sigma, dtype=float)[good]
+        observed = self.image_sd if sigma is None else np.asarray(sigma, dtype=float)[good]
         out.uv[good] = uv[good] - correction.duv
         out.sigma[good] = np.sqrt(observed ** 2 + correction.sd ** 2)
         out.status[good] = np.where(correction.outside, OUTSIDE, OK)

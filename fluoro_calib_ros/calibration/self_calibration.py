@@ -96,7 +96,7 @@ class _State:
         self.rows = {name: np.flatnonzero(of_point == f) for f, name in enumerate(measured.fluoroscopes)}
         self.regressors = {
             name: Regressor(options.model, network.uv[rows], network.exposure[rows],
-                            options.interior == 'estimated', options.k) for name, rows in self.rows.items()}
+                            options.interior == 'fixed', options.k) for name, rows in self.rows.items()}
 
     def choose(self, values, adjustment, information):
         """Inliers and k of this round; returns G and whether anything changed."""

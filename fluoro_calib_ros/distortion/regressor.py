@@ -18,12 +18,12 @@ class Regressor:
     """Correction model of one fluoroscope through the rounds of a self-calibration.
 
     kind of the model; uv (N, 2) observed pixels of all image points and exposure (N,) of each: they stay
-    where they are, so neighbours are looked up again only when the inliers change. gauge_held: whether the
-    fitted correction is kept orthogonal to the gauge. k: neighbours, None: chosen by cross-validation.
+    where they are, so neighbours are looked up again only when the inliers change. interior_held:
+    whether the interior orientation is, which makes the gauge smaller. k: neighbours, None: chosen by cross-validation.
     """
 
-    def __init__(self, kind, uv, exposure, gauge_held, k=None):
-        self.kind, self.uv, self.exposure, self.gauge_held = kind, uv, exposure, gauge_held
+    def __init__(self, kind, uv, exposure, interior_held, k=None):
+        self.kind, self.uv, self.exposure, self._interior_held = kind, uv, exposure, interior_held
         self.k, self.score, self.changed = 0 if kind == 'none' else k, 0.0, False
         self._wanted_k = k
         self.inliers = self._near = None
@@ -86,12 +86,12 @@ class Regressor:
 
     def without_gauge(self, values, interior):
         """values (N, 2) changed so that their fitted correction is orthogonal to the gauge at the inliers."""
-        if not self.gauge_held or self.kind == 'none':
+        if self.kind == 'none':
             return values
-        basis = gauge_basis(self.uv, interior)
+        basis = gauge_basis(self.uv, interior, self._interior_held)
         for _ in range(3 if self.kind == 'knn' else 1):   # a mean of neighbours repeats a plane only nearly
             fitted = self.smooth(values)[self.inliers]
-            values = values - basis @ gauge_coefficients(self.uv[self.inliers], fitted, interior)
+            values = values - basis @ gauge_coefficients(self.uv[self.inliers], fitted, interior, self._interior_held)
         return values
 
     def model(self, values):

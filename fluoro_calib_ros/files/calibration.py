@@ -44,6 +44,7 @@ FIELDS = {
     'train_exposure': Field('int', ('N',), least=0),
     'noise_px': Field('float', least=0),
     'bias_px': Field('float', least=0),
+    'image_sd': Field('float', least=0),
     'sigma0': Field('float', least=0),
     'nu': Field('float', least=0, special='inf'),
     'exposures': Field('int', least=0),

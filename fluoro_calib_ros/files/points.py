@@ -79,7 +79,7 @@ def correct_points(points, calibrations):
         rows, calibration = np.flatnonzero(names == name), calibrations[str(name)]
         sigma = points.sigma
         if sigma is not None:
-            sigma = np.where(np.isnan(sigma[rows]), calibration.sigma0, sigma[rows])
+            sigma = np.where(np.isnan(sigma[rows]), calibration.image_sd, sigma[rows])
         part = calibration.correct(points.uv[rows], sigma)
         out.uv[rows], out.sigma[rows], out.status[rows] = part.uv, part.sigma, part.status
     return out

@@ -76,7 +76,7 @@ def message_from_calibration(calibration):
     return message
 
 
-SAME_NAME = ('fluoroscope', 'interior_estimated', 'sigma0', 'nu', 'exposures', 'observations', 'inliers',
+SAME_NAME = ('fluoroscope', 'interior_estimated', 'image_sd', 'sigma0', 'nu', 'exposures', 'observations', 'inliers',
              'cost_adjustment', 'cost_regression', 'iterations', 'converged', 'seconds', 'source_digest')
 
 

@@ -52,13 +52,13 @@ class DistortionField:
 
 
 def random_field(rng, strength=1.0, image_size=(1024, 1024)):
-    """A field drawn at random: at strength 1 some 18 px along the rim of the image, 30 to 42 px in its corners."""
+    """A field drawn at random: at strength 1 some 15 px along the rim of the image, 26 to 35 px in its corners."""
     sign = rng.choice([-1.0, 1.0], size=4)
     centre = np.asarray(image_size) / 2 - 0.5 + rng.uniform(-20, 20, 2)
     count = 14
     ripples = np.column_stack([rng.uniform(0, image_size[0], count), rng.uniform(0, image_size[1], count),
                                rng.uniform(70, 130, count), rng.uniform(-1.2, 1.2, (count, 2))])
     ripples[:, 3:] *= strength
-    return DistortionField(centre, strength * rng.uniform(10.5, 12.0),
-                           strength * sign[:2] * rng.uniform(1.5, 3.0, 2),
-                           strength * sign[2] * rng.uniform(1.5, 3.0), ripples)
+    return DistortionField(centre, strength * rng.uniform(9.0, 10.2),
+                           strength * sign[:2] * rng.uniform(1.2, 2.4, 2),
+                           strength * sign[2] * rng.uniform(1.2, 2.4), ripples)

@@ -115,9 +115,17 @@ class Graph:
             self.client.connect(node, process)
         return process
 
-    def calibration_node(self, directory, **parameters):
+    def calibration_node(self, directory, wait=True, **parameters):
         return self.start('calibration_node', {'phantom': BAGS / 'phantom.csv', 'calibration_directory': directory,
-                                               **parameters})
+                                               **parameters}, wait=wait)
+
+    def both_nodes(self, directory, **parameters):
+        """Start calibration node and correction node together; returns their processes by name."""
+        nodes = {'calibration_node': self.calibration_node(directory, wait=False, **parameters),
+                 'correction_node': self.start('correction_node', wait=False)}
+        for name, process in nodes.items():
+            self.client.connect(name, process)
+        return nodes
 
     def play(self, bag, readers, rate=10.0):
         """Play a bag to the end."""
@@ -229,11 +237,17 @@ class Client(Node):
     def publish_message(self, name, message):
         self._outputs[name].publish(message)
 
-    def stream(self, pairs, rate):
-        """Publish pairs of frames at a rate while the client spins, until end_stream(); .published counts them."""
+    def stream(self, pairs, rate, answered=None):
+        """Publish pairs of frames at a rate while the client spins, until end_stream(); .published counts them.
+
+        answered() pairs have come back: never more than half a queue ahead of them, so that nothing can be lost
+        by design where the machine is too busy for the rate.
+        """
         self.published = 0
 
         def publish():
+            if answered is not None and self.published - answered() >= OBSERVATIONS.depth // 2:
+                return
             pair = next(pairs, None)
             if pair is not None:
                 for frame in pair:

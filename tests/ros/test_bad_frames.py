@@ -10,7 +10,7 @@ import pytest
 from fluoro_calib_ros.files.calibration import load_calibrations
 from fluoro_calib_ros.nodes.conversion import doubles, message_from_frame
 
-BOTH, COLLECTS, CORRECTS = ('calibration_node', 'correction_node'), ('calibration_node',), ('correction_node',)
+BOTH, COLLECTS = ('calibration_node', 'correction_node'), ('calibration_node',)
 
 
 def put(field, index, value):
@@ -60,8 +60,7 @@ def rig(module_graph, by_command, exposures):
     graph.bad {fault: frame number}, graph.corrected {frame number: message}.
     """
     graph, client, frame = module_graph, module_graph.client, exposures['a'][0]
-    graph.nodes = {'calibration_node': graph.calibration_node(by_command[0], collect='request'),
-                   'correction_node': graph.start('correction_node')}
+    graph.nodes = graph.both_nodes(by_command[0], collect='request')
     corrected = client.listen('a/corrected_observations')
     id = load_calibrations(by_command[0])['a'].calibration_id
     client.wait_for_diagnostics('correction_node', lambda s: id in [v.value for v in s.values])

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from fluoro_calib_msgs.srv import Calibrate, LoadCalibration, SaveCalibration
-from ros_graph import BAGS, NAMES
+from ros_graph import NAMES
 
 from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
 
@@ -76,8 +76,8 @@ def test_correction_before_and_after_a_calibration_in_mid_stream(graph, calibrat
 
     graph.calibration_node(calibrated)
     client.wait_for_diagnostics('correction_node', lambda s: first in [v.value for v in s.values])
-    stream = iter(pairs[10:] + [None])   # the calibration changes somewhere in it
-    client.stream(stream, 100.0)
+    stream = iter(pairs[10:])   # the calibration changes somewhere in it
+    client.stream(stream, 100.0, lambda: len(corrected))
     client.wait_until(lambda: len(corrected) > 20, what='frames corrected with the first calibration')
     answer = client.call_async(LoadCalibration, 'load_calibration', directory=str(other))
     client.wait_until(lambda: client.published == 290, what='the end of the stream')

@@ -62,7 +62,7 @@ def test_node_that_cannot_start_says_why(graph, tmp_path, node, parameters, sent
 def test_interrupt_in_the_stream_ends_every_node_cleanly(graph, by_command, exposures):
     client = graph.client
     client.listen('a/corrected_observations')
-    nodes = [graph.calibration_node(by_command[0]), graph.start('correction_node'),
+    nodes = [*graph.both_nodes(by_command[0]).values(),
              graph.start('simulator_node', {'scene': 'markers', 'rate': 120.0}),
              graph.start('player_node', {'bag': BAGS / 'tracking', 'loop': True, 'wait_for_readers': 1})]
     client.wait_until(lambda: len(client.messages['a/corrected_observations']) > 100, what='corrected frames')

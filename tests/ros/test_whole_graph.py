@@ -25,8 +25,7 @@ def rig(module_graph, tmp_path_factory):
     """The graph with all recorded exposures collected."""
     graph, client = module_graph, module_graph.client
     graph.directory_of_calibrations = tmp_path_factory.mktemp('calibrations')
-    graph.calibration_node(graph.directory_of_calibrations)
-    graph.start('correction_node')
+    graph.both_nodes(graph.directory_of_calibrations)
     for topic in ('calibration', 'corrected_observations', 'camera_info'):
         for name in NAMES:
             client.listen(f'{name}/{topic}')
@@ -48,7 +47,7 @@ def tracked(rig, by_service, tracking):
     client = rig.client
     for name, id in zip(by_service.fluoroscope, by_service.calibration_id):
         client.wait_for_diagnostics('correction_node', lambda s, id=id: id in [v.value for v in s.values], name)
-    rig.play(BAGS / 'tracking', readers=2, rate=2.0)
+    rig.play(BAGS / 'tracking', readers=2, rate=0.5)
     got = {n: client.messages[f'{n}/corrected_observations'] for n in NAMES}
     client.wait_until(lambda: all(len(got[n]) >= len(tracking[n]) for n in NAMES), what='all corrected frames')
     return got

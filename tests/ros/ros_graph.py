@@ -104,10 +104,10 @@ class Graph:
     def start(self, node, parameters=None, remaps=None, wait=True):
         """Start a node with {parameter: value} and {from: to}; returns its Process once the client is connected."""
         number = len(self.processes)
-        arguments = ['--ros-args', '-r', f'__ns:={self.namespace}']
+        arguments = ['--ros-args']
         for key, value in (parameters or {}).items():
             arguments += ['-p', f'{key}:={value}']
-        for key, value in (remaps or {}).items():
+        for key, value in {'__ns': self.namespace, **(remaps or {})}.items():   # of two rules the first counts
             arguments += ['-r', f'{key}:={value}']
         process = Process(entry_point(node) + arguments, self.directory / f'{number}_{node}.log')
         self.processes.append(process)

@@ -54,7 +54,8 @@ def test_standing_phantom_is_one_exposure_and_a_moving_one_none(graph, exposures
 
     def stream(count, **options):
         nonlocal sent
-        client.stream(pairs_of(exposures, count=count, first=sent + 1, start_ns=10 ** 18 + sent * 10 ** 9, **options), 200)
+        client.stream(pairs_of(exposures, count=count, first=sent + 1, start_ns=10 ** 18 + sent * 10 ** 9, **options),
+                      200)   # what counts is the stamps
         client.wait_until(lambda: client.published == count, what=f'{count} frames to be published')
         client.end_stream()
         sent += count

@@ -1,4 +1,4 @@
-"""A self-calibration beside the stream: nothing stops for it, it can be cancelled, and wrong requests change nothing."""
+"""A self-calibration beside the stream: nothing stops for it, cancelled or refused it changes nothing."""
 
 import time
 
@@ -23,8 +23,7 @@ class Rig:
         self.collect(exposures)
         self.client.wait_until(lambda: all(self.messages('calibration').values()), what='the loaded calibrations')
         for name in NAMES:
-            self.client.wait_for_diagnostics('correction_node', lambda s: s.message != '' and 'no calib' not in s.message,
-                                             name)
+            self.client.wait_for_diagnostics('correction_node', lambda s: 'no calibration' not in s.message, name)
 
     def collect(self, exposures):
         """Publish exposures, and wait until all are collected."""

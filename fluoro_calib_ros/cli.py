@@ -150,34 +150,19 @@ def calibrate(options):
     """Self-calibrate and write result and calibrations."""
     from .calibration.job import calibrate as run
     from .calibration.self_calibration import Options
-    from .files.calibration import save_calibration
-    from .files.document import result_document
     from .files.phantom import read_phantom
-    from .files.results import write_result
     phantom = read_phantom(options.phantom)
     frames = _frames_of(options, options.collect)
     job = run(frames, phantom, Options(options.model, options.interior, options.loss, options.k,
                                        options.max_iterations),
               options.joint, options.principal_distance, _print_round)
-    document = result_document(job)
-    for calibration in job.calibrations.values():
-        save_calibration(options.out, calibration)
-    write_result(options.out / 'result.json', document)
-    if options.figures:
-        from .report.figures import write_figures
-        write_figures(job, options.out / 'figures')
-    for sentence in job.left_out:
-        print(f'not used: {sentence}', file=sys.stderr)
-    _report(options, document, _summary(job))
+    _write_job(options, job)
 
 
 def adjust(options):
     """Adjust with calibrations held and write the result."""
     from .calibration.job import adjust_with
-    from .files.calibration import save_calibration
-    from .files.document import result_document
     from .files.phantom import read_phantom
-    from .files.results import write_result
     phantom = read_phantom(options.phantom)
     calibrations = _calibrations_in(options.calibration)
     frames = _frames_of(options, 'all')
@@ -186,13 +171,25 @@ def adjust(options):
         raise DataError(f'{options.calibration}: there is no calibration of fluoroscope {missing[0]}, '
                         f'only of {", ".join(calibrations)}')
     job = adjust_with(frames, phantom, {name: calibrations[name] for name in frames}, options.loss)
+    _write_job(options, job)
+
+
+def _write_job(options, job):
+    """Write result, calibrations and, where they are asked for, figures of a job; report it."""
+    from .files.calibration import save_calibration
+    from .files.document import result_document
+    from .files.results import write_result
+    from .report.tables import summary_table
     document = result_document(job)
     for calibration in job.calibrations.values():
         save_calibration(options.out, calibration)
     write_result(options.out / 'result.json', document)
+    if getattr(options, 'figures', False):
+        from .report.figures import write_figures
+        write_figures(job, options.out / 'figures')
     for sentence in job.left_out:
         print(f'not used: {sentence}', file=sys.stderr)
-    _report(options, document, _summary(job))
+    _report(options, document, summary_table(job))
 
 
 def correct(options):
@@ -245,11 +242,6 @@ def _print_round(label, this):
         rmse = '  '.join(f'{n}: {r[0]:.3f} {r[1]:.3f} px' for n, r in this.rmse.items())
         print(f'{label}: round {this.iteration:2d}  F {this.F:12.2f}  G {this.G:12.2f}  k {max(this.k.values()):3d}  '
               f'RMSE {rmse}', file=sys.stderr)
-
-
-def _summary(job):
-    from .report.tables import summary_table
-    return summary_table(job)
 
 
 def _report(options, document, text):

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 from fluoro_calib_msgs.action import SelfCalibrate
-from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration, TargetObservations
+from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration
 from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Reset, SaveCalibration
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -31,7 +31,7 @@ from ..files.phantom import read_phantom
 from ..photogrammetry.observations import DataError, check_frame
 from . import support
 from .conversion import message_from_calibration
-from .qos import LATCHED, OBSERVATIONS, overridable
+from .qos import LATCHED
 from .support import StartError, declare
 
 COLLECT = ('still', 'request')
@@ -108,12 +108,7 @@ class CalibrationNode(Node):
             self._calibration_outputs[name] = self.create_publisher(FluoroscopeCalibration, f'{name}/calibration',
                                                                     LATCHED)
             self._status[name] = self.create_publisher(CalibrationStatus, f'{name}/calibration_status', 10)
-            self.create_subscription(TargetObservations, f'{name}/target_observations',
-                                     lambda message, name=name: self._on_frame(name, message), OBSERVATIONS,
-                                     event_callbacks=support.on_incompatible_qos(
-                                         f'{name}/target_observations',
-                                         lambda fault, name=name: self._on_deaf(name, fault)),
-                                     qos_overriding_options=overridable())
+            support.subscribe_observations(self, name, self._on_frame, self._on_deaf)
         for kind, name, callback in ((Calibrate, 'calibrate', self._on_calibrate),
                                      (Capture, 'capture', self._on_capture), (Reset, 'reset', self._on_reset),
                                      (SaveCalibration, 'save_calibration', self._on_save),

@@ -5,7 +5,7 @@ import time
 from collections import deque
 
 import numpy as np
-from fluoro_calib_msgs.msg import CorrectedObservations, FluoroscopeCalibration, TargetObservations
+from fluoro_calib_msgs.msg import CorrectedObservations, FluoroscopeCalibration
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 
@@ -49,12 +49,7 @@ class CorrectionNode(Node):
             self._info[name] = self.create_publisher(CameraInfo, f'{name}/camera_info', LATCHED)
             self.create_subscription(FluoroscopeCalibration, f'{name}/calibration',
                                      lambda message, name=name: self._on_calibration(name, message), LATCHED)
-            self.create_subscription(TargetObservations, f'{name}/target_observations',
-                                     lambda message, name=name: self._on_frame(name, message), OBSERVATIONS,
-                                     event_callbacks=support.on_incompatible_qos(
-                                         f'{name}/target_observations',
-                                         lambda fault, name=name: self._on_deaf(name, fault)),
-                                     qos_overriding_options=overridable())
+            support.subscribe_observations(self, name, self._on_frame, self._on_deaf)
         self._diagnostics = support.Diagnostics(self)
         self.create_timer(1.0, self._on_timer)
 

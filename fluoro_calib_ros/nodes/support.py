@@ -8,6 +8,7 @@ import time
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+from fluoro_calib_msgs.msg import TargetObservations
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy._rclpy_pybind11 import RCLError
 from rclpy.event_handler import SubscriptionEventCallbacks
@@ -15,6 +16,8 @@ from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.qos import qos_policy_name_from_kind
 from rclpy.signals import SignalHandlerOptions
+
+from .qos import OBSERVATIONS, overridable
 
 OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
 
@@ -134,12 +137,21 @@ def run(make_node, args=None):
     sys.exit(code)
 
 
-def on_incompatible_qos(topic, say):
-    """Event callbacks of a subscription that say, in a sentence, that a publisher offers less than is asked for."""
-    def callback(event):
+def subscribe_observations(node, name, on_frame, on_deaf):
+    """Subscribe a node to the target observations of a fluoroscope.
+
+    on_frame(name, message) for every frame; on_deaf(name, sentence) where nothing can come from a publisher,
+    since it offers less than is asked for.
+    """
+    topic = f'{name}/target_observations'
+
+    def incompatible(event):
         policy = qos_policy_name_from_kind(event.last_policy_kind)
-        say(f'topic {topic}: a publisher offers an incompatible quality of service ({policy}), nothing comes from it')
-    return SubscriptionEventCallbacks(incompatible_qos=callback)
+        on_deaf(name, f'topic {topic}: a publisher offers an incompatible quality of service ({policy}), '
+                      'nothing comes from it')
+    node.create_subscription(TargetObservations, topic, lambda message: on_frame(name, message), OBSERVATIONS,
+                             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
+                             qos_overriding_options=overridable())
 
 
 class StartError(RuntimeError):

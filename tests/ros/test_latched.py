@@ -4,7 +4,7 @@ import shutil
 from dataclasses import replace
 
 import numpy as np
-from fluoro_calib_msgs.srv import Calibrate, LoadCalibration, SaveCalibration
+from fluoro_calib_msgs.srv import LoadCalibration, SaveCalibration
 from ros_graph import NAMES
 
 from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration

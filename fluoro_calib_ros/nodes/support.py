@@ -127,7 +127,7 @@ def run(make_node, args=None):
             getattr(node, 'stop', lambda: None)()
             executor.shutdown()
         code = int(getattr(node, 'failed', False))
-    except StartError as error:
+    except (StartError, ParameterException) as error:
         rclpy.logging.get_logger('fluoro_calib').fatal(str(error))
         code = 1
     finally:

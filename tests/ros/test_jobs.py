@@ -16,7 +16,9 @@ class Rig:
 
     def __init__(self, graph, folder, exposures):
         self.folder, self.client = folder, graph.client
-        graph.both_nodes(folder)
+        # A queue for a machine that is too busy for the rate.
+        graph.both_nodes(folder, **{f'qos_overrides.{graph.namespace}/{n}/target_observations.subscription.depth': 5000
+                                    for n in NAMES})
         for topic in ('calibration', 'corrected_observations'):
             for name in NAMES:
                 self.client.listen(f'{name}/{topic}')

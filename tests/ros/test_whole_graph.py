@@ -16,8 +16,8 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion
 
 NOISE_PX = 0.25
 RESULT_FIELDS = ('fluoroscope', 'calibration_id', 'model_kind', 'k', 'iterations', 'converged', 'xp', 'yp', 'c',
-                 'sd_xp', 'sd_yp', 'sd_c', 'rmse_before_u', 'rmse_before_v', 'rmse_after_u', 'rmse_after_v', 'observations',
-                 'inliers')
+                 'sd_xp', 'sd_yp', 'sd_c', 'rmse_before_u', 'rmse_before_v', 'rmse_after_u', 'rmse_after_v',
+                 'observations', 'inliers')
 
 
 @pytest.fixture(scope='module')

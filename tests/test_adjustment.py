@@ -10,6 +10,7 @@ from threadpoolctl import threadpool_limits
 import rigs
 from fluoro_calib_ros.calibration.self_calibration import adjusted_with_precision
 from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
+from fluoro_calib_ros.photogrammetry import normal as normal_module
 from fluoro_calib_ros.photogrammetry import precision as precision_module
 from fluoro_calib_ros.photogrammetry.adjustment import adjust, eliminates_points, residuals_and_q, total_cost
 from fluoro_calib_ros.photogrammetry.collinearity import project
@@ -105,8 +106,8 @@ def test_both_eliminations_give_the_same_solution_and_covariances(monkeypatch, s
     assert eliminates_points(network) == (shape is not MANY_EXPOSURES)
     found = []
     for points in (True, False):
-        monkeypatch.setattr(adjustment_module, 'eliminates_points', lambda network, points=points: points)
-        monkeypatch.setattr(precision_module, 'eliminates_points', lambda network, points=points: points)
+        for module in (adjustment_module, normal_module, precision_module):
+            monkeypatch.setattr(module, 'eliminates_points', lambda network, points=points: points)
         result = adjust(network, rigs.disturbed(truth), noise=Noise(loss))
         found.append((result, precision(network, result)))
     (one, one_precise), (other, other_precise) = found

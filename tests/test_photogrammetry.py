@@ -267,11 +267,28 @@ def test_scale_is_estimated_from_residuals_of_unequal_redundancy(loss):
     """Residuals are smaller than the noise by the root of their redundancy numbers; the scale is the noise's."""
     rng = np.random.default_rng(8)
     share = rng.choice([0.2, 0.9], 60_000)
-    noise = rng.normal(0, 0.25, (len(share), 2)) if loss != 'student_t' else bivariate_t(rng, len(share), 6.0, 0.25)
-    found = Noise(loss).estimated(share * np.sum(noise ** 2, axis=1), share)
+    noise = rng.normal(0, 0.25, (len(share), 2))
+    found = Noise(loss).estimated(share * np.sum(noise ** 2, axis=1), 2 * (1 - share))
     assert found.scale == pytest.approx(0.25, rel=0.015)
     if loss == 'student_t':
-        assert found.nu == pytest.approx(6, rel=0.1)
+        assert found.nu > 60
+
+
+@pytest.mark.parametrize('nu', [4.0, 200.0])
+def test_gross_errors_beside_the_student_t_leave_its_core_alone(nu):
+    """One in twenty false matches all over the image: scale and degrees of freedom are those without them."""
+    rng = np.random.default_rng(4)
+    noise = bivariate_t(rng, 20_000, nu, 0.25)
+    squared = np.sum(noise ** 2, axis=1)
+    clean = Noise().estimated(squared)
+    squared[:1000] = np.sum(rng.uniform(-300, 300, (1000, 2)) ** 2, axis=1)
+    found = Noise(gross=0.01).estimated(squared)
+    assert found.gross == pytest.approx(0.05, abs=0.003)
+    assert found.scale == pytest.approx(clean.scale, rel=0.02)
+    assert 1 / found.nu == pytest.approx(1 / clean.nu, abs=0.02)
+    assert Noise().estimated(squared).nu == pytest.approx(NU_RANGE[0], rel=1e-2)
+    weight = found.weight(squared / found.scale ** 2)
+    assert weight[:1000].max() < 0.2 and np.median(weight[:1000]) < 1e-6
 
 
 def test_robust_scale_withstands_false_matches():

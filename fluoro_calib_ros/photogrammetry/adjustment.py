@@ -8,12 +8,13 @@ eliminating object points or exposures, whichever leaves the smaller system.
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 
-from .collinearity import project, project_with_jacobian
+from .collinearity import project
 from .noise import Noise
+from .normal import bordered_blocks, damped_step, eliminates_points, normal_equations
 from .rotations import matrix_from_vector
 
 # No target is measured better than this; where there is hardly any redundancy the scale could vanish.
@@ -27,7 +28,8 @@ class Network:
     uv (N, 2) observed [px]; sigma (N,) a-priori standard deviation [px], or ones; exposure (N,) ascending
     and point (N,): row of the exposure and of the object point, each pair at most once;
     fluoroscope (m,) of each exposure; survey_mm (n, 3) and survey_sd_mm (n,) of the object points;
-    interior_free (F,): whether the interior orientation of a fluoroscope is estimated.
+    interior_free (F,): whether the interior orientation of a fluoroscope is estimated; additional (F): Additional
+    parameters of each, or None.
     """
 
     uv: np.ndarray
@@ -38,6 +40,7 @@ class Network:
     survey_mm: np.ndarray
     survey_sd_mm: np.ndarray
     interior_free: np.ndarray
+    additional: tuple = ()
 
     @property
     def shape(self):
@@ -47,18 +50,54 @@ class Network:
     @property
     def unknowns(self):
         """Number of unknowns."""
-        return 6 * len(self.fluoroscope) + self.survey_mm.size + 3 * int(np.sum(self.interior_free))
+        return 6 * len(self.fluoroscope) + self.survey_mm.size + int(np.sum(self.global_free))
+
+    @cached_property
+    def additional_columns(self):
+        """Columns of the additional parameters of each fluoroscope among the global unknowns."""
+        counts = [0 if a is None else a.count for a in self.additional]
+        ends = 3 * len(self.interior_free) + np.cumsum(counts, dtype=int)
+        return tuple(slice(int(end - count), int(end)) for end, count in zip(ends, counts))
+
+    @cached_property
+    def global_free(self):
+        """True (G,) for the global unknowns that are estimated: interior orientations, then additional parameters."""
+        count = sum(a.count for a in self.additional if a is not None)
+        return np.concatenate([np.repeat(np.asarray(self.interior_free, dtype=bool), 3), np.ones(count, dtype=bool)])
+
+    @cached_property
+    def by_point(self):
+        """Order (N,) of the image points by object point."""
+        return np.argsort(self.point, kind='stable')
+
+    @cached_property
+    def _rows(self):
+        of_point = self.fluoroscope[self.exposure]
+        return tuple(np.flatnonzero(of_point == f) for f in range(len(self.interior_free)))
+
+    def rows(self, f):
+        """Rows of the image points of fluoroscope number f."""
+        return self._rows[f]
+
+    def added(self, parameters):
+        """Corrections (N, 2) [px] by the additional parameters; zero without them."""
+        out = np.zeros_like(self.uv)
+        for f, additional in enumerate(self.additional):
+            if additional is not None:
+                out[self.rows(f)] = additional.correction(parameters.additional[f])
+        return out
 
 
 @dataclass(frozen=True)
 class Parameters:
     """Values of the unknowns: interior (F, 3) xp, yp, c [px]; rotation (m, 3, 3); position_mm (m, 3);
-    points_mm (n, 3)."""
+    points_mm (n, 3); additional: coefficients (p,) of the additional parameters by fluoroscope."""
 
     interior: np.ndarray
     rotation: np.ndarray
     position_mm: np.ndarray
     points_mm: np.ndarray
+    additional: tuple = ()
 
     def per_image_point(self, network):
         """Rotation, position, point and interior orientation of every image point."""
@@ -89,147 +128,35 @@ class Adjustment:
         return self.noise.inliers(self.q)
 
 
-@dataclass(frozen=True)
-class NormalEquations:
-    """Blocks of the normal matrix and of its right side.
-
-    Exposures ee (m, 6, 6), points pp (n, 3, 3) and interior ii (3F, 3F); mixed ei (m, 6, 3) with the
-    fluoroscope of the exposure, pi (n, 3, 3F) and pe (N, 3, 6); right sides e, p and i.
-    """
-
-    ee: np.ndarray
-    pp: np.ndarray
-    ii: np.ndarray
-    ei: np.ndarray
-    pi: np.ndarray
-    pe: np.ndarray
-    e: np.ndarray
-    p: np.ndarray
-    i: np.ndarray
-
-
 def residuals_and_q(network, parameters, correction, noise):
     """Residuals (N, 2) [px] and normalised squared residuals (N,); NaN where a point is behind the source."""
-    r = network.uv - correction - project(*parameters.per_image_point(network))
+    r = network.uv - correction - network.added(parameters) - project(*parameters.per_image_point(network))
     return r, np.sum(r * r, axis=1) / (noise.scale * network.sigma) ** 2
 
 
 def total_cost(network, parameters, q, noise):
     """F: negative log-likelihood of image points and surveyed coordinates; infinite behind the source."""
     survey = np.sum(((parameters.points_mm - network.survey_mm) / network.survey_sd_mm[:, None]) ** 2) / 2
-    value = noise.cost(q, network.sigma) + survey
+    prior = sum(a @ additional.prior @ a / 2 for additional, a in zip(network.additional, parameters.additional)
+                if additional is not None)
+    value = noise.cost(q, network.sigma) + survey + prior
     return value if np.isfinite(value) else np.inf
-
-
-def _sum_by(index, values, count):
-    """Sums (count, ...) of values (N, ...) that share an index; index (N,) ascending, none left out."""
-    starts = np.searchsorted(index, np.arange(count))
-    return np.add.reduceat(values, starts, axis=0)
-
-
-def normal_equations(network, parameters, correction, noise, image_factor=1.0):
-    """Normal equations of the weighted linearised problem; image_factor multiplies the image weights."""
-    n_image, m, n, n_fluoro = network.shape
-    uv, d_e, d_p, d_i = project_with_jacobian(*parameters.per_image_point(network))
-    r = network.uv - correction - uv
-    variance = (noise.scale * network.sigma) ** 2
-    root = np.sqrt(image_factor * noise.weight(np.sum(r * r, axis=1) / variance) / variance)
-    r = (root[:, None] * r)[..., None]
-    a_e, a_p, a_i = (root[:, None, None] * a for a in (d_e, d_p, d_i))
-    a_et, a_pt, a_it = (a.transpose(0, 2, 1) for a in (a_e, a_p, a_i))
-
-    by_exposure = _sum_by(network.exposure, np.concatenate([a_et @ a_e, a_et @ a_i, a_et @ r], axis=2), m)
-    own = _sum_by(network.exposure, np.concatenate([a_it @ a_i, a_it @ r], axis=2), m)
-    order = np.argsort(network.point, kind='stable')
-    by_point = _sum_by(network.point[order], np.concatenate([a_pt @ a_p, a_pt @ r], axis=2)[order], n)
-
-    survey = 1 / network.survey_sd_mm ** 2
-    pp = by_point[:, :, :3] + survey[:, None, None] * np.eye(3)
-    p = by_point[:, :, 3] + survey[:, None] * (network.survey_mm - parameters.points_mm)
-    ii, i = np.zeros((3 * n_fluoro, 3 * n_fluoro)), np.zeros(3 * n_fluoro)
-    pi = np.zeros((n, 3, 3 * n_fluoro))
-    a_pi, of_point = (a_pt @ a_i)[order], network.fluoroscope[network.exposure[order]]
-    for f in range(n_fluoro):
-        cols, mine = slice(3 * f, 3 * f + 3), network.fluoroscope == f
-        ii[cols, cols], i[cols] = own[mine, :, :3].sum(axis=0), own[mine, :, 3].sum(axis=0)
-        pi[:, :, cols] = _sum_by(network.point[order], a_pi * (of_point == f)[:, None, None], n)
-    return NormalEquations(by_exposure[:, :, :6], pp, ii, by_exposure[:, :, 6:9], pi, a_pt @ a_e,
-                           by_exposure[:, :, 9], p, i)
-
-
-def eliminates_points(network):
-    """Whether the object points are eliminated (else the exposures): what leaves the smaller system."""
-    _, m, n, _ = network.shape
-    return 6 * m < 3 * n
-
-
-def bordered_blocks(network, equations):
-    """The normal equations as a block-diagonal part and the rest.
-
-    Returns bb (k, b, b), br (k, b, q), rr (q, q), right sides b (k, b) and r (q,). The rest ends with the
-    interior orientation, of which only the free ones are kept.
-    """
-    n_image, m, n, n_fluoro = network.shape
-    free = np.repeat(network.interior_free, 3)
-    k = 3 * n_fluoro
-    ei = np.zeros((m, 6, k))
-    for f in range(n_fluoro):
-        mine = network.fluoroscope == f
-        ei[mine, :, 3 * f:3 * f + 3] = equations.ei[mine]
-    if eliminates_points(network):
-        br = np.zeros((n, 3, m, 6))
-        br[network.point, :, network.exposure, :] = equations.pe
-        br = np.concatenate([br.reshape(n, 3, 6 * m), equations.pi[:, :, free]], axis=2)
-        bb, b, rest, rest_i, r = equations.pp, equations.p, equations.ee, ei, equations.e
-    else:
-        br = np.zeros((m, 6, n, 3))
-        br[network.exposure, :, network.point, :] = equations.pe.transpose(0, 2, 1)
-        br = np.concatenate([br.reshape(m, 6, 3 * n), ei[:, :, free]], axis=2)
-        bb, b, rest, rest_i, r = equations.ee, equations.e, equations.pp, equations.pi, equations.p
-    count, size = rest.shape[:2]
-    rr = np.zeros((br.shape[2], br.shape[2]))
-    diagonal = np.arange(count * size).reshape(count, size)
-    rr[diagonal[:, :, None], diagonal[:, None, :]] = rest
-    rr[:count * size, count * size:] = rest_i.reshape(count * size, k)[:, free]
-    rr[count * size:, :count * size] = rr[:count * size, count * size:].T
-    rr[count * size:, count * size:] = equations.ii[np.ix_(free, free)]
-    return bb, br, rr, b, np.concatenate([r.ravel(), equations.i[free]])
-
-
-def reduce_blocks(bb, br, rr):
-    """Inverse blocks (k, b, b), G = bb^-1 br as (k b, q), and the Schur complement (q, q)."""
-    inverse = np.linalg.inv(bb)
-    g = inverse @ br
-    q = br.shape[2]
-    g = g.reshape(-1, q)
-    return inverse, g, rr - br.reshape(-1, q).T @ g
-
-
-def _damped_step(blocks, mu):
-    """Solution of (H + mu diag H) x = b for the bordered blocks: x_b (k, b) and x_r (q,).
-
-    Raises numpy.linalg.LinAlgError where the damped matrix is not positive definite.
-    """
-    bb, br, rr, b, r = blocks
-    bb = bb + mu * bb * np.eye(bb.shape[1])
-    rr = rr + mu * np.diag(np.diag(rr))
-    inverse, g, schur = reduce_blocks(bb, br, rr)
-    x_r = cho_solve(cho_factor(schur, lower=True, check_finite=True), r - g.T @ b.ravel())
-    return (inverse @ b[..., None])[..., 0] - (g @ x_r).reshape(b.shape), x_r
 
 
 def _moved(network, parameters, x_b, x_r):
     """Parameters after a step."""
     _, m, n, n_fluoro = network.shape
-    free = np.flatnonzero(network.interior_free)
     if eliminates_points(network):
-        d_p, d_e, d_i = x_b, x_r[:6 * m].reshape(m, 6), x_r[6 * m:]
+        d_p, d_e, rest = x_b, x_r[:6 * m].reshape(m, 6), x_r[6 * m:]
     else:
-        d_p, d_e, d_i = x_r[:3 * n].reshape(n, 3), x_b, x_r[3 * n:]
-    interior = parameters.interior.copy()
-    interior[free] += d_i.reshape(-1, 3)
-    return Parameters(interior, matrix_from_vector(d_e[:, 3:]) @ parameters.rotation,
-                      parameters.position_mm + d_e[:, :3], parameters.points_mm + d_p)
+        d_p, d_e, rest = x_r[:3 * n].reshape(n, 3), x_b, x_r[3 * n:]
+    step = np.zeros(len(network.global_free))
+    step[network.global_free] = rest
+    additional = tuple(a if network.additional[f] is None else a + step[network.additional_columns[f]]
+                       for f, a in enumerate(parameters.additional))
+    return Parameters(parameters.interior + step[:3 * n_fluoro].reshape(-1, 3),
+                      matrix_from_vector(d_e[:, 3:]) @ parameters.rotation,
+                      parameters.position_mm + d_e[:, :3], parameters.points_mm + d_p, additional)
 
 
 def adjust(network, start, correction=None, noise=Noise(), redundancy=None, tolerance=1e-8, max_steps=100,
@@ -304,7 +231,7 @@ def _trial(network, parameters, blocks, mu, stretch):
     in a third of the steps where the tails are heavy. Raises numpy.linalg.LinAlgError, or ValueError for NaN.
     """
     bb, _, rr, b, right = blocks
-    x_b, x_r = _damped_step(blocks, mu)
+    x_b, x_r = damped_step(blocks, mu)
     undamped = np.sum(x_b * b) + np.sum(x_r * right)
     damping = mu * (np.einsum('ki,kii,ki', x_b, bb, x_b) + np.sum(x_r * x_r * np.diag(rr)))
     return _moved(network, parameters, stretch * x_b, stretch * x_r), (undamped + damping) / 2
@@ -314,6 +241,6 @@ def _renewed(network, noise, q, redundancy):
     """Noise model estimated anew from q, and q under it."""
     if not np.isfinite(q).all():
         return noise, q
-    new = noise.estimated(q * noise.scale ** 2, redundancy)
+    new = noise.estimated(q * noise.scale ** 2, 2 * (1 - np.asarray(redundancy)))
     new = replace(new, scale=max(new.scale, SMALLEST_NOISE_PX / float(np.median(network.sigma))))
     return new, q * (noise.scale / new.scale) ** 2

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from .adjustment import bordered_blocks, eliminates_points, normal_equations, reduce_blocks
 from .collinearity import project_with_jacobian
 from .noise import Noise
+from .normal import bordered_blocks, eliminates_points, normal_equations, reduce_blocks
 
-CHUNK = 50_000   # image points handled at once, to bound the memory
+CHUNK = 5_000   # image points handled at once, to bound the memory
 
 
 @dataclass(frozen=True)
@@ -33,55 +33,80 @@ class Precision:
     survey_redundancy: np.ndarray
 
 
-def _covariance_blocks(network, equations):
-    """Blocks of the inverse normal matrix: ee (m,6,6), pp (n,3,3), ii (3F,3F), ei (m,6,3), pi (n,3,3F), pe(i)."""
-    _, m, n, n_fluoro = network.shape
-    bb, br, rr, _, _ = bordered_blocks(network, equations)
-    inverse, g, schur = reduce_blocks(bb, br, rr)
-    c_rr = cho_solve(cho_factor(schur, lower=True), np.eye(len(schur)))
-    c_br = -(g @ c_rr)
-    k, size, q = br.shape
-    c_bb = inverse - c_br.reshape(k, size, q) @ g.reshape(k, size, q).transpose(0, 2, 1)
-    c_br = c_br.reshape(k, size, q)
+@dataclass(frozen=True)
+class CovarianceBlocks:
+    """Blocks of the inverse normal matrix: ee (m, 6, 6), pp (n, 3, 3), gg (G, G), eg (m, 6, G), pg (n, 3, G), zeros where
+    a global unknown is held; pe(e, p): blocks (k, 3, 6) of points p (k,) with exposures e (k,)."""
 
-    cells = m if eliminates_points(network) else n
-    width = 6 if eliminates_points(network) else 3
+    ee: np.ndarray
+    pp: np.ndarray
+    gg: np.ndarray
+    eg: np.ndarray
+    pg: np.ndarray
+    pe: object
+
+
+def covariance_blocks(network, equations):
+    """CovarianceBlocks of normal equations. Raises numpy.linalg.LinAlgError where the matrix is singular."""
+    _, m, n, _ = network.shape
+    bb, br, rr, _, _ = bordered_blocks(network, equations)
+    inverse, h, schur = reduce_blocks(bb, br, rr)
+    k, size, q = br.shape
+    c_rr = cho_solve(cho_factor(schur, lower=True, overwrite_a=True), np.eye(q))
+    g = (inverse.transpose(0, 2, 1) @ h.reshape(k, size, q))
+    c_br = -(g.reshape(-1, q) @ c_rr).reshape(k, size, q)
+    c_bb = inverse.transpose(0, 2, 1) @ inverse - c_br @ g.transpose(0, 2, 1)
+
+    points = eliminates_points(network)
+    cells, width = (m, 6) if points else (n, 3)
     rest = np.arange(cells * width).reshape(cells, width)
     c_rest = c_rr[rest[:, :, None], rest[:, None, :]]
-    free = np.repeat(network.interior_free, 3)
-    c_ii = np.zeros((3 * n_fluoro, 3 * n_fluoro))
-    c_ii[np.ix_(free, free)] = c_rr[cells * width:, cells * width:]
-    c_rest_i, c_b_i = np.zeros((cells, width, 3 * n_fluoro)), np.zeros((k, size, 3 * n_fluoro))
-    c_rest_i[:, :, free] = c_rr[:cells * width, cells * width:].reshape(cells, width, -1)
-    c_b_i[:, :, free] = c_br[:, :, cells * width:]
+    free, count = network.global_free, len(network.global_free)
+    c_gg, c_rest_g, c_b_g = np.zeros((count, count)), np.zeros((cells, width, count)), np.zeros((k, size, count))
+    c_gg[np.ix_(free, free)] = c_rr[cells * width:, cells * width:]
+    c_rest_g[:, :, free] = c_rr[:cells * width, cells * width:].reshape(cells, width, -1)
+    c_b_g[:, :, free] = c_br[:, :, cells * width:]
     c_pairs = c_br[:, :, :cells * width].reshape(k, size, cells, width)
-    if eliminates_points(network):
-        return c_rest, c_bb, c_ii, c_rest_i, c_b_i, lambda e, p: c_pairs[p, :, e, :]
-    return c_bb, c_rest, c_ii, c_b_i, c_rest_i, lambda e, p: c_pairs[e, :, p, :].transpose(0, 2, 1)
+    if points:
+        return CovarianceBlocks(c_rest, c_bb, c_gg, c_rest_g, c_b_g, lambda e, p: c_pairs[p, :, e, :])
+    return CovarianceBlocks(c_bb, c_rest, c_gg, c_b_g, c_rest_g,
+                            lambda e, p: c_pairs[e, :, p, :].transpose(0, 2, 1))
 
 
-def _covariance_of_projection(network, parameters, blocks):
-    """A C_x A^T (N, 2, 2) [px^2] of the image points."""
-    ee, pp, ii, ei, pi, pe = blocks
+def covariance_of_projection(network, parameters, blocks):
+    """A C_x A^T (N, 2, 2) [px^2] of the image points, their additional parameters among the unknowns."""
     out = np.empty((len(network.uv), 2, 2))
     everything = parameters.per_image_point(network)
-    for start in range(0, len(out), CHUNK):
-        part = slice(start, start + CHUNK)
-        e, p = network.exposure[part], network.point[part]
-        f = network.fluoroscope[e]
-        cols = 3 * f[:, None] + np.arange(3)
-        _, d_e, d_p, d_i = project_with_jacobian(*(a[part] for a in everything))
-        c = np.empty((len(e), 12, 12))
-        c[:, :6, :6], c[:, 6:9, 6:9] = ee[e], pp[p]
-        c[:, 9:, 9:] = ii[cols[:, :, None], cols[:, None, :]]
-        c[:, 6:9, :6] = pe(e, p)
-        c[:, :6, 9:] = np.take_along_axis(ei[e], cols[:, None, :], axis=2)
-        c[:, 6:9, 9:] = np.take_along_axis(pi[p], cols[:, None, :], axis=2)
-        c[:, :6, 6:9] = c[:, 6:9, :6].transpose(0, 2, 1)
-        c[:, 9:, :9] = c[:, :9, 9:].transpose(0, 2, 1)
-        a = np.concatenate([d_e, d_p, d_i], axis=2)
-        out[part] = a @ c @ a.transpose(0, 2, 1)
+    for f in range(network.shape[3]):
+        rows = network.rows(f)
+        for start in range(0, len(rows), CHUNK):
+            local = slice(start, start + CHUNK)
+            part = rows[local]
+            _, d_e, d_p, d_i = project_with_jacobian(*(a[part] for a in everything))
+            a = np.concatenate([d_e, d_p, d_i], axis=2)
+            e, p = network.exposure[part], network.point[part]
+            out[part] = a @ _covariance_of_orientation(blocks, f, e, p) @ a.transpose(0, 2, 1)
+            additional = network.additional[f] if network.additional else None
+            if additional is not None:
+                cols = network.additional_columns[f]
+                out[part] += additional.variance(blocks.gg[cols, cols], local)
+                own = np.broadcast_to(blocks.gg[3 * f:3 * f + 3, cols], (len(e), 3, additional.count))
+                mixed = a @ np.concatenate([additional.against(c, local) for c in (
+                    blocks.eg[e][:, :, cols], blocks.pg[p][:, :, cols], own)], axis=1)
+                out[part] += mixed + mixed.transpose(0, 2, 1)
     return out
+
+
+def _covariance_of_orientation(blocks, f, e, p):
+    """Covariances (k, 12, 12) of exterior orientation, object point and interior orientation for image points."""
+    cols = slice(3 * f, 3 * f + 3)
+    c = np.empty((len(e), 12, 12))
+    c[:, :6, :6], c[:, 6:9, 6:9], c[:, 9:, 9:] = blocks.ee[e], blocks.pp[p], blocks.gg[cols, cols]
+    c[:, 6:9, :6] = blocks.pe(e, p)
+    c[:, :6, 9:], c[:, 6:9, 9:] = blocks.eg[e][:, :, cols], blocks.pg[p][:, :, cols]
+    c[:, :6, 6:9] = c[:, 6:9, :6].transpose(0, 2, 1)
+    c[:, 9:, :9] = c[:, :9, 9:].transpose(0, 2, 1)
+    return c
 
 
 def precision(network, adjustment, correction=None):
@@ -93,18 +118,18 @@ def precision(network, adjustment, correction=None):
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
     parameters, noise = adjustment.parameters, adjustment.noise
-    weighted = _covariance_blocks(network, normal_equations(network, parameters, correction, noise))
-    projected = _covariance_of_projection(network, parameters, weighted)
+    weighted = covariance_blocks(network, normal_equations(network, parameters, correction, noise))
+    projected = covariance_of_projection(network, parameters, weighted)
     variance = (noise.scale * network.sigma) ** 2 / noise.weight(adjustment.q)
     residual = variance[:, None, None] * np.eye(2) - projected
     redundancy = 1 - np.diagonal(projected, axis1=1, axis2=2) / variance[:, None]
-    survey = 1 - np.diagonal(weighted[1], axis1=1, axis2=2) / network.survey_sd_mm[:, None] ** 2
+    survey = 1 - np.diagonal(weighted.pp, axis1=1, axis2=2) / network.survey_sd_mm[:, None] ** 2
 
     factor = noise.information_factor(adjustment.q)
-    honest = weighted if factor == 1.0 else _covariance_blocks(
+    honest = weighted if factor == 1.0 else covariance_blocks(
         network, normal_equations(network, parameters, correction, noise, factor))
-    interior = np.stack([honest[2][3 * f:3 * f + 3, 3 * f:3 * f + 3] for f in range(network.shape[3])])
-    return Precision(interior, honest[0], honest[1], residual, redundancy, survey)
+    interior = np.stack([honest.gg[3 * f:3 * f + 3, 3 * f:3 * f + 3] for f in range(network.shape[3])])
+    return Precision(interior, honest.ee, honest.pp, residual, redundancy, survey)
 
 
 def geometric_redundancy(network, parameters, noise):
@@ -114,6 +139,14 @@ def geometric_redundancy(network, parameters, noise):
     the noise from them. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
     """
     plain = Noise('gaussian', noise.scale)
-    blocks = _covariance_blocks(network, normal_equations(network, parameters, 0.0, plain))
-    projected = _covariance_of_projection(network, parameters, blocks)
+    blocks = covariance_blocks(network, normal_equations(network, parameters, 0.0, plain))
+    projected = covariance_of_projection(network, parameters, blocks)
     return 1 - np.trace(projected, axis1=1, axis2=2) / (2 * (noise.scale * network.sigma) ** 2)
+
+
+def projected_variance(network, parameters, correction, noise):
+    """tr(A C_x A^T) (N,) [px^2] of the image points under the robust weights of a noise model: what the unknowns leave
+    open. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
+    """
+    blocks = covariance_blocks(network, normal_equations(network, parameters, correction, noise))
+    return np.trace(covariance_of_projection(network, parameters, blocks), axis1=1, axis2=2)

@@ -1,7 +1,14 @@
-"""Speed, side by side in one run: the self-calibration, and the correction of frames against scikit-learn."""
+"""Speed, side by side in one run and on one thread: ours, COLMAP's bundle adjuster and scikit-learn.
 
+    python -m benchmarks                      all tables, written to docs/performance.md
+    python -m benchmarks scaling adjustment   these only, printed
+"""
+
+import argparse
+import os
+import platform
 import sys
-import time
+from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
@@ -9,64 +16,149 @@ from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.calibration.job import calibrate
+from fluoro_calib_ros.calibration.network import measured_network
 from fluoro_calib_ros.calibration.self_calibration import Options
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
-REPEATS = 5
+from . import adjustments, profiling, scaling
+from .peers import self_calibrate_with_peers
+from .timing import section, timed
+
+MODELS = ('auto', 'local_linear', 'collocation', 'hybrid', 'parametric', 'knn', 'none')
 
 
-def median_seconds(function, repeats=REPEATS):
-    """Median of the wall times of repeated calls [s]."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        function()
-        times.append(time.perf_counter() - start)
-    return float(np.median(times))
+def exposures():
+    """Virtual rig and 15 exposures of it by fluoroscope a, of about 132 targets each."""
+    rig = virtual_rig(1)
+    return rig, {'a': simulate_exposures(rig, 15, 1, matched=(130, 134)).frames['a']}
 
 
-def self_calibrations(rig, frames):
-    """Rows: seconds of a self-calibration of one fluoroscope, choice of k included."""
-    for model in ('local_linear', 'knn', 'none'):
-        job = []
-        seconds = median_seconds(lambda: job.append(calibrate({'a': frames}, rig.phantom, Options(model))), 3)
-        figures, rounds = job[0].fluoroscopes['a'], len(job[0].history['a'])
-        yield [f'self-calibration, {model}', f'{len(frames)} exposures, {figures.observations} image points',
-               f'{seconds:.2f} s', f'{rounds} rounds, k = {figures.k}']
+def models():
+    """Options of the correction models that there are."""
+    for model in MODELS:
+        try:
+            yield Options(model)
+        except ValueError:   # not in this version
+            continue
 
 
-def corrections(calibration, knn):
+def calibration_section():
+    """The self-calibration with every model, beside a loop of COLMAP and scikit-learn."""
+    rig, frames = exposures()
+    ours = []
+    for options in models():
+        job, seconds = timed(lambda: calibrate(frames, rig.phantom, options), 3)
+        ours.append((options.model, job, seconds))
+
+    def with_peers():
+        measured = measured_network(frames, rig.phantom)
+        return self_calibrate_with_peers(measured.network, measured.start)
+
+    peer, peer_seconds = timed(with_peers)
+    rows = []
+    for model, job, seconds in ours:
+        f = job.fluoroscopes['a']
+        rows.append([model, f'{seconds:.2f} s', str(len(job.history['a'])), str(f.k), f'{f.interior[2]:.1f}',
+                     ', '.join(f'{x:.3f}' for x in f.rmse_after), f'{peer_seconds / seconds:.0f}'])
+    rows.append(['COLMAP and GridSearchCV', f'{peer_seconds:.2f} s', str(peer.rounds), str(peer.k),
+                 f'{peer.interior[2]:.1f}', ', '.join(f'{x:.3f}' for x in peer.rmse), '1'])
+    count = sum(len(frame.target_id) for frame in frames['a'])
+    return section(
+        f'Self-calibration of {len(frames["a"])} exposures, {count} image points',
+        'Everything from the frames on: start values, the choice of k in every round, precision. Beside it the same '
+        "alternation made of COLMAP's bundle adjuster (Cauchy loss, started from its last result) and scikit-learn's "
+        'GridSearchCV of KNeighborsRegressor (k = 3..49, ten folds of whole exposures). That loop '
+        f'{"settled" if peer.converged else "had not settled yet"} after {peer.rounds} rounds; the grid searches took '
+        f'{peer.search_seconds:.1f} s, everything else {peer_seconds - peer.search_seconds:.1f} s.',
+        ['model', 'median time', 'rounds', 'k', 'c [px]', 'RMSE of inliers u, v [px]', 'faster by'], rows)
+
+
+def adjustment_section():
+    """One adjustment beside COLMAP's."""
+    return section(
+        'One adjustment beside COLMAP',
+        'Every target in every exposure, Student-t noise, its scale held, interior orientation estimated, the same '
+        'start values. Every tenth object point is held, the others are free: COLMAP knows no surveyed coordinates '
+        'with standard deviations. The costs are the negative log-likelihoods of the image points.',
+        adjustments.HEADER, [adjustments.beside_colmap(size) for size in adjustments.SIZES])
+
+
+def scaling_section():
+    """Time and memory by the number of exposures."""
+    return section('Many exposures', 'One adjustment with surveyed coordinates and estimated noise, each size in a '
+                   'fresh process.', scaling.HEADER, list(scaling.rows()))
+
+
+def correction_rows(calibration):
     """Rows: time of a correction of one frame, prepared and not, beside scikit-learn's k nearest neighbours."""
-    rng = np.random.default_rng(0)
+    rng, model = np.random.default_rng(0), calibration.model
+    calibration.prepare()
+    peer = KNeighborsRegressor(model.k).fit(model.train_uv, model.train_duv)
     for targets in (30, 503, 2028):
         uv = rng.uniform(80, 940, (targets, 2))
-        for label, one in (('local_linear', calibration), ('knn', knn)):
-            one.prepare()
-            peer = KNeighborsRegressor(one.model.k).fit(one.model.train_uv, one.model.train_duv)
-            repeats = 200
-            ours = median_seconds(lambda: one.correct(uv), repeats)
-            direct = median_seconds(lambda: one.model.evaluate(uv), repeats // 4)
-            theirs = median_seconds(lambda: peer.predict(uv), repeats // 4)
-            yield [f'correction, {label}, k = {one.model.k}', f'frame of {targets} targets', f'{ours * 1e3:.3f} ms',
-                   f'{direct / ours:.1f} times as fast as a search of all training points, {theirs / ours:.1f} times '
-                   'as KNeighborsRegressor.predict']
+        ours, direct, theirs = (timed(function, repeats)[1] for function, repeats in (
+            (lambda: calibration.correct(uv), 200), (lambda: model.evaluate(uv), 50), (lambda: peer.predict(uv), 50)))
+        yield [f'{model.kind}, k = {model.k}', str(targets), f'{ours * 1e3:.3f} ms', f'{direct / ours:.1f}',
+               f'{theirs / ours:.1f}']
 
 
-def main():
-    """Print the table, and write it to docs/performance.md."""
-    rig = virtual_rig(1)
-    frames = simulate_exposures(rig, 15, 1, matched=(130, 134)).frames['a']
+def correction_section():
+    """The correction of a frame."""
+    rig, frames = exposures()
+    rows = []
+    for model in ('local_linear', 'knn'):
+        rows += correction_rows(calibrate(frames, rig.phantom, Options(model)).calibrations['a'])
+    return section('Correction of a frame', 'Exact: the sum over the nearest training points, with standard deviation '
+                   'and status.', ['model', 'targets', 'median time', 'as fast as a search of all training points',
+                                   'as KNeighborsRegressor.predict'], rows)
+
+
+def profile_section():
+    """Where the time of the self-calibration goes."""
+    rig, frames = exposures()
+    calibrate(frames, rig.phantom)   # what only the first call does is not counted
+    rows = list(profiling.rows(lambda: calibrate(frames, rig.phantom)))
+    return section(
+        'Where the time of a self-calibration goes',
+        f'cProfile of the self-calibration above with the default model ({Options().model}): functions of the program '
+        'with the largest cumulative times. Under the profiler all takes somewhat longer.', profiling.HEADER, rows)
+
+
+SECTIONS = {'calibration': calibration_section, 'adjustment': adjustment_section, 'scaling': scaling_section,
+            'correction': correction_section, 'profile': profile_section}
+
+
+def machine():
+    """The machine and the versions that the figures belong to, in one sentence."""
+    cpu = platform.processor() or platform.machine()
+    information = Path('/proc/cpuinfo')
+    if information.exists():
+        names = [line.split(':', 1)[1].strip() for line in information.read_text().splitlines()
+                 if line.startswith('model name')]
+        cpu = names[0] if names else cpu
+    memory = os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2 ** 30
+    packages = ', '.join(f'{name} {version(name)}' for name in ('numpy', 'scipy', 'scikit-learn', 'pycolmap'))
+    return (f'{cpu} ({platform.machine()}), {os.cpu_count()} cores, {memory:.0f} GiB, {platform.system()}; '
+            f'Python {platform.python_version()}, {packages}.')
+
+
+def main(arguments=None):
+    """Print the tables; with all of them, write docs/performance.md."""
+    parser = argparse.ArgumentParser(prog='python -m benchmarks', description=__doc__.splitlines()[0])
+    parser.add_argument('section', nargs='*', help=f'{", ".join(SECTIONS)} (default: all)')
+    chosen = parser.parse_args(arguments).section or list(SECTIONS)
+    for name in chosen:
+        if name not in SECTIONS:
+            parser.error(f'{name}: there is no such section; there are {", ".join(SECTIONS)}')
+    parts = ['# Performance\n\nWritten by `make bench` (`python -m benchmarks`), everything on one thread.\n'
+             + machine()]
     with threadpool_limits(1):
-        rows = list(self_calibrations(rig, frames))
-        fitted = {model: calibrate({'a': frames}, rig.phantom, Options(model)).calibrations['a']
-                  for model in ('local_linear', 'knn')}
-        rows += corrections(fitted['local_linear'], fitted['knn'])
-    header = ['what', 'size', 'median time', 'beside it']
-    lines = ['| ' + ' | '.join(row) + ' |' for row in [header, ['---'] * 4, *rows]]
-    text = ('# Performance\n\nWritten by `make bench` (`python -m benchmarks`), one thread of the machine it ran on. A '
-            'correction is\nexact: the sum over the nearest training points, with standard deviation and status.\n\n'
-            + '\n'.join(lines) + '\n')
-    Path('docs/performance.md').write_text(text)
+        for name in chosen:
+            print(name, file=sys.stderr)
+            parts.append(SECTIONS[name]())
+    text = '\n\n'.join(parts) + '\n'
+    if chosen == list(SECTIONS):
+        Path('docs/performance.md').write_text(text)
     sys.stdout.write(text)
 
 

@@ -1,18 +1,17 @@
 """A whole calibration or adjustment: from frames to what is published and saved."""
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ..photogrammetry.noise import Noise
 from ..photogrammetry.observations import check_frame
 from ..photogrammetry.precision import geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
 from .network import measured_network
 from .result import FluoroscopeCalibration, digest_of_sources
-from .self_calibration import Options, adjusted_with_precision, rmse_of_inliers, self_calibrate
+from .self_calibration import Options, adjusted_with_precision, rmse_of_inliers, self_calibrate, start_noise
 
 SEEN_FOR_NOISE = 3   # mean number of image points of a target from which an adjustment estimates the noise itself
 
@@ -119,15 +118,11 @@ def adjust_with(frames, phantom, calibrations, loss='student_t', check=None):
     with threadpool_limits(1):
         measured = measured_network(frames, phantom, interior=interior, interior_free=False, min_exposures=1,
                                     corrections={n: calibrations[n].model.predict for n in frames}, check=check)
-        network = measured.network
-        of_point = network.fluoroscope[network.exposure]
-        correction = np.zeros_like(network.uv)
-        for f, name in enumerate(frames):
-            correction[of_point == f] = calibrations[name].model.predict(network.uv[of_point == f])
+        correction, network = _held_corrections(measured, calibrations)
         # Few exposures do not tell noise from errors of the survey; then it is that of the calibration.
         held = len(network.uv) < SEEN_FOR_NOISE * len(network.survey_mm)
-        noise = Noise(loss, float(np.median([c.sigma0 for c in calibrations.values()])),
-                      float(np.median([c.nu for c in calibrations.values()])))
+        noise = replace(start_noise(loss), scale=float(np.median([c.sigma0 for c in calibrations.values()])),
+                        nu=float(np.median([c.nu for c in calibrations.values()])))
         after, precise = adjusted_with_precision(network, measured.start, correction, noise, check=check,
                                                  noise_held=held)
         before, _ = adjusted_with_precision(network, after.parameters, np.zeros_like(correction),
@@ -136,6 +131,21 @@ def adjust_with(frames, phantom, calibrations, loss='student_t', check=None):
                for f, name in enumerate(frames)}
     return JobResult(figures, dict(calibrations), _targets(measured, after, precise), {}, {}, measured.left_out,
                      after.converged, time.perf_counter() - began)
+
+
+def _held_corrections(measured, calibrations):
+    """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in its sigma.
+
+    Where a correction is uncertain, at the rim and beyond the calibrated area, an image point weighs less.
+    """
+    network = measured.network
+    correction, sigma = np.zeros_like(network.uv), network.sigma.copy()
+    for f, name in enumerate(measured.fluoroscopes):
+        rows = network.rows(f)
+        found = calibrations[name].model.evaluate(network.uv[rows])
+        correction[rows] = found.duv
+        sigma[rows] = np.hypot(sigma[rows], found.sd / calibrations[name].sigma0)
+    return correction, replace(network, sigma=sigma)
 
 
 def _targets(measured, adjustment, precise):

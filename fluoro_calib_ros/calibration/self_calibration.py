@@ -1,27 +1,35 @@
-"""The self-calibration of Chow et al.: a robust bundle adjustment in turn with a regressor of its residuals.
+"""The self-calibration of Chow et al. and beyond: a robust bundle adjustment and a model of the distortion.
 
-One round: a correction model is fitted to (residual + present correction) of the inliers, its k chosen by
-cross-validation; the network is adjusted with that correction held. The rounds are a fixed-point iteration
-of the values the model is fitted to; Anderson acceleration shortens it. Model and adjustment of a round
-belong together.
+knn, local_linear and hybrid are the paper's way. One round: a correction model is fitted to (residual + present
+correction) of the inliers, its k chosen by cross-validation; the network is adjusted with that correction held. The
+rounds are a fixed-point iteration of the values the model is fitted to; Anderson acceleration shortens it. In
+hybrid a trend is adjusted along. collocation and parametric are adjusted as a whole (see collocation, stepwise). Model
+and adjustment of a round belong together.
 """
 
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..distortion.models import CorrectionModel
 from ..distortion.regressor import Regressor
 from ..distortion.smoothers import KINDS
-from ..photogrammetry.adjustment import Adjustment, adjust, residuals_and_q
+from ..photogrammetry.adjustment import Adjustment, adjust
+from ..photogrammetry.estimation import SETTLED, adjust_and_estimate_noise, renewed_noise
 from ..photogrammetry.noise import LOSSES, Noise
+from ..photogrammetry.normal import normal_equations
 from ..photogrammetry.observations import DataError
-from ..photogrammetry.precision import Precision, geometric_redundancy, precision
+from ..photogrammetry.precision import Precision, covariance_blocks, precision, residual_covariance, solved
 from .anderson import Anderson
+from .automatic import better_kind
+from .collocation import Collocation, adjust_with_signal
 from .network import Measured
+from .stepwise import adjust_stepwise
 
+MODELS = ('auto', *KINDS)
 INTERIORS = ('estimated', 'fixed')
 ROUND_TOLERANCE = 1e-4   # decrease of F that a round may leave to the next: a hundredth of a sigma
-RESCALINGS = 6   # times that the redundancy numbers are renewed before the first adjustment counts
+START_GROSS = 0.01   # share of gross errors with which the estimation of the noise begins
 SETTLED_PX = 2e-3   # RMS change of the correction below which a round is taken as the last
 
 
@@ -29,12 +37,12 @@ SETTLED_PX = 2e-3   # RMS change of the correction below which a round is taken 
 class Options:
     """Options of a self-calibration.
 
-    model 'none', 'knn' or 'local_linear'; interior 'estimated' or 'fixed' (held, and learned by the model);
+    model 'auto' or one of KINDS; interior 'estimated' or 'fixed' (held, and learned by the model);
     loss 'student_t', 'huber' or 'gaussian'; k: neighbours, None: chosen; max_iterations of the loop;
     tolerance: relative change of F and G at which it ends. Raises ValueError for a value that is none of these.
     """
 
-    model: str = 'local_linear'
+    model: str = 'auto'
     interior: str = 'estimated'
     loss: str = 'student_t'
     k: int | None = None
@@ -42,7 +50,7 @@ class Options:
     tolerance: float = 1e-4
 
     def __post_init__(self):
-        for name, values in (('model', KINDS), ('interior', INTERIORS), ('loss', LOSSES)):
+        for name, values in (('model', MODELS), ('interior', INTERIORS), ('loss', LOSSES)):
             if getattr(self, name) not in values:
                 raise ValueError(f'{name} is one of {", ".join(values)}, not {getattr(self, name)!r}')
         if self.max_iterations < 1 or not self.tolerance > 0:
@@ -53,7 +61,8 @@ class Options:
 class Round:
     """One round of the loop.
 
-    F negative log-likelihood, G weighted square sum of the cross-validation; k and RMSE (2,) of the inlier
+    F negative log-likelihood; G weighted square sum of the cross-validation, or of the inlier residuals where the model is
+    adjusted as a whole; k (0 for a model without neighbours) and RMSE (2,) of the inlier
     residuals [px] by fluoroscope; quadratic: robustly weighted square sum of the residuals [px^2]; change:
     RMS change of the correction that the next round would make [px].
     """
@@ -71,8 +80,8 @@ class Round:
 class SelfCalibration:
     """Result of a self-calibration.
 
-    measured network; adjustment before (without correction) and after; precision after; correction (N, 2)
-    [px] of the image points; trained (N,) True for those the models were fitted to; models by fluoroscope;
+    measured network, with the additional parameters of the model; adjustment before (without correction) and after; precision after; correction (N, 2)
+    [px] of the image points, additional parameters included; trained (N,) True for those the models were fitted to; models by fluoroscope;
     history of Rounds; converged: False where the largest number of rounds ended it.
     """
 
@@ -90,13 +99,13 @@ class SelfCalibration:
 class _State:
     """Regressors of all fluoroscopes of a network, as one smoother of values (N, 2)."""
 
-    def __init__(self, measured, options):
+    def __init__(self, measured, options, trend):
         network = measured.network
-        of_point = network.fluoroscope[network.exposure]
-        self.rows = {name: np.flatnonzero(of_point == f) for f, name in enumerate(measured.fluoroscopes)}
+        self.rows = {name: network.rows(f) for f, name in enumerate(measured.fluoroscopes)}
         self.regressors = {
-            name: Regressor(options.model, network.uv[rows], network.exposure[rows],
-                            options.interior == 'fixed', options.k) for name, rows in self.rows.items()}
+            name: Regressor(options.model, network.uv[rows], network.exposure[rows], options.interior == 'fixed',
+                            options.k, None if trend is None else trend.values[f])
+            for f, (name, rows) in enumerate(self.rows.items())}
 
     def choose(self, values, adjustment, information):
         """Inliers and k of this round; returns G and whether anything changed."""
@@ -135,43 +144,25 @@ def rmse_of_inliers(adjustment, rows):
     return np.sqrt(np.mean(r * r, axis=0)) if len(r) else np.full(2, np.nan)
 
 
-def adjusted_with_precision(network, start, correction, noise, redundancy=None, tolerance=1e-8, check=None,
-                            noise_held=False):
-    """Adjustment and Precision of a network; redundancy (N,) or None: from its geometry; noise_held: as given.
+def start_noise(loss):
+    """Noise model with which an estimation begins: beside a Student-t, gross errors are looked for."""
+    return Noise(loss, gross=START_GROSS if loss == 'student_t' else 0.0)
+
+
+def adjusted_with_precision(network, start, correction, noise, tolerance=1e-8, check=None, noise_held=False):
+    """Adjustment and Precision of a network; noise: start values, or the noise model where noise_held.
 
     Raises DataError where the network does not determine the unknowns.
     """
     try:
-        if redundancy is not None or noise_held:
-            result = adjust(network, start, correction, noise, redundancy, tolerance, check=check,
-                            noise_held=noise_held)
+        if noise_held:
+            result = adjust(network, start, correction, noise, tolerance=tolerance, check=check, noise_held=True)
         else:
-            result = _adjusted_from_afar(network, start, correction, noise, tolerance, check)
+            result = adjust_and_estimate_noise(network, start, correction, noise, tolerance, check)
         return result, precision(network, result, correction)
     except np.linalg.LinAlgError:
         raise DataError('the exposures do not determine the unknowns: the normal matrix is singular; '
                         'add exposures with the phantom turned and moved') from None
-
-
-def _adjusted_from_afar(network, start, correction, noise, tolerance, check):
-    """Adjustment from start values, with redundancy numbers that belong to the noise scale it finds.
-
-    Image points and survey share the redundancy according to their precision, so the numbers depend on the
-    scale. The residuals at the start hold the errors of the survey too and give a scale that is rather too
-    large: from there it comes down to its place, while from too small a one it could fall for ever.
-    """
-    _, q = residuals_and_q(network, start, correction, noise)
-    if np.isfinite(q).all():
-        noise = noise.estimated(q * noise.scale ** 2)
-    parameters = start
-    for _ in range(RESCALINGS):
-        redundancy = geometric_redundancy(network, parameters, noise)
-        result = adjust(network, parameters, correction, noise, redundancy, tolerance, check=check)
-        settled = abs(result.noise.scale - noise.scale) <= 0.02 * noise.scale
-        parameters, noise = result.parameters, result.noise
-        if settled:
-            break
-    return result
 
 
 def self_calibrate(measured, options=Options(), progress=None, check=None):
@@ -184,46 +175,107 @@ def self_calibrate(measured, options=Options(), progress=None, check=None):
     network = replace(measured.network, interior_free=np.full(
         len(measured.fluoroscopes), options.interior == 'estimated'))
     measured = replace(measured, network=network)
-    correction = np.zeros_like(network.uv)
-    before, precise = adjusted_with_precision(network, measured.start, correction, Noise(options.loss), check=check)
-    state, after, history, accelerated = _State(measured, options), before, [], Anderson()
-    converged = False
-    values = before.residuals
+    before, _ = adjusted_with_precision(network, measured.start, np.zeros_like(network.uv), start_noise(options.loss),
+                                        check=check)
+    if options.model not in ('auto', 'collocation', 'parametric'):
+        return _alternate(measured, before, options, progress, check)
+    try:
+        run = _adjust_as_a_whole(measured, before, options, progress, check)
+    except np.linalg.LinAlgError:
+        raise DataError('the exposures do not determine orientation and distortion: the normal matrix is singular; '
+                        'add exposures with the phantom turned and moved') from None
+    if options.model != 'auto':
+        return run
+    kind = better_kind(run)
+    return run if kind is None else self_calibrate(measured, replace(options, model=kind), progress, check)
+
+
+def _adjust_as_a_whole(measured, before, options, progress, check):
+    """SelfCalibration with the model among the unknowns: collocation, or stepwise chosen terms."""
+    history = []
+
+    def report(adjustment, change):
+        square = float(np.sum(adjustment.q[adjustment.inliers]))
+        history.append(_round(len(history) + 1, measured, adjustment, square, dict.fromkeys(measured.fluoroscopes, 0), change))
+        if progress is not None:
+            progress(history[-1])
+
+    solve = adjust_stepwise if options.model == 'parametric' else adjust_with_signal
+    kind = 'parametric' if options.model == 'parametric' else 'collocation'
+    network, state, after, converged = solve(measured, before, options.interior == 'fixed', options.max_iterations,
+                                             report, check)
+    correction = network.added(after.parameters)
+    precise = precision(network, after)
+    measured, inliers = replace(measured, network=network), after.inliers
+    models = {}
+    for f, name in enumerate(measured.fluoroscopes):
+        rows = network.rows(f)
+        rows = rows[inliers[rows]]
+        models[name] = CorrectionModel(
+            kind, 0, network.uv[rows], (after.residuals + correction)[rows],
+            series=state.series(f, after.parameters.additional[f], precise.additional[f]))
+    return SelfCalibration(measured, before, after, precise, correction, inliers, models, tuple(history), converged)
+
+
+def _alternate(measured, before, options, progress, check):
+    """SelfCalibration by adjustment and regression in turn."""
+    network, trend = measured.network, None
+    if options.model == 'hybrid':
+        trend = Collocation(measured, before, options.interior == 'fixed', modes=0)
+        network = trend.with_priors(network)
+        before_parameters = replace(before.parameters, additional=trend.zeros())
+    else:
+        before_parameters = before.parameters
+    state, history, accelerated = _State(measured, options, trend), [], Anderson()
+    after, noise, converged, values = replace(before, parameters=before_parameters), before.noise, False, before.residuals
+    information = _information(network, after, np.zeros_like(network.uv))[0]
     for iteration in range(1, options.max_iterations + 1):
-        g_cost, changed = state.choose(values, after, np.linalg.inv(precise.residual))
+        g_cost, changed = state.choose(values, after, information)
         if changed:
             accelerated.restart()
         values = state.without_gauge(values, after.parameters.interior)
         correction = state.smooth(values)
-        redundancy = geometric_redundancy(network, after.parameters, after.noise)
-        after, precise = adjusted_with_precision(network, after.parameters, correction, after.noise,
-                                                 redundancy, ROUND_TOLERANCE, check)
+        after = adjust(network, after.parameters, correction, noise, tolerance=ROUND_TOLERANCE, check=check,
+                       noise_held=True)
+        information, noise = _information(network, after, correction)
         image = state.without_gauge(after.residuals + correction, after.parameters.interior)
         core = state.inliers()
         change = float(np.sqrt(np.mean((state.smooth(image) - correction)[core] ** 2)))
-        history.append(_round(iteration, after, g_cost, state, change))
+        history.append(_round(iteration, measured, after, g_cost, {n: r.k for n, r in state.regressors.items()}, change))
         if progress is not None:
             progress(history[-1])
-        if options.model == 'none' or (not changed and _settled(history, options.tolerance)):
+        steady = abs(noise.scale - after.noise.scale) <= SETTLED * noise.scale
+        if not changed and steady and (options.model == 'none' or _settled(history, options.tolerance)):
             converged = after.converged
             break
         if iteration < options.max_iterations:
             # Outliers follow, but do not steer the acceleration.
             values = accelerated.next(values, image, core)
     # The correction of the last round stays; what its adjustment left to a next one is done here.
-    after, precise = adjusted_with_precision(network, after.parameters, correction, after.noise, redundancy,
-                                             check=check)
-    models = {name: state.regressors[name].model(values[rows]) for name, rows in state.rows.items()}
-    return SelfCalibration(measured, before, after, precise, correction, state.inliers(), models, tuple(history),
-                           converged)
+    after, precise = adjusted_with_precision(network, after.parameters, correction, noise, check=check, noise_held=True)
+    added = network.added(after.parameters)
+    models = {name: state.regressors[name].model(values[rows], None if trend is None else trend.series(
+        f, after.parameters.additional[f], precise.additional[f])) for f, (name, rows) in enumerate(state.rows.items())}
+    return SelfCalibration(replace(measured, network=network), before, after, precise, correction + added,
+                           state.inliers(), models, tuple(history), converged)
 
 
-def _round(iteration, adjustment, g_cost, state, change):
+def _information(network, adjustment, correction):
+    """C_r^-1 (N, 2, 2) [1/px^2] of the residuals, and the noise model that they show. Raises DataError."""
+    try:
+        matrix = solved(network, normal_equations(network, adjustment.parameters, correction, adjustment.noise))
+    except np.linalg.LinAlgError:
+        raise DataError('the exposures do not determine the unknowns: the normal matrix is singular; '
+                        'add exposures with the phantom turned and moved') from None
+    blocks = covariance_blocks(network, matrix)
+    return np.linalg.inv(residual_covariance(network, adjustment, blocks)), renewed_noise(network, adjustment, blocks)
+
+
+def _round(iteration, measured, adjustment, g_cost, k, change):
     """The record of a round."""
     weighted = adjustment.noise.weight(adjustment.q)[:, None] * adjustment.residuals ** 2
-    return Round(iteration, adjustment.cost, float(g_cost), {n: r.k for n, r in state.regressors.items()},
-                 {n: rmse_of_inliers(adjustment, rows) for n, rows in state.rows.items()},
-                 float(weighted.sum()), change)
+    rmse = {name: rmse_of_inliers(adjustment, measured.network.rows(f)) for f, name in enumerate(measured.fluoroscopes)}
+    return Round(iteration, adjustment.cost, float(g_cost), k, rmse, float(weighted.sum()), change)
 
 
 def _settled(history, tolerance):

@@ -6,10 +6,13 @@ import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from .cells import CellPredictor
-from .smoothers import KINDS, SMALLEST_K, Neighbourhoods
+from .series import Series
+from .smoothers import KINDS, SMALLEST_K, SMOOTHERS, Neighbourhoods
 from .trend import Trend, least_squares_map
 
 CHUNK = 2_000_000   # weights held at once, to bound the memory
+SERIES_CHUNK = 20_000   # pixels for which a series is evaluated at once
+SERIES = ('parametric', 'hybrid', 'collocation')   # the kinds that have one
 
 
 @dataclass(frozen=True)
@@ -26,10 +29,11 @@ class Correction:
 class CorrectionModel:
     """A correction model: (du, dv) as a function of the observed pixel.
 
-    kind 'none', 'knn' or 'local_linear'; k neighbours; train_uv (N, 2) observed pixels and train_duv (N, 2)
+    kind: one of KINDS; k neighbours, 0 for a kind without; train_uv (N, 2) observed pixels and train_duv (N, 2)
     corrections there [px]; noise_px: standard deviation of one training correction; bias_px: systematic
-    error of a prediction. The trend of the kind, if it has one, is fitted to the training corrections here.
-    Raises ValueError for an unknown kind or a k that the training points do not allow.
+    error of a prediction; series: of parametric, hybrid and collocation, as it was adjusted. In local_linear
+    a trend is fitted to the training corrections here. Raises ValueError for an unknown kind, a series too many or
+    missing, or a k that the training points do not allow.
     """
 
     kind: str
@@ -38,6 +42,7 @@ class CorrectionModel:
     train_duv: np.ndarray
     noise_px: float = 0.0
     bias_px: float = 0.0
+    series: Series | None = None
     tree: cKDTree = field(init=False, repr=False, compare=False)
     trend: Trend = field(init=False, repr=False, compare=False)
     trend_coefficients: np.ndarray = field(init=False, repr=False, compare=False)
@@ -53,7 +58,10 @@ class CorrectionModel:
             raise ValueError(f'{len(uv)} training points, but {len(duv)} corrections')
         if not (np.isfinite(uv).all() and np.isfinite(duv).all()):
             raise ValueError('a training point or its correction is not a number')
-        if self.kind != 'none' and not SMALLEST_K[self.kind] <= self.k <= len(uv):
+        if (self.series is not None) != (self.kind in SERIES):
+            raise ValueError(f'{self.kind} and ' + ('no series' if self.series is None else 'a series')
+                             + ' do not go together')
+        if self.kind in SMOOTHERS and not SMALLEST_K[self.kind] <= self.k <= len(uv):
             raise ValueError(f'{self.kind} with k = {self.k} cannot be had from {len(uv)} training points')
         object.__setattr__(self, 'train_uv', uv)
         object.__setattr__(self, 'train_duv', duv)
@@ -63,7 +71,8 @@ class CorrectionModel:
         coefficients = least_squares_map(basis) @ duv
         object.__setattr__(self, 'trend', trend)
         object.__setattr__(self, 'trend_coefficients', coefficients)
-        object.__setattr__(self, 'left', duv - basis @ coefficients)
+        left = duv - basis @ coefficients
+        object.__setattr__(self, 'left', left if self.series is None else left - self.series.predict(uv))
         object.__setattr__(self, '_hull', _half_planes(uv))
 
     def at_frame_rate(self, image_size):
@@ -77,11 +86,19 @@ class CorrectionModel:
     def evaluate(self, uv):
         """Correction at pixels uv (n, 2), with standard deviations and what lies outside."""
         duv, norm2 = self._evaluate(uv, with_sd=True)
-        return Correction(duv, self.sd(norm2), self.outside(uv))
+        return Correction(duv, self.sd(norm2, uv), self.outside(uv))
 
-    def sd(self, norm2):
-        """Standard deviations (n,) [px] of predictions from the squared norms (n,) of their weights."""
-        return np.sqrt(self.noise_px ** 2 * norm2 + self.bias_px ** 2)
+    def sd(self, norm2, uv):
+        """Standard deviations (n,) [px] of predictions at pixels uv (n, 2), squared norms (n,) of their weights given."""
+        variance = self.noise_px ** 2 * norm2 + self.bias_px ** 2
+        return np.sqrt(variance if self.series is None else variance + self.series.sd_at(uv) ** 2)
+
+    def global_part(self, uv):
+        """Trend or series (n, 2) [px] at pixels uv (n, 2)."""
+        if self.series is None:
+            return self.trend.basis(uv) @ self.trend_coefficients
+        parts = range(0, len(uv), SERIES_CHUNK)
+        return np.concatenate([self.series.predict(uv[i:i + SERIES_CHUNK]) for i in parts] or [np.zeros((0, 2))])
 
     def outside(self, uv):
         """True (n,) where a pixel (n, 2) lies beyond the convex hull of the training points."""
@@ -95,6 +112,8 @@ class CorrectionModel:
         duv, norm2 = np.zeros_like(uv), np.zeros(len(uv))
         if self.kind == 'none':
             return duv, norm2
+        if self.kind not in SMOOTHERS:
+            return self.global_part(uv), norm2
         size = max(1, CHUNK // self.k)
         for start in range(0, len(uv), size):
             part = slice(start, start + size)
@@ -102,7 +121,7 @@ class CorrectionModel:
             duv[part] = np.einsum('nk,nkc->nc', weights, self.left[index])
             if with_sd:
                 norm2[part] = np.einsum('nk,nk->n', weights, weights)
-        return duv + self.trend.basis(uv) @ self.trend_coefficients, norm2
+        return duv + self.global_part(uv), norm2
 
 
 class FrameModel:
@@ -113,7 +132,7 @@ class FrameModel:
 
     def __init__(self, model, image_size):
         self._model = model
-        self._predictor = None if model.kind == 'none' else CellPredictor(
+        self._predictor = None if model.kind not in SMOOTHERS else CellPredictor(
             model.kind, model.k, model.tree, model.left, image_size)
 
     def evaluate(self, uv):
@@ -121,8 +140,8 @@ class FrameModel:
         if self._predictor is None:
             return self._model.evaluate(uv)
         duv, norm2 = self._predictor(uv)
-        duv += self._model.trend.basis(uv) @ self._model.trend_coefficients
-        return Correction(duv, self._model.sd(norm2), self._model.outside(uv))
+        duv += self._model.global_part(uv)
+        return Correction(duv, self._model.sd(norm2, uv), self._model.outside(uv))
 
 
 def neighbours_and_weights(tree, kind, uv, k):

@@ -3,13 +3,14 @@
 import numpy as np
 
 from ..photogrammetry.noise import INLIER_Q
-from .gauge import gauge_basis, gauge_coefficients
+from .gauge import gauge_basis
 from .models import CorrectionModel, no_correction
 from .selection import CrossValidation, NearestTable, candidate_k, exposure_folds
-from .smoothers import SMALLEST_K, Neighbourhoods
+from .smoothers import SMALLEST_K, SMOOTHERS, Neighbourhoods
 from .trend import Trend, least_squares_map
 
 KEEP_K = 1e-3   # relative gain in G below which k stays as it is
+REACH = 2.0   # factor about the last k within which it is looked for first
 STAY_IN = 1.5   # five sigma of each coordinate
 SMALLEST_TRAINING = 60   # inliers
 
@@ -20,12 +21,14 @@ class Regressor:
     kind of the model; uv (N, 2) observed pixels of all image points and exposure (N,) of each: they stay
     where they are, so neighbours are looked up again only when the inliers change. interior_held:
     whether the interior orientation is, which makes the gauge smaller. k: neighbours, None: chosen by cross-validation.
+    trend (N, m): functions whose coefficients are adjusted; the correction is then kept orthogonal to all of them.
     """
 
-    def __init__(self, kind, uv, exposure, interior_held, k=None):
+    def __init__(self, kind, uv, exposure, interior_held, k=None, trend=None):
         self.kind, self.uv, self.exposure, self._interior_held = kind, uv, exposure, interior_held
         self.k, self.score, self.changed = 0 if kind == 'none' else k, 0.0, False
         self._wanted_k = k
+        self._trend = None if trend is None else np.einsum('nm,ab->nabm', trend, np.eye(2)).reshape(len(uv), 2, -1)
         self.inliers = self._near = None
 
     def choose(self, values, q, information):
@@ -50,6 +53,11 @@ class Regressor:
             self._take_inliers(inliers)
         scores = self._validation.scores(values[inliers], information[inliers])
         best = int(np.argmin(scores))
+        while self._wanted_k is None and self._at_border(best):
+            self.k = int(self._validation.candidates[best])
+            self._take_inliers(inliers)
+            scores = self._validation.scores(values[inliers], information[inliers])
+            best = int(np.argmin(scores))
         now = np.flatnonzero(self._validation.candidates == self.k)
         if len(now) and scores[now[0]] <= scores[best] * (1 + KEEP_K):
             best = int(now[0])
@@ -72,8 +80,17 @@ class Regressor:
         candidates = candidate_k(self.kind, count) if wanted is None else [wanted]
         if self._near is None:
             self._near = NearestTable(self.uv, candidates[-1])
+        self._all = candidates
+        if wanted is None and self.k:   # it moves little from round to round
+            candidates = candidates[(candidates >= self.k / REACH) & (candidates <= self.k * REACH)]
         self._validation = CrossValidation(self.kind, self.uv[inliers], exposure_folds(self.exposure[inliers]),
                                            candidates, self._near.restricted(inliers))
+
+    def _at_border(self, best):
+        """Whether the best of the candidates is the first or last of them, but not of all there are."""
+        candidates = self._validation.candidates
+        return (best == 0 and candidates[0] > self._all[0]) or (
+            best == len(candidates) - 1 and len(candidates) > 1 and candidates[-1] < self._all[-1])
 
     def smooth(self, values):
         """Fitted corrections (N, 2) at all image points of values (N, 2) [px]."""
@@ -88,14 +105,18 @@ class Regressor:
         """values (N, 2) changed so that their fitted correction is orthogonal to the gauge at the inliers."""
         if self.kind == 'none':
             return values
-        basis = gauge_basis(self.uv, interior, self._interior_held)
-        for _ in range(3 if self.kind == 'knn' else 1):   # a mean of neighbours repeats a plane only nearly
+        basis = gauge_basis(self.uv, interior, self._interior_held) if self._trend is None else self._trend
+        flat = basis[self.inliers].reshape(-1, basis.shape[2])
+        for _ in range(1 if self.kind == 'local_linear' else 3):   # means and planes repeat the gauge only nearly
             fitted = self.smooth(values)[self.inliers]
-            values = values - basis @ gauge_coefficients(self.uv[self.inliers], fitted, interior, self._interior_held)
+            values = values - basis @ np.linalg.lstsq(flat, fitted.reshape(-1), rcond=None)[0]
         return values
 
-    def model(self, values):
-        """The correction model of values (N, 2), with noise and bias as residuals and cross-validation show them."""
+    def model(self, values, series=None):
+        """The correction model of values (N, 2), with noise and bias as residuals and cross-validation show them.
+
+        series: of a hybrid, that was adjusted and is not in the values.
+        """
         if self.kind == 'none':
             return no_correction()
         inside = self.inliers
@@ -109,5 +130,6 @@ class Regressor:
         noise2 = error2 / max(1 - 2 * trace + norm2, 0.1)
         held_out = self._validation.predictions_for(self.k, values[inside])
         bias2 = np.mean((values[inside] - held_out) ** 2) - noise2 * (1 + norm2)
-        return CorrectionModel(self.kind, self.k, self.uv[inside], values[inside],
-                               float(np.sqrt(noise2)), float(np.sqrt(max(bias2, 0.0))))
+        uv, duv = self.uv[inside], values[inside]
+        return CorrectionModel(self.kind, self.k, uv, duv if series is None else duv + series.predict(uv),
+                               float(np.sqrt(noise2)), float(np.sqrt(max(bias2, 0.0))), series)

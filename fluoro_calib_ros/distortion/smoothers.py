@@ -7,8 +7,9 @@ unlike the mean it has no bias where all neighbours lie to one side, as they do 
 
 import numpy as np
 
-KINDS = ('none', 'knn', 'local_linear')
-SMALLEST_K = {'none': 0, 'knn': 1, 'local_linear': 6}
+KINDS = ('none', 'knn', 'local_linear', 'parametric', 'hybrid', 'collocation')
+SMALLEST_K = {'knn': 1, 'local_linear': 6, 'hybrid': 6}   # of the kinds that have neighbours
+SMOOTHERS = tuple(SMALLEST_K)
 RIDGE = 1e-6   # of the slopes, relative to the tricube weights: keeps collinear neighbours harmless
 
 

@@ -8,7 +8,7 @@ polynomial is fitted first, and the local planes to what is left.
 
 import numpy as np
 
-DEGREE = {'knn': None, 'local_linear': 3}   # of the polynomial of each kind of model; None: there is none
+DEGREE = {'local_linear': 3}   # of the polynomial of each kind of model; None: there is none
 
 
 class Trend:

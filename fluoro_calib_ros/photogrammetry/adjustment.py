@@ -12,9 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from .collinearity import project
 from .noise import Noise
-from .normal import bordered_blocks, damped_step, eliminates_points, normal_equations
+from .normal import bordered_blocks, damped_step, eliminates_points, normal_equations, projected
 from .rotations import matrix_from_vector
 
 # No target is measured better than this; where there is hardly any redundancy the scale could vanish.
@@ -130,7 +129,7 @@ class Adjustment:
 
 def residuals_and_q(network, parameters, correction, noise):
     """Residuals (N, 2) [px] and normalised squared residuals (N,); NaN where a point is behind the source."""
-    r = network.uv - correction - network.added(parameters) - project(*parameters.per_image_point(network))
+    r = network.uv - correction - network.added(parameters) - projected(network, parameters)
     return r, np.sum(r * r, axis=1) / (noise.scale * network.sigma) ** 2
 
 
@@ -212,7 +211,7 @@ class _Damping:
     """Nielsen's damping: mu follows the gain ratio, and grows ever faster while steps are refused."""
 
     def __init__(self):
-        self.mu, self._growth = 1e-6, 2.0
+        self.mu, self._growth = 1e-8, 2.0
 
     def accept(self, gain):
         """A step was taken; gain: its decrease over the predicted one."""

@@ -12,7 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from .adjustment import adjust, residuals_and_q
-from .precision import projected_variance
+from .normal import normal_equations
+from .precision import covariance_blocks, covariance_of_projection, solved
 
 ROUNDS = 40
 SETTLED = 2e-3   # relative change of the scale at which the turns end: a hundredth of its standard deviation
@@ -33,7 +34,9 @@ def adjust_and_estimate_noise(network, start, correction, noise, tolerance=1e-8,
     parameters, settled = start, False
     for _ in range(ROUNDS):
         result = adjust(network, parameters, correction, noise, tolerance=LOOSE, check=check, noise_held=True)
-        noise, last = renewed_noise(network, result, correction), noise
+        blocks = covariance_blocks(network, solved(network, normal_equations(
+            network, result.parameters, correction, noise)))
+        noise, last = renewed_noise(network, result, blocks), noise
         parameters = result.parameters
         if abs(noise.scale - last.scale) <= SETTLED * last.scale:
             settled = True
@@ -42,10 +45,10 @@ def adjust_and_estimate_noise(network, start, correction, noise, tolerance=1e-8,
     return replace(result, converged=result.converged and settled)
 
 
-def renewed_noise(network, adjustment, correction):
-    """The noise model that the residuals of an Adjustment show."""
+def renewed_noise(network, adjustment, blocks):
+    """The noise model that the residuals of an Adjustment and the CovarianceBlocks of its unknowns show."""
     noise = adjustment.noise
-    left_open = projected_variance(network, adjustment.parameters, correction, noise)
+    left_open = np.trace(covariance_of_projection(network, adjustment.parameters, blocks), axis1=1, axis2=2)
     new = noise.estimated(adjustment.q * noise.scale ** 2, left_open / (noise.scale * network.sigma) ** 2)
     return replace(new, scale=max(new.scale, SMALLEST_NOISE_PX / float(np.median(network.sigma))))
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import blas, cho_factor, cho_solve
 
-from .collinearity import project_with_jacobian
+CHUNK = 8_000   # image points linearised at once: what belongs to them stays in the cache
 
 
 @dataclass(frozen=True)
@@ -33,42 +33,140 @@ class NormalEquations:
     g: np.ndarray
 
 
-def _sum_by(index, values, count):
-    """Sums (count, ...) of values (N, ...) that share an index; index (N,) ascending, none left out."""
-    starts = np.searchsorted(index, np.arange(count))
-    return np.add.reduceat(values, starts, axis=0)
+def _by_component(values, index=None):
+    """Components of values (n, ...) as rows (c, N), taken at index (N,)."""
+    rows = values.reshape(len(values), -1).T
+    return np.ascontiguousarray(rows) if index is None else np.take(rows, index, axis=1)
+
+
+def _in_sensor(network, parameters, rows):
+    """X/Z, Y/Z, 1/Z (N,) of the image points rows (a slice), interior orientation (3, N) and rotation (9, N)."""
+    e = network.exposure[rows]
+    rotation = _by_component(parameters.rotation, e)
+    offset = _by_component(parameters.points_mm, network.point[rows]) - _by_component(parameters.position_mm, e)
+    x, y, z = (rotation[3 * i] * offset[0] + rotation[3 * i + 1] * offset[1] + rotation[3 * i + 2] * offset[2]
+               for i in range(3))
+    with np.errstate(divide='ignore', invalid='ignore'):
+        depth = np.where(z > 0, 1 / z, np.nan)
+    return x * depth, y * depth, depth, _by_component(parameters.interior, network.fluoroscope[e]), rotation
+
+
+def projected(network, parameters):
+    """Image points (N, 2) [px] of a network; NaN where a point is behind the source."""
+    out = np.empty_like(network.uv)
+    for start in range(0, len(out), CHUNK):
+        rows = slice(start, start + CHUNK)
+        x, y, _, (xp, yp, c), _ = _in_sensor(network, parameters, rows)
+        out[rows, 0], out[rows, 1] = xp + c * x, yp + c * y
+    return out
+
+
+@dataclass(frozen=True)
+class _Linearised:
+    """Weighted derivatives of some image points, by component: root (k,) of the weights; u and v (10, k): by T in the
+    sensor frame, w, interior orientation and residual; pu and pv (3, k): by the object point."""
+
+    root: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    pu: np.ndarray
+    pv: np.ndarray
+
+    def by_image_point(self):
+        """Derivatives by exterior orientation, object point and interior orientation, and residuals (k, 2, ...)."""
+        a, a_p = np.stack([self.u.T, self.v.T], axis=1), np.stack([self.pu.T, self.pv.T], axis=1)
+        return np.concatenate([-a_p, a[:, :, 3:6]], axis=2), a_p, a[:, :, 6:9], a[:, :, 9]
+
+
+def _linearised(network, parameters, correction, noise, image_factor, rows):
+    """_Linearised image points rows (a slice).
+
+    With s the derivative of the image point by the point X in the sensor frame, those by P, T and w are s R, -s R and
+    -s [X]x. T is turned into the sensor frame here: the same turn for a whole exposure is made after the sums.
+    """
+    x, y, depth, (xp, yp, c), rotation = _in_sensor(network, parameters, rows)
+    observed = network.uv[rows] - correction[rows]
+    ru, rv = observed[:, 0] - xp - c * x, observed[:, 1] - yp - c * y
+    variance = (noise.scale * network.sigma[rows]) ** 2
+    root = np.sqrt(image_factor * noise.weight((ru * ru + rv * rv) / variance) / variance)
+    b = c * root
+    a, bx, by, zero = b * depth, b * x, b * y, np.zeros_like(b)
+    ax, ay, bxy = a * x, a * y, bx * y
+    u = np.stack([-a, zero, ax, -bxy, b + bx * x, -by, root, zero, root * x, root * ru])
+    v = np.stack([zero, -a, ay, -b - by * y, bxy, bx, zero, root, root * y, root * rv])
+    return _Linearised(root, u, v, a * rotation[0:3] - ax * rotation[6:9], a * rotation[3:6] - ay * rotation[6:9])
+
+
+def _add_by_point(lin, point, sums, pe):
+    """Add to the sums (18, n) by object point, and fill in pe (k, 18), for some image points of the points (k,).
+
+    The sums are the nine products with P and the residual - xx, xy, xz, yy, yz, zz, rx, ry, rz - and by component of P
+    those with xp, yp and c. A product with T is one with P, its sign changed.
+    """
+    n, number, mixed = sums.shape[1], 0, np.empty((18, len(point)))
+    for i in range(3):
+        for j in range(i, 3):
+            product = lin.pu[i] * lin.pu[j] + lin.pv[i] * lin.pv[j]
+            sums[number] += np.bincount(point, product, n)
+            number += 1
+            np.negative(product, out=mixed[6 * i + j])
+            mixed[6 * j + i] = mixed[6 * i + j]
+        for j in range(3):
+            np.add(lin.pu[i] * lin.u[3 + j], lin.pv[i] * lin.v[3 + j], out=mixed[6 * i + 3 + j])
+        sums[6 + i] += np.bincount(point, lin.pu[i] * lin.u[9] + lin.pv[i] * lin.v[9], n)
+        sums[9 + 3 * i] += np.bincount(point, lin.pu[i] * lin.u[6], n)
+        sums[10 + 3 * i] += np.bincount(point, lin.pv[i] * lin.v[7], n)
+        sums[11 + 3 * i] += np.bincount(point, lin.pu[i] * lin.u[8] + lin.pv[i] * lin.v[8], n)
+    pe[:] = mixed.T
+
+
+def _chunks(network):
+    """Ranges of exposures, of one fluoroscope each, with about CHUNK image points."""
+    starts = np.searchsorted(network.exposure, np.arange(network.shape[1] + 1))
+    first = 0
+    while first < network.shape[1]:
+        others = np.flatnonzero(network.fluoroscope[first:] != network.fluoroscope[first])
+        end = first + (others[0] if len(others) else network.shape[1] - first)
+        last = max(first + 1, min(end, int(np.searchsorted(starts, starts[first] + CHUNK, side='right')) - 1))
+        yield first, last, starts[first:last + 1]
+        first = last
 
 
 def normal_equations(network, parameters, correction, noise, image_factor=1.0):
     """Normal equations of the weighted linearised problem; image_factor multiplies the image weights."""
-    _, m, n, n_fluoro = network.shape
-    uv, d_e, d_p, d_i = project_with_jacobian(*parameters.per_image_point(network))
-    r = network.uv - correction - network.added(parameters) - uv
-    variance = (noise.scale * network.sigma) ** 2
-    root = np.sqrt(image_factor * noise.weight(np.sum(r * r, axis=1) / variance) / variance)
-    r = (root[:, None] * r)[..., None]
-    a_e, a_p, a_i = (root[:, None, None] * a for a in (d_e, d_p, d_i))
-    a_et, a_pt, a_it = (a.transpose(0, 2, 1) for a in (a_e, a_p, a_i))
-
-    by_exposure = _sum_by(network.exposure, np.concatenate([a_et @ a_e, a_et @ a_i, a_et @ r], axis=2), m)
-    own = _sum_by(network.exposure, np.concatenate([a_it @ a_i, a_it @ r], axis=2), m)
-    order = network.by_point
-    by_point = _sum_by(network.point[order], np.concatenate([a_pt @ a_p, a_pt @ r], axis=2)[order], n)
+    n_image, m, n, n_fluoro = network.shape
+    correction = np.broadcast_to(correction + network.added(parameters), network.uv.shape)
+    by_exposure, by_point = np.zeros((m, 10, 10)), np.zeros((n_fluoro, 18, n))
+    pe, kept = np.empty((n_image, 18)), []
+    for first, last, starts in _chunks(network):
+        rows = slice(starts[0], starts[-1])
+        lin = _linearised(network, parameters, correction, noise, image_factor, rows)
+        for e, start, end in zip(range(first, last), starts - starts[0], starts[1:] - starts[0]):
+            u, v = lin.u[:, start:end], lin.v[:, start:end]
+            by_exposure[e] = u @ u.T + v @ v.T
+        _add_by_point(lin, network.point[rows], by_point[network.fluoroscope[first]], pe[rows])
+        if any(a is not None for a in network.additional):
+            kept.append(lin)
+    turn = np.tile(np.eye(10), (m, 1, 1))
+    turn[:, :3, :3] = parameters.rotation
+    by_exposure = turn.transpose(0, 2, 1) @ by_exposure @ turn
 
     survey = 1 / network.survey_sd_mm ** 2
-    pp = by_point[:, :, :3] + survey[:, None, None] * np.eye(3)
-    p = by_point[:, :, 3] + survey[:, None] * (network.survey_mm - parameters.points_mm)
+    both = by_point[:, :9].sum(axis=0)
+    pp = both[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(n, 3, 3) + survey[:, None, None] * np.eye(3)
+    p = both[6:].T + survey[:, None] * (network.survey_mm - parameters.points_mm)
     size = len(network.global_free)
     gg, g = np.zeros((size, size)), np.zeros(size)
     eg, pg = np.zeros((m, 6, size)), np.zeros((n, 3, size))
-    a_pi, of_point = (a_pt @ a_i)[order], network.fluoroscope[network.exposure[order]]
     for f in range(n_fluoro):
         cols, mine = slice(3 * f, 3 * f + 3), network.fluoroscope == f
-        gg[cols, cols], g[cols] = own[mine, :, :3].sum(axis=0), own[mine, :, 3].sum(axis=0)
-        eg[mine, :, cols] = by_exposure[mine, :, 6:9]
-        pg[:, :, cols] = _sum_by(network.point[order], a_pi * (of_point == f)[:, None, None], n)
-    _add_additional(network, parameters, root, (a_e, a_p, a_i, r[..., 0]), (gg, eg, pg, g))
-    return NormalEquations(by_exposure[:, :, :6], pp, gg, eg, pg, a_pt @ a_e, by_exposure[:, :, 9], p, g)
+        gg[cols, cols], g[cols] = by_exposure[mine, 6:9, 6:9].sum(axis=0), by_exposure[mine, 6:9, 9].sum(axis=0)
+        eg[mine, :, cols], pg[:, :, cols] = by_exposure[mine, :6, 6:9], by_point[f, 9:].T.reshape(n, 3, 3)
+    if kept:
+        root = np.concatenate([lin.root for lin in kept])
+        weighted = [np.concatenate(parts) for parts in zip(*(lin.by_image_point() for lin in kept))]
+        _add_additional(network, parameters, root, weighted, (gg, eg, pg, g))
+    return NormalEquations(by_exposure[:, :6, :6], pp, gg, eg, pg, pe.reshape(-1, 3, 6), by_exposure[:, :6, 9], p, g)
 
 
 def _add_additional(network, parameters, root, weighted, blocks):
@@ -123,7 +221,7 @@ def bordered_blocks(network, equations):
     return bb, br, rr, b, np.concatenate([r.ravel(), equations.g[free]])
 
 
-def reduce_blocks(bb, br, rr):
+def reduce_blocks(bb, br, rr, overwrite=False):
     """Inverse Cholesky factors (k, b, b) of bb, H = L^-1 br as (k b, q), and the Schur complement (q, q).
 
     Only the lower triangle of the Schur complement is set. Raises numpy.linalg.LinAlgError where bb is not
@@ -132,7 +230,7 @@ def reduce_blocks(bb, br, rr):
     inverse = np.linalg.inv(np.linalg.cholesky(bb))
     h = (inverse @ br).reshape(-1, br.shape[2])
     # In BLAS's order of storage h is its transpose: half the operations of a full product, and no copy.
-    schur = blas.dsyrk(-1.0, h.T, beta=1.0, c=np.asfortranarray(rr), trans=0, lower=1, overwrite_c=0)
+    schur = blas.dsyrk(-1.0, h.T, beta=1.0, c=rr.T, trans=0, lower=1, overwrite_c=overwrite)
     return inverse, h, schur
 
 
@@ -143,8 +241,9 @@ def damped_step(blocks, mu):
     """
     bb, br, rr, b, r = blocks
     bb = bb + mu * bb * np.eye(bb.shape[1])
-    rr = rr + mu * np.diag(np.diag(rr))
-    inverse, h, schur = reduce_blocks(bb, br, rr)
+    rr = rr.copy()
+    rr.ravel()[::len(rr) + 1] *= 1 + mu
+    inverse, h, schur = reduce_blocks(bb, br, rr, overwrite=True)
     half = (inverse @ b[..., None]).ravel()
     x_r = cho_solve(cho_factor(schur, lower=True, overwrite_a=True, check_finite=True), r - h.T @ half)
     x_b = inverse.transpose(0, 2, 1) @ (half - h @ x_r).reshape(b.shape)[..., None]

@@ -13,6 +13,7 @@ from .collinearity import project_with_jacobian
 from .noise import Noise
 from .normal import bordered_blocks, eliminates_points, normal_equations, reduce_blocks
 
+SMALLEST_WEIGHT = 1e-9   # of a gross error
 CHUNK = 5_000   # image points handled at once, to bound the memory
 
 
@@ -22,7 +23,8 @@ class Precision:
 
     interior (F, 3, 3) [px^2], zeros where held; exterior (m, 6, 6) of T [mm] and w [rad]; points (n, 3, 3)
     [mm^2]; residual (N, 2, 2) [px^2]; redundancy (N, 2) of the image coordinates and survey_redundancy
-    (n, 3) of the surveyed ones: together their sum is the number of observations less that of the unknowns.
+    (n, 3) of the surveyed ones: together their sum is the number of observations less that of the unknowns, where
+    no prior adds to them; additional: (p, p) of the additional parameters by fluoroscope, None where there are none.
     """
 
     interior: np.ndarray
@@ -31,6 +33,7 @@ class Precision:
     residual: np.ndarray
     redundancy: np.ndarray
     survey_redundancy: np.ndarray
+    additional: tuple = ()
 
 
 @dataclass(frozen=True)
@@ -46,16 +49,33 @@ class CovarianceBlocks:
     pe: object
 
 
-def covariance_blocks(network, equations):
-    """CovarianceBlocks of normal equations. Raises numpy.linalg.LinAlgError where the matrix is singular."""
-    _, m, n, _ = network.shape
+@dataclass(frozen=True)
+class Solved:
+    """A normal matrix after the elimination: inverse Cholesky factors (k, b, b) of the block-diagonal part, H (k b, q)
+    as in reduce_blocks, and the lower Cholesky factor (q, q) of the Schur complement."""
+
+    inverse: np.ndarray
+    h: np.ndarray
+    factor: np.ndarray
+
+
+def solved(network, equations):
+    """Solved normal equations. Raises numpy.linalg.LinAlgError where the matrix is singular."""
     bb, br, rr, _, _ = bordered_blocks(network, equations)
     inverse, h, schur = reduce_blocks(bb, br, rr)
-    k, size, q = br.shape
-    c_rr = cho_solve(cho_factor(schur, lower=True, overwrite_a=True), np.eye(q))
-    g = (inverse.transpose(0, 2, 1) @ h.reshape(k, size, q))
+    return Solved(inverse, h, cho_factor(schur, lower=True, overwrite_a=True)[0])
+
+
+def covariance_blocks(network, matrix):
+    """CovarianceBlocks of a Solved normal matrix."""
+    _, m, n, _ = network.shape
+    k, size = matrix.inverse.shape[:2]
+    q = len(matrix.factor)
+    c_rr = cho_solve((matrix.factor, True), np.eye(q))
+    back = matrix.inverse.transpose(0, 2, 1)
+    g = back @ matrix.h.reshape(k, size, q)
     c_br = -(g.reshape(-1, q) @ c_rr).reshape(k, size, q)
-    c_bb = inverse.transpose(0, 2, 1) @ inverse - c_br @ g.transpose(0, 2, 1)
+    c_bb = back @ matrix.inverse - c_br @ g.transpose(0, 2, 1)
 
     points = eliminates_points(network)
     cells, width = (m, 6) if points else (n, 3)
@@ -71,6 +91,25 @@ def covariance_blocks(network, equations):
         return CovarianceBlocks(c_rest, c_bb, c_gg, c_rest_g, c_b_g, lambda e, p: c_pairs[p, :, e, :])
     return CovarianceBlocks(c_bb, c_rest, c_gg, c_b_g, c_rest_g,
                             lambda e, p: c_pairs[e, :, p, :].transpose(0, 2, 1))
+
+
+def information_of_additional(network, matrix, f):
+    """Information (p, p) of the additional parameters of fluoroscope f, prior included, all else eliminated.
+
+    In a Cholesky factor the last rows are the factor of their Schur complement.
+    """
+    first = len(matrix.factor) - int(np.sum(network.global_free[3 * network.shape[3]:]))
+    factor = np.tril(matrix.factor[first:, first:])
+    everything = factor @ factor.T
+    columns = network.additional_columns[f]
+    offset = 3 * network.shape[3]
+    own = np.arange(columns.start, columns.stop) - offset
+    rest = np.setdiff1d(np.arange(len(everything)), own)
+    out = everything[np.ix_(own, own)]
+    if len(rest):
+        mixed = everything[np.ix_(rest, own)]
+        out = out - mixed.T @ np.linalg.solve(everything[np.ix_(rest, rest)], mixed)
+    return out
 
 
 def covariance_of_projection(network, parameters, blocks):
@@ -118,18 +157,33 @@ def precision(network, adjustment, correction=None):
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
     parameters, noise = adjustment.parameters, adjustment.noise
-    weighted = covariance_blocks(network, normal_equations(network, parameters, correction, noise))
+    weighted = covariance_blocks(network, solved(network, normal_equations(network, parameters, correction, noise)))
     projected = covariance_of_projection(network, parameters, weighted)
-    variance = (noise.scale * network.sigma) ** 2 / noise.weight(adjustment.q)
-    residual = variance[:, None, None] * np.eye(2) - projected
+    residual = residual_covariance(network, adjustment, weighted, projected)
+    variance = _variance(network, adjustment)
     redundancy = 1 - np.diagonal(projected, axis1=1, axis2=2) / variance[:, None]
     survey = 1 - np.diagonal(weighted.pp, axis1=1, axis2=2) / network.survey_sd_mm[:, None] ** 2
 
     factor = noise.information_factor(adjustment.q)
     honest = weighted if factor == 1.0 else covariance_blocks(
-        network, normal_equations(network, parameters, correction, noise, factor))
+        network, solved(network, normal_equations(network, parameters, correction, noise, factor)))
     interior = np.stack([honest.gg[3 * f:3 * f + 3, 3 * f:3 * f + 3] for f in range(network.shape[3])])
-    return Precision(interior, honest.ee, honest.pp, residual, redundancy, survey)
+    additional = tuple(None if a is None else honest.gg[columns, columns]
+                       for a, columns in zip(network.additional, network.additional_columns))
+    return Precision(interior, honest.ee, honest.pp, residual, redundancy, survey, additional)
+
+
+def _variance(network, adjustment):
+    """Variances (N,) [px^2] of the image points of the weighted least squares problem."""
+    weight = np.maximum(adjustment.noise.weight(adjustment.q), SMALLEST_WEIGHT)
+    return (adjustment.noise.scale * network.sigma) ** 2 / weight
+
+
+def residual_covariance(network, adjustment, blocks, projected=None):
+    """C_r (N, 2, 2) [px^2] of the residuals, of the CovarianceBlocks of the unknowns; projected: A C_x A^T if at hand."""
+    if projected is None:
+        projected = covariance_of_projection(network, adjustment.parameters, blocks)
+    return _variance(network, adjustment)[:, None, None] * np.eye(2) - projected
 
 
 def geometric_redundancy(network, parameters, noise):
@@ -139,14 +193,6 @@ def geometric_redundancy(network, parameters, noise):
     the noise from them. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
     """
     plain = Noise('gaussian', noise.scale)
-    blocks = covariance_blocks(network, normal_equations(network, parameters, 0.0, plain))
+    blocks = covariance_blocks(network, solved(network, normal_equations(network, parameters, 0.0, plain)))
     projected = covariance_of_projection(network, parameters, blocks)
     return 1 - np.trace(projected, axis1=1, axis2=2) / (2 * (noise.scale * network.sigma) ** 2)
-
-
-def projected_variance(network, parameters, correction, noise):
-    """tr(A C_x A^T) (N,) [px^2] of the image points under the robust weights of a noise model: what the unknowns leave
-    open. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
-    """
-    blocks = covariance_blocks(network, normal_equations(network, parameters, correction, noise))
-    return np.trace(covariance_of_projection(network, parameters, blocks), axis1=1, axis2=2)

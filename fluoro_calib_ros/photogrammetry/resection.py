@@ -133,8 +133,8 @@ def resect(xyz, uv, interior, projection=None, max_steps=100):
         squared = np.sum(r * r, axis=1)
         noise = Noise(nu=3.0, scale=float(np.sqrt(max(np.median(squared) / (2 * np.log(2)), 1e-12))))
         w = noise.weight(squared / noise.scale ** 2)
-        h = np.einsum('n,nai,naj->ij', w, jacobian, jacobian)
-        g = np.einsum('n,nai,na->i', w, jacobian, r)
+        weighted = (np.repeat(w, 2)[:, None] * jacobian.reshape(-1, 6)).T
+        h, g = weighted @ jacobian.reshape(-1, 6), weighted @ r.ravel()
         cost = noise.cost(squared / noise.scale ** 2, np.ones(len(xyz)))
         while True:
             step = np.linalg.solve(h + mu * np.diag(np.diag(h)), g)
@@ -148,7 +148,7 @@ def resect(xyz, uv, interior, projection=None, max_steps=100):
                 moved, step = (rotation, position), np.zeros(6)
                 break
         rotation, position = moved
-        if step @ h @ step <= 1e-6 * noise.scale ** 2:
+        if step @ h @ step <= 1e-4 * noise.scale ** 2:
             break
     return Resection(rotation, position, noise.scale, noise.inliers(squared / noise.scale ** 2))
 

@@ -1,0 +1,113 @@
+"""Self-calibration with trend and signal of the distortion among the unknowns of the adjustment.
+
+In the alternation of Chow et al. the orientations and object points take up part of the distortion before the
+regressor sees it. Here all are adjusted together; what is left to turns is what the adjustment takes for known: the
+noise model and the prior of the signal, each from its marginal likelihood.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ..distortion.series import MARGIN, Functions, Series, sd_over_image
+from ..distortion.signal import gauge_precision, most_likely_prior, prior_precision, starting_prior
+from ..photogrammetry.additional import Additional
+from ..photogrammetry.adjustment import adjust
+from ..photogrammetry.estimation import SETTLED, renewed_noise
+from ..photogrammetry.normal import normal_equations
+from ..photogrammetry.precision import covariance_blocks, information_of_additional, solved
+
+DEGREE = 3   # of the trend: pincushion, S-shape and spiral are cubic to first order (Gronenschild 1997)
+MODES = 18   # half waves along the image, until the reach of the signal is known
+MODES_RANGE = (10, 28)
+CUT_OFF = 8.0   # reach times frequency beyond which a Matern signal has less than 1e-4 of its spectral density
+SETTLED_PRIOR = 0.15   # change of the logarithms of reach and sd: no correction changes visibly
+ON_THE_WAY = 1.0   # decrease of F that an adjustment may leave while noise and prior are still to be renewed
+TOLERANCE = 1e-5   # decrease of F that the last one may leave
+
+
+class Collocation:
+    """Trend and signal of all fluoroscopes of a network, and their priors, through the turns of a calibration."""
+
+    def __init__(self, measured, before, interior_held, modes=MODES):
+        self.network, self.interior_held = measured.network, interior_held
+        self.sizes, self.interior = measured.image_size, before.parameters.interior
+        self.functions, self.priors, self.gauges, self.values = [], [], [], []
+        for f, size in enumerate(self.sizes):
+            core = before.residuals[self.network.rows(f)][before.inliers[self.network.rows(f)]]
+            self._take(f, Functions(size, DEGREE, modes))
+            self.priors.append(starting_prior(self.functions[f], max(float(np.sqrt(np.mean(core ** 2))), 0.1)))
+
+    def _take(self, f, functions):
+        """Use these functions for fluoroscope f."""
+        uv = self.network.uv[self.network.rows(f)]
+        for part, value in ((self.functions, functions), (self.values, functions(uv)), (self.gauges, gauge_precision(
+                functions, uv, self.interior[f], self.interior_held))):
+            part[f:f + 1] = [value]
+
+    def with_priors(self, network):
+        """The network with additional parameters under the present priors."""
+        return replace(network, additional=tuple(
+            Additional(values, prior_precision(functions, prior) + gauge) for values, functions, prior, gauge
+            in zip(self.values, self.functions, self.priors, self.gauges)))
+
+    def zeros(self):
+        """Coefficients of no correction."""
+        return tuple(np.zeros(2 * len(functions)) for functions in self.functions)
+
+    def series(self, f, coefficients, covariance):
+        """Series of fluoroscope f of its coefficients (2m,), those of u first, and their covariance (2m, 2m)."""
+        functions = self.functions[f]
+        return Series(functions, coefficients.reshape(2, -1), sd_over_image(functions, covariance))
+
+    def renew(self, network, matrix, coefficients):
+        """Priors from a Solved normal matrix at the solution; returns whether they have settled."""
+        settled = True
+        for f, functions in enumerate(self.functions):
+            last, present = self.priors[f], network.additional[f].prior
+            information = information_of_additional(network, matrix, f) - present
+            right = (information + present) @ coefficients[f]
+            now = most_likely_prior(functions, information, right, self.gauges[f], last)
+            self.priors[f] = now
+            settled &= abs(np.log(now.sd / last.sd)) + abs(np.log(now.reach / last.reach)) < SETTLED_PRIOR
+        return settled
+
+    def fit_modes(self, coefficients):
+        """Take as many modes as the reach of each signal asks for; returns the coefficients for them."""
+        out = []
+        for f, (functions, prior) in enumerate(zip(self.functions, self.priors)):
+            modes = int(np.clip(np.ceil(CUT_OFF / prior.reach * MARGIN * max(self.sizes[f]) / np.pi), *MODES_RANGE))
+            self._take(f, Functions(self.sizes[f], DEGREE, modes))
+            out.append(self.functions[f].taken_over(functions, coefficients[f]))
+        return tuple(out)
+
+
+def adjust_with_signal(measured, before, interior_held, max_rounds, report, check=None):
+    """Adjust a network together with trend and signal; returns the network, Collocation, Adjustment and convergence.
+
+    before: Adjustment without correction; report(Adjustment, change) after every round, change the RMS change of the
+    correction [px]. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
+    """
+    zero = np.zeros_like(measured.network.uv)
+    state = Collocation(measured, before, interior_held)
+    parameters, noise = replace(before.parameters, additional=state.zeros()), before.noise
+    converged, correction = False, zero
+    for turn in range(max_rounds):
+        network = state.with_priors(measured.network)
+        result = adjust(network, parameters, zero, noise, tolerance=ON_THE_WAY, check=check, noise_held=True)
+        parameters, last = result.parameters, correction
+        correction = network.added(parameters)
+        report(result, float(np.sqrt(np.mean((correction - last) ** 2))))
+        matrix = solved(network, normal_equations(network, parameters, zero, noise, noise.information_factor(result.q)))
+        now = renewed_noise(network, result, covariance_blocks(network, matrix))
+        settled = state.renew(network, matrix, parameters.additional)
+        if turn == 0:
+            parameters, settled = replace(parameters, additional=state.fit_modes(parameters.additional)), False
+        settled &= abs(now.scale - noise.scale) <= SETTLED * noise.scale
+        noise = now
+        if settled:
+            converged = True
+            break
+    network = state.with_priors(measured.network)
+    result = adjust(network, parameters, zero, noise, tolerance=TOLERANCE, check=check, noise_held=True)
+    return network, state, result, converged and result.converged

@@ -4,13 +4,20 @@ import argparse
 import sys
 from pathlib import Path
 
+from .cli_validate import EXAMPLE, TEXT, add_validate
+from .cli_validate import validate as run_validate
 from .photogrammetry.observations import DataError
 
 EXAMPLES = {
     'simulate': 'fluoro-calib simulate --out rig --seed 1 --exposures 15',
     'calibrate': 'fluoro-calib calibrate bags/calibration --phantom bags/phantom.csv --out result',
     'adjust': 'fluoro-calib adjust test --phantom phantom.csv --calibration result --out check',
-    'correct': 'fluoro-calib correct points.csv --calibration result --out corrected.csv'}
+    'correct': 'fluoro-calib correct points.csv --calibration result --out corrected.csv',
+    'validate': EXAMPLE}
+
+
+MODELS = ('auto', 'collocation', 'hybrid', 'local_linear', 'knn', 'parametric', 'none')
+OF_NEIGHBOURS = ('hybrid', 'local_linear', 'knn')
 
 
 def image_size(text):
@@ -60,6 +67,7 @@ def make_parser():
     sub.add_argument('points', type=Path, metavar='POINTS.csv', help='columns u, v [px], perhaps fluoroscope, sigma')
     sub.add_argument('--calibration', required=True, type=Path, metavar='DIR', help='folder that calibrate has written')
     sub.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
+    add_validate(command('validate', TEXT, validate), image_size)
     return parser
 
 
@@ -93,8 +101,8 @@ def _add_loss(sub):
 
 
 def _add_calibrate(sub):
-    sub.add_argument('--model', choices=('local_linear', 'knn', 'none'), default='local_linear',
-                     help='correction model (default: local_linear)')
+    sub.add_argument('--model', choices=MODELS, default='auto',
+                     help='correction model (default: auto, chosen by cross-validation)')
     sub.add_argument('--interior', choices=('estimated', 'fixed'), default='estimated',
                      help='interior orientation: estimated, or held and learned by the model (default: estimated)')
     together = sub.add_mutually_exclusive_group()
@@ -105,7 +113,7 @@ def _add_calibrate(sub):
     _add_loss(sub)
     sub.add_argument('--principal-distance', type=number_in(1, 1e7), metavar='PX',
                      help='start value, or with --interior fixed the held value (default: from the observations)')
-    sub.add_argument('--k', type=number_in(1, 100000, int), help='neighbours (default: by cross-validation)')
+    sub.add_argument('--k', type=number_in(1, 100000, int), help='neighbours of knn, local_linear or hybrid (default: by cross-validation)')
     sub.add_argument('--max-iterations', type=number_in(1, 10000, int), default=60, help='most rounds (default: 60)')
     sub.add_argument('--collect', choices=('auto', 'all', 'still'), default='auto',
                      help='exposures of a bag: all frames, or those in which the phantom stands still in a new pose; '
@@ -115,7 +123,10 @@ def _add_calibrate(sub):
 
 def main(arguments=None):
     """Entry point: exit status 0 done, 1 failed for a reason in the data, 2 wrong usage."""
-    options = make_parser().parse_args(arguments)
+    parser = make_parser()
+    options = parser.parse_args(arguments)
+    if getattr(options, 'k', None) and options.model not in OF_NEIGHBOURS:
+        parser.error(f'--k is a number of neighbours, it needs --model {", ".join(OF_NEIGHBOURS)}')
     try:
         options.run(options)
     except (DataError, OSError) as error:
@@ -151,12 +162,14 @@ def calibrate(options):
     from .calibration.job import calibrate as run
     from .calibration.self_calibration import Options
     from .files.phantom import read_phantom
+    from .files.validation import write_sources
     phantom = read_phantom(options.phantom)
     frames = _frames_of(options, options.collect)
-    job = run(frames, phantom, Options(options.model, options.interior, options.loss, options.k,
-                                       options.max_iterations),
-              options.joint, options.principal_distance, _print_round)
+    how = (Options(options.model, options.interior, options.loss, options.k, options.max_iterations), options.joint,
+           options.principal_distance)
+    job = run(frames, phantom, *how, _print_round)
     _write_job(options, job)
+    write_sources(options.out, frames, phantom, *how)
 
 
 def adjust(options):
@@ -190,6 +203,11 @@ def _write_job(options, job):
     for sentence in job.left_out:
         print(f'not used: {sentence}', file=sys.stderr)
     _report(options, document, summary_table(job))
+
+
+def validate(options):
+    """Validate a calibration with the observations it was made of."""
+    run_validate(options, lambda o: _frames_of(o, o.collect), _report)
 
 
 def correct(options):

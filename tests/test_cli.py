@@ -140,7 +140,8 @@ def test_calibrate_writes_result_and_calibrations(result):
         with np.load(result / f'{name}.calibration.npz', allow_pickle=False) as arrays:
             np.testing.assert_array_equal(arrays['interior'], [figures['interior'][key] for key in ('xp', 'yp', 'c')])
             assert int(arrays['model_k']) == figures['model']['k']
-    assert sorted(p.name for p in result.iterdir()) == ['a.calibration.npz', 'b.calibration.npz', 'result.json']
+    assert sorted(p.name for p in result.iterdir()) == [
+        'a.calibration.npz', 'b.calibration.npz', 'observations.csv', 'options.json', 'phantom.csv', 'result.json']
 
 
 def test_a_bag_and_its_csv_give_the_same_numbers(rig, tmp_path):
@@ -320,9 +321,15 @@ def test_too_few_exposures_are_told(rig, tmp_path, capsys):
 
 
 def test_a_k_that_the_observations_do_not_allow_is_told(rig, tmp_path, capsys):
-    more = ('--fluoroscopes', 'a', '--max-iterations', 1, '--k')
+    more = ('--fluoroscopes', 'a', '--max-iterations', 1, '--model', 'local_linear', '--k')
     assert 'fluoroscope a: ' in said(capsys, calibrate(rig, tmp_path / 'x', *more, 100000))
     assert 'fluoroscope a: local_linear with k = 3' in said(capsys, calibrate(rig, tmp_path / 'x', *more, 3))
+
+
+def test_a_k_for_a_model_without_neighbours_is_wrong_usage(rig, tmp_path, capsys):
+    with pytest.raises(SystemExit) as ended:
+        main([str(a) for a in calibrate(rig, tmp_path / 'x', '--k', 30)])
+    assert ended.value.code == 2 and '--k is a number of neighbours' in capsys.readouterr().err
 
 
 def test_an_empty_or_damaged_calibration_folder_is_told(rig, result, tmp_path, capsys):

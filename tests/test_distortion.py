@@ -121,7 +121,7 @@ def test_local_linear_reproduces_cubic_polynomials():
 
 def test_knn_has_no_trend_and_local_linear_a_cubic_one():
     """A mean of neighbours is the paper's model: nothing is added to it."""
-    assert DEGREE['knn'] is None and len(Trend('knn', training()[0])) == 0
+    assert 'knn' not in DEGREE and len(Trend('knn', training()[0])) == 0
     assert len(Trend('local_linear', training()[0])) == 10
     assert least_squares_map(np.zeros((5, 0))).shape == (0, 5)
 
@@ -143,7 +143,7 @@ def test_no_correction_corrects_nothing_and_knows_no_outside():
 
 
 @pytest.mark.parametrize('arguments, said', [
-    (('spline', 5, np.zeros((9, 2)), np.zeros((9, 2))), "one of none, knn, local_linear, not 'spline'"),
+    (('spline', 5, np.zeros((9, 2)), np.zeros((9, 2))), "one of none, knn, local_linear, parametric, hybrid, collocation, not 'spline'"),
     (('knn', 10, np.zeros((9, 2)), np.zeros((9, 2))), 'knn with k = 10 cannot be had from 9 training points'),
     (('knn', 0, np.zeros((9, 2)), np.zeros((9, 2))), 'knn with k = 0 cannot be had'),
     (('local_linear', 5, np.zeros((9, 2)), np.zeros((9, 2))), 'local_linear with k = 5 cannot be had'),

@@ -273,7 +273,7 @@ def test_the_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
 def test_numpy_reads_it_without_pickle_and_the_document_names_every_array(tmp_path):
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
         assert file.files == ['format_version', *FIELDS]
-        assert file['format_version'] == 1
+        assert file['format_version'] == 2
         document = open(os.path.join(os.path.dirname(__file__), '..', 'docs', 'calibration_file.md')).read()
         for name in file.files:
             dtype = 'text' if file[name].dtype.kind == 'U' else file[name].dtype.name
@@ -295,7 +295,7 @@ class Bomb:
 
 
 @pytest.mark.parametrize('arrays, sentence', [
-    ({'format_version': np.array(7)}, 'layout version 7, this program knows version 1'),
+    ({'format_version': np.array(7)}, 'layout version 7, this program knows versions 1 to 2'),
     ({'format_version': np.array('1')}, 'format_version is not a whole number'),
     ({'format_version': None}, 'it has no array format_version'),
     ({'interior': None}, 'has no array interior'),

@@ -16,7 +16,7 @@ from fluoro_calib_ros.report.tables import markdown_table, summary_table
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 OF_FLUOROSCOPE = ('residuals_histogram', 'residuals_position', 'distortion')
-QUICK = {'k': 30, 'max_iterations': 3}
+QUICK = {'model': 'local_linear', 'k': 30, 'max_iterations': 3}
 
 
 @pytest.fixture(scope='module')

@@ -6,13 +6,15 @@ import signal
 from dataclasses import replace
 
 from .job import calibrate
+from .validation import validate_or_tell
 
 POLL_S = 0.05   # how often the caller may stop it
 NICE = 10   # what runs live goes first
 
 
-def calibrate_beside(frames, phantom, options, joint, principal_distance, progress, check):
-    """calibrate() of job.py in a process of its own; returns its JobResult without the runs.
+def calibrate_beside(frames, phantom, options, joint, principal_distance, progress, check, validated=False):
+    """calibrate() of job.py in a process of its own; returns its JobResult without the runs, and the Validation of
+    it, or None unless validated.
 
     progress(fluoroscope, Round) after every round; check() is called all the time and may raise to end it at
     once. Raises DataError as calibrate() does, and RuntimeError where it failed otherwise.
@@ -20,7 +22,7 @@ def calibrate_beside(frames, phantom, options, joint, principal_distance, progre
     context = multiprocessing.get_context('spawn')   # a fork would take locks of other threads along
     here, there = context.Pipe(duplex=False)
     process = context.Process(target=_work, daemon=True, args=(
-        there, frames, phantom, options, joint, principal_distance))
+        there, validated, frames, phantom, options, joint, principal_distance))
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])   # is inherited
     process.start()   # without the interrupt from the keyboard, which comes to all: the caller ends it
     signal.pthread_sigmask(signal.SIG_SETMASK, masked)
@@ -46,12 +48,14 @@ def calibrate_beside(frames, phantom, options, joint, principal_distance, progre
         here.close()
 
 
-def _work(there, *arguments):
-    """Calibrate, and send ('round', (fluoroscope, Round)), then ('done', JobResult) or ('fault', exception)."""
+def _work(there, validated, frames, phantom, *how):
+    """Calibrate, and send ('round', (fluoroscope, Round)), then ('done', (JobResult, Validation or None)) or
+    ('fault', exception)."""
     os.nice(NICE)
     try:
-        job = calibrate(*arguments, progress=lambda *content: there.send(('round', content)))
-        there.send(('done', replace(job, runs={})))
+        job = calibrate(frames, phantom, *how, progress=lambda *content: there.send(('round', content)))
+        verdict = validate_or_tell(frames, phantom, job.calibrations, *how) if validated else None
+        there.send(('done', (replace(job, runs={}), verdict)))
     except ValueError as error:   # DataError among them
         there.send(('fault', error))
     except Exception as error:

@@ -40,10 +40,13 @@ class Collocation:
 
     def _take(self, f, functions):
         """Use these functions for fluoroscope f."""
+        self.functions[f:f + 1] = [functions]
+        self.values[f:f + 1] = [functions(self.network.uv[self.network.rows(f)])]
+        self.gauges[f:f + 1] = [self._gauge(f)]
+
+    def _gauge(self, f):
         uv = self.network.uv[self.network.rows(f)]
-        for part, value in ((self.functions, functions), (self.values, functions(uv)), (self.gauges, gauge_precision(
-                functions, uv, self.interior[f], self.interior_held))):
-            part[f:f + 1] = [value]
+        return gauge_precision(self.values[f], uv, self.interior[f], self.interior_held)
 
     def with_priors(self, network):
         """The network with additional parameters under the present priors."""
@@ -60,15 +63,16 @@ class Collocation:
         functions = self.functions[f]
         return Series(functions, coefficients.reshape(2, -1), sd_over_image(functions, covariance))
 
-    def renew(self, network, matrix, coefficients):
-        """Priors from a Solved normal matrix at the solution; returns whether they have settled."""
-        settled = True
+    def renew(self, network, matrix, parameters):
+        """Priors from a Solved normal matrix at the solution, and gauges; returns whether the priors have settled."""
+        settled, coefficients, self.interior = True, parameters.additional, parameters.interior
         for f, functions in enumerate(self.functions):
             last, present = self.priors[f], network.additional[f].prior
             information = information_of_additional(network, matrix, f) - present
             right = (information + present) @ coefficients[f]
             now = most_likely_prior(functions, information, right, self.gauges[f], last)
             self.priors[f] = now
+            self.gauges[f] = self._gauge(f)
             settled &= abs(np.log(now.sd / last.sd)) + abs(np.log(now.reach / last.reach)) < SETTLED_PRIOR
         return settled
 
@@ -82,10 +86,15 @@ class Collocation:
         return tuple(out)
 
 
+def rms_change(correction, last):
+    """RMS change [px] of corrections (N, 2)."""
+    return float(np.sqrt(np.mean((correction - last) ** 2)))
+
+
 def adjust_with_signal(measured, before, interior_held, max_rounds, report, check=None):
     """Adjust a network together with trend and signal; returns the network, Collocation, Adjustment and convergence.
 
-    before: Adjustment without correction; report(Adjustment, change) after every round, change the RMS change of the
+    before: Adjustment without correction; report(Adjustment, change) after every adjustment, change the RMS change of the
     correction [px]. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
     """
     zero = np.zeros_like(measured.network.uv)
@@ -93,21 +102,19 @@ def adjust_with_signal(measured, before, interior_held, max_rounds, report, chec
     parameters, noise = replace(before.parameters, additional=state.zeros()), before.noise
     converged, correction = False, zero
     for turn in range(max_rounds):
-        network = state.with_priors(measured.network)
-        result = adjust(network, parameters, zero, noise, tolerance=ON_THE_WAY, check=check, noise_held=True)
+        network, final = state.with_priors(measured.network), converged or turn == max_rounds - 1
+        result = adjust(network, parameters, zero, noise, tolerance=TOLERANCE if final else ON_THE_WAY, check=check,
+                        noise_held=True)
         parameters, last = result.parameters, correction
         correction = network.added(parameters)
-        report(result, float(np.sqrt(np.mean((correction - last) ** 2))))
+        report(result, rms_change(correction, last))
+        if final:
+            break
         matrix = solved(network, normal_equations(network, parameters, zero, noise, noise.information_factor(result.q)))
         now = renewed_noise(network, result, covariance_blocks(network, matrix))
-        settled = state.renew(network, matrix, parameters.additional)
-        if turn == 0:
-            parameters, settled = replace(parameters, additional=state.fit_modes(parameters.additional)), False
-        settled &= abs(now.scale - noise.scale) <= SETTLED * noise.scale
+        converged = state.renew(network, matrix, parameters)
+        converged &= abs(now.scale - noise.scale) <= SETTLED * noise.scale
         noise = now
-        if settled:
-            converged = True
-            break
-    network = state.with_priors(measured.network)
-    result = adjust(network, parameters, zero, noise, tolerance=TOLERANCE, check=check, noise_held=True)
+        if turn == 0:
+            parameters, converged = replace(parameters, additional=state.fit_modes(parameters.additional)), False
     return network, state, result, converged and result.converged

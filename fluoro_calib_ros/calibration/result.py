@@ -7,6 +7,7 @@ from functools import cached_property
 import numpy as np
 
 from ..distortion.models import CorrectionModel
+from ..distortion.series import packed
 from ..photogrammetry.observations import points_on_image
 
 OK, OUTSIDE, INVALID = 0, 1, 2   # status of a corrected image point
@@ -63,6 +64,9 @@ class FluoroscopeCalibration:
         for array in (self.interior, self.image_size, self.model.train_uv, self.model.train_duv,
                       [self.model.k, self.model.noise_px, self.model.bias_px, self.image_sd, self.sigma0]):
             digest.update(np.ascontiguousarray(array, dtype=float).tobytes())
+        if self.model.series is not None:
+            degree, modes, coefficients, sd = packed(self.model.series)
+            digest.update(np.concatenate([[degree, modes], coefficients.ravel(), sd.ravel()]).tobytes())
         digest.update(f'{self.fluoroscope}/{self.model.kind}/{self.source_digest}'.encode())
         object.__setattr__(self, 'calibration_id', f'{self.fluoroscope}-{digest.hexdigest()[:16]}')
 

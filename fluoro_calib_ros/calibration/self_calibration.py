@@ -12,8 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..distortion.models import CorrectionModel
-from ..distortion.regressor import Regressor
-from ..distortion.smoothers import KINDS
+from ..distortion.regressor import SMALLEST_TRAINING, Regressor
+from ..distortion.smoothers import KINDS, SMOOTHERS
 from ..photogrammetry.adjustment import Adjustment, adjust
 from ..photogrammetry.estimation import SETTLED, adjust_and_estimate_noise, renewed_noise
 from ..photogrammetry.noise import LOSSES, Noise
@@ -39,7 +39,7 @@ class Options:
 
     model 'auto' or one of KINDS; interior 'estimated' or 'fixed' (held, and learned by the model);
     loss 'student_t', 'huber' or 'gaussian'; k: neighbours, None: chosen; max_iterations of the loop;
-    tolerance: relative change of F and G at which it ends. Raises ValueError for a value that is none of these.
+    tolerance: relative change of F and G at which it ends, where adjustment and regression go in turns. Raises ValueError for a value that is none of these.
     """
 
     model: str = 'auto'
@@ -53,6 +53,8 @@ class Options:
         for name, values in (('model', MODELS), ('interior', INTERIORS), ('loss', LOSSES)):
             if getattr(self, name) not in values:
                 raise ValueError(f'{name} is one of {", ".join(values)}, not {getattr(self, name)!r}')
+        if self.k is not None and self.model not in SMOOTHERS:
+            raise ValueError(f'k is a number of neighbours, and the model {self.model} has none to be given')
         if self.max_iterations < 1 or not self.tolerance > 0:
             raise ValueError('max_iterations is at least 1 and tolerance above 0')
 
@@ -180,23 +182,29 @@ def self_calibrate(measured, options=Options(), progress=None, check=None):
     if options.model not in ('auto', 'collocation', 'parametric'):
         return _alternate(measured, before, options, progress, check)
     try:
-        run = _adjust_as_a_whole(measured, before, options, progress, check)
+        run, state = _adjust_as_a_whole(measured, before, options, progress, check)
     except np.linalg.LinAlgError:
         raise DataError('the exposures do not determine orientation and distortion: the normal matrix is singular; '
                         'add exposures with the phantom turned and moved') from None
     if options.model != 'auto':
         return run
-    kind = better_kind(run)
+    kind = better_kind(run, state)
     return run if kind is None else self_calibrate(measured, replace(options, model=kind), progress, check)
 
 
 def _adjust_as_a_whole(measured, before, options, progress, check):
-    """SelfCalibration with the model among the unknowns: collocation, or stepwise chosen terms."""
+    """SelfCalibration with the model among the unknowns, collocation or stepwise chosen terms, and the model's state."""
     history = []
 
     def report(adjustment, change):
         square = float(np.sum(adjustment.q[adjustment.inliers]))
-        history.append(_round(len(history) + 1, measured, adjustment, square, dict.fromkeys(measured.fluoroscopes, 0), change))
+        for f, name in enumerate(measured.fluoroscopes):
+            count = int(adjustment.inliers[measured.network.rows(f)].sum())
+            if count < SMALLEST_TRAINING:
+                raise DataError(f'fluoroscope {name}: {count} inliers are too few for the correction model, '
+                                f'{SMALLEST_TRAINING} are needed')
+        history.append(_round(len(history) + 1, measured, adjustment, square,
+                              dict.fromkeys(measured.fluoroscopes, 0), change))
         if progress is not None:
             progress(history[-1])
 
@@ -214,7 +222,8 @@ def _adjust_as_a_whole(measured, before, options, progress, check):
         models[name] = CorrectionModel(
             kind, 0, network.uv[rows], (after.residuals + correction)[rows],
             series=state.series(f, after.parameters.additional[f], precise.additional[f]))
-    return SelfCalibration(measured, before, after, precise, correction, inliers, models, tuple(history), converged)
+    return SelfCalibration(measured, before, after, precise, correction, inliers, models, tuple(history),
+                           converged), state
 
 
 def _alternate(measured, before, options, progress, check):
@@ -245,7 +254,7 @@ def _alternate(measured, before, options, progress, check):
         if progress is not None:
             progress(history[-1])
         steady = abs(noise.scale - after.noise.scale) <= SETTLED * noise.scale
-        if not changed and steady and (options.model == 'none' or _settled(history, options.tolerance)):
+        if options.model == 'none' or (not changed and steady and _settled(history, options.tolerance)):
             converged = after.converged
             break
         if iteration < options.max_iterations:

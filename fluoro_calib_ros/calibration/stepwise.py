@@ -19,6 +19,7 @@ from ..photogrammetry.adjustment import adjust
 from ..photogrammetry.estimation import LOOSE, SETTLED, renewed_noise
 from ..photogrammetry.normal import normal_equations
 from ..photogrammetry.precision import covariance_blocks, information_of_additional, solved
+from .collocation import TOLERANCE, rms_change
 
 SIGNIFICANCE = 0.01   # of all terms that are tested for one together
 HELD = 1e12   # precision that holds a term at zero
@@ -132,19 +133,18 @@ def adjust_stepwise(measured, before, interior_held, max_rounds, report, check=N
     state = Terms(measured, before, interior_held)
     parameters, noise, correction = replace(before.parameters, additional=state.zeros()), before.noise, zero
     converged = False
-    for _ in range(max(max_rounds, 2 * len(state.names))):
-        network = state.with_terms(measured.network)
-        result = adjust(network, parameters, zero, noise, tolerance=LOOSE, check=check, noise_held=True)
+    for turn in range(max_rounds):
+        network, final = state.with_terms(measured.network), converged or turn == max_rounds - 1
+        result = adjust(network, parameters, zero, noise, tolerance=TOLERANCE if final else LOOSE, check=check,
+                        noise_held=True)
         parameters, last = result.parameters, correction
         correction = network.added(parameters)
-        report(result, float(np.sqrt(np.mean((correction - last) ** 2))))
+        report(result, rms_change(correction, last))
+        if final:
+            break
         matrix = solved(network, normal_equations(network, parameters, zero, noise, noise.information_factor(result.q)))
         now = renewed_noise(network, result, covariance_blocks(network, matrix))
         changed = [state.step(f, network, matrix, result) for f in range(len(state.functions))]
         converged = not any(changed) and abs(now.scale - noise.scale) <= SETTLED * noise.scale
         noise = now
-        if converged:
-            break
-    network = state.with_terms(measured.network)
-    result = adjust(network, parameters, zero, noise, check=check, noise_held=True)
     return network, state, result, converged and result.converged

@@ -13,6 +13,7 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 MARGIN = 1.3   # the rectangle of the sines over the image: they vanish at its border
+LARGEST_DEGREE, LARGEST_MODES = 15, 100   # of a series that is read
 SD_GRID = 33   # values of the standard deviation across the image, between which it is interpolated
 
 
@@ -91,6 +92,30 @@ class Series:
         """Standard deviations (n,) [px] of the corrections at pixels uv (n, 2), interpolated."""
         place = (np.asarray(uv, dtype=float) + 0.5) / np.asarray(self.functions.image_size) * (SD_GRID - 1)
         return map_coordinates(self.sd, place[:, ::-1].T, order=1, mode='nearest')
+
+
+def packed(series):
+    """Degree, modes, coefficients (2, m) and sd (33, 33) of a Series as they are sent and saved; -1 and 0, and empty
+    arrays, of None."""
+    if series is None:
+        return -1, 0, np.zeros((2, 0)), np.zeros((0, 0))
+    return series.functions.degree, series.functions.modes, series.coefficients, series.sd
+
+
+def unpacked(image_size, degree, modes, coefficients, sd):
+    """The Series, or None, of what packed has made of it. Raises ValueError where the parts do not fit together."""
+    coefficients, sd = (np.ascontiguousarray(a, dtype=float) for a in (coefficients, sd))
+    if degree == -1 and not modes and not coefficients.size:
+        return None
+    if not (0 <= degree <= LARGEST_DEGREE and 0 <= modes <= LARGEST_MODES):
+        raise ValueError(f'a series of degree {degree} with {modes} modes is unknown')
+    functions = Functions(tuple(int(s) for s in image_size), int(degree), int(modes))
+    if coefficients.shape != (2, len(functions)) or sd.shape != (SD_GRID, SD_GRID):
+        raise ValueError(f'a series of degree {degree} with {modes} modes has 2 x {len(functions)} coefficients and '
+                         f'{SD_GRID} x {SD_GRID} standard deviations, not {coefficients.shape} and {sd.shape}')
+    if not (np.isfinite(coefficients).all() and np.isfinite(sd).all()):
+        raise ValueError('a coefficient of the series, or a standard deviation, is not a number')
+    return Series(functions, coefficients, sd)
 
 
 def sd_grid_pixels(image_size):

@@ -17,7 +17,7 @@ from .gauge import gauge_basis
 from .terms import trend_transformation
 
 MATERN = 2.5
-GAUGE_SD_PX = 3e-4   # to which the gauge is held; a much smaller one would damp the steps of the adjustment
+GAUGE_SD_PX = 3e-5   # to which the gauge is held; a much smaller one would damp the steps of the adjustment
 SMALLEST_VARIANCE = 1e-10   # of a coefficient of the signal: an amplitude of 1e-8 px
 NOT_THERE = 1e-3   # variance of a trend term that is not there, over that with which it is determined
 LARGEST_VARIANCE = 1e8   # of a trend term that is taken to be there
@@ -75,10 +75,10 @@ def _trend_precision(functions, prior):
     return to_terms[:count].T @ (to_terms[:count] / prior.trend[:, None])
 
 
-def gauge_precision(functions, uv, interior, interior_held=False):
-    """Precision matrix (2m, 2m) that keeps a series orthogonal to the gauge at pixels uv (n, 2)."""
+def gauge_precision(values, uv, interior, interior_held=False):
+    """Precision matrix (2m, 2m) that keeps a series with values (n, m) of its functions at pixels uv (n, 2) orthogonal
+    to the gauge there."""
     gauge = gauge_basis(uv, interior, interior_held)
-    values = functions(uv)
     rows = np.concatenate([gauge[:, axis].T @ values for axis in (0, 1)], axis=1) / len(uv)
     return rows.T @ rows / GAUGE_SD_PX ** 2
 

@@ -10,18 +10,20 @@ import numpy as np
 
 from ..calibration.result import FluoroscopeCalibration
 from ..distortion.models import CorrectionModel
+from ..distortion.series import packed, unpacked
 from ..photogrammetry.observations import DataError
 from .access import cause_of, check_safe_name, make_folder, read_bytes
 from .atomic import atomic_file
 
-VERSION = 1   # of the layout
+VERSION = 2   # of the layout
+READABLE = (1, 2)   # version 1 knew no series
 SUFFIX = '.calibration.npz'
 _DATE = (1980, 1, 1, 0, 0, 0)   # of every member: the same calibration gives the same bytes
 
 
 @dataclass(frozen=True)
 class Field:
-    """What an array of the file must be: dtype 'text', 'int', 'float' or 'bool'; shape, 'N' for any length;
+    """What an array of the file must be: dtype 'text', 'int', 'float' or 'bool'; shape, a letter for any length;
     least: smallest value, and special: values besides finite ones ('inf' or 'nan') that it may have."""
 
     dtype: str
@@ -44,6 +46,10 @@ FIELDS = {
     'train_exposure': Field('int', ('N',), least=0),
     'noise_px': Field('float', least=0),
     'bias_px': Field('float', least=0),
+    'series_degree': Field('int', least=-1),
+    'series_modes': Field('int', least=0),
+    'series_coefficients': Field('float', (2, 'M')),
+    'series_sd': Field('float', ('S', 'S'), least=0),
     'image_sd': Field('float', least=0),
     'sigma0': Field('float', least=0),
     'nu': Field('float', least=0, special='inf'),
@@ -61,6 +67,7 @@ FIELDS = {
     'source_digest': Field('text'),
 }
 _DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?')}
+_SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
 _OF_MODEL = {'model_kind': 'kind', 'model_k': 'k', 'train_uv': 'train_uv', 'train_duv': 'train_duv',
              'noise_px': 'noise_px', 'bias_px': 'bias_px'}   # array: attribute of the CorrectionModel
 
@@ -129,6 +136,8 @@ def load_calibrations(directory):
 
 
 def _value_of(calibration, name):
+    if name in _SERIES:
+        return packed(calibration.model.series)[_SERIES.index(name)]
     if name in _OF_MODEL:
         return getattr(calibration.model, _OF_MODEL[name])
     return getattr(calibration, name)
@@ -163,13 +172,14 @@ def _read_arrays(path, archive):
     version = _read_member(path, archive, 'format_version')
     if version.shape != () or version.dtype.kind not in 'iu':
         raise DataError(f'{path}: this is not a calibration file, its format_version is not a whole number')
-    if version != VERSION:
+    if version not in READABLE:
         raise DataError(f'{path}: the file has layout version {int(version)}, '
-                        f'this program knows version {VERSION}')
-    missing = [name for name in FIELDS if f'{name}.npy' not in names]
+                        f'this program knows versions {READABLE[0]} to {READABLE[-1]}')
+    known = dict(zip(_SERIES, map(np.asarray, packed(None)))) if version == 1 else {}
+    missing = [name for name in FIELDS if f'{name}.npy' not in names and name not in known]
     if missing:
         raise DataError(f'{path}: the calibration has no array {missing[0]}')
-    return {name: _read_member(path, archive, name) for name in FIELDS}
+    return {name: known[name] if name in known else _read_member(path, archive, name) for name in FIELDS}
 
 
 def _read_member(path, archive, name):
@@ -187,7 +197,8 @@ def _checked(path, name, array, field):
     if array.dtype.kind != 'U' if wanted == 'text' else array.dtype != wanted:
         raise DataError(f'{path}: the array {name} has dtype {array.dtype}, not {wanted}')
     shape = field.shape
-    if array.ndim != len(shape) or any(want not in ('N', have) for want, have in zip(shape, array.shape)):
+    if array.ndim != len(shape) or any(
+            want != have and isinstance(want, int) for want, have in zip(shape, array.shape)):
         raise DataError(f'{path}: the array {name} has shape {array.shape}, '
                         f'not ({", ".join(map(str, shape))})')
     if field.dtype == 'float':
@@ -212,7 +223,9 @@ def _calibration(path, arrays):
     identity, values['image_size'] = values.pop('calibration_id'), tuple(values['image_size'].tolist())
     check_safe_name(values['fluoroscope'], path)
     model = {_OF_MODEL[name]: values.pop(name) for name in _OF_MODEL}
+    series = [values.pop(name) for name in _SERIES]
     try:
+        model['series'] = unpacked(values['image_size'], *series)
         calibration = FluoroscopeCalibration(model=CorrectionModel(**model), **values)
     except ValueError as error:
         raise DataError(f'{path}: {error}') from None

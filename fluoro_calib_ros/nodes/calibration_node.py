@@ -25,9 +25,10 @@ from ..bags.reader import frame_from_message
 from ..calibration.beside import calibrate_beside
 from ..calibration.collector import ExposureCollector, FramePairer, StillOptions
 from ..calibration.network import MIN_TARGETS_OF_EXPOSURE
-from ..calibration.self_calibration import Options
+from ..calibration.self_calibration import MODELS, Options
 from ..files.calibration import SUFFIX, load_calibrations, save_calibration
 from ..files.phantom import read_phantom
+from ..files.validation import write_sources, write_validation
 from ..photogrammetry.observations import DataError, check_frame
 from . import support
 from .conversion import message_from_calibration
@@ -89,7 +90,7 @@ class CalibrationNode(Node):
                          round(1e9 * declare(self, 'pair_tolerance', 0.002,
                                              'largest difference of the stamps of a pair [s]', 0.0, 1.0)))
         self._defaults = {
-            'model': declare(self, 'model', 'local_linear', 'correction model: local_linear, knn or none'),
+            'model': declare(self, 'model', 'auto', f'correction model: {", ".join(MODELS)}'),
             'interior': declare(self, 'interior', 'estimated', 'interior orientation: estimated or fixed'),
             'loss': declare(self, 'loss', 'student_t', 'noise model: student_t, huber or gaussian'),
             'max_iterations': declare(self, 'max_iterations', 60, 'most rounds of a self-calibration', 1, 1000)}
@@ -287,15 +288,19 @@ class CalibrationNode(Node):
             self.get_logger().warning(result.message)
             return False
         try:
-            job = await self._start_job(request, progress, cancel_requested)
+            job, validation, sources = await self._start_job(request, progress, cancel_requested)
             calibrations = {n: replace(c, seconds=job.seconds) for n, c in job.calibrations.items()}
             for calibration in calibrations.values():
                 save_calibration(self._directory, calibration)
+            write_sources(self._directory, *sources)
+            if validation is not None:
+                write_validation(self._directory, validation)
             self._publish(calibrations)
             _fill_result(result, job, calibrations)
             for sentence in job.left_out:
                 self.get_logger().warning(f'not used: {sentence}')
             self.get_logger().info(result.message)
+            self._tell_verdict(result, validation)
         except Cancelled:
             result.message = 'cancelled, nothing was changed'
             self.get_logger().info(result.message)
@@ -311,9 +316,14 @@ class CalibrationNode(Node):
         return False
 
     def _start_job(self, request, progress, cancel_requested):
-        """Start a calibration; returns the Future of its JobResult. Raises DataError and ValueError."""
+        """Start a calibration; returns the Future of JobResult, Validation or None, and what it is made of.
+
+        Raises DataError and ValueError.
+        """
         frames = self._collector.frames(list(request.fluoroscopes))
-        options, done = self._options_of(request), Future()
+        sources = (frames, self._phantom, self._options_of(request), self._joint and len(frames) > 1,
+                   request.principal_distance or None)
+        done = Future()
 
         def on_round(label, this):
             for name in label.split('+'):
@@ -326,8 +336,7 @@ class CalibrationNode(Node):
 
         def wait():
             try:
-                done.set_result(calibrate_beside(frames, self._phantom, options, self._joint and len(frames) > 1,
-                                                 request.principal_distance or None, on_round, check))
+                done.set_result((*calibrate_beside(*sources, on_round, check, request.validate), sources))
             except Exception as error:
                 done.set_exception(error)
             if self.executor is not None:
@@ -342,6 +351,15 @@ class CalibrationNode(Node):
         if request.principal_distance < 0 or not np.isfinite(request.principal_distance):
             raise ValueError(f'principal_distance is a length in pixels, not {request.principal_distance}')
         return Options(**{name: getattr(request, name) or default for name, default in self._defaults.items()})
+
+    def _tell_verdict(self, result, validation):
+        """Fill in and log the verdict on a calibration, where one was asked for."""
+        if validation is not None:
+            result.verdict, result.findings = validation.verdict, list(validation.findings)
+            result.message += f'; verdict: {validation.verdict}'
+            self.get_logger().info(f'verdict: {validation.verdict} ({validation.seconds:.1f} s)')
+            for sentence in validation.findings:
+                self.get_logger().warning(sentence)
 
     def _publish(self, calibrations):
         """Take calibrations over and publish them."""

@@ -9,6 +9,7 @@ from sensor_msgs.msg import CameraInfo
 
 from ..calibration import result as calibration_result
 from ..distortion.models import CorrectionModel
+from ..distortion.series import SD_GRID, packed, unpacked
 from ..photogrammetry.observations import DataError
 
 
@@ -68,6 +69,9 @@ def message_from_calibration(calibration):
     message.train_u, message.train_v = doubles(model.train_uv[:, 0]), doubles(model.train_uv[:, 1])
     message.train_du, message.train_dv = doubles(model.train_duv[:, 0]), doubles(model.train_duv[:, 1])
     message.train_exposure = unsigned(calibration.train_exposure)
+    message.series_degree, message.series_modes, coefficients, sd = packed(model.series)
+    message.series_u, message.series_v = doubles(coefficients[0]), doubles(coefficients[1])
+    message.series_sd = doubles(sd)
     message.rmse_before_u, message.rmse_before_v = (float(x) for x in calibration.rmse_before)
     message.rmse_after_u, message.rmse_after_v = (float(x) for x in calibration.rmse_after)
     for name in SAME_NAME:
@@ -91,7 +95,8 @@ def calibration_from_message(message):
         raise DataError(f'{where}: its training points have different numbers of coordinates and corrections')
     try:
         model = CorrectionModel(message.model_kind, message.k, np.stack(train[:2], axis=1),
-                                np.stack(train[2:], axis=1), message.model_noise, message.model_bias)
+                                np.stack(train[2:], axis=1), message.model_noise, message.model_bias,
+                                _series_of(message))
     except ValueError as error:
         raise DataError(f'{where}: {error}') from None
     calibration = calibration_result.FluoroscopeCalibration(
@@ -106,6 +111,16 @@ def calibration_from_message(message):
     if calibration.calibration_id != message.calibration_id:
         raise DataError(f'{where}: its content does not belong to its id {message.calibration_id}')
     return calibration
+
+
+def _series_of(message):
+    """Series of a FluoroscopeCalibration message, None where it has none. Raises ValueError."""
+    if len(message.series_u) != len(message.series_v):
+        raise ValueError('its series has different numbers of coefficients in u and in v')
+    sd = np.array(message.series_sd)
+    sd = sd.reshape(SD_GRID, SD_GRID) if len(sd) == SD_GRID ** 2 else sd[None]
+    return unpacked((message.image_width, message.image_height), message.series_degree, message.series_modes,
+                    np.array([message.series_u, message.series_v]), sd)
 
 
 def camera_info(calibration, stamp):

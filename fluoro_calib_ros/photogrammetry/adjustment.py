@@ -1,7 +1,7 @@
 """Robust bundle adjustment of one or more fluoroscopes that look at one phantom.
 
 Maximum likelihood of the image points (Student-t, Huber or Gaussian) and of the surveyed coordinates
-(Gaussian, they fix the datum) by Levenberg-Marquardt with Nielsen's damping (Madsen, Nielsen and Tingleff,
+(Gaussian, they fix the datum, unless inner constraints do) by Levenberg-Marquardt with Nielsen's damping (Madsen, Nielsen and Tingleff,
 "Methods for non-linear least squares problems", DTU 2004), iteratively reweighted. Each step solves the
 normal equations by the Schur complement (Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000),
 eliminating object points or exposures, whichever leaves the smaller system.
@@ -12,8 +12,10 @@ from functools import cached_property
 
 import numpy as np
 
+from .datum import DEFECT, in_datum
 from .noise import Noise
 from .normal import bordered_blocks, damped_step, eliminates_points, normal_equations, projected
+from .relative import UNKNOWNS, discrepancies, moved_along
 from .rotations import matrix_from_vector
 
 # No target is measured better than this; where there is hardly any redundancy the scale could vanish.
@@ -28,7 +30,10 @@ class Network:
     and point (N,): row of the exposure and of the object point, each pair at most once;
     fluoroscope (m,) of each exposure; survey_mm (n, 3) and survey_sd_mm (n,) of the object points;
     interior_free (F,): whether the interior orientation of a fluoroscope is estimated; additional (F): Additional
-    parameters of each, or None.
+    parameters of each, or None; relative: a Relative constraint for every pair of fluoroscopes that has one, the
+    first of the pair the same in all; interior_mean and interior_sd (F, 3): what is known of the interior orientations
+    beforehand [px], sd infinite for nothing; datum 'survey', or 'inner': the surveyed coordinates weigh nothing and
+    inner constraints over the object points give the datum.
     """
 
     uv: np.ndarray
@@ -40,6 +45,10 @@ class Network:
     survey_sd_mm: np.ndarray
     interior_free: np.ndarray
     additional: tuple = ()
+    relative: tuple = ()
+    interior_mean: np.ndarray | None = None
+    interior_sd: np.ndarray | None = None
+    datum: str = 'survey'
 
     @property
     def shape(self):
@@ -48,21 +57,52 @@ class Network:
 
     @property
     def unknowns(self):
-        """Number of unknowns."""
-        return 6 * len(self.fluoroscope) + self.survey_mm.size + int(np.sum(self.global_free))
+        """Number of unknowns, less those that the datum of a free network fixes."""
+        every = 6 * len(self.fluoroscope) + self.survey_mm.size + int(np.sum(self.global_free))
+        return every - (DEFECT if self.datum == 'inner' else 0)
+
+    @property
+    def observations(self):
+        """Number of observations, priors not counted."""
+        survey = self.survey_mm.size if self.datum == 'survey' else 0
+        return 2 * len(self.uv) + survey + UNKNOWNS * sum(len(r.pairs) for r in self.relative)
+
+    @cached_property
+    def relative_columns(self):
+        """Columns of the relative orientations among the global unknowns."""
+        first = 3 * len(self.interior_free)
+        return tuple(slice(first + UNKNOWNS * i, first + UNKNOWNS * (i + 1)) for i in range(len(self.relative)))
 
     @cached_property
     def additional_columns(self):
         """Columns of the additional parameters of each fluoroscope among the global unknowns."""
         counts = [0 if a is None else a.count for a in self.additional]
-        ends = 3 * len(self.interior_free) + np.cumsum(counts, dtype=int)
+        ends = 3 * len(self.interior_free) + UNKNOWNS * len(self.relative) + np.cumsum(counts, dtype=int)
         return tuple(slice(int(end - count), int(end)) for end, count in zip(ends, counts))
 
     @cached_property
     def global_free(self):
-        """True (G,) for the global unknowns that are estimated: interior orientations, then additional parameters."""
-        count = sum(a.count for a in self.additional if a is not None)
+        """True (G,) for the global unknowns that are estimated: interior orientations, relative orientations, then
+        additional parameters."""
+        count = sum(a.count for a in self.additional if a is not None) + UNKNOWNS * len(self.relative)
         return np.concatenate([np.repeat(np.asarray(self.interior_free, dtype=bool), 3), np.ones(count, dtype=bool)])
+
+    @cached_property
+    def interior_weight(self):
+        """Weights (F, 3) [1/px^2] of the interior orientations known beforehand."""
+        if self.interior_sd is None:
+            return np.zeros((len(self.interior_free), 3))
+        return 1 / np.asarray(self.interior_sd, dtype=float) ** 2
+
+    @cached_property
+    def cells(self):
+        """Cell (m,) of every exposure, place (m,) in it and places of a cell: exposures that a constraint couples
+        share a cell, so that their part of the normal matrix is block-diagonal."""
+        head, place = np.arange(len(self.fluoroscope)), np.zeros(len(self.fluoroscope), dtype=int)
+        for number, constraint in enumerate(self.relative):
+            a, b = constraint.pairs.T
+            head[b], place[b] = a, number + 1
+        return np.unique(head, return_inverse=True)[1], place, len(self.relative) + 1
 
     @cached_property
     def by_point(self):
@@ -90,13 +130,15 @@ class Network:
 @dataclass(frozen=True)
 class Parameters:
     """Values of the unknowns: interior (F, 3) xp, yp, c [px]; rotation (m, 3, 3); position_mm (m, 3);
-    points_mm (n, 3); additional: coefficients (p,) of the additional parameters by fluoroscope."""
+    points_mm (n, 3); additional: coefficients (p,) of the additional parameters by fluoroscope; relative: a
+    RelativePose for each constraint of the network."""
 
     interior: np.ndarray
     rotation: np.ndarray
     position_mm: np.ndarray
     points_mm: np.ndarray
     additional: tuple = ()
+    relative: tuple = ()
 
     def per_image_point(self, network):
         """Rotation, position, point and interior orientation of every image point."""
@@ -134,11 +176,17 @@ def residuals_and_q(network, parameters, correction, noise):
 
 
 def total_cost(network, parameters, q, noise):
-    """F: negative log-likelihood of image points and surveyed coordinates; infinite behind the source."""
-    survey = np.sum(((parameters.points_mm - network.survey_mm) / network.survey_sd_mm[:, None]) ** 2) / 2
-    prior = sum(a @ additional.prior @ a / 2 for additional, a in zip(network.additional, parameters.additional)
-                if additional is not None)
-    value = noise.cost(q, network.sigma) + survey + prior
+    """F: negative log-likelihood of image points, surveyed coordinates, constraints and priors; infinite behind the
+    source. Constants of what is Gaussian are left out."""
+    square = sum(a @ additional.prior @ a for additional, a in zip(network.additional, parameters.additional)
+                 if additional is not None)
+    if network.datum == 'survey':
+        square += np.sum(((parameters.points_mm - network.survey_mm) / network.survey_sd_mm[:, None]) ** 2)
+    if network.interior_sd is not None:
+        square += np.sum(network.interior_weight * (parameters.interior - network.interior_mean) ** 2)
+    for constraint, pose in zip(network.relative, parameters.relative):
+        square += np.sum(discrepancies(constraint, pose, parameters) ** 2 @ constraint.weights)
+    value = noise.cost(q, network.sigma) + square / 2
     return value if np.isfinite(value) else np.inf
 
 
@@ -148,14 +196,17 @@ def _moved(network, parameters, x_b, x_r):
     if eliminates_points(network):
         d_p, d_e, rest = x_b, x_r[:6 * m].reshape(m, 6), x_r[6 * m:]
     else:
-        d_p, d_e, rest = x_r[:3 * n].reshape(n, 3), x_b, x_r[3 * n:]
+        cell, place, places = network.cells
+        d_p, d_e, rest = x_r[:3 * n].reshape(n, 3), x_b.reshape(-1, places, 6)[cell, place], x_r[3 * n:]
     step = np.zeros(len(network.global_free))
     step[network.global_free] = rest
     additional = tuple(a if network.additional[f] is None else a + step[network.additional_columns[f]]
                        for f, a in enumerate(parameters.additional))
-    return Parameters(parameters.interior + step[:3 * n_fluoro].reshape(-1, 3),
-                      matrix_from_vector(d_e[:, 3:]) @ parameters.rotation,
-                      parameters.position_mm + d_e[:, :3], parameters.points_mm + d_p, additional)
+    relative = tuple(pose.moved(step[columns]) for pose, columns in zip(parameters.relative, network.relative_columns))
+    moved = Parameters(parameters.interior + step[:3 * n_fluoro].reshape(-1, 3),
+                       matrix_from_vector(d_e[:, 3:]) @ parameters.rotation,
+                       parameters.position_mm + d_e[:, :3], parameters.points_mm + d_p, additional, relative)
+    return moved_along(network, parameters, moved, d_e, step)
 
 
 def adjust(network, start, correction=None, noise=Noise(), redundancy=None, tolerance=1e-8, max_steps=100,
@@ -169,7 +220,7 @@ def adjust(network, start, correction=None, noise=Noise(), redundancy=None, tole
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
     if redundancy is None:
-        redundancy = max(0.1, 1 - network.unknowns / (2 * len(network.uv) + network.survey_mm.size))
+        redundancy = max(0.1, 1 - network.unknowns / network.observations)
 
     def renewed(noise, q):
         return (noise, q) if noise_held else _renewed(network, noise, q, redundancy)
@@ -204,7 +255,7 @@ def adjust(network, start, correction=None, noise=Noise(), redundancy=None, tole
         if predicted <= tolerance and abs(noise.scale - last_scale) <= 1e-4 * last_scale:
             converged = True
             break
-    return Adjustment(parameters, r, q, noise, float(cost), step, converged)
+    return Adjustment(in_datum(network, parameters), r, q, noise, float(cost), step, converged)
 
 
 class _Damping:

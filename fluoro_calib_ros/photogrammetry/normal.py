@@ -1,14 +1,18 @@
 """Normal equations of a bundle adjustment and their solution by the Schur complement.
 
 Triggs, McLauchlan, Hartley and Fitzgibbon, "Bundle Adjustment - A Modern Synthesis", 2000, section 6. Object
-points or exposures are eliminated, whichever leaves the smaller system. Interior orientations and
-additional parameters, which touch everything, come last.
+points or exposures are eliminated, whichever leaves the smaller system; exposures that a relative orientation couples
+are eliminated together. Interior orientations, relative orientations and additional parameters, which touch
+everything, come last.
 """
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import blas, cho_factor, cho_solve
+
+from .datum import Gauge, gauge_of, held_directions
+from .relative import discrepancies_with_jacobian
 
 CHUNK = 8_000   # image points linearised at once: what belongs to them stays in the cache
 
@@ -17,9 +21,10 @@ CHUNK = 8_000   # image points linearised at once: what belongs to them stays in
 class NormalEquations:
     """Blocks of the normal matrix and of its right side.
 
-    Exposures ee (m, 6, 6), points pp (n, 3, 3) and global unknowns gg (G, G): interior orientations (3F), then
-    the additional parameters of each fluoroscope; mixed eg (m, 6, G), pg (n, 3, G) and pe (N, 3, 6); right sides
-    e, p and g.
+    Exposures ee (m, 6, 6), points pp (n, 3, 3) and global unknowns gg (G, G): interior orientations (3F), relative
+    orientations, then the additional parameters of each fluoroscope; mixed eg (m, 6, G), pg (n, 3, G) and pe
+    (N, 3, 6); right sides e, p and g. coupled: ((k, 2), (k, 6, 6)) pairs of exposures and their mixed blocks; gauge:
+    the directions that a free network leaves open, None where there are none.
     """
 
     ee: np.ndarray
@@ -31,6 +36,8 @@ class NormalEquations:
     e: np.ndarray
     p: np.ndarray
     g: np.ndarray
+    coupled: tuple = ()
+    gauge: Gauge | None = None
 
 
 def _by_component(values, index=None):
@@ -151,10 +158,24 @@ def normal_equations(network, parameters, correction, noise, image_factor=1.0):
     turn[:, :3, :3] = parameters.rotation
     by_exposure = turn.transpose(0, 2, 1) @ by_exposure @ turn
 
-    survey = 1 / network.survey_sd_mm ** 2
+    survey = 1 / network.survey_sd_mm ** 2 if network.datum == 'survey' else np.zeros(n)
     both = by_point[:, :9].sum(axis=0)
     pp = both[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(n, 3, 3) + survey[:, None, None] * np.eye(3)
     p = both[6:].T + survey[:, None] * (network.survey_mm - parameters.points_mm)
+    ee, e = by_exposure[:, :6, :6], by_exposure[:, :6, 9]
+    gg, eg, pg, g = _global_blocks(network, parameters, by_exposure, by_point)
+    coupled = _add_relative(network, parameters, (ee, eg, gg, e, g))
+    if kept:
+        root = np.concatenate([lin.root for lin in kept])
+        weighted = [np.concatenate(parts) for parts in zip(*(lin.by_image_point() for lin in kept))]
+        _add_additional(network, parameters, root, weighted, (gg, eg, pg, g))
+    return NormalEquations(ee, pp, gg, eg, pg, pe.reshape(-1, 3, 6), e, p, g, coupled, gauge_of(network, parameters))
+
+
+def _global_blocks(network, parameters, by_exposure, by_point):
+    """Blocks gg, eg, pg and right side g with the interior orientations filled in, from the sums by exposure
+    (m, 10, 10) and by fluoroscope and point (F, 18, n)."""
+    _, m, n, n_fluoro = network.shape
     size = len(network.global_free)
     gg, g = np.zeros((size, size)), np.zeros(size)
     eg, pg = np.zeros((m, 6, size)), np.zeros((n, 3, size))
@@ -162,11 +183,30 @@ def normal_equations(network, parameters, correction, noise, image_factor=1.0):
         cols, mine = slice(3 * f, 3 * f + 3), network.fluoroscope == f
         gg[cols, cols], g[cols] = by_exposure[mine, 6:9, 6:9].sum(axis=0), by_exposure[mine, 6:9, 9].sum(axis=0)
         eg[mine, :, cols], pg[:, :, cols] = by_exposure[mine, :6, 6:9], by_point[f, 9:].T.reshape(n, 3, 3)
-    if kept:
-        root = np.concatenate([lin.root for lin in kept])
-        weighted = [np.concatenate(parts) for parts in zip(*(lin.by_image_point() for lin in kept))]
-        _add_additional(network, parameters, root, weighted, (gg, eg, pg, g))
-    return NormalEquations(by_exposure[:, :6, :6], pp, gg, eg, pg, pe.reshape(-1, 3, 6), by_exposure[:, :6, 9], p, g)
+    if network.interior_sd is not None:
+        diagonal, weight = np.arange(3 * n_fluoro), network.interior_weight
+        gg[diagonal, diagonal] += weight.ravel()
+        g[diagonal] += (weight * (network.interior_mean - parameters.interior)).ravel()
+    return gg, eg, pg, g
+
+
+def _add_relative(network, parameters, blocks):
+    """Add the relative orientation constraints to ee, eg, gg, e and g; returns pairs (k, 2) and mixed blocks (k, 6, 6)."""
+    ee, eg, gg, e, g = blocks
+    pairs, mixed = [np.zeros((0, 2), dtype=int)], [np.zeros((0, 6, 6))]
+    for constraint, pose, cols in zip(network.relative, parameters.relative, network.relative_columns):
+        off, d_a, d_b, d_pose = discrepancies_with_jacobian(constraint, pose, parameters)
+        (a, b), w = constraint.pairs.T, constraint.weights[:, None]
+        for rows, d in ((a, d_a), (b, d_b)):
+            back = d.transpose(0, 2, 1)
+            ee[rows] += back @ (w * d)
+            eg[rows, :, cols] += back @ (w * d_pose)
+            e[rows] -= (back @ (w * off[:, :, None]))[..., 0]
+        gg[cols, cols] += np.einsum('kia,i,kib->ab', d_pose, w[:, 0], d_pose)
+        g[cols] -= np.einsum('kia,i,ki->a', d_pose, w[:, 0], off)
+        pairs.append(constraint.pairs)
+        mixed.append(d_a.transpose(0, 2, 1) @ (w * d_b))
+    return np.concatenate(pairs), np.concatenate(mixed)
 
 
 def _add_additional(network, parameters, root, weighted, blocks):
@@ -197,7 +237,8 @@ def bordered_blocks(network, equations):
     """The normal equations as a block-diagonal part and the rest.
 
     Returns bb (k, b, b), br (k, b, q), rr (q, q), right sides (k, b) and (q,). The rest ends with the
-    global unknowns, of which only the free ones are kept.
+    global unknowns, of which only the free ones are kept. The directions that a free network leaves open are held
+    in the rest.
     """
     _, m, n, _ = network.shape
     free = network.global_free
@@ -207,10 +248,8 @@ def bordered_blocks(network, equations):
         br[:, :, 6 * m:] = equations.pg[:, :, free]
         bb, b, rest, rest_g, r = equations.pp, equations.p, equations.ee, equations.eg, equations.e
     else:
-        br = np.zeros((m, 6, 3 * n + int(free.sum())))
-        br[:, :, :3 * n].reshape(m, 6, n, 3)[network.exposure, :, network.point, :] = equations.pe.transpose(0, 2, 1)
-        br[:, :, 3 * n:] = equations.eg[:, :, free]
-        bb, b, rest, rest_g, r = equations.ee, equations.e, equations.pp, equations.pg, equations.p
+        bb, br, b = _by_cell(network, equations)
+        rest, rest_g, r = equations.pp, equations.pg, equations.p
     count, size = rest.shape[:2]
     rr = np.zeros((br.shape[2], br.shape[2]))
     diagonal = np.arange(count * size).reshape(count, size)
@@ -218,7 +257,41 @@ def bordered_blocks(network, equations):
     rr[:count * size, count * size:] = rest_g.reshape(count * size, -1)[:, free]
     rr[count * size:, :count * size] = rr[:count * size, count * size:].T
     rr[count * size:, count * size:] = equations.gg[np.ix_(free, free)]
+    if eliminates_points(network) and len(network.relative):
+        (one, other), mixed = equations.coupled[0].T, equations.coupled[1]
+        rr[diagonal[one][:, :, None], diagonal[other][:, None, :]] = mixed
+        rr[diagonal[other][:, :, None], diagonal[one][:, None, :]] = mixed.transpose(0, 2, 1)
+    if equations.gauge is not None:
+        gauge, part = equations.gauge, slice(0, count * size)
+        held = held_directions((gauge.e if eliminates_points(network) else gauge.p).reshape(count * size, -1),
+                               np.diagonal(rr)[part])
+        rr[part, part] += held @ held.T
     return bb, br, rr, b, np.concatenate([r.ravel(), equations.g[free]])
+
+
+def _by_cell(network, equations):
+    """bb (k, b, b), br (k, b, q) and right side (k, b) of the exposures, those that are coupled side by side.
+
+    A place that no exposure takes has a one in the diagonal and zeros elsewhere.
+    """
+    _, m, n, _ = network.shape
+    free = network.global_free
+    cell, place, places = network.cells
+    count = int(cell.max()) + 1
+    br = np.zeros((count, places, 6, 3 * n + int(free.sum())))
+    br[..., :3 * n].reshape(count, places, 6, n, 3)[
+        cell[network.exposure], place[network.exposure], :, network.point, :] = equations.pe.transpose(0, 2, 1)
+    br[cell, place, :, 3 * n:] = equations.eg[:, :, free]
+    bb, b = np.zeros((count, places, 6, places, 6)), np.zeros((count, places, 6))
+    diagonal = np.einsum('kiaia->kia', bb)   # a view
+    diagonal[...] = 1
+    bb[cell, place, :, place, :], b[cell, place] = equations.ee, equations.e
+    if len(network.relative):
+        (one, other), mixed = equations.coupled[0].T, equations.coupled[1]
+        bb[cell[one], place[one], :, place[other], :] = mixed
+        bb[cell[one], place[other], :, place[one], :] = mixed.transpose(0, 2, 1)
+    width = 6 * places
+    return bb.reshape(count, width, width), br.reshape(count, width, -1), b.reshape(count, width)
 
 
 def reduce_blocks(bb, br, rr, overwrite=False):

@@ -10,8 +10,10 @@ import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
 from .collinearity import project_with_jacobian
+from .datum import Gauge, STransformation
 from .noise import Noise
 from .normal import bordered_blocks, eliminates_points, normal_equations, reduce_blocks
+from .relative import UNKNOWNS, discrepancies_with_jacobian
 
 SMALLEST_WEIGHT = 1e-9   # of a gross error
 CHUNK = 5_000   # image points handled at once, to bound the memory
@@ -24,7 +26,10 @@ class Precision:
     interior (F, 3, 3) [px^2], zeros where held; exterior (m, 6, 6) of T [mm] and w [rad]; points (n, 3, 3)
     [mm^2]; residual (N, 2, 2) [px^2]; redundancy (N, 2) of the image coordinates and survey_redundancy
     (n, 3) of the surveyed ones: together their sum is the number of observations less that of the unknowns, where
-    no prior adds to them; additional: (p, p) of the additional parameters by fluoroscope, None where there are none.
+    no prior adds to them; additional: (p, p) of the additional parameters by fluoroscope, None where there are none;
+    relative: (6, 6) of every relative orientation, translation [mm] and rotation [rad], that is constrained, and
+    relative_redundancy (k, 6) of its pairs; all_global (G, G) of the global unknowns and exterior_global (m, 6, G) of
+    the exposures with them.
     """
 
     interior: np.ndarray
@@ -34,12 +39,17 @@ class Precision:
     redundancy: np.ndarray
     survey_redundancy: np.ndarray
     additional: tuple = ()
+    relative: tuple = ()
+    relative_redundancy: tuple = ()
+    all_global: np.ndarray | None = None
+    exterior_global: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
 class CovarianceBlocks:
     """Blocks of the inverse normal matrix: ee (m, 6, 6), pp (n, 3, 3), gg (G, G), eg (m, 6, G), pg (n, 3, G), zeros where
-    a global unknown is held; pe(e, p): blocks (k, 3, 6) of points p (k,) with exposures e (k,)."""
+    a global unknown is held; pe(e, p): blocks (k, 3, 6) of points p (k,) with exposures e (k,); between(e, f): blocks
+    (k, 6, 6) of exposures e (k,) with others f (k,)."""
 
     ee: np.ndarray
     pp: np.ndarray
@@ -47,27 +57,30 @@ class CovarianceBlocks:
     eg: np.ndarray
     pg: np.ndarray
     pe: object
+    between: object
 
 
 @dataclass(frozen=True)
 class Solved:
     """A normal matrix after the elimination: inverse Cholesky factors (k, b, b) of the block-diagonal part, H (k b, q)
-    as in reduce_blocks, and the lower Cholesky factor (q, q) of the Schur complement."""
+    as in reduce_blocks, and the lower Cholesky factor (q, q) of the Schur complement; gauge: the directions that the
+    network leaves open, None where there are none."""
 
     inverse: np.ndarray
     h: np.ndarray
     factor: np.ndarray
+    gauge: Gauge | None = None
 
 
 def solved(network, equations):
     """Solved normal equations. Raises numpy.linalg.LinAlgError where the matrix is singular."""
     bb, br, rr, _, _ = bordered_blocks(network, equations)
     inverse, h, schur = reduce_blocks(bb, br, rr)
-    return Solved(inverse, h, cho_factor(schur, lower=True, overwrite_a=True)[0])
+    return Solved(inverse, h, cho_factor(schur, lower=True, overwrite_a=True)[0], equations.gauge)
 
 
 def covariance_blocks(network, matrix):
-    """CovarianceBlocks of a Solved normal matrix."""
+    """CovarianceBlocks of a Solved normal matrix, those of a free network in its datum."""
     _, m, n, _ = network.shape
     k, size = matrix.inverse.shape[:2]
     q = len(matrix.factor)
@@ -75,22 +88,89 @@ def covariance_blocks(network, matrix):
     back = matrix.inverse.transpose(0, 2, 1)
     g = back @ matrix.h.reshape(k, size, q)
     c_br = -(g.reshape(-1, q) @ c_rr).reshape(k, size, q)
-    c_bb = back @ matrix.inverse - c_br @ g.transpose(0, 2, 1)
+    own = back @ matrix.inverse
+    c_bb = own - c_br @ g.transpose(0, 2, 1)
 
     points = eliminates_points(network)
     cells, width = (m, 6) if points else (n, 3)
     rest = np.arange(cells * width).reshape(cells, width)
     c_rest = c_rr[rest[:, :, None], rest[:, None, :]]
+    if not points:
+        between = _between_eliminated(network, own, c_br, g)
+        c_bb, c_br = _of_exposures(network, c_bb, c_br)
     free, count = network.global_free, len(network.global_free)
-    c_gg, c_rest_g, c_b_g = np.zeros((count, count)), np.zeros((cells, width, count)), np.zeros((k, size, count))
+    c_gg, c_rest_g = np.zeros((count, count)), np.zeros((cells, width, count))
+    c_b_g = np.zeros(c_br.shape[:2] + (count,))
     c_gg[np.ix_(free, free)] = c_rr[cells * width:, cells * width:]
     c_rest_g[:, :, free] = c_rr[:cells * width, cells * width:].reshape(cells, width, -1)
     c_b_g[:, :, free] = c_br[:, :, cells * width:]
-    c_pairs = c_br[:, :, :cells * width].reshape(k, size, cells, width)
+    c_pairs = c_br[:, :, :cells * width].reshape(c_br.shape[:2] + (cells, width))
     if points:
-        return CovarianceBlocks(c_rest, c_bb, c_gg, c_rest_g, c_b_g, lambda e, p: c_pairs[p, :, e, :])
-    return CovarianceBlocks(c_bb, c_rest, c_gg, c_b_g, c_rest_g,
-                            lambda e, p: c_pairs[e, :, p, :].transpose(0, 2, 1))
+        blocks = CovarianceBlocks(c_rest, c_bb, c_gg, c_rest_g, c_b_g, lambda e, p: c_pairs[p, :, e, :],
+                                  lambda e, f: c_rr[rest[e][:, :, None], rest[f][:, None, :]])
+    else:
+        blocks = CovarianceBlocks(c_bb, c_rest, c_gg, c_b_g, c_rest_g,
+                                  lambda e, p: c_pairs[e, :, p, :].transpose(0, 2, 1), between)
+    return blocks if matrix.gauge is None else _in_datum(network, matrix, blocks)
+
+
+def _of_exposures(network, c_bb, c_br):
+    """Blocks (m, 6, 6) and (m, 6, q) of the exposures, of those of their cells."""
+    cell, place, places = network.cells
+    k, size, q = c_br.shape
+    return (c_bb.reshape(k, places, 6, places, 6)[cell, place, :, place, :],
+            c_br.reshape(k, places, 6, q)[cell, place])
+
+
+def _between_eliminated(network, own, c_br, g):
+    """Function of exposures e (k,) and f (k,) for their mixed covariances (k, 6, 6)."""
+    cell, place, places = network.cells
+    k, size, q = c_br.shape
+    own = own.reshape(k, places, 6, places, 6)
+    c_br, g = (a.reshape(k, places, 6, q) for a in (c_br, g))
+
+    def between(e, f):
+        same = (cell[e] == cell[f])[:, None, None]
+        return (np.where(same, own[cell[e], place[e], :, place[f], :], 0.0)
+                - c_br[cell[e], place[e]] @ g[cell[f], place[f]].transpose(0, 2, 1))
+    return between
+
+
+def _in_datum(network, matrix, blocks):
+    """CovarianceBlocks of a free network, of those with other directions held, in its datum."""
+    gauge = matrix.gauge
+    s = STransformation(gauge, *_covariance_times(network, matrix, gauge.constraint))
+
+    def rows(pair, index):
+        return pair[0][index], pair[1][index]
+    free = network.global_free
+    return CovarianceBlocks(
+        s.block(blocks.ee, s.e, s.e), s.block(blocks.pp, s.p, s.p), s.block(blocks.gg, s.g, s.g) * np.outer(free, free),
+        s.block(blocks.eg, s.e, s.g) * free, s.block(blocks.pg, s.p, s.g) * free,
+        lambda e, p: s.block(blocks.pe(e, p), rows(s.p, p), rows(s.e, e)),
+        lambda e, f: s.block(blocks.between(e, f), rows(s.e, e), rows(s.e, f)))
+
+
+def _covariance_times(network, matrix, of_points):
+    """Products of the inverse of a Solved matrix with columns that are of_points (n, 3, d), zero for other unknowns:
+    exposures (m, 6, d), points (n, 3, d) and global unknowns (G, d)."""
+    _, m, n, _ = network.shape
+    k, size = matrix.inverse.shape[:2]
+    d, q = of_points.shape[2], len(matrix.factor)
+    points = eliminates_points(network)
+    half, right = np.zeros((k * size, d)), np.zeros((q, d))
+    if points:
+        half = (matrix.inverse @ of_points).reshape(-1, d)
+    else:
+        right[:3 * n] = of_points.reshape(-1, d)
+    x_r = cho_solve((matrix.factor, True), right - matrix.h.T @ half)
+    x_b = matrix.inverse.transpose(0, 2, 1) @ (half - matrix.h @ x_r).reshape(k, size, d)
+    x_g = np.zeros((len(network.global_free), d))
+    x_g[network.global_free] = x_r[6 * m if points else 3 * n:]
+    if points:
+        return x_r[:6 * m].reshape(m, 6, d), x_b, x_g
+    cell, place, places = network.cells
+    return x_b.reshape(-1, places, 6, d)[cell, place], x_r[:3 * n].reshape(n, 3, d), x_g
 
 
 def information_of_additional(network, matrix, f):
@@ -98,11 +178,11 @@ def information_of_additional(network, matrix, f):
 
     In a Cholesky factor the last rows are the factor of their Schur complement.
     """
-    first = len(matrix.factor) - int(np.sum(network.global_free[3 * network.shape[3]:]))
+    offset = 3 * network.shape[3] + UNKNOWNS * len(network.relative)
+    first = len(matrix.factor) - int(np.sum(network.global_free[offset:]))
     factor = np.tril(matrix.factor[first:, first:])
     everything = factor @ factor.T
     columns = network.additional_columns[f]
-    offset = 3 * network.shape[3]
     own = np.arange(columns.start, columns.stop) - offset
     rest = np.setdiff1d(np.arange(len(everything)), own)
     out = everything[np.ix_(own, own)]
@@ -162,7 +242,9 @@ def precision(network, adjustment, correction=None):
     residual = residual_covariance(network, adjustment, weighted, projected)
     variance = _variance(network, adjustment)
     redundancy = 1 - np.diagonal(projected, axis1=1, axis2=2) / variance[:, None]
-    survey = 1 - np.diagonal(weighted.pp, axis1=1, axis2=2) / network.survey_sd_mm[:, None] ** 2
+    survey = np.zeros_like(network.survey_mm)
+    if network.datum == 'survey':
+        survey = 1 - np.diagonal(weighted.pp, axis1=1, axis2=2) / network.survey_sd_mm[:, None] ** 2
 
     factor = noise.information_factor(adjustment.q)
     honest = weighted if factor == 1.0 else covariance_blocks(
@@ -170,7 +252,25 @@ def precision(network, adjustment, correction=None):
     interior = np.stack([honest.gg[3 * f:3 * f + 3, 3 * f:3 * f + 3] for f in range(network.shape[3])])
     additional = tuple(None if a is None else honest.gg[columns, columns]
                        for a, columns in zip(network.additional, network.additional_columns))
-    return Precision(interior, honest.ee, honest.pp, residual, redundancy, survey, additional)
+    relative = tuple(honest.gg[columns, columns] for columns in network.relative_columns)
+    return Precision(interior, honest.ee, honest.pp, residual, redundancy, survey, additional, relative,
+                     _relative_redundancy(network, parameters, weighted), honest.gg, honest.eg)
+
+
+def _relative_redundancy(network, parameters, blocks):
+    """Redundancy numbers (k, 6) of the pairs of every relative orientation constraint."""
+    out = []
+    for constraint, pose, cols in zip(network.relative, parameters.relative, network.relative_columns):
+        (a, b), (_, d_a, d_b, d_pose) = constraint.pairs.T, discrepancies_with_jacobian(constraint, pose, parameters)
+        a_x = np.concatenate([d_a, d_b, d_pose], axis=2)
+        c = np.empty((len(a), 18, 18))
+        c[:, :6, :6], c[:, 6:12, 6:12], c[:, 12:, 12:] = blocks.ee[a], blocks.ee[b], blocks.gg[cols, cols]
+        c[:, :6, 6:12], c[:, :6, 12:], c[:, 6:12, 12:] = (
+            blocks.between(a, b), blocks.eg[a][:, :, cols], blocks.eg[b][:, :, cols])
+        for rows, columns in ((slice(6, 12), slice(0, 6)), (slice(12, 18), slice(0, 12))):
+            c[:, rows, columns] = c[:, columns, rows].transpose(0, 2, 1)
+        out.append(1 - np.einsum('kia,kab,kib->ki', a_x, c, a_x) * constraint.weights)
+    return tuple(out)
 
 
 def _variance(network, adjustment):

@@ -42,7 +42,7 @@ def write_figures(job, directory):
     drawn = {}
     with style.context(['default', STYLE]):   # whatever matplotlibrc says
         for label, run in job.runs.items():
-            drawn.update((name, _png(figure)) for name, figure in _figures_of_run(label, run))
+            drawn.update((name, png_bytes(figure)) for name, figure in _figures_of_run(label, run))
     paths = [os.path.join(directory, name) for name in drawn]
     for path, content in zip(paths, drawn.values()):
         write_bytes(path, content)
@@ -66,7 +66,7 @@ def _figures_of_run(label, run):
                 run.models[name], name, run.measured.image_size[f], bool(network.interior_free[f]))
 
 
-def _figure(width, height, title, layout='constrained'):
+def new_figure(width, height, title, layout='constrained'):
     """An empty figure, width and height in inches."""
     figure = Figure(figsize=(width, height), dpi=DPI, layout=layout)
     figure.suptitle(title)
@@ -77,7 +77,7 @@ def _described(model):
     return 'no correction model' if model.kind == 'none' else f'{model.kind}, k = {model.k}'
 
 
-def _png(figure):
+def png_bytes(figure):
     """Bytes of a figure as PNG, the same for the same figure."""
     buffer = io.BytesIO()
     FigureCanvasAgg(figure).print_png(buffer, metadata={'Software': None})
@@ -107,7 +107,7 @@ def cost_figure(run):
     names = run.measured.fluoroscopes
     kinds = ', '.join(sorted({model.kind for model in run.models.values()}))
     end = 'converged' if run.converged else 'NOT converged'
-    figure = _figure(15, 6, f'{_title_of(names)}: self-calibration with {kinds}, {end} after '
+    figure = new_figure(15, 6, f'{_title_of(names)}: self-calibration with {kinds}, {end} after '
                             f'{len(run.history)} iterations')
     left, middle, right = figure.subplots(1, 3)
     f, g, recorded = relative_costs(run)
@@ -166,7 +166,7 @@ def normalised_residuals(run, rows, redundancy):
 def histogram_figure(run, name, rows, redundancy):
     """Histograms of the normalised residuals of one fluoroscope, with the unit normal."""
     before, after = normalised_residuals(run, rows, redundancy)
-    figure = _figure(13, 6.3, f'Fluoroscope {name}: normalised residuals before and after the calibration '
+    figure = new_figure(13, 6.3, f'Fluoroscope {name}: normalised residuals before and after the calibration '
                               f'({_described(run.models[name])})')
     limit = float(np.clip(2.5 * before.std(), 5, WIDEST_HISTOGRAM))
     edges = np.linspace(-limit, limit, 2 * round(limit / 0.25) + 1)
@@ -196,7 +196,7 @@ def _within(values, limit):
 
 def position_figure(run, name, rows, image_size):
     """Residuals of one fluoroscope over the image: before, after to the same scale, and after to its own."""
-    figure = _figure(15, 8.4, f'Fluoroscope {name}: residuals over the image ({_described(run.models[name])})')
+    figure = new_figure(15, 8.4, f'Fluoroscope {name}: residuals over the image ({_described(run.models[name])})')
     uv = run.measured.network.uv[rows]
     grid = figure.subplots(2, 3)
     for axis in (0, 1):
@@ -235,7 +235,7 @@ def _residual_panel(axes, position, residual, inside, limit, size, colour):
 def distortion_figure(model, name, image_size, interior_estimated):
     """The learned distortion as arrows over its magnitude, and its standard deviation with the training points."""
     width, height = np.asarray(image_size) + np.array([2, 3]) * MARGIN * max(image_size)
-    figure = _figure(15, min(2 + 5.3 * height / width, 15), f'Fluoroscope {name}: learned distortion '
+    figure = new_figure(15, min(2 + 5.3 * height / width, 15), f'Fluoroscope {name}: learned distortion '
                      f'({_described(model)})', 'compressed')
     left, right = figure.subplots(1, 2)
     centres, field = _field_on_grid(model, image_size, FIELD_CELLS)

@@ -44,6 +44,19 @@ def number_in(low, high, kind=float):
     return convert
 
 
+def numbers_of(count):
+    """Type of an argument: count numbers above 0, with commas between."""
+    def convert(text):
+        try:
+            values = tuple(float(part) for part in text.split(','))
+        except ValueError:
+            values = ()
+        if len(values) != count or not all(0 < v < float('inf') for v in values):
+            raise argparse.ArgumentTypeError(f'{text!r} is not {count} numbers above 0 with commas between')
+        return values
+    return convert
+
+
 def make_parser():
     """The command line."""
     parser = argparse.ArgumentParser(prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.')
@@ -108,12 +121,21 @@ def _add_calibrate(sub):
     together = sub.add_mutually_exclusive_group()
     together.add_argument('--joint', action='store_true', help='all fluoroscopes in one adjustment')
     together.add_argument('--separate', action='store_true', help='one after the other (the default)')
-    sub.add_argument('--relative-orientation', choices=('none',), default='none',
-                     help='constraint between the fluoroscopes (default, and only choice so far: none)')
+    sub.add_argument('--relative-orientation', choices=('none', 'soft', 'hard'), default='none',
+                     help='of the fluoroscopes, the same in every exposure: not asked for, within --relative-sd, or '
+                          'exactly; needs --joint (default: none)')
+    sub.add_argument('--relative-sd', type=numbers_of(2), default=(0.5, 2e-4), metavar='MM,RAD',
+                     help='standard deviations of a soft relative orientation (default: 0.5,0.0002)')
+    sub.add_argument('--datum', choices=('survey', 'inner'), default='survey',
+                     help='weighted surveyed coordinates, or a free network (default: survey)')
+    sub.add_argument('--interior-sd', type=numbers_of(3), metavar='XP,YP,C',
+                     help='standard deviations [px] of the start values of the interior orientation: principal point '
+                          'in the middle of the image, and --principal-distance (default: they are not known)')
     _add_loss(sub)
     sub.add_argument('--principal-distance', type=number_in(1, 1e7), metavar='PX',
                      help='start value, or with --interior fixed the held value (default: from the observations)')
-    sub.add_argument('--k', type=number_in(1, 100000, int), help='neighbours of knn, local_linear or hybrid (default: by cross-validation)')
+    sub.add_argument('--k', type=number_in(1, 100000, int),
+                     help='neighbours of knn, local_linear or hybrid (default: by cross-validation)')
     sub.add_argument('--max-iterations', type=number_in(1, 10000, int), default=60, help='most rounds (default: 60)')
     sub.add_argument('--collect', choices=('auto', 'all', 'still'), default='auto',
                      help='exposures of a bag: all frames, or those in which the phantom stands still in a new pose; '
@@ -127,6 +149,10 @@ def main(arguments=None):
     options = parser.parse_args(arguments)
     if getattr(options, 'k', None) and options.model not in OF_NEIGHBOURS:
         parser.error(f'--k is a number of neighbours, it needs --model {", ".join(OF_NEIGHBOURS)}')
+    if getattr(options, 'relative_orientation', 'none') != 'none' and not options.joint:
+        parser.error('--relative-orientation needs --joint: the fluoroscopes in one adjustment')
+    if getattr(options, 'interior_sd', None) and (options.interior == 'fixed' or options.principal_distance is None):
+        parser.error('--interior-sd needs --principal-distance and --interior estimated')
     try:
         options.run(options)
     except (DataError, OSError) as error:
@@ -165,8 +191,9 @@ def calibrate(options):
     from .files.validation import write_sources
     phantom = read_phantom(options.phantom)
     frames = _frames_of(options, options.collect)
-    how = (Options(options.model, options.interior, options.loss, options.k, options.max_iterations), options.joint,
-           options.principal_distance)
+    how = (Options(options.model, options.interior, options.loss, options.k, options.max_iterations,
+                   relative_orientation=options.relative_orientation, relative_sd=options.relative_sd,
+                   datum=options.datum, interior_sd=options.interior_sd), options.joint, options.principal_distance)
     job = run(frames, phantom, *how, _print_round)
     _write_job(options, job)
     write_sources(options.out, frames, phantom, *how)

@@ -151,7 +151,7 @@ def test_the_fitted_correction_has_no_part_in_the_gauge(model):
     """While the interior orientation is estimated: neither a shift nor a scale nor a turn is left in it."""
     run = rigs.calibrated(model=model).runs['a']
     uv, core = run.measured.network.uv, run.trained
-    whole = model in ('auto', 'hybrid', 'parametric')   # with all image points, about the interior orientation a round before
+    whole = model in ('auto', 'hybrid', 'parametric')   # with all image points, about a round before
     core = np.ones_like(core) if whole else core
     for fitted in (run.correction, run.models['a'].predict(uv)):
         part = gauge_coefficients(uv[core], fitted[core], run.after.parameters.interior[0])
@@ -217,7 +217,8 @@ def test_check_stops_a_calibration_at_once(when):
     assert calls[-1] == len(told) == (when == 'second round') and not any(calls[:-1])
 
 
-@pytest.mark.parametrize('options', [{'loss': 'huber'}, {'loss': 'gaussian'}, {'model': 'local_linear', 'k': 25}, {'interior': 'fixed'}])
+@pytest.mark.parametrize('options', [{'loss': 'huber'}, {'loss': 'gaussian'}, {'model': 'local_linear', 'k': 25},
+                                     {'interior': 'fixed'}])
 def test_options_reach_the_calculation(options):
     job = short(**options)
     run, plain = job.runs['a'], short()
@@ -380,7 +381,7 @@ def shuffled_ids(frame, seed=4):
     (lambda f: f[:4] + [replace(f[4], image_size=(1024, 1025))],
      'fluoroscope a, frame 5: the image is 1024 x 1025 px, but the calibration is for 1024 x 1024 px'),
     (lambda f: f[:4] + [cut(f[4], 0)], 'fluoroscope a, frame 5: the frame is empty'),
-    (lambda f: [every(frame, 8) for frame in f[:3]], 'fluoroscope a: [45]. inliers are too few for the correction model'),
+    (lambda f: [every(frame, 8) for frame in f[:3]], 'fluoroscope a: [45]. inliers are too few for the correction'),
     (lambda f: [cut(frame, 30) for frame in f[:3]], 'fluoroscope a, exposure 1: all targets lie in one plane'),
     (lambda f: f[:2] + [shuffled_ids(f[2])],
      'fluoroscope a: only 2 of 3 exposures fit the phantom, 3 are needed; the first .* fluoroscope a, exposure 3: ')])

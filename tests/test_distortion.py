@@ -143,7 +143,8 @@ def test_no_correction_corrects_nothing_and_knows_no_outside():
 
 
 @pytest.mark.parametrize('arguments, said', [
-    (('spline', 5, np.zeros((9, 2)), np.zeros((9, 2))), "one of none, knn, local_linear, parametric, hybrid, collocation, not 'spline'"),
+    (('spline', 5, np.zeros((9, 2)), np.zeros((9, 2))),
+     "one of none, knn, local_linear, parametric, hybrid, collocation, not 'spline'"),
     (('knn', 10, np.zeros((9, 2)), np.zeros((9, 2))), 'knn with k = 10 cannot be had from 9 training points'),
     (('knn', 0, np.zeros((9, 2)), np.zeros((9, 2))), 'knn with k = 0 cannot be had'),
     (('local_linear', 5, np.zeros((9, 2)), np.zeros((9, 2))), 'local_linear with k = 5 cannot be had'),

@@ -56,7 +56,8 @@ def some_calibration(name='a', n=400, **changes):
     values = dict(
         fluoroscope=name, image_size=SIZE, interior=np.array([510.1, 480.2, 2000.3]),
         interior_covariance=np.diag([1.0, 2.0, 3.0]), interior_estimated=True, model=model,
-        train_exposure=rng.integers(0, 15, n), image_sd=0.27, sigma0=0.25, nu=4.5, exposures=15, observations=n + 9, inliers=n,
+        train_exposure=rng.integers(0, 15, n), image_sd=0.27, sigma0=0.25, nu=4.5, exposures=15,
+        observations=n + 9, inliers=n,
         rmse_before=np.array([5.0, 6.0]), rmse_after=np.array([0.25, 0.26]), cost_adjustment=-12.5,
         cost_regression=99.0, iterations=7, converged=True, stamp_ns=1_700_000_000_123_456_789,
         frame_id=f'{name}_optical', source_digest='0f' * 32, seconds=3.25)

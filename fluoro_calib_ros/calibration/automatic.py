@@ -7,7 +7,7 @@ from ..distortion.selection import CrossValidation, candidate_k, exposure_folds
 from ..distortion.terms import HIGHEST
 from ..distortion.series import Functions
 
-CLEARLY = 0.98   # a kind is preferred to collocation where its squared errors are smaller by more than 2 %
+CLEARLY = 0.99   # a kind is preferred to collocation where its squared errors are smaller by more than 1 %
 OTHERS = ('local_linear', 'knn', 'parametric')
 LARGEST = 40_000   # image points of a fluoroscope from which on collocation is taken: no other model gains on it there
 

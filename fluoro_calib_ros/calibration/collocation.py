@@ -19,7 +19,7 @@ from ..photogrammetry.precision import covariance_blocks, information_of_additio
 
 DEGREE = 3   # of the trend: pincushion, S-shape and spiral are cubic to first order (Gronenschild 1997)
 MODES = 18   # half waves along the image, until the reach of the signal is known
-MODES_RANGE = (10, 28)
+MODES_RANGE = (10, 24)   # more cost more than they bring: unknowns grow with the square
 CUT_OFF = 8.0   # reach times frequency beyond which a Matern signal has less than 1e-4 of its spectral density
 SETTLED_PRIOR = 0.15   # change of the logarithms of reach and sd: no correction changes visibly
 ON_THE_WAY = 1.0   # decrease of F that an adjustment may leave while noise and prior are still to be renewed
@@ -94,8 +94,8 @@ def rms_change(correction, last):
 def adjust_with_signal(measured, before, interior_held, max_rounds, report, check=None):
     """Adjust a network together with trend and signal; returns the network, Collocation, Adjustment and convergence.
 
-    before: Adjustment without correction; report(Adjustment, change) after every adjustment, change the RMS change of the
-    correction [px]. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
+    before: Adjustment without correction; report(Adjustment, change) after every adjustment, change the RMS change of
+    the correction [px]. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
     """
     zero = np.zeros_like(measured.network.uv)
     state = Collocation(measured, before, interior_held)

@@ -9,6 +9,7 @@ from threadpoolctl import threadpool_limits
 from ..photogrammetry.observations import check_frame
 from ..photogrammetry.precision import geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
+from .joint import correlations_of, outliers_of, relative_orientations
 from .network import measured_network
 from .result import FluoroscopeCalibration, digest_of_sources
 from .self_calibration import Options, adjusted_with_precision, rmse_of_inliers, self_calibrate, start_noise
@@ -58,7 +59,9 @@ class JobResult:
     """Result of a job: figures and calibrations by fluoroscope, targets, and for the report the runs behind it.
 
     history: Rounds by fluoroscope, or by '+'.join(fluoroscopes) where they were adjusted together;
-    runs: SelfCalibration by the same names; left_out: a sentence for every exposure that was not used.
+    runs: SelfCalibration by the same names; left_out: a sentence for every exposure that was not used; relative: a
+    RelativeOrientation of every further fluoroscope with the first where they were adjusted together; outliers: dicts
+    of image points and of targets that fail their tests; correlations above 0.95: (name, name, value).
     """
 
     fluoroscopes: dict
@@ -69,6 +72,9 @@ class JobResult:
     left_out: tuple
     converged: bool
     seconds: float
+    relative: tuple = ()
+    outliers: tuple = ((), ())
+    correlations: tuple = ()
 
 
 def calibrate(frames, phantom, options=Options(), joint=False, principal_distance=None, progress=None, check=None):
@@ -76,11 +82,14 @@ def calibrate(frames, phantom, options=Options(), joint=False, principal_distanc
 
     frames {fluoroscope: [Frame, ...]}; progress(fluoroscope, Round) after every round; check() may raise to
     stop. Returns JobResult, the same to the last bit for the same observations, whatever their order.
-    Raises DataError for observations that do not suffice.
+    Raises DataError for observations that do not suffice, ValueError for a relative orientation that is to be
+    constrained while the fluoroscopes are not adjusted together.
     """
+    if options.relative_orientation != 'none' and not joint:
+        raise ValueError('a relative orientation constraint needs the joint adjustment')
     began = time.perf_counter()
     groups = [tuple(frames)] if joint else [(name,) for name in frames]
-    figures, calibrations, runs, targets, left_out = {}, {}, {}, [], []
+    figures, calibrations, runs, targets, left_out, relative = {}, {}, {}, [], [], ()
     # One thread: faster than two for these sizes, and the sums are always made in the same order.
     with threadpool_limits(1):
         for group in groups:
@@ -94,13 +103,22 @@ def calibrate(frames, phantom, options=Options(), joint=False, principal_distanc
             seconds = time.perf_counter() - start
             targets.append(_targets(run.measured, run.after, run.precision))
             left_out += run.measured.left_out
+            relative += relative_orientations(run, options.relative_orientation)
             for f, name in enumerate(group):
                 figures[name] = _figures(run.measured, run.before, run.after, run.precision, f, run.models[name])
                 calibrations[name] = _calibration(run, f, name, options,
                                                   digest_of_sources(frames[name], phantom), seconds)
-    return JobResult(figures, calibrations, combined_targets(targets, phantom),
+    return JobResult(figures, calibrations, combined_targets(targets, phantom, options.datum == 'survey'),
                      {label: run.history for label, run in runs.items()}, runs, tuple(left_out),
-                     all(run.converged for run in runs.values()), time.perf_counter() - began)
+                     all(run.converged for run in runs.values()), time.perf_counter() - began, relative,
+                     *_judged(runs.values()))
+
+
+def _judged(runs):
+    """Outliers (image points, targets) of all runs, and their correlations."""
+    found = [outliers_of(run) for run in runs]
+    return (tuple(sum((part[i] for part in found), []) for i in (0, 1)),
+            tuple(c for run in runs for c in correlations_of(run)))
 
 
 def adjust_with(frames, phantom, calibrations, loss='student_t', check=None):
@@ -152,11 +170,11 @@ def _targets(measured, adjustment, precise):
     return Targets(measured.target_id, adjustment.parameters.points_mm, precise.points)
 
 
-def combined_targets(parts, phantom):
+def combined_targets(parts, phantom, weighted=True):
     """One set of object points from separate adjustments of the same phantom (Targets, ...).
 
     Each holds the survey once; in the sum of their information it is to count once only, so that of the
-    survey is taken off for every further one.
+    survey is taken off for every further one; weighted False: none holds the survey.
     """
     if len(parts) == 1:
         return parts[0]
@@ -170,8 +188,9 @@ def combined_targets(parts, phantom):
         information[at] += own
         right[at] += (own @ part.xyz_mm[..., None])[..., 0]
         seen[at] += 1
-    information -= (seen - 1)[:, None, None] * survey
-    right -= (seen - 1)[:, None] * (survey @ phantom.xyz_mm[row, :, None])[..., 0]
+    further = (seen - 1) * weighted
+    information -= further[:, None, None] * survey
+    right -= further[:, None] * (survey @ phantom.xyz_mm[row, :, None])[..., 0]
     covariance = np.linalg.inv(information)
     return Targets(target_id, (covariance @ right[..., None])[..., 0], covariance)
 
@@ -215,7 +234,8 @@ def _calibration(run, f, name, options, digest, seconds):
         fluoroscope=name, image_size=run.measured.image_size[f], interior=run.after.parameters.interior[f],
         interior_covariance=run.precision.interior[f], interior_estimated=options.interior == 'estimated',
         model=run.models[name], train_exposure=numbers[run.measured.network.exposure[rows[trained]]],
-        image_sd=_image_sd(run, rows), sigma0=run.after.noise.scale, nu=run.after.noise.nu, exposures=len(frames), observations=len(rows),
+        image_sd=_image_sd(run, rows), sigma0=run.after.noise.scale, nu=run.after.noise.nu, exposures=len(frames),
+        observations=len(rows),
         inliers=int(run.after.inliers[rows].sum()), rmse_before=rmse_of_inliers(run.before, rows),
         rmse_after=rmse_of_inliers(run.after, rows), cost_adjustment=last.F, cost_regression=last.G,
         iterations=last.iteration, converged=run.converged, stamp_ns=max(frame.stamp_ns for frame in frames),

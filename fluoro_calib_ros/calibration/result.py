@@ -29,8 +29,9 @@ class FluoroscopeCalibration:
 
     interior (3,) xp, yp, c and interior_covariance (3, 3) [px]; image_size (width, height) [px]; image_sd:
     standard deviation of an image coordinate of an inlier [px]; sigma0 and nu: scale and degrees of freedom of
-    the Student-t noise, sigma0 a factor of sigma where that was given; rmse_before and rmse_after (2,) of the inlier residuals [px]; cost_adjustment F and
-    cost_regression G; stamp_ns of the last exposure used; seconds the calibration took, NaN where it was
+    the Student-t noise, sigma0 a factor of sigma where that was given; rmse_before and rmse_after (2,) of the
+    inlier residuals [px]; cost_adjustment F and cost_regression G;
+    stamp_ns of the last exposure used; seconds the calibration took, NaN where it was
     read from a file; source_digest of observations and phantom. calibration_id follows from the content.
     """
 

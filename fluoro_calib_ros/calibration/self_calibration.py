@@ -15,6 +15,7 @@ from ..distortion.models import CorrectionModel
 from ..distortion.regressor import SMALLEST_TRAINING, Regressor
 from ..distortion.smoothers import KINDS, SMOOTHERS
 from ..photogrammetry.adjustment import Adjustment, adjust
+from ..photogrammetry.datum import DATUMS
 from ..photogrammetry.estimation import SETTLED, adjust_and_estimate_noise, renewed_noise
 from ..photogrammetry.noise import LOSSES, Noise
 from ..photogrammetry.normal import normal_equations
@@ -23,6 +24,7 @@ from ..photogrammetry.precision import Precision, covariance_blocks, precision, 
 from .anderson import Anderson
 from .automatic import better_kind
 from .collocation import Collocation, adjust_with_signal
+from .joint import CONSTRAINTS, constrained, refuse_undetermined, what_is_open
 from .network import Measured
 from .stepwise import adjust_stepwise
 
@@ -39,7 +41,11 @@ class Options:
 
     model 'auto' or one of KINDS; interior 'estimated' or 'fixed' (held, and learned by the model);
     loss 'student_t', 'huber' or 'gaussian'; k: neighbours, None: chosen; max_iterations of the loop;
-    tolerance: relative change of F and G at which it ends, where adjustment and regression go in turns. Raises ValueError for a value that is none of these.
+    tolerance: relative change of F and G at which it ends, where adjustment and regression go in turns;
+    relative_orientation of fluoroscopes that are adjusted together, the same in every exposure: 'none', 'soft' with
+    standard deviations relative_sd of each component [mm, rad], or 'hard'; datum 'survey', or 'inner' for a free
+    network; interior_sd (xp, yp, c): what the start values of the interior orientation are known to [px], None: not at
+    all. Raises ValueError for a value that is none of these.
     """
 
     model: str = 'auto'
@@ -48,23 +54,36 @@ class Options:
     k: int | None = None
     max_iterations: int = 60
     tolerance: float = 1e-4
+    relative_orientation: str = 'none'
+    relative_sd: tuple = (0.5, 2e-4)
+    datum: str = 'survey'
+    interior_sd: tuple | None = None
 
     def __post_init__(self):
-        for name, values in (('model', MODELS), ('interior', INTERIORS), ('loss', LOSSES)):
+        for name, values in (('model', MODELS), ('interior', INTERIORS), ('loss', LOSSES), ('datum', DATUMS),
+                             ('relative_orientation', CONSTRAINTS)):
             if getattr(self, name) not in values:
                 raise ValueError(f'{name} is one of {", ".join(values)}, not {getattr(self, name)!r}')
         if self.k is not None and self.model not in SMOOTHERS:
             raise ValueError(f'k is a number of neighbours, and the model {self.model} has none to be given')
         if self.max_iterations < 1 or not self.tolerance > 0:
             raise ValueError('max_iterations is at least 1 and tolerance above 0')
+        for name, size in (('relative_sd', 2), ('interior_sd', 3)):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, tuple(float(v) for v in value))   # as read from a file it is a list
+                if len(value) != size or not all(v > 0 for v in value):
+                    raise ValueError(f'{name} is {size} numbers above 0')
+        if self.interior_sd is not None and self.interior == 'fixed':
+            raise ValueError('interior_sd goes with an interior orientation that is estimated')
 
 
 @dataclass(frozen=True)
 class Round:
     """One round of the loop.
 
-    F negative log-likelihood; G weighted square sum of the cross-validation, or of the inlier residuals where the model is
-    adjusted as a whole; k (0 for a model without neighbours) and RMSE (2,) of the inlier
+    F negative log-likelihood; G weighted square sum of the cross-validation, or of the inlier residuals where the
+    model is adjusted as a whole; k (0 for a model without neighbours) and RMSE (2,) of the inlier
     residuals [px] by fluoroscope; quadratic: robustly weighted square sum of the residuals [px^2]; change:
     RMS change of the correction that the next round would make [px].
     """
@@ -82,8 +101,9 @@ class Round:
 class SelfCalibration:
     """Result of a self-calibration.
 
-    measured network, with the additional parameters of the model; adjustment before (without correction) and after; precision after; correction (N, 2)
-    [px] of the image points, additional parameters included; trained (N,) True for those the models were fitted to; models by fluoroscope;
+    measured network, with the additional parameters of the model; adjustment before (without correction) and after;
+    precision after; correction (N, 2) [px] of the image points, additional parameters included; trained (N,) True for
+    those the models were fitted to; models by fluoroscope;
     history of Rounds; converged: False where the largest number of rounds ended it.
     """
 
@@ -176,9 +196,14 @@ def self_calibrate(measured, options=Options(), progress=None, check=None):
     """
     network = replace(measured.network, interior_free=np.full(
         len(measured.fluoroscopes), options.interior == 'estimated'))
-    measured = replace(measured, network=network)
-    before, _ = adjusted_with_precision(network, measured.start, np.zeros_like(network.uv), start_noise(options.loss),
-                                        check=check)
+    measured = constrained(replace(measured, network=network), options)
+    network = measured.network
+    try:
+        before, precise = adjusted_with_precision(network, measured.start, np.zeros_like(network.uv),
+                                                  start_noise(options.loss), check=check)
+    except DataError as error:
+        raise DataError(what_is_open(measured) or str(error)) from None
+    refuse_undetermined(measured, before, precise)
     if options.model not in ('auto', 'collocation', 'parametric'):
         return _alternate(measured, before, options, progress, check)
     try:
@@ -193,7 +218,7 @@ def self_calibrate(measured, options=Options(), progress=None, check=None):
 
 
 def _adjust_as_a_whole(measured, before, options, progress, check):
-    """SelfCalibration with the model among the unknowns, collocation or stepwise chosen terms, and the model's state."""
+    """SelfCalibration with the model among the unknowns, collocation or stepwise terms, and the model's state."""
     history = []
 
     def report(adjustment, change):
@@ -236,7 +261,8 @@ def _alternate(measured, before, options, progress, check):
     else:
         before_parameters = before.parameters
     state, history, accelerated = _State(measured, options, trend), [], Anderson()
-    after, noise, converged, values = replace(before, parameters=before_parameters), before.noise, False, before.residuals
+    after, noise = replace(before, parameters=before_parameters), before.noise
+    converged, values = False, before.residuals
     information = _information(network, after, np.zeros_like(network.uv))[0]
     for iteration in range(1, options.max_iterations + 1):
         g_cost, changed = state.choose(values, after, information)
@@ -250,7 +276,8 @@ def _alternate(measured, before, options, progress, check):
         image = state.without_gauge(after.residuals + correction, after.parameters.interior)
         core = state.inliers()
         change = float(np.sqrt(np.mean((state.smooth(image) - correction)[core] ** 2)))
-        history.append(_round(iteration, measured, after, g_cost, {n: r.k for n, r in state.regressors.items()}, change))
+        k = {name: regressor.k for name, regressor in state.regressors.items()}
+        history.append(_round(iteration, measured, after, g_cost, k, change))
         if progress is not None:
             progress(history[-1])
         steady = abs(noise.scale - after.noise.scale) <= SETTLED * noise.scale

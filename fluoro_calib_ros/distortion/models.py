@@ -89,7 +89,7 @@ class CorrectionModel:
         return Correction(duv, self.sd(norm2, uv), self.outside(uv))
 
     def sd(self, norm2, uv):
-        """Standard deviations (n,) [px] of predictions at pixels uv (n, 2), squared norms (n,) of their weights given."""
+        """Standard deviations (n,) [px] of predictions at pixels uv (n, 2), norm2 (n,) of their weights."""
         variance = self.noise_px ** 2 * norm2 + self.bias_px ** 2
         return np.sqrt(variance if self.series is None else variance + self.series.sd_at(uv) ** 2)
 

@@ -51,7 +51,7 @@ class Functions:
         return len(self.powers) + len(self._sines)
 
     def taken_over(self, other, coefficients):
-        """Coefficients (2m,) of the functions that are among others too, from those of the others; zero for the rest."""
+        """Coefficients (2m,) for these functions from those for others; zero for functions the others lack."""
         number = {tuple(key): k for k, key in enumerate([*other.powers, *(('sine', *pair) for pair in other._sines)])}
         mine = [number.get(tuple(key), -1) for key in [*self.powers, *(('sine', *pair) for pair in self._sines)]]
         return np.where(np.asarray(mine) >= 0, coefficients.reshape(2, -1)[:, mine], 0.0).ravel()
@@ -125,7 +125,7 @@ def sd_grid_pixels(image_size):
 
 
 def sd_over_image(functions, covariance):
-    """Standard deviations (33, 33) [px] of a series from the covariance (2m, 2m) of its coefficients, those of u first."""
+    """Standard deviations (33, 33) [px] of a series from the covariance (2m, 2m) of its coefficients, u first."""
     values = functions(sd_grid_pixels(functions.image_size))
     m = len(functions)
     variance = np.einsum('np,np->n', values @ (covariance[:m, :m] + covariance[m:, m:]), values) / 2

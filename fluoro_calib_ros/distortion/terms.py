@@ -1,9 +1,9 @@
 """Terms of parametric distortion models as polynomials of the image coordinates.
 
 Radial and decentring terms after Brown, "Close-range camera calibration", Photogrammetric Engineering 37, 1971;
-affinity and shear after El-Hakim, 1986 (both in Luhmann et al., "Close-Range Photogrammetry and 3D Imaging", 2014, 3.3);
-spiral, S-shape and higher polynomials are those of image intensifiers (Gronenschild, Medical Physics 24, 1997; Lichti
-et al., IEEE Trans. Med. Imaging 34, 2015).
+affinity and shear after El-Hakim, 1986 (both in Luhmann et al., "Close-Range Photogrammetry and 3D Imaging", 2014,
+3.3); spiral, S-shape and higher polynomials are those of image intensifiers (Gronenschild, Medical Physics 24,
+1997; Lichti et al., IEEE Trans. Med. Imaging 34, 2015).
 """
 
 from functools import lru_cache

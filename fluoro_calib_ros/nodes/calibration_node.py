@@ -95,9 +95,13 @@ class CalibrationNode(Node):
             'loss': declare(self, 'loss', 'student_t', 'noise model: student_t, huber or gaussian'),
             'max_iterations': declare(self, 'max_iterations', 60, 'most rounds of a self-calibration', 1, 1000)}
         self._joint = declare(self, 'joint', False, 'adjust all fluoroscopes together')
+        self._fixed = {
+            'relative_orientation': declare(self, 'relative_orientation', 'none', 'between fluoroscopes adjusted '
+                                            'together: none, soft or hard'),
+            'datum': declare(self, 'datum', 'survey', 'survey (weighted) or inner (free network)')}
         self._capture_timeout = declare(self, 'capture_timeout', 5.0, 'longest wait of a capture [s]', 0.1, 600.0)
         try:
-            Options(**self._defaults)
+            Options(**self._defaults, **self._fixed)
             FramePairer(self._names, *self._pairing)
         except ValueError as error:
             raise StartError(f'parameter {error}') from None
@@ -321,7 +325,8 @@ class CalibrationNode(Node):
         Raises DataError and ValueError.
         """
         frames = self._collector.frames(list(request.fluoroscopes))
-        sources = (frames, self._phantom, self._options_of(request), self._joint and len(frames) > 1,
+        joint = self._joint and len(frames) > 1
+        sources = (frames, self._phantom, self._options_of(request, joint), joint,
                    request.principal_distance or None)
         done = Future()
 
@@ -346,11 +351,14 @@ class CalibrationNode(Node):
         self._job.start()
         return done
 
-    def _options_of(self, request):
+    def _options_of(self, request, joint):
         """Options of a request, with the node's parameters where it leaves them open. Raises ValueError."""
         if request.principal_distance < 0 or not np.isfinite(request.principal_distance):
             raise ValueError(f'principal_distance is a length in pixels, not {request.principal_distance}')
-        return Options(**{name: getattr(request, name) or default for name, default in self._defaults.items()})
+        fixed = dict(self._fixed)
+        if not joint:
+            del fixed['relative_orientation']
+        return Options(**{name: getattr(request, name) or default for name, default in self._defaults.items()}, **fixed)
 
     def _tell_verdict(self, result, validation):
         """Fill in and log the verdict on a calibration, where one was asked for."""

@@ -81,6 +81,6 @@ class Additional:
         return out
 
     def against(self, other, part=slice(None)):
-        """Covariances (n, q, 2) of other unknowns with the corrections; other (n, q, p) of them with the coefficients."""
+        """Covariances (n, q, 2) of other unknowns with the corrections; other (n, q, p): with the coefficients."""
         return np.stack([(other[:, :, columns] @ f[part][:, :, None])[..., 0]
                          for f, columns in self._by_axis()], axis=2)

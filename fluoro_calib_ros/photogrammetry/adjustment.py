@@ -1,10 +1,10 @@
 """Robust bundle adjustment of one or more fluoroscopes that look at one phantom.
 
 Maximum likelihood of the image points (Student-t, Huber or Gaussian) and of the surveyed coordinates
-(Gaussian, they fix the datum, unless inner constraints do) by Levenberg-Marquardt with Nielsen's damping (Madsen, Nielsen and Tingleff,
-"Methods for non-linear least squares problems", DTU 2004), iteratively reweighted. Each step solves the
-normal equations by the Schur complement (Triggs et al., "Bundle Adjustment - A Modern Synthesis", 2000),
-eliminating object points or exposures, whichever leaves the smaller system.
+(Gaussian, they fix the datum, unless inner constraints do) by Levenberg-Marquardt with Nielsen's damping
+(Madsen, Nielsen and Tingleff, "Methods for non-linear least squares problems", DTU 2004), iteratively reweighted.
+Each step solves the normal equations by the Schur complement (Triggs et al., "Bundle Adjustment - A Modern
+Synthesis", 2000), eliminating object points or exposures, whichever leaves the smaller system.
 """
 
 from dataclasses import dataclass, replace
@@ -262,7 +262,7 @@ class _Damping:
     """Nielsen's damping: mu follows the gain ratio, and grows ever faster while steps are refused."""
 
     def __init__(self):
-        self.mu, self._growth = 1e-8, 2.0
+        self.mu, self._growth = 1e-10, 2.0
 
     def accept(self, gain):
         """A step was taken; gain: its decrease over the predicted one."""

@@ -3,9 +3,9 @@
 An image point has D = 2 coordinates with one scale. q = |r|^2 / (scale * sigma)^2 is its normalised
 squared residual. Beside the core of the distribution a share of gross errors (false matches) can be
 estimated, spread evenly over a wide area: where they are left to the tails of the Student-t they make them heavy,
-and the efficient use of the good image points is lost. Sources: Lange, Little and Taylor, "Robust statistical modeling using the t
-distribution", JASA 1989 (weights, information); Liu and Rubin, "ML estimation of the t distribution using
-EM and its extensions, ECM and ECME", Statistica Sinica 1995 (scale and degrees of freedom); Fraley and
+and the efficient use of the good image points is lost. Sources: Lange, Little and Taylor, "Robust statistical
+modeling using the t distribution", JASA 1989 (weights, information); Liu and Rubin, "ML estimation of the
+t distribution using EM and its extensions, ECM and ECME", Statistica Sinica 1995 (scale and degrees of freedom); Fraley and
 Raftery, "Model-based clustering, discriminant analysis, and density estimation", JASA 2002, 3.1 (even
 background); Huber, "Robust Statistics", Wiley 1981.
 """
@@ -118,7 +118,7 @@ class Noise:
             _weighted_median(squared / redundancy, redundancy) / (2 * np.log(2)))))
 
     def _most_likely(self, squared, open_part):
-        """Student-t with scale, nu and share of gross errors; open_part (n,): expected q beside that of the residual."""
+        """Student-t with scale, nu and share of gross errors; open_part (n,): expected q beside the residual's."""
         now, scale2 = self, self.scale ** 2
         for _ in range(50):
             before, nu = scale2, now.nu

@@ -15,6 +15,9 @@ from .datum import Gauge, gauge_of, held_directions
 from .relative import discrepancies_with_jacobian
 
 CHUNK = 8_000   # image points linearised at once: what belongs to them stays in the cache
+# Of a gross error in a free network, where no survey holds a point that is left with one ray: it moves nothing, and the
+# point is found to be undetermined instead of the whole network.
+SMALLEST_WEIGHT = 1e-8
 
 
 @dataclass(frozen=True)
@@ -95,7 +98,10 @@ def _linearised(network, parameters, correction, noise, image_factor, rows):
     observed = network.uv[rows] - correction[rows]
     ru, rv = observed[:, 0] - xp - c * x, observed[:, 1] - yp - c * y
     variance = (noise.scale * network.sigma[rows]) ** 2
-    root = np.sqrt(image_factor * noise.weight((ru * ru + rv * rv) / variance) / variance)
+    weight = noise.weight((ru * ru + rv * rv) / variance)
+    if network.datum == 'inner':
+        weight = np.maximum(weight, SMALLEST_WEIGHT)
+    root = np.sqrt(image_factor * weight / variance)
     b = c * root
     a, bx, by, zero = b * depth, b * x, b * y, np.zeros_like(b)
     ax, ay, bxy = a * x, a * y, bx * y
@@ -191,7 +197,8 @@ def _global_blocks(network, parameters, by_exposure, by_point):
 
 
 def _add_relative(network, parameters, blocks):
-    """Add the relative orientation constraints to ee, eg, gg, e and g; returns pairs (k, 2) and mixed blocks (k, 6, 6)."""
+    """Add the relative orientation constraints to ee, eg, gg, e and g; returns pairs (k, 2) and mixed blocks
+    (k, 6, 6)."""
     ee, eg, gg, e, g = blocks
     pairs, mixed = [np.zeros((0, 2), dtype=int)], [np.zeros((0, 6, 6))]
     for constraint, pose, cols in zip(network.relative, parameters.relative, network.relative_columns):

@@ -47,9 +47,9 @@ class Precision:
 
 @dataclass(frozen=True)
 class CovarianceBlocks:
-    """Blocks of the inverse normal matrix: ee (m, 6, 6), pp (n, 3, 3), gg (G, G), eg (m, 6, G), pg (n, 3, G), zeros where
-    a global unknown is held; pe(e, p): blocks (k, 3, 6) of points p (k,) with exposures e (k,); between(e, f): blocks
-    (k, 6, 6) of exposures e (k,) with others f (k,)."""
+    """Blocks of the inverse normal matrix: ee (m, 6, 6), pp (n, 3, 3), gg (G, G), eg (m, 6, G), pg (n, 3, G), zeros
+    where a global unknown is held; pe(e, p): blocks (k, 3, 6) of points p (k,) with exposures e (k,); between(e, f):
+    blocks (k, 6, 6) of exposures e (k,) with others f (k,)."""
 
     ee: np.ndarray
     pp: np.ndarray
@@ -280,7 +280,8 @@ def _variance(network, adjustment):
 
 
 def residual_covariance(network, adjustment, blocks, projected=None):
-    """C_r (N, 2, 2) [px^2] of the residuals, of the CovarianceBlocks of the unknowns; projected: A C_x A^T if at hand."""
+    """C_r (N, 2, 2) [px^2] of the residuals, of the CovarianceBlocks of the unknowns; projected: A C_x A^T, None if it
+    is not at hand."""
     if projected is None:
         projected = covariance_of_projection(network, adjustment.parameters, blocks)
     return _variance(network, adjustment)[:, None, None] * np.eye(2) - projected

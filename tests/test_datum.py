@@ -1,0 +1,196 @@
+"""Free networks: inner constraints against a bordered dense solution, and against other datums."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_limits
+
+import rigs
+from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
+from fluoro_calib_ros.photogrammetry import normal as normal_module
+from fluoro_calib_ros.photogrammetry import precision as precision_module
+from fluoro_calib_ros.photogrammetry.adjustment import adjust
+from fluoro_calib_ros.photogrammetry.collinearity import project
+from fluoro_calib_ros.photogrammetry.datum import directions
+from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
+from fluoro_calib_ros.photogrammetry.precision import precision
+from fluoro_calib_ros.photogrammetry.relative import Relative
+from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
+from test_relative import disturbed, rigid_network
+
+SHAPES = [dict(exposures=5, targets=30), dict(exposures=14, targets=20)]   # points, exposures eliminated
+
+
+@pytest.fixture(autouse=True)
+def one_thread():
+    with threadpool_limits(1):
+        yield
+
+
+def free_network(free=True, **shape):
+    network, truth = rigs.small_network(**shape, free=free, seen=0.9)
+    return replace(network, datum='inner'), truth
+
+
+def dense_free(network, result, factor=1.0):
+    """Dense normal matrix (u, u) of the images alone, and the inner constraints (7, u)."""
+    counted = replace(network, datum='survey')
+    a = rigs.design_matrix(counted, result.parameters)
+    weight = factor * result.noise.weight(result.q) / (result.noise.scale * network.sigma) ** 2
+    _, m, n, _ = network.shape
+    b = np.zeros((7, a.shape[1]))
+    b[:, 6 * m:6 * m + 3 * n] = directions(network.survey_mm, network.survey_mm.mean(axis=0)).reshape(-1, 7).T
+    return a.T @ (np.repeat(weight, 2)[:, None] * a), b
+
+
+def bordered_inverse(normal, b):
+    """Inverse of the bordered matrix [N B; B^T 0], whose first block is the covariance (Granshaw 1980)."""
+    scale = np.sqrt(np.diagonal(normal))
+    b = b / scale
+    b = b / np.linalg.norm(b, axis=1, keepdims=True)
+    matrix = np.block([[normal / np.outer(scale, scale), b.T], [b, np.zeros((7, 7))]])
+    return np.linalg.inv(matrix)[:len(normal), :len(normal)] / np.outer(scale, scale)
+
+
+@pytest.mark.parametrize('free', [True, False])
+@pytest.mark.parametrize('loss', LOSSES)
+@pytest.mark.parametrize('shape', SHAPES)
+def test_solution_and_covariances_equal_those_of_a_bordered_dense_one(shape, loss, free):
+    network, truth = free_network(free, **shape)
+    start = rigs.disturbed(truth)
+    start = start if free else replace(start, interior=truth.interior)
+    result = adjust(network, start, noise=Noise(loss), tolerance=1e-12)
+    assert result.converged
+    normal, b = dense_free(network, result)
+    weight = result.noise.weight(result.q) / (result.noise.scale * network.sigma) ** 2
+    covariance = bordered_inverse(normal, b)
+    a = rigs.design_matrix(replace(network, datum='survey'), result.parameters)
+    step = covariance @ (a.T @ (np.repeat(weight, 2) * result.residuals.ravel()))
+    sd = np.sqrt(np.diagonal(covariance))
+    assert np.max(np.abs(step) / sd) < 1e-4, 'a bordered Newton step moves the solution'
+    _, m, n, _ = network.shape
+    off = (result.parameters.points_mm - network.survey_mm).ravel()
+    assert np.max(np.abs(b[:, 6 * m:6 * m + 3 * n] @ off)) < 1e-6   # sums of mm and of mm^2
+
+    precise = precision(network, result)
+    honest = covariance / result.noise.information_factor(result.q)
+    for j in range(m):
+        part = slice(6 * j, 6 * j + 6)
+        np.testing.assert_allclose(precise.exterior[j], honest[part, part], rtol=1e-5,
+                                   atol=1e-6 * np.max(np.abs(honest[part, part])))
+    for i in range(n):
+        part = slice(6 * m + 3 * i, 6 * m + 3 * i + 3)
+        np.testing.assert_allclose(precise.points[i], honest[part, part], rtol=1e-5, atol=1e-9)
+    if free:
+        np.testing.assert_allclose(precise.interior[0], honest[-3:, -3:], rtol=1e-5, atol=1e-6)
+    residual = np.diag(1 / np.repeat(weight, 2)) - a @ covariance @ a.T
+    for row, own in enumerate(precise.residual):
+        part = slice(2 * row, 2 * row + 2)
+        np.testing.assert_allclose(own, residual[part, part], rtol=0, atol=1e-6 / weight[row])
+    assert precise.redundancy.sum() == pytest.approx(network.observations - network.unknowns, rel=1e-7)
+
+
+@pytest.mark.parametrize('shape', SHAPES)
+def test_residuals_and_interior_orientation_are_those_of_a_minimal_datum(shape):
+    """Two points and a coordinate of a third held by a survey of vanishing sd, the others free: seven numbers."""
+    network, truth = free_network(**shape)
+    noise = Noise('gaussian', 0.3)
+    inner = adjust(network, rigs.disturbed(truth), noise=noise, noise_held=True, tolerance=1e-12)
+    dense_b, m = np.zeros((7, replace(network, datum='survey').unknowns)), network.shape[1]
+    for row, column in enumerate([0, 1, 2, 3, 4, 5]):   # the first exposure
+        dense_b[row, column] = 1
+    dense_b[6, 6] = 1   # and a coordinate of the second source: the scale
+    parameters = replace(truth)
+    plain = replace(network, datum='survey')
+    for _ in range(30):
+        r = network.uv - project(*parameters.per_image_point(network))
+        a = rigs.design_matrix(plain, parameters)
+        weight = np.repeat((0.3 * network.sigma) ** -2.0, 2)
+        covariance = bordered_inverse(a.T @ (weight[:, None] * a), dense_b)
+        step = covariance @ (a.T @ (weight * r.ravel()))
+        parameters = rigs.moved(plain, parameters, step)
+        if np.max(np.abs(step) / np.sqrt(np.diagonal(covariance) + 1e-12)) < 1e-7:
+            break
+    np.testing.assert_allclose(inner.residuals, r, atol=1e-5)
+    np.testing.assert_allclose(inner.parameters.interior, parameters.interior, atol=1e-3)
+    np.testing.assert_allclose(precision(network, inner).interior[0], covariance[-3:, -3:], rtol=1e-4, atol=1e-5)
+    assert m == network.shape[1]
+
+
+def test_a_turned_shifted_and_scaled_start_does_not_matter():
+    network, truth = free_network(**SHAPES[0])
+    here = adjust(network, rigs.disturbed(truth))
+    turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    there = replace(truth, rotation=truth.rotation @ turn.T, position_mm=1.3 * truth.position_mm @ turn.T + 50,
+                    points_mm=1.3 * truth.points_mm @ turn.T + 50)
+    other = adjust(network, there)
+    np.testing.assert_allclose(here.parameters.points_mm, other.parameters.points_mm, atol=1e-4)
+    np.testing.assert_allclose(here.residuals, other.residuals, atol=1e-4)
+    assert np.max(rotation_angle(here.parameters.rotation @ other.parameters.rotation.transpose(0, 2, 1))) < 1e-6
+
+
+@pytest.mark.parametrize('shape', SHAPES)
+@pytest.mark.parametrize('constrained', [True, False])
+def test_both_eliminations_give_the_same(monkeypatch, shape, constrained):
+    network, truth = rigid_network(**shape)
+    length = float(np.linalg.norm(truth.relative[0].translation_mm))
+    constraint = Relative((0, 1), network.relative[0].pairs, 0.5, 2e-4, length)
+    network = replace(network, datum='inner', relative=(constraint,) if constrained else ())
+    start = disturbed(truth) if constrained else replace(rigs.disturbed(truth), relative=())
+    found = []
+    for points in (True, False):
+        for module in (adjustment_module, normal_module, precision_module):
+            monkeypatch.setattr(module, 'eliminates_points', lambda network, points=points: points)
+        result = adjust(network, start)
+        assert result.converged
+        precise = precision(network, result)
+        redundancy = precise.redundancy.sum() + sum(r.sum() for r in precise.relative_redundancy)
+        assert redundancy == pytest.approx(network.observations - network.unknowns, rel=1e-6)
+        found.append((result, precise))
+    (one, one_precise), (other, other_precise) = found
+    np.testing.assert_allclose(one.parameters.points_mm, other.parameters.points_mm, atol=1e-5)
+    for name in ('interior', 'exterior', 'points', 'residual', 'redundancy', 'all_global', 'exterior_global'):
+        a, b = getattr(one_precise, name), getattr(other_precise, name)
+        np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.max(np.abs(b)), err_msg=name)
+
+
+def test_a_wrong_survey_leaves_the_shape_of_a_free_network_alone():
+    network, truth = free_network(**SHAPES[0])
+    survey = network.survey_mm.copy()
+    survey[3] += [2.0, 0.0, 0.0]
+    right, wrong = adjust(network, truth), adjust(replace(network, survey_mm=survey), truth)
+    np.testing.assert_allclose(right.residuals, wrong.residuals, atol=1e-4)
+    assert right.parameters.interior[0, 2] == pytest.approx(wrong.parameters.interior[0, 2], abs=1e-3)
+
+
+@pytest.mark.parametrize('shape', SHAPES)
+def test_a_weighted_interior_orientation_is_a_pseudo_observation(shape):
+    """Solution and covariances are those of the dense normal matrix with its weights added."""
+    network, truth = rigs.small_network(**shape)
+    mean, sd = truth.interior + [[3.0, -2.0, 30.0]], np.array([[1.0, 2.0, 15.0]])
+    weighted = replace(network, interior_mean=mean, interior_sd=sd)
+    result = adjust(weighted, rigs.disturbed(truth), noise=Noise('gaussian', 0.3), noise_held=True, tolerance=1e-12)
+    normal = rigs.dense_normal_matrix(network, result)
+    normal[-3:, -3:] += np.diag(sd[0] ** -2.0)
+    np.testing.assert_allclose(precision(weighted, result).interior[0], np.linalg.inv(normal)[-3:, -3:], rtol=1e-6)
+    a = rigs.design_matrix(network, result.parameters)
+    gradient = a.T @ (np.repeat((0.3 * network.sigma) ** -2.0, 2) * result.residuals.ravel())
+    _, m, n, _ = network.shape
+    gradient[6 * m:6 * m + 3 * n] += ((network.survey_mm - result.parameters.points_mm)
+                                      / network.survey_sd_mm[:, None] ** 2).ravel()
+    gradient[-3:] += ((mean - result.parameters.interior) / sd ** 2)[0]
+    assert np.max(np.abs(np.linalg.solve(normal, gradient)) / np.sqrt(np.diagonal(np.linalg.inv(normal)))) < 1e-5
+
+
+def test_weights_of_the_interior_orientation_lie_between_held_and_estimated():
+    network, truth = rigs.small_network(**SHAPES[0])
+    mean = truth.interior + [[0.0, 0.0, 50.0]]
+    found = []
+    for sd in (1e6, 10.0, 1e-6):
+        weighted = replace(network, interior_mean=mean, interior_sd=np.full((1, 3), sd))
+        found.append(adjust(weighted, truth).parameters.interior[0, 2])
+    assert found[0] == pytest.approx(adjust(network, truth).parameters.interior[0, 2], abs=1e-3)
+    assert found[2] == pytest.approx(mean[0, 2], abs=1e-3)
+    assert min(found[0], found[2]) < found[1] < max(found[0], found[2])

@@ -9,6 +9,7 @@ from ..distortion.series import Functions
 
 CLEARLY = 0.99   # a kind is preferred to collocation where its squared errors are smaller by more than 1 %
 OTHERS = ('local_linear', 'knn', 'parametric')
+MOST_NEIGHBOURS = {'local_linear': 100, 'knn': 40}   # more follow a distortion no closer than collocation does
 LARGEST = 40_000   # image points of a fluoroscope from which on collocation is taken: no other model gains on it there
 
 
@@ -34,7 +35,8 @@ def better_kind(run, state):
                     'parametric': _held_out(Functions(run.measured.image_size[f], HIGHEST)(uv), None, values,
                                             weight / variance, fold)}
         for kind in ('local_linear', 'knn'):
-            validation = CrossValidation(kind, uv, fold, candidate_k(kind, len(uv)))
+            candidates = candidate_k(kind, len(uv))
+            validation = CrossValidation(kind, uv, fold, candidates[candidates <= MOST_NEIGHBOURS[kind]])
             information = (weight / variance)[:, None, None] * np.eye(2)
             scores[kind] += float(np.min(validation.scores(values, information)))
         for kind, predicted in held_out.items():

@@ -138,7 +138,7 @@ def _most_likely_trend(functions, information, right, prior):
             precision = np.concatenate([1 / variance, np.zeros(len(to_terms) - count)])
             precision[j] = 0
             # The term is estimated once without prior; beyond its own variance, its square is the prior's.
-            c = cho_solve(cho_factor(matrix + np.diag(precision)), np.stack([right, np.eye(len(right))[j]], axis=1))
+            c = np.linalg.solve(matrix + np.diag(precision), np.stack([right, np.eye(len(right))[j]], axis=1))
             variance[j] = np.clip(c[j, 0] ** 2 - c[j, 1], NOT_THERE * c[j, 1], LARGEST_VARIANCE)
     return replace(prior, trend=variance)
 

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import sparse
+from scipy.linalg import blas
 
 
 @dataclass(frozen=True)
@@ -44,7 +45,10 @@ class Additional:
         out = np.zeros((self.count, self.count))
         if self.functions.ndim == 2:
             m = self.functions.shape[1]
-            out[:m, :m] = out[m:, m:] = self.functions.T @ (weight[:, None] * self.functions)
+            weighted = np.sqrt(weight)[:, None] * self.functions
+            half = blas.dsyrk(1.0, weighted.T, lower=1)   # in BLAS's order of storage this is the transpose
+            out[:m, :m] = half + np.tril(half, -1).T
+            out[m:, m:] = out[:m, :m]
             return out
         for f, _ in self._by_axis():
             out += f.T @ (weight[:, None] * f)
@@ -80,7 +84,17 @@ class Additional:
         out[:, 0, 1] = out[:, 1, 0] = np.einsum('np,np->n', fu @ covariance[cu, cv], fv)
         return out
 
-    def against(self, other, part=slice(None)):
-        """Covariances (n, q, 2) of other unknowns with the corrections; other (n, q, p): with the coefficients."""
-        return np.stack([(other[:, :, columns] @ f[part][:, :, None])[..., 0]
-                         for f, columns in self._by_axis()], axis=2)
+    def against(self, other, index, part=slice(None)):
+        """Covariances (n, q, 2) of other unknowns with the corrections at image points.
+
+        other (k, q, p): covariances of those unknowns with the coefficients, of which an image point has that in row
+        index (n,); part: the image points.
+        """
+        out = np.empty((len(index), other.shape[1], 2))
+        order = np.argsort(index, kind='stable')
+        starts = np.flatnonzero(np.diff(index[order], prepend=-1))
+        for axis, (f, columns) in enumerate(self._by_axis()):
+            f, mixed = f[part], other[:, :, columns]
+            for rows in np.split(order, starts[1:]):
+                out[rows, :, axis] = f[rows] @ mixed[index[rows[0]]].T
+        return out

@@ -209,9 +209,9 @@ def covariance_of_projection(network, parameters, blocks):
             if additional is not None:
                 cols = network.additional_columns[f]
                 out[part] += additional.variance(blocks.gg[cols, cols], local)
-                own = np.broadcast_to(blocks.gg[3 * f:3 * f + 3, cols], (len(e), 3, additional.count))
-                mixed = a @ np.concatenate([additional.against(c, local) for c in (
-                    blocks.eg[e][:, :, cols], blocks.pg[p][:, :, cols], own)], axis=1)
+                own = blocks.gg[None, 3 * f:3 * f + 3, cols]
+                mixed = a @ np.concatenate([additional.against(c, index, local) for c, index in (
+                    (blocks.eg[:, :, cols], e), (blocks.pg[:, :, cols], p), (own, np.zeros_like(e)))], axis=1)
                 out[part] += mixed + mixed.transpose(0, 2, 1)
     return out
 
@@ -222,7 +222,7 @@ def _covariance_of_orientation(blocks, f, e, p):
     c = np.empty((len(e), 12, 12))
     c[:, :6, :6], c[:, 6:9, 6:9], c[:, 9:, 9:] = blocks.ee[e], blocks.pp[p], blocks.gg[cols, cols]
     c[:, 6:9, :6] = blocks.pe(e, p)
-    c[:, :6, 9:], c[:, 6:9, 9:] = blocks.eg[e][:, :, cols], blocks.pg[p][:, :, cols]
+    c[:, :6, 9:], c[:, 6:9, 9:] = blocks.eg[:, :, cols][e], blocks.pg[:, :, cols][p]
     c[:, :6, 6:9] = c[:, 6:9, :6].transpose(0, 2, 1)
     c[:, 9:, :9] = c[:, :9, 9:].transpose(0, 2, 1)
     return c

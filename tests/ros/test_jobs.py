@@ -124,7 +124,8 @@ def test_second_request_is_refused_while_one_runs(rig):
 
 @pytest.mark.parametrize('request_fields, message', [
     ({'fluoroscopes': ['a', 'z']}, 'fluoroscope z is unknown, there are a, b'),
-    ({'model': 'spline'}, "model is one of none, knn, local_linear, not 'spline'"),
+    ({'model': 'spline'},
+     "model is one of auto, none, knn, local_linear, parametric, hybrid, collocation, not 'spline'"),
     ({'interior': 'free'}, "interior is one of estimated, fixed, not 'free'"),
     ({'loss': 'cauchy'}, "loss is one of student_t, huber, gaussian, not 'cauchy'"),
     ({'principal_distance': -1.0}, 'principal_distance is a length in pixels, not -1.0'),

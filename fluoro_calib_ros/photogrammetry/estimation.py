@@ -30,7 +30,8 @@ def adjust_and_estimate_noise(network, start, correction, noise, tolerance=1e-8,
     """
     _, q = residuals_and_q(network, start, correction, noise)
     if np.isfinite(q).all():
-        noise = noise.estimated(q * noise.scale ** 2)
+        # From afar whole exposures may look like gross errors: these are told from the rest after the first adjustment.
+        noise = replace(replace(noise, gross=0.0).estimated(q * noise.scale ** 2), gross=noise.gross)
     parameters, settled = start, False
     for _ in range(ROUNDS):
         result = adjust(network, parameters, correction, noise, tolerance=LOOSE, check=check, noise_held=True)

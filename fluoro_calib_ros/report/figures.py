@@ -74,7 +74,9 @@ def new_figure(width, height, title, layout='constrained'):
 
 
 def _described(model):
-    return 'no correction model' if model.kind == 'none' else f'{model.kind}, k = {model.k}'
+    if model.kind == 'none':
+        return 'no correction model'
+    return f'{model.kind}, k = {model.k}' if model.k else model.kind
 
 
 def png_bytes(figure):

@@ -1,7 +1,5 @@
 """One adjustment of many image points, ours beside COLMAP's: the same problem, start values and cost."""
 
-from dataclasses import replace
-
 import numpy as np
 
 from fluoro_calib_ros.photogrammetry.adjustment import Network, Parameters, adjust

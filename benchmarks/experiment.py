@@ -13,7 +13,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.job import SEEN_FOR_NOISE, calibrate
+from fluoro_calib_ros.calibration.job import SEEN_FOR_NOISE, calibrate, held_corrections
 from fluoro_calib_ros.calibration.network import measured_network
 from fluoro_calib_ros.calibration.self_calibration import Options, start_noise
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
@@ -293,18 +293,6 @@ def with_interior(measured, interior):
         depth = np.sum(axis * (start.points_mm.mean(axis=0) - position[rows]), axis=1)
         position[rows] -= ((now[2] / last[2] - 1) * depth)[:, None] * axis
     return replace(start, interior=interior, rotation=rotation, position_mm=position)
-
-
-def held_corrections(measured, calibrations):
-    """Corrections (N, 2) [px], and the network with their uncertainty in its sigma, as in adjust_with."""
-    network = measured.network
-    correction, sigma = np.zeros_like(network.uv), network.sigma.copy()
-    for f, name in enumerate(measured.fluoroscopes):
-        rows = network.rows(f)
-        found = calibrations[name].model.evaluate(network.uv[rows])
-        correction[rows] = found.duv
-        sigma[rows] = np.hypot(sigma[rows], found.sd / calibrations[name].sigma0)
-    return correction, replace(network, sigma=sigma)
 
 
 def _details(job):

@@ -19,8 +19,8 @@ from fluoro_calib_ros.calibration.self_calibration import (Options, _adjust_as_a
 from fluoro_calib_ros.distortion.models import CorrectionModel
 from fluoro_calib_ros.distortion.series import (SD_GRID, Functions, Series, packed, sd_grid_pixels, sd_over_image,
                                                 unpacked)
-from fluoro_calib_ros.distortion.signal import (Prior, gauge_precision, most_likely_prior, prior_precision,
-                                                spectral_density, starting_prior)
+from fluoro_calib_ros.distortion.signal import (Prior, gauge_precision, most_likely_prior, spectral_density,
+                                                starting_prior)
 from fluoro_calib_ros.distortion.terms import GAUGE, HIGHEST, _polynomial, expert_terms, trend_transformation
 from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
 from fluoro_calib_ros.photogrammetry import normal as normal_module
@@ -290,6 +290,7 @@ def whole(rig, model, count=10, seed=1):
     return _adjust_as_a_whole(measured, before, Options(model), None, None)
 
 
+@pytest.mark.long
 def test_stepwise_takes_the_terms_that_are_there():
     """Pincushion and spiral alone: radial and spiral are found, and next to nothing else; nothing where nothing is."""
     def smooth(field):
@@ -302,6 +303,7 @@ def test_stepwise_takes_the_terms_that_are_there():
     assert state.chosen[0].sum() <= 1
 
 
+@pytest.mark.long
 def test_auto_takes_collocation_unless_held_out_exposures_speak_against_it():
     """Steps of the distortion in small squares are no smooth signal: their neighbours tell them better."""
     run, state = whole(virtual_rig(1), 'collocation', 15)
@@ -312,6 +314,7 @@ def test_auto_takes_collocation_unless_held_out_exposures_speak_against_it():
     assert better_kind(stepped, state) in ('local_linear', 'knn')
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('model, most', [('auto', 1.1), ('hybrid', 1.15), ('parametric', 1.8)])
 def test_out_of_sample_error_is_near_that_of_known_distortion(model, most):
     """40 exposures that the calibration has not seen; 3-D error of the object points over that of known distortion."""
@@ -332,6 +335,7 @@ def test_out_of_sample_error_is_near_that_of_known_distortion(model, most):
 
 # ---- smaller versions of the long runs
 
+@pytest.mark.long
 def test_precision_is_honest():
     """Some calibrations of `make precision`: object points 0.9 to 1.1, intervals of the correction near 95 %."""
     from benchmarks.precision import normalised
@@ -342,6 +346,7 @@ def test_precision_is_honest():
     assert np.mean([r['sigma0'] for r in results]) == pytest.approx(0.25, rel=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('seed', [5001, 5003, 5008])
 def test_random_rigs_converge_to_the_right_answer(seed):
     """Some cases of `make convergence`."""

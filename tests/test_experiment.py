@@ -24,6 +24,8 @@ from benchmarks.experiment_tables import (PAPER_INSIDE, PAPER_OUTSIDE, PAPER_REP
                                           Comparison)
 from benchmarks.experiment_text import document_text, shortcomings  # noqa: E402
 
+pytestmark = pytest.mark.long
+
 SMALL = {'exposures': 30, 'every': 5, 'rounds': 3}
 
 

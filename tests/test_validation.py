@@ -23,6 +23,8 @@ from fluoro_calib_ros.files.validation import read_sources, validation_document,
 from fluoro_calib_ros.photogrammetry.observations import DataError, Phantom
 from fluoro_calib_ros.report.verdict import verdict_text
 
+pytestmark = pytest.mark.long
+
 CHECKS = ['halves', 'whiteness', 'worst_area', 'drift', 'held_out', 'exposures', 'beads', 'distances']
 SIZE = (1024, 1024)
 LOCAL = {'model': 'local_linear'}

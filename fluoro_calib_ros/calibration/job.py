@@ -136,7 +136,7 @@ def adjust_with(frames, phantom, calibrations, loss='student_t', check=None):
     with threadpool_limits(1):
         measured = measured_network(frames, phantom, interior=interior, interior_free=False, min_exposures=1,
                                     corrections={n: calibrations[n].model.predict for n in frames}, check=check)
-        correction, network = _held_corrections(measured, calibrations)
+        correction, network = held_corrections(measured, calibrations)
         # Few exposures do not tell noise from errors of the survey; then it is that of the calibration.
         held = len(network.uv) < SEEN_FOR_NOISE * len(network.survey_mm)
         noise = replace(start_noise(loss), scale=float(np.median([c.sigma0 for c in calibrations.values()])),
@@ -151,7 +151,7 @@ def adjust_with(frames, phantom, calibrations, loss='student_t', check=None):
                      after.converged, time.perf_counter() - began)
 
 
-def _held_corrections(measured, calibrations):
+def held_corrections(measured, calibrations):
     """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in its sigma.
 
     Where a correction is uncertain, at the rim and beyond the calibrated area, an image point weighs less.

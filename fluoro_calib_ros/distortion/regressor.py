@@ -6,7 +6,7 @@ from ..photogrammetry.noise import INLIER_Q
 from .gauge import gauge_basis
 from .models import CorrectionModel, no_correction
 from .selection import CrossValidation, NearestTable, candidate_k, exposure_folds
-from .smoothers import SMALLEST_K, SMOOTHERS, Neighbourhoods
+from .smoothers import SMALLEST_K, Neighbourhoods
 from .trend import Trend, least_squares_map
 
 KEEP_K = 1e-3   # relative gain in G below which k stays as it is

@@ -1,9 +1,4 @@
-"""Self-calibration with trend and signal of the distortion among the unknowns of the adjustment.
-
-In the alternation of Chow et al. the orientations and object points take up part of the distortion before the
-regressor sees it. Here all are adjusted together; what is left to turns is what the adjustment takes for known: the
-noise model and the prior of the signal, each from its marginal likelihood.
-"""
+"""Trend and signal of the distortion among the unknowns of the adjustment: least-squares collocation."""
 
 from dataclasses import replace
 
@@ -12,25 +7,22 @@ import numpy as np
 from ..distortion.series import MARGIN, Functions, Series, sd_over_image
 from ..distortion.signal import gauge_precision, most_likely_prior, prior_precision, starting_prior
 from ..photogrammetry.additional import Additional
-from ..photogrammetry.adjustment import adjust
-from ..photogrammetry.estimation import SETTLED, renewed_noise
-from ..photogrammetry.normal import normal_equations
-from ..photogrammetry.precision import covariance_blocks, information_of_additional, solved
+from ..photogrammetry.precision import information_of_additional
 
 DEGREE = 3   # of the trend: pincushion, S-shape and spiral are cubic to first order (Gronenschild 1997)
 MODES = 18   # half waves along the image, until the reach of the signal is known
 MODES_RANGE = (10, 24)   # more cost more than they bring: unknowns grow with the square
 CUT_OFF = 8.0   # reach times frequency beyond which a Matern signal has less than 1e-4 of its spectral density
 SETTLED_PRIOR = 0.15   # change of the logarithms of reach and sd: no correction changes visibly
-ON_THE_WAY = 1.0   # decrease of F that an adjustment may leave while noise and prior are still to be renewed
-TOLERANCE = 1e-5   # decrease of F that the last one may leave
 
 
 class Collocation:
     """Trend and signal of all fluoroscopes of a network, and their priors, through the turns of a calibration."""
 
+    on_the_way = 1.0   # noise and prior are still to be renewed
+
     def __init__(self, measured, before, interior_held, modes=MODES):
-        self.network, self.interior_held = measured.network, interior_held
+        self.network, self.interior_held, self._fitted = measured.network, interior_held, False
         self.sizes, self.interior = measured.image_size, before.parameters.interior
         self.functions, self.priors, self.gauges, self.values = [], [], [], []
         for f, size in enumerate(self.sizes):
@@ -48,7 +40,7 @@ class Collocation:
         uv = self.network.uv[self.network.rows(f)]
         return gauge_precision(self.values[f], uv, self.interior[f], self.interior_held)
 
-    def with_priors(self, network):
+    def with_additional(self, network):
         """The network with additional parameters under the present priors."""
         return replace(network, additional=tuple(
             Additional(values, prior_precision(functions, prior) + gauge) for values, functions, prior, gauge
@@ -63,9 +55,13 @@ class Collocation:
         functions = self.functions[f]
         return Series(functions, coefficients.reshape(2, -1), sd_over_image(functions, covariance))
 
-    def renew(self, network, matrix, parameters):
-        """Priors from a Solved normal matrix at the solution, and gauges; returns whether the priors have settled."""
-        settled, coefficients, self.interior = True, parameters.additional, parameters.interior
+    def renew(self, network, matrix, adjustment):
+        """Priors from a Solved normal matrix at the solution, and gauges, the first time also the number of modes.
+
+        Returns whether the priors have settled, and the coefficients to go on with.
+        """
+        settled, coefficients = True, adjustment.parameters.additional
+        self.interior = adjustment.parameters.interior
         for f, functions in enumerate(self.functions):
             last, present = self.priors[f], network.additional[f].prior
             information = information_of_additional(network, matrix, f) - present
@@ -74,9 +70,12 @@ class Collocation:
             self.priors[f] = now
             self.gauges[f] = self._gauge(f)
             settled &= abs(np.log(now.sd / last.sd)) + abs(np.log(now.reach / last.reach)) < SETTLED_PRIOR
-        return settled
+        if self._fitted:
+            return settled, coefficients
+        self._fitted = True
+        return False, self._fit_modes(coefficients)
 
-    def fit_modes(self, coefficients):
+    def _fit_modes(self, coefficients):
         """Take as many modes as the reach of each signal asks for; returns the coefficients for them."""
         out = []
         for f, (functions, prior) in enumerate(zip(self.functions, self.priors)):
@@ -84,37 +83,3 @@ class Collocation:
             self._take(f, Functions(self.sizes[f], DEGREE, modes))
             out.append(self.functions[f].taken_over(functions, coefficients[f]))
         return tuple(out)
-
-
-def rms_change(correction, last):
-    """RMS change [px] of corrections (N, 2)."""
-    return float(np.sqrt(np.mean((correction - last) ** 2)))
-
-
-def adjust_with_signal(measured, before, interior_held, max_rounds, report, check=None):
-    """Adjust a network together with trend and signal; returns the network, Collocation, Adjustment and convergence.
-
-    before: Adjustment without correction; report(Adjustment, change) after every adjustment, change the RMS change of
-    the correction [px]. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
-    """
-    zero = np.zeros_like(measured.network.uv)
-    state = Collocation(measured, before, interior_held)
-    parameters, noise = replace(before.parameters, additional=state.zeros()), before.noise
-    converged, correction = False, zero
-    for turn in range(max_rounds):
-        network, final = state.with_priors(measured.network), converged or turn == max_rounds - 1
-        result = adjust(network, parameters, zero, noise, tolerance=TOLERANCE if final else ON_THE_WAY, check=check,
-                        noise_held=True)
-        parameters, last = result.parameters, correction
-        correction = network.added(parameters)
-        report(result, rms_change(correction, last))
-        if final:
-            break
-        matrix = solved(network, normal_equations(network, parameters, zero, noise, noise.information_factor(result.q)))
-        now = renewed_noise(network, result, covariance_blocks(network, matrix))
-        converged = state.renew(network, matrix, parameters)
-        converged &= abs(now.scale - noise.scale) <= SETTLED * noise.scale
-        noise = now
-        if turn == 0:
-            parameters, converged = replace(parameters, additional=state.fit_modes(parameters.additional)), False
-    return network, state, result, converged and result.converged

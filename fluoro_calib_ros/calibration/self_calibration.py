@@ -3,7 +3,7 @@
 knn, local_linear and hybrid are the paper's way. One round: a correction model is fitted to (residual + present
 correction) of the inliers, its k chosen by cross-validation; the network is adjusted with that correction held. The
 rounds are a fixed-point iteration of the values the model is fitted to; Anderson acceleration shortens it. In
-hybrid a trend is adjusted along. collocation and parametric are adjusted as a whole (see collocation, stepwise). Model
+hybrid a trend is adjusted along. collocation and parametric are adjusted as a whole (see turns). Model
 and adjustment of a round belong together.
 """
 
@@ -23,10 +23,11 @@ from ..photogrammetry.observations import DataError
 from ..photogrammetry.precision import Precision, covariance_blocks, precision, residual_covariance, solved
 from .anderson import Anderson
 from .automatic import better_kind
-from .collocation import Collocation, adjust_with_signal
+from .collocation import Collocation
 from .joint import CONSTRAINTS, constrained, refuse_undetermined, what_is_open
 from .network import Measured
-from .stepwise import adjust_stepwise
+from .stepwise import Terms
+from .turns import adjust_in_turns
 
 MODELS = ('auto', *KINDS)
 INTERIORS = ('estimated', 'fixed')
@@ -233,10 +234,9 @@ def _adjust_as_a_whole(measured, before, options, progress, check):
         if progress is not None:
             progress(history[-1])
 
-    solve = adjust_stepwise if options.model == 'parametric' else adjust_with_signal
     kind = 'parametric' if options.model == 'parametric' else 'collocation'
-    network, state, after, converged = solve(measured, before, options.interior == 'fixed', options.max_iterations,
-                                             report, check)
+    state = {'parametric': Terms, 'collocation': Collocation}[kind](measured, before, options.interior == 'fixed')
+    network, after, converged = adjust_in_turns(measured, before, state, options.max_iterations, report, check)
     correction = network.added(after.parameters)
     precise = precision(network, after)
     measured, inliers = replace(measured, network=network), after.inliers
@@ -256,7 +256,7 @@ def _alternate(measured, before, options, progress, check):
     network, trend = measured.network, None
     if options.model == 'hybrid':
         trend = Collocation(measured, before, options.interior == 'fixed', modes=0)
-        network = trend.with_priors(network)
+        network = trend.with_additional(network)
         before_parameters = replace(before.parameters, additional=trend.zeros())
     else:
         before_parameters = before.parameters

@@ -15,11 +15,8 @@ from ..distortion.gauge import gauge_basis
 from ..distortion.series import Functions, Series, sd_over_image
 from ..distortion.terms import HIGHEST, expert_terms
 from ..photogrammetry.additional import Additional
-from ..photogrammetry.adjustment import adjust
-from ..photogrammetry.estimation import LOOSE, SETTLED, renewed_noise
-from ..photogrammetry.normal import normal_equations
-from ..photogrammetry.precision import covariance_blocks, information_of_additional, solved
-from .collocation import TOLERANCE, rms_change
+from ..photogrammetry.estimation import LOOSE
+from ..photogrammetry.precision import information_of_additional
 
 SIGNIFICANCE = 0.01   # of all terms that are tested for one together
 HELD = 1e12   # precision that holds a term at zero
@@ -29,6 +26,8 @@ NEIGHBOURS = 8   # of an image point, whose mean residual tells the trend
 
 class Terms:
     """The 31 terms of every fluoroscope of a network, and which of them are in the model."""
+
+    on_the_way = LOOSE   # the tests of significance want a solution
 
     def __init__(self, measured, before, interior_held):
         self.network = measured.network
@@ -47,7 +46,7 @@ class Terms:
         self.chosen = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
         self._tried = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
 
-    def with_terms(self, network):
+    def with_additional(self, network):
         """The network with the terms as additional parameters; those not chosen are held at zero."""
         return replace(network, additional=tuple(
             Additional(values, np.diag(np.where(chosen, 0.0, HELD)))
@@ -63,7 +62,12 @@ class Terms:
         return Series(functions, (coefficients @ to_polynomials).reshape(2, -1),
                       sd_over_image(functions, to_polynomials.T @ covariance @ to_polynomials))
 
-    def step(self, f, network, matrix, result):
+    def renew(self, network, matrix, adjustment):
+        """Add or take out a term of every fluoroscope; returns whether none was, and the coefficients to go on with."""
+        changed = [self._step(f, network, matrix, adjustment) for f in range(len(self.functions))]
+        return not any(changed), adjustment.parameters.additional
+
+    def _step(self, f, network, matrix, result):
         """Add the best term of fluoroscope f, or take out one that is not significant; returns whether one was."""
         present = network.additional[f].prior
         information = information_of_additional(network, matrix, f) - present
@@ -125,26 +129,3 @@ def _without_gauge(terms, functions, uv, values, interior, interior_held):
     own = np.einsum('nm,tam->nat', values, terms).reshape(-1, len(terms))
     share = np.linalg.lstsq(flat, own, rcond=None)[0]
     return terms - np.einsum('gt,gam->tam', share, as_polynomials)
-
-
-def adjust_stepwise(measured, before, interior_held, max_rounds, report, check=None):
-    """Adjust a network together with parametric terms; arguments and results as of adjust_with_signal."""
-    zero = np.zeros_like(measured.network.uv)
-    state = Terms(measured, before, interior_held)
-    parameters, noise, correction = replace(before.parameters, additional=state.zeros()), before.noise, zero
-    converged = False
-    for turn in range(max_rounds):
-        network, final = state.with_terms(measured.network), converged or turn == max_rounds - 1
-        result = adjust(network, parameters, zero, noise, tolerance=TOLERANCE if final else LOOSE, check=check,
-                        noise_held=True)
-        parameters, last = result.parameters, correction
-        correction = network.added(parameters)
-        report(result, rms_change(correction, last))
-        if final:
-            break
-        matrix = solved(network, normal_equations(network, parameters, zero, noise, noise.information_factor(result.q)))
-        now = renewed_noise(network, result, covariance_blocks(network, matrix))
-        changed = [state.step(f, network, matrix, result) for f in range(len(state.functions))]
-        converged = not any(changed) and abs(now.scale - noise.scale) <= SETTLED * noise.scale
-        noise = now
-    return network, state, result, converged and result.converged

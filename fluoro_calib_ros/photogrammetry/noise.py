@@ -5,8 +5,8 @@ squared residual. Beside the core of the distribution a share of gross errors (f
 estimated, spread evenly over a wide area: where they are left to the tails of the Student-t they make them heavy,
 and the efficient use of the good image points is lost. Sources: Lange, Little and Taylor, "Robust statistical
 modeling using the t distribution", JASA 1989 (weights, information); Liu and Rubin, "ML estimation of the
-t distribution using EM and its extensions, ECM and ECME", Statistica Sinica 1995 (scale and degrees of freedom); Fraley and
-Raftery, "Model-based clustering, discriminant analysis, and density estimation", JASA 2002, 3.1 (even
+t distribution using EM and its extensions, ECM and ECME", Statistica Sinica 1995 (scale and degrees of freedom);
+Fraley and Raftery, "Model-based clustering, discriminant analysis, and density estimation", JASA 2002, 3.1 (even
 background); Huber, "Robust Statistics", Wiley 1981.
 """
 

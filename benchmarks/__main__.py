@@ -99,8 +99,8 @@ def correction_rows(calibration):
         uv = rng.uniform(80, 940, (targets, 2))
         ours, direct, theirs = (timed(function, repeats)[1] for function, repeats in (
             (lambda: calibration.correct(uv), 200), (lambda: model.evaluate(uv), 50), (lambda: peer.predict(uv), 50)))
-        yield [f'{model.kind}, k = {model.k}' if model.k else model.kind, str(targets), f'{ours * 1e3:.3f} ms', f'{direct / ours:.1f}',
-               f'{theirs / ours:.1f}']
+        yield [f'{model.kind}, k = {model.k}' if model.k else model.kind, str(targets), f'{ours * 1e3:.3f} ms',
+               f'{direct / ours:.1f}', f'{theirs / ours:.1f}']
 
 
 def correction_section():
@@ -110,8 +110,8 @@ def correction_section():
     for model in ('auto', 'local_linear', 'knn'):
         rows += correction_rows(calibrate(frames, rig.phantom, Options(model)).calibrations['a'])
     return section('Correction of a frame', 'Exact: the sum over the nearest training points, or of the series, with '
-                   'standard deviation and status.', ['model', 'targets', 'median time', 'as fast as a search of all training points',
-                                   'as KNeighborsRegressor.predict'], rows)
+                   'standard deviation and status.',
+                   ['model', 'targets', 'median time', 'as fast as a search of all training points', 'as KNeighborsRegressor.predict'], rows)
 
 
 def profile_section():

@@ -79,8 +79,8 @@ TEXT = """# Precision
 
 Written by `make precision` (`python -m benchmarks.precision`): {count} simulated calibrations, each of another rig,
 {exposures} exposures of about 132 targets, noise 0.25 px, 1 % false matches, model {model}. The square of an error over
-the standard deviation that is claimed for it has the mean 1 if the claim is honest, more if it is optimistic. T and q are
-the exterior orientations, three coordinates each. Errors are taken in the gauge of the calibration.
+the standard deviation that is claimed for it has the mean 1 if the claim is honest, more if it is optimistic. T and q
+are the exterior orientations, three coordinates each. Errors are taken in the gauge of the calibration.
 
 {table}
 

@@ -24,6 +24,8 @@ from rigs import disturbed, small_network
 sys.path.append(str(Path(__file__).resolve().parent.parent))   # benchmarks are not installed
 from benchmarks.peers import TIGHT, ColmapAdjustment, seen_in, with_datum  # noqa: E402
 
+pytestmark = pytest.mark.long
+
 
 def small_problem():
     """Network, start values and noise: six exposures of some thirty targets, heavy tails."""

@@ -6,6 +6,7 @@ import numpy as np
 
 from fluoro_calib_ros.calibration.job import calibrate
 from fluoro_calib_ros.calibration.self_calibration import Options
+from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.photogrammetry.adjustment import Network, Parameters
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
@@ -101,3 +102,12 @@ def dense_normal_matrix(network, adjustment, factor=1.0):
     points = np.arange(6 * m, 6 * m + 3 * n)
     normal[points, points] += np.repeat(1 / network.survey_sd_mm ** 2, 3)
     return normal
+
+
+def run(*arguments):
+    """Exit status of the command fluoro-calib, in this process."""
+    try:
+        main([str(a) for a in arguments])
+    except SystemExit as stop:
+        return stop.code
+    return 0

@@ -11,6 +11,7 @@ import sys
 
 import numpy as np
 import pytest
+from rigs import run
 
 from fluoro_calib_ros.bags.dataset import write_bag
 from fluoro_calib_ros.cli import EXAMPLES, main
@@ -18,15 +19,6 @@ from fluoro_calib_ros.files.calibration import load_calibration
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 IMAGE = ('--image-size', '1024x1024')
-
-
-def run(*arguments):
-    """Exit status of the command, in this process."""
-    try:
-        main([str(a) for a in arguments])
-    except SystemExit as stop:
-        return stop.code
-    return 0
 
 
 def command(*arguments, **options):

@@ -1,6 +1,7 @@
 """The two packages, their metadata and the set-up agree with each other."""
 
 import configparser
+import fnmatch
 import importlib.metadata
 import importlib.util
 import pathlib
@@ -94,15 +95,23 @@ def test_lock_is_exact():
     assert not {name.lower().replace('_', '-') for name in wanted} - locked
 
 
-def test_no_path_of_a_machine():
-    """No file of the project names a folder of the machine on which it was written."""
+def project_files():
+    """Paths of the files of the project: those git knows, in an unpacked archive all but what is made here."""
     listing = subprocess.run(['git', 'ls-files', '--cached', '--others', '--exclude-standard', '-z'],
                              cwd=ROOT, capture_output=True, check=False)
-    if listing.returncode:
-        pytest.skip('not a git checkout')
+    if not listing.returncode:
+        return [ROOT / name.decode() for name in filter(None, listing.stdout.split(b'\0'))]
+    made = {line.strip().strip('/') for line in (ROOT / '.gitignore').read_text().splitlines()}
+    return [path for path in ROOT.rglob('*')
+            if not any(fnmatch.fnmatch(part, pattern) for part in path.relative_to(ROOT).parts for pattern in made)]
+
+
+def test_no_path_of_a_machine():
+    """No file of the project names a folder of the machine on which it was written."""
+    files = project_files()
+    assert ROOT / 'README.md' in files
     foreign = re.compile(rb'(?<![\w.])/(?:home|root|Users|work)/[\w.]')
-    for name in filter(None, listing.stdout.split(b'\0')):
-        path = ROOT / name.decode()
+    for path in files:
         if path.is_file() and not path.is_symlink():
             content = path.read_bytes()
             if b'\0' in content[:8192]:

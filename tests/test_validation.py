@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import calibrated, exposures, rig
+from rigs import calibrated, exposures, rig, run
 
 from fluoro_calib_ros.calibration.job import adjust_with, calibrate
 from fluoro_calib_ros.calibration.self_calibration import Options
@@ -17,7 +17,6 @@ from fluoro_calib_ros.calibration.validation_beads import Beads, distances, inte
 from fluoro_calib_ros.calibration.validation_fields import difference, orientation_fields, place_name
 from fluoro_calib_ros.calibration.validation_residuals import (
     ALARM, Residuals, common_trend, moved, residuals_of)
-from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
 from fluoro_calib_ros.files.validation import read_sources, validation_document, write_sources
 from fluoro_calib_ros.photogrammetry.observations import DataError, Phantom
@@ -264,15 +263,6 @@ def folder(tmp_path_factory):
     assert run('calibrate', place / 'few.csv', '--image-size', '1024x1024', '--phantom', root / 'phantom.csv', '--out',
                place / 'result', '--fluoroscopes', 'a', '--model', 'local_linear', '--max-iterations', 3) == 0
     return place / 'result'
-
-
-def run(*arguments):
-    """Exit status of the command."""
-    try:
-        main([str(a) for a in arguments])
-    except SystemExit as stop:
-        return stop.code
-    return 0
 
 
 def copied(folder, to):

@@ -104,7 +104,7 @@ def load_calibration(path):
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             arrays = _read_arrays(path, archive)
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, NotImplementedError):
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError):   # last: unknown compression
         raise DataError(f'{path}: this is not a calibration file, or it is damaged') from None
     checked = {name: _checked(path, name, arrays[name], field) for name, field in FIELDS.items()}
     _check_lengths(path, checked)

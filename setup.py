@@ -27,6 +27,8 @@ setup(
         'rosbags',
         'threadpoolctl',
         'PyYAML',
+        'opencv-python-headless',
+        'tqdm',
     ],
     extras_require={'test': ['pytest', 'pytest-timeout']},
     zip_safe=False,
@@ -39,6 +41,8 @@ setup(
         'console_scripts': [
             'calibration_node = fluoro_calib_ros.nodes.calibration_node:main',
             'correction_node = fluoro_calib_ros.nodes.correction_node:main',
+            'reconstruction_node = fluoro_calib_ros.nodes.reconstruction_node:main',
+            'image_node = fluoro_calib_ros.nodes.image_node:main',
             'player_node = fluoro_calib_ros.nodes.player_node:main',
             'simulator_node = fluoro_calib_ros.nodes.simulator_node:main',
             'fluoro_calib_demo = fluoro_calib_ros.nodes.demo:main',

@@ -4,6 +4,10 @@ import argparse
 import sys
 from pathlib import Path
 
+from .cli_reconstruct import EXAMPLES as OF_SPACE
+from .cli_reconstruct import TEXTS, add_orient, add_reconstruct, orientation_of_calibration, write_orientation
+from .cli_reconstruct import orient as run_orient
+from .cli_reconstruct import reconstruct as run_reconstruct
 from .cli_validate import EXAMPLE, TEXT, add_validate
 from .cli_validate import validate as run_validate
 from .photogrammetry.observations import DataError
@@ -13,7 +17,8 @@ EXAMPLES = {
     'calibrate': 'fluoro-calib calibrate bags/calibration --phantom bags/phantom.csv --out result',
     'adjust': 'fluoro-calib adjust test --phantom phantom.csv --calibration result --out check',
     'correct': 'fluoro-calib correct points.csv --calibration result --out corrected.csv',
-    'validate': EXAMPLE}
+    'validate': EXAMPLE,
+    **OF_SPACE}
 
 
 MODELS = ('auto', 'collocation', 'hybrid', 'local_linear', 'knn', 'parametric', 'none')
@@ -81,6 +86,9 @@ def make_parser():
     sub.add_argument('--calibration', required=True, type=Path, metavar='DIR', help='folder that calibrate has written')
     sub.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
     add_validate(command('validate', TEXT, validate), image_size)
+    add_orient(command('orient', TEXTS['orient'], lambda o: run_orient(o, _report)), image_size)
+    add_reconstruct(command('reconstruct', TEXTS['reconstruct'], lambda o: run_reconstruct(o, _report)), image_size,
+                    number_in)
     return parser
 
 
@@ -195,8 +203,10 @@ def calibrate(options):
                    relative_orientation=options.relative_orientation, relative_sd=options.relative_sd,
                    datum=options.datum, interior_sd=options.interior_sd), options.joint, options.principal_distance)
     job = run(frames, phantom, *how, _print_round)
+    orientation = orientation_of_calibration(frames, phantom, job)
     _write_job(options, job)
     write_sources(options.out, frames, phantom, *how)
+    write_orientation(options.out, orientation)
 
 
 def adjust(options):

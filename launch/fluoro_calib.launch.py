@@ -1,7 +1,7 @@
-"""Calibration and correction of the fluoroscopes of one rig.
+"""Calibration, correction and reconstruction of the fluoroscopes of one rig.
 
 ros2 launch fluoro_calib_ros fluoro_calib.launch.py phantom:=/path/to/phantom.csv [namespace:=rig1]
-[params_file:=my.yaml] [bag:=recording] [simulate:=true]
+[params_file:=my.yaml] [bag:=recording] [simulate:=true] [images:=true]
 """
 
 import os
@@ -22,6 +22,7 @@ def generate_launch_description():
         DeclareLaunchArgument('namespace', default_value='', description='namespace of the rig'),
         DeclareLaunchArgument('params_file', default_value=parameters, description='parameters of the nodes'),
         DeclareLaunchArgument('bag', default_value='', description='bag to play (default: none)'),
+        DeclareLaunchArgument('images', default_value='false', description='true: correct images too'),
         DeclareLaunchArgument('simulate', default_value='false', description='true: with the virtual rig')]
     namespace, params_file = LaunchConfiguration('namespace'), LaunchConfiguration('params_file')
 
@@ -33,6 +34,8 @@ def generate_launch_description():
     return LaunchDescription(arguments + [
         node('calibration_node', {'phantom': LaunchConfiguration('phantom')}),
         node('correction_node'),
+        node('reconstruction_node'),
+        node('image_node', condition=IfCondition(LaunchConfiguration('images'))),
         node('player_node', {'bag': LaunchConfiguration('bag'), 'wait_for_readers': 2},
              condition=IfCondition(has_bag)),
         node('simulator_node', condition=IfCondition(LaunchConfiguration('simulate')))])

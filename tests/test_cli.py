@@ -14,6 +14,7 @@ import pytest
 from rigs import run
 
 from fluoro_calib_ros.bags.dataset import write_bag
+from fluoro_calib_ros.calibration.result import OUTSIDE
 from fluoro_calib_ros.cli import EXAMPLES, main
 from fluoro_calib_ros.files.calibration import load_calibration
 
@@ -133,7 +134,8 @@ def test_calibrate_writes_result_and_calibrations(result):
             np.testing.assert_array_equal(arrays['interior'], [figures['interior'][key] for key in ('xp', 'yp', 'c')])
             assert int(arrays['model_k']) == figures['model']['k']
     assert sorted(p.name for p in result.iterdir()) == [
-        'a.calibration.npz', 'b.calibration.npz', 'observations.csv', 'options.json', 'phantom.csv', 'result.json']
+        'a.calibration.npz', 'b.calibration.npz', 'observations.csv', 'options.json', 'phantom.csv', 'result.json',
+        'rig_orientation.npz']
 
 
 def test_a_bag_and_its_csv_give_the_same_numbers(rig, tmp_path):
@@ -209,13 +211,15 @@ def test_correct_takes_the_distortion_off(rig, result, tmp_path, capsys):
     assert told['status']['OK'] > 0.9 * len(rows)
     assert list(rows[0]) == [*given[0], 'u_corrected', 'v_corrected', 'sigma', 'status']
     for name in 'ab':
-        model = load_calibration(str(result / f'{name}.calibration.npz')).model
+        calibration = load_calibration(str(result / f'{name}.calibration.npz'))
         mine = [(g, r) for g, r in zip(given, rows) if r['fluoroscope'] == name]
         uv = np.array([[float(g['u']), float(g['v'])] for g, _ in mine])
         corrected = np.array([[float(r['u_corrected']), float(r['v_corrected'])] for _, r in mine])
-        np.testing.assert_allclose(corrected, uv - model.predict(uv), atol=1e-9)
+        np.testing.assert_allclose(corrected, uv - calibration.model.predict(uv), atol=0.01)   # the lookup grid's
         assert all(g == {key: r[key] for key in g} for g, r in mine)
-        assert all((r['status'] == 'OUTSIDE') == bool(o) for (_, r), o in zip(mine, model.outside(uv)))
+        wanted = calibration.correct(uv)
+        assert np.array_equal(corrected, wanted.uv)
+        assert [r['status'] == 'OUTSIDE' for _, r in mine] == (wanted.status == OUTSIDE).tolist()
 
 
 # ---- what users get wrong

@@ -61,7 +61,19 @@ def test_only_the_last_frames_wait():
     assert pairer.add(frame('b', 3)) is not None
     pairer.flush()
     assert pairer.unpaired == {'a': 4, 'b': 1}
+    assert pairer.late == {'a': 0, 'b': 1}
     assert pairer.add(frame('b', 4)) is None, 'flush gives all up'
+
+
+@pytest.mark.parametrize('by', ['frame_number', 'stamp'])
+def test_frames_of_a_fluoroscope_that_was_started_anew_are_not_late(by):
+    pairer = FramePairer('ab', by, waiting=3)
+    for number in range(10_000, 10_006):
+        pairer.add(frame('a', number, number))
+    for number in range(1, 4):
+        assert pairer.add(frame('b', number, number)) is None
+        assert pairer.add(frame('a', number, number)) is not None
+    assert pairer.late == {'a': 0, 'b': 0}
 
 
 def test_a_number_that_comes_again_replaces_the_frame_that_waits():

@@ -30,7 +30,8 @@ LOG = BUILD / 'setup.log'
 LOCK = ROOT / 'requirements.lock'
 HOOK = ROOT / 'tools' / 'venv_hook.py'
 PACKAGE = 'fluoro_calib_ros'
-MESSAGES = 'fluoro_calib_msgs'
+# tf2_msgs has no wheel: its one message that the nodes publish is built where ROS does not bring it
+MESSAGES = {'fluoro_calib_msgs': ROOT / 'msg_defs', 'tf2_msgs': ROOT / 'tools' / 'tf2_msgs'}
 
 BASE_PYTHON = getattr(sys, '_base_executable', None) or sys.executable
 VENV_PYTHON = str(VENV / 'bin' / 'python')
@@ -224,22 +225,24 @@ def install_hook():
 
 
 def build_messages():
-    """Build msg_defs with colcon and install the messages into .venv."""
-    for pattern in (f'share/{MESSAGES}', f'include/{MESSAGES}', f'lib/lib{MESSAGES}__*', f'lib/{MESSAGES}',
-                    f'lib/python3*/site-packages/{MESSAGES}*', f'share/ament_index/resource_index/*/{MESSAGES}',
-                    f'share/colcon-core/packages/{MESSAGES}'):
-        for name in glob.glob(str(VENV / pattern)):  # a message that is gone must not stay installed
-            if os.path.isdir(name):
-                shutil.rmtree(name)
-            else:
-                os.remove(name)
+    """Build the messages with colcon and install them into .venv."""
+    for package in MESSAGES:
+        for pattern in (f'share/{package}', f'include/{package}', f'lib/lib{package}__*', f'lib/{package}',
+                        f'lib/python3*/site-packages/{package}*', f'share/ament_index/resource_index/*/{package}',
+                        f'share/colcon-core/packages/{package}'):
+            for name in glob.glob(str(VENV / pattern)):  # a message that is gone must not stay installed
+                if os.path.isdir(name):
+                    shutil.rmtree(name)
+                else:
+                    os.remove(name)
     shutil.rmtree(BUILD / 'messages', ignore_errors=True)
     run(str(VENV / 'bin' / 'colcon'), '--log-base', str(BUILD / 'colcon_log'), 'build',
-        '--base-paths', str(ROOT / 'msg_defs'), '--build-base', str(BUILD / 'messages'),
+        '--base-paths', *(str(folder) for folder in MESSAGES.values()), '--build-base', str(BUILD / 'messages'),
         '--install-base', str(VENV), '--merge-install', '--event-handlers', 'console_direct+',
         '--cmake-args', f'-DPython3_EXECUTABLE={VENV_PYTHON}', '-DPython3_FIND_VIRTUALENV=ONLY',
         '-DBUILD_TESTING=OFF', '-DCMAKE_BUILD_TYPE=Release')
-    run(VENV_PYTHON, '-c', f'import rclpy, {MESSAGES}.msg as m; m.TargetObservations.__class__.__import_type_support__()')
+    run(VENV_PYTHON, '-c', 'import rclpy, fluoro_calib_msgs.msg as m, tf2_msgs.msg as t; '
+        'm.TargetObservations.__class__.__import_type_support__(); t.TFMessage.__class__.__import_type_support__()')
 
 
 def install_package():
@@ -262,7 +265,7 @@ def steps():
     return [
         venv,
         Step('hook', 'start-up hook', install_hook, venv.wanted, HOOK),
-        Step('messages', 'ROS messages of msg_defs', build_messages, venv.wanted, ROOT / 'msg_defs'),
+        Step('messages', 'ROS messages', build_messages, venv.wanted, *MESSAGES.values()),
         Step('package', 'fluoro_calib_ros, editable', install_package, venv.wanted,
              *(ROOT / name for name in ('setup.py', 'setup.cfg', 'package.xml', 'resource'))),
     ]

@@ -24,7 +24,8 @@ class FramePairer:
     """Brings together the frames of the fluoroscopes that belong to one exposure.
 
     By frame number, or by stamp within tolerance_ns where pair_by is 'stamp'. Of each fluoroscope the last
-    `waiting` frames wait for their partners; a frame that drops out alone is counted as unpaired.
+    `waiting` frames wait for their partners; a frame that drops out alone is counted as unpaired. A frame that comes
+    after one of its partners has dropped out is late: counted as both, and given up at once.
     """
 
     def __init__(self, fluoroscopes, pair_by='frame_number', tolerance_ns=2_000_000, waiting=64):
@@ -33,12 +34,21 @@ class FramePairer:
         self.fluoroscopes, self.pair_by = tuple(fluoroscopes), pair_by
         self._tolerance, self._limit, self._pairs = tolerance_ns, waiting, 0
         self._waiting = {name: OrderedDict() for name in self.fluoroscopes}
+        self._dropped = dict.fromkeys(self.fluoroscopes)   # key that dropped out last
         self.unpaired = dict.fromkeys(self.fluoroscopes, 0)
+        self.late = dict.fromkeys(self.fluoroscopes, 0)
 
     def add(self, frame):
-        """Take a frame; returns {fluoroscope: Frame} once all of an exposure are there, else None."""
+        """Take a frame; returns {fluoroscope: Frame} once all of an exposure are there, else None.
+
+        Frames need a fluoroscope, a number and a stamp_ns.
+        """
         waiting = self._waiting[frame.fluoroscope]
         key = frame.number if self.pair_by == 'frame_number' else frame.stamp_ns
+        if self._is_late(frame.fluoroscope, key):
+            self.late[frame.fluoroscope] += 1
+            self.unpaired[frame.fluoroscope] += 1
+            return None
         if key in waiting:
             self.unpaired[frame.fluoroscope] += 1   # the number came again: the older one lost its chance
         waiting[key] = frame
@@ -50,9 +60,25 @@ class FramePairer:
             return pair if self.pair_by == 'frame_number' else {
                 name: replace(frame, number=self._pairs) for name, frame in pair.items()}
         while len(waiting) > self._limit:
-            waiting.popitem(last=False)
+            self._dropped[frame.fluoroscope], _ = waiting.popitem(last=False)
             self.unpaired[frame.fluoroscope] += 1
         return None
+
+    def _is_late(self, fluoroscope, key):
+        """Whether a frame of that key has a partner that has dropped out already.
+
+        Keys that lie before all that wait, and not after the one that dropped out last: those of a fluoroscope that
+        has been started anew are further back.
+        """
+        for name in self.fluoroscopes:
+            dropped = self._dropped[name]
+            if name == fluoroscope or dropped is None or key > dropped:
+                continue
+            near = key >= dropped - self._limit if self.pair_by == 'frame_number' else (
+                key >= dropped - 10 ** 9)
+            if near and self._partner(name, key) is None:
+                return True
+        return False
 
     def _partner(self, name, key):
         waiting = self._waiting[name]

@@ -6,11 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
+from ..distortion.grid import INVALID, OK, OUTSIDE, CorrectionGrid
 from ..distortion.models import CorrectionModel
 from ..distortion.series import packed
 from ..photogrammetry.observations import points_on_image
-
-OK, OUTSIDE, INVALID = 0, 1, 2   # status of a corrected image point
 
 
 @dataclass(frozen=True)
@@ -72,28 +71,45 @@ class FluoroscopeCalibration:
         object.__setattr__(self, 'calibration_id', f'{self.fluoroscope}-{digest.hexdigest()[:16]}')
 
     @cached_property
-    def _frame_model(self):
-        return self.model.at_frame_rate(self.image_size)
+    def grid(self):
+        """The CorrectionGrid that answers for the model; it is built when it is first asked for."""
+        return CorrectionGrid(self.model, self.image_size)
 
     def prepare(self):
         """Build what the first correction needs, so that no frame waits for it."""
-        self._frame_model
+        self.grid
 
-    def correct(self, uv, sigma=None):
+    def correct(self, uv, sigma=None, exact=False):
         """Corrected image points of observed pixels uv (n, 2); sigma (n,) of them, None: that of the calibration.
 
-        Standard deviations are those of observation and correction together.
+        Standard deviations are those of observation and correction together. exact: from the model itself and not
+        from its grid, which differs by grid.error_px and tells OUTSIDE up to a cell before the calibrated area ends.
         """
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
+        sigma = None if sigma is None else np.asarray(sigma, dtype=float)
+        if exact:
+            return self._correct_exactly(uv, self.image_sd if sigma is None else sigma)
+        u, v, sigma, _, status = self.correct_arrays(uv[:, 0], uv[:, 1], sigma)
+        return CorrectedPoints(np.stack([u, v], axis=1), sigma, status)
+
+    def correct_arrays(self, u, v, sigma=None):
+        """The same for arrays u, v and sigma (n,) of floats: corrected u and v (n,) [px], sigma (n,) [px], that of the
+        correction alone (n,) [px] and status (n,). The numbers are those of `correct`, and nothing is done that a frame
+        of few points would wait for."""
+        (du, dv, sd), status = self.grid.look_up(u, v)
+        np.subtract(u, du, out=du)
+        np.subtract(v, dv, out=dv)
+        total = sd * sd
+        total += self.image_sd ** 2 if sigma is None else sigma * sigma
+        return du, dv, np.sqrt(total, out=total), sd, status
+
+    def _correct_exactly(self, uv, sigma):
         good = points_on_image(uv, self.image_size)
         out = CorrectedPoints(np.full(uv.shape, np.nan), np.full(len(uv), np.nan),
                               np.full(len(uv), INVALID, dtype=np.uint8))
-        if not good.any():
-            return out
-        correction = self._frame_model.evaluate(uv[good])
-        observed = self.image_sd if sigma is None else np.asarray(sigma, dtype=float)[good]
+        correction = self.model.evaluate(uv[good])
         out.uv[good] = uv[good] - correction.duv
-        out.sigma[good] = np.sqrt(observed ** 2 + correction.sd ** 2)
+        out.sigma[good] = np.sqrt(np.broadcast_to(sigma, len(uv))[good] ** 2 + correction.sd ** 2)
         out.status[good] = np.where(correction.outside, OUTSIDE, OK)
         return out
 

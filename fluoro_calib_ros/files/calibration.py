@@ -1,10 +1,6 @@
 """The calibration file DIR/<fluoroscope>.calibration.npz, described in docs/calibration_file.md."""
 
-import io
 import os
-import zipfile
-import zlib
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -12,25 +8,12 @@ from ..calibration.result import FluoroscopeCalibration
 from ..distortion.models import CorrectionModel
 from ..distortion.series import packed, unpacked
 from ..photogrammetry.observations import DataError
-from .access import cause_of, check_safe_name, make_folder, read_bytes
-from .atomic import atomic_file
+from .access import cause_of, check_safe_name, make_folder
+from .arrays import Field, array_of, read_arrays, values_of, write_arrays
 
 VERSION = 2   # of the layout
 READABLE = (1, 2)   # version 1 knew no series
 SUFFIX = '.calibration.npz'
-_DATE = (1980, 1, 1, 0, 0, 0)   # of every member: the same calibration gives the same bytes
-
-
-@dataclass(frozen=True)
-class Field:
-    """What an array of the file must be: dtype 'text', 'int', 'float' or 'bool'; shape, a letter for any length;
-    least: smallest value, and special: values besides finite ones ('inf' or 'nan') that it may have."""
-
-    dtype: str
-    shape: tuple = ()
-    least: float | None = None
-    special: str = ''
-
 
 FIELDS = {
     'fluoroscope': Field('text'),
@@ -66,7 +49,6 @@ FIELDS = {
     'frame_id': Field('text'),
     'source_digest': Field('text'),
 }
-_DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?')}
 _SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
 _OF_MODEL = {'model_kind': 'kind', 'model_k': 'k', 'train_uv': 'train_uv', 'train_duv': 'train_duv',
              'noise_px': 'noise_px', 'bias_px': 'bias_px'}   # array: attribute of the CorrectionModel
@@ -85,13 +67,10 @@ def save_calibration(directory, calibration):
     written or holds something that could not be read again; a file that was there is then left as it was.
     """
     path = calibration_path(directory, calibration.fluoroscope)
-    arrays = {name: _array(path, name, _value_of(calibration, name)) for name in FIELDS}
+    arrays = {name: array_of(path, name, _value_of(calibration, name), field) for name, field in FIELDS.items()}
     _check_lengths(path, arrays)
     make_folder(directory)
-    with atomic_file(path) as file, zipfile.ZipFile(file, 'w', zipfile.ZIP_STORED) as archive:
-        _write_member(archive, 'format_version', np.array(VERSION, dtype=_DTYPES['int']))
-        for name, array in arrays.items():
-            _write_member(archive, name, array)
+    write_arrays(path, VERSION, arrays)
     return path
 
 
@@ -100,13 +79,8 @@ def load_calibration(path):
 
     Raises DataError for a file that is no calibration, is damaged, or has a layout this program does not know.
     """
-    content = read_bytes(path)
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            arrays = _read_arrays(path, archive)
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError):   # last: unknown compression
-        raise DataError(f'{path}: this is not a calibration file, or it is damaged') from None
-    checked = {name: _checked(path, name, arrays[name], field) for name, field in FIELDS.items()}
+    without_series = dict(zip(_SERIES, map(np.asarray, packed(None))))
+    checked = read_arrays(path, FIELDS, READABLE, 'a calibration', {1: without_series})
     _check_lengths(path, checked)
     return _calibration(path, checked)
 
@@ -140,75 +114,9 @@ def _value_of(calibration, name):
         return packed(calibration.model.series)[_SERIES.index(name)]
     if name in _OF_MODEL:
         return getattr(calibration.model, _OF_MODEL[name])
+    if name == 'train_exposure' and not len(calibration.train_exposure):
+        return np.zeros(0, dtype=np.int64)   # an empty list would be one of floats
     return getattr(calibration, name)
-
-
-def _array(path, name, value):
-    """value as the array that is written, checked as it will be when it is read."""
-    field = FIELDS[name]
-    if field.dtype == 'text':
-        return _checked(path, name, np.array(str(value)), field)
-    array = np.asarray(value)
-    if name == 'train_exposure' and array.size == 0:
-        array = array.astype(np.int64)
-    if array.dtype.kind in 'iub' and field.dtype in ('int', 'float') or array.dtype.kind == field.dtype[0]:
-        array = array.astype(_DTYPES[field.dtype])
-    return _checked(path, name, np.ascontiguousarray(array).reshape(array.shape), field)
-
-
-def _write_member(archive, name, array):
-    info = zipfile.ZipInfo(f'{name}.npy', date_time=_DATE)
-    info.create_system, info.external_attr = 3, 0o644 << 16   # the same on every system
-    buffer = io.BytesIO()
-    np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
-    archive.writestr(info, buffer.getvalue())
-
-
-def _read_arrays(path, archive):
-    """The arrays of an archive by name, their version checked first; CRC of every member checked."""
-    names = archive.namelist()
-    if 'format_version.npy' not in names:
-        raise DataError(f'{path}: this is not a calibration file, it has no array format_version')
-    version = _read_member(path, archive, 'format_version')
-    if version.shape != () or version.dtype.kind not in 'iu':
-        raise DataError(f'{path}: this is not a calibration file, its format_version is not a whole number')
-    if version not in READABLE:
-        raise DataError(f'{path}: the file has layout version {int(version)}, '
-                        f'this program knows versions {READABLE[0]} to {READABLE[-1]}')
-    known = dict(zip(_SERIES, map(np.asarray, packed(None)))) if version == 1 else {}
-    missing = [name for name in FIELDS if f'{name}.npy' not in names and name not in known]
-    if missing:
-        raise DataError(f'{path}: the calibration has no array {missing[0]}')
-    return {name: known[name] if name in known else _read_member(path, archive, name) for name in FIELDS}
-
-
-def _read_member(path, archive, name):
-    content = archive.read(f'{name}.npy')
-    try:
-        return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, EOFError, MemoryError, OverflowError, TypeError, SyntaxError):
-        raise DataError(f'{path}: the array {name} is not one of plain numbers or text, '
-                        f'and nothing else is read') from None
-
-
-def _checked(path, name, array, field):
-    """array, if it is what field says. Raises DataError."""
-    wanted = 'text' if field.dtype == 'text' else _DTYPES[field.dtype]
-    if array.dtype.kind != 'U' if wanted == 'text' else array.dtype != wanted:
-        raise DataError(f'{path}: the array {name} has dtype {array.dtype}, not {wanted}')
-    shape = field.shape
-    if array.ndim != len(shape) or any(
-            want != have and isinstance(want, int) for want, have in zip(shape, array.shape)):
-        raise DataError(f'{path}: the array {name} has shape {array.shape}, '
-                        f'not ({", ".join(map(str, shape))})')
-    if field.dtype == 'float':
-        good = np.isfinite(array)
-        good |= {'inf': array == np.inf, 'nan': np.isnan(array), '': False}[field.special]
-        if not good.all():
-            raise DataError(f'{path}: the array {name} holds {array[~good].flat[0]}, which is not a finite number')
-    if field.least is not None and (array < field.least).any():
-        raise DataError(f'{path}: the array {name} holds {array.min()}, which is below {field.least}')
-    return array
 
 
 def _check_lengths(path, arrays):
@@ -219,7 +127,7 @@ def _check_lengths(path, arrays):
 
 
 def _calibration(path, arrays):
-    values = {name: array.item() if array.ndim == 0 else array for name, array in arrays.items()}
+    values = values_of(arrays)
     identity, values['image_size'] = values.pop('calibration_id'), tuple(values['image_size'].tolist())
     check_safe_name(values['fluoroscope'], path)
     model = {_OF_MODEL[name]: values.pop(name) for name in _OF_MODEL}

@@ -4,7 +4,7 @@ from array import array
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from fluoro_calib_msgs.msg import CorrectedObservations, FluoroscopeCalibration, TargetObservations
+from fluoro_calib_msgs.msg import FluoroscopeCalibration, TargetObservations
 from sensor_msgs.msg import CameraInfo
 
 from ..calibration import result as calibration_result
@@ -45,15 +45,15 @@ def message_from_frame(frame):
     return message
 
 
-def corrected_message(source, calibration_id, corrected):
-    """CorrectedObservations of the TargetObservations message source and its CorrectedPoints."""
-    message = CorrectedObservations()
+def fill_corrected(message, source, calibration_id, corrected):
+    """Fill in a CorrectedObservations message: that of the TargetObservations message source, corrected to arrays u, v,
+    sigma, correction_sd and status (n,)."""
+    u, v, sigma, correction_sd, status = corrected
     message.header, message.frame_number = source.header, source.frame_number
     message.calibration_id, message.target_id = calibration_id, source.target_id
-    message.u, message.v = doubles(corrected.uv[:, 0]), doubles(corrected.uv[:, 1])
-    message.sigma = doubles(corrected.sigma)
-    message.status = array('B', corrected.status.tobytes())
-    return message
+    message.u, message.v = array('d', u.tobytes()), array('d', v.tobytes())
+    message.sigma, message.correction_sd = array('d', sigma.tobytes()), array('d', correction_sd.tobytes())
+    message.status = array('B', status.tobytes())
 
 
 def message_from_calibration(calibration):

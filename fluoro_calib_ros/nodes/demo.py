@@ -1,4 +1,4 @@
-"""The main job on recorded bags, over real ROS 2: collect, self-calibrate, correct live, and report."""
+"""The main job on recorded bags, over real ROS 2: collect, self-calibrate, correct and reconstruct live, and report."""
 
 import argparse
 import json
@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.action import SelfCalibrate
 from fluoro_calib_msgs.msg import (CalibrationStatus, CorrectedObservations, FluoroscopeCalibration,
-                                   TargetObservations)
+                                   ReconstructedPoints, RigOrientation, TargetObservations)
 from rclpy.action import ActionClient
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
@@ -42,7 +43,12 @@ class Client(Node):
         super().__init__('demo_client')
         self.names = names
         self.exposures, self.calibrations, self.ready = {}, {}, {}
-        self.sent, self.corrected, self.latency = {}, {}, []
+        self.sent, self.corrected, self.points, self.orientations = {}, {}, [], []
+        self.create_subscription(ReconstructedPoints, 'reconstruction/points_with_covariance',
+                                 lambda m, info: self.points.append((m, info['source_timestamp'])), OBSERVATIONS)
+        self.create_subscription(RigOrientation, 'rig_orientation', self.orientations.append, LATCHED)
+        self.readers = {}   # of the corrected observations, by fluoroscope, as the correction node knows them
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
         for n in names:
             self.create_subscription(CalibrationStatus, f'{n}/calibration_status',
                                      lambda m, n=n: self.exposures.update({n: m.exposures}), 10)
@@ -55,6 +61,11 @@ class Client(Node):
             self.create_subscription(CorrectedObservations, f'{n}/corrected_observations',
                                      lambda m, info, n=n: self._on_corrected(n, m, info), OBSERVATIONS)
         self.action = ActionClient(self, SelfCalibrate, 'self_calibrate')
+
+    def _on_diagnostics(self, array):
+        for status in array.status:
+            if status.name.startswith('/correction_node: '):
+                self.readers.update({status.hardware_id: int(v.value) for v in status.values if v.key == 'readers'})
 
     def _on_sent(self, name, message, info):
         self.sent[name, message.frame_number] = (message, info['source_timestamp'])
@@ -107,6 +118,7 @@ def run_graph(bags, out, names):
             graph.start('calibration_node', {'fluoroscopes': listed, 'phantom': bags / 'phantom.csv',
                                              'calibration_directory': out / 'calibration'})
             graph.start('correction_node', {'fluoroscopes': listed})
+            graph.start('reconstruction_node', {'fluoroscopes': listed})
             print(f'1  player -> calibration node: {min(recorded.values())} exposures of {" and ".join(names)}')
             graph.start('player_node', {'bag': bags / 'calibration', 'rate': 5.0, 'wait_for_readers': 3})
             client.wait(lambda: client.exposures and min(client.exposures.values()) >= min(recorded.values())
@@ -115,11 +127,15 @@ def run_graph(bags, out, names):
             print('2  client -> calibration node: self-calibrate')
             self_calibrate(client)
             client.wait(lambda: len(client.ready) == len(names), 20, 'the correction node to take up the calibration')
-            print('3  player -> correction node: markers in motion, corrected live')
+            client.wait(lambda: client.orientations and all(client.readers.get(n, 0) > 1 for n in names), 20,
+                        'the reconstruction node')
+            print('3  player -> correction node -> reconstruction node: markers in motion, corrected and in space, live')
             client.sent.clear()
             graph.start('player_node', {'bag': bags / 'tracking', 'wait_for_readers': 3})
             client.wait(lambda: len(client.corrected) >= sum(tracked.values()) or graph.ended(), 60,
                         f'{sum(tracked.values())} corrected frames ({len(client.corrected)} have come)')
+            client.wait(lambda: len(client.points) >= min(tracked.values()) or graph.ended(), 30,
+                        f'{min(tracked.values())} exposures in space ({len(client.points)} have come)')
             _stop_for_faults(graph, out)
             client.wait(lambda: client.corrected.keys() <= client.sent.keys(), 5, 'the frames that were played')
     finally:
@@ -163,6 +179,32 @@ def against_truth(bags, client):
     return out
 
 
+def points_against_truth(bags, client):
+    """Figures of the points in space: RMSE [mm] against the true markers after the turn and shift that bring them
+    nearest, their mean normalised squared error by coordinate, the part that is good, and the median latency [ms]."""
+    markers = np.loadtxt(bags / 'truth' / 'markers.csv', delimiter=',', skiprows=1)
+    order = {(int(row[0]), int(row[1])): row[2:] for row in markers}
+    points, true, covariance, count = [], [], [], 0
+    for message, _ in client.points:
+        c = {n: np.array(getattr(message, f'cov_{n}')) for n in ('xx', 'xy', 'xz', 'yy', 'yz', 'zz')}
+        whole = np.stack([c[n] for n in ('xx', 'xy', 'xz', 'xy', 'yy', 'yz', 'xz', 'yz', 'zz')], axis=1)
+        good = np.array(message.status) <= message.OUTSIDE
+        count += len(good)
+        points.append(1e3 * np.stack([message.x, message.y, message.z], axis=1)[good])
+        covariance.append(1e6 * whole.reshape(-1, 3, 3)[good])
+        true += [order[message.frame_number, i] for i in np.array(message.target_id)[good]]
+    points, covariance, true = np.concatenate(points), np.concatenate(covariance), np.array(true)
+    a, b = points - points.mean(axis=0), true - true.mean(axis=0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    error = a - b @ (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).T
+    normalised = np.einsum('ni,nij,nj->n', error, np.linalg.inv(covariance), error).mean() / 3
+    first = client.names[0]
+    latency = [(stamp - client.sent[first, m.frame_number][1]) * 1e-6 for m, stamp in client.points
+               if (first, m.frame_number) in client.sent]
+    return {'rmse_mm': float(np.sqrt((error ** 2).sum(axis=1).mean())), 'normalised': float(normalised),
+            'good': len(points) / count, 'exposures': len(client.points), 'latency_ms': float(np.median(latency))}
+
+
 def projective_misfit(uv, ideal):
     """RMSE [px] of a coordinate between ideal (n, 2) and the projective map of uv (n, 2) that fits it best."""
     x, y = (uv - 511.5).T / 512
@@ -186,13 +228,16 @@ def report(bags, out, client, began):
     figures = write_figures(job, out / 'figures')
     latency = latencies_ms(client)
     same = {name: job.calibrations[name].calibration_id == c.calibration_id for name, c in live.items()}
-    truth = against_truth(bags, client)
+    truth, space = against_truth(bags, client), points_against_truth(bags, client)
     lines = [summary_table(job, {'p50': np.percentile(latency, 50), 'p99': np.percentile(latency, 99),
                                  'max': latency.max(), 'frames': len(latency)}), '',
              'Markers in motion against the truth (after the best projective map):',
              markdown_table(['fluoroscope', 'observed RMSE [px]', 'corrected RMSE [px]', 'frames in', 'frames out'], [
                  [n, f'{truth[n][0]:.3f}', f'{truth[n][1]:.3f}', str(sum(k[0] == n for k in client.sent)),
                   str(sum(k[0] == n for k in client.corrected))] for n in client.names]), '',
+             f'In space: {space["exposures"]} exposures, {100 * space["good"]:.1f} % of the points; RMSE against the truth '
+             f'{space["rmse_mm"]:.3f} mm (3-D), squared error over its variance {space["normalised"]:.2f}; latency '
+             f'{space["latency_ms"]:.1f} ms (median)', '',
              'Calibration through the nodes and without ROS the same to the last bit: '
              + ', '.join(f'{n} {"yes" if ok else "NO"}' for n, ok in same.items()),
              f'Figures: {out / "figures"} ({len(figures)} pictures), calibration: {out / "calibration"}',

@@ -6,14 +6,17 @@ import sys
 import threading
 import time
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from fluoro_calib_msgs.msg import TargetObservations
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
 from rclpy._rclpy_pybind11 import RCLError
+from rclpy.duration import Duration
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import qos_policy_name_from_kind
 from rclpy.signals import SignalHandlerOptions
 
@@ -74,6 +77,29 @@ class Diagnostics:
             array.status.append(status)
         self._publisher.publish(array)
 
+    def close(self):
+        """Take the publisher back."""
+        self._node.destroy_publisher(self._publisher)
+
+
+class Latencies:
+    """The last latencies [ns], written by one thread and read by another."""
+
+    def __init__(self, count=2000):
+        self._ring, self._number = np.zeros(count, dtype=np.int64), 0
+
+    def add(self, nanoseconds):
+        """Take a latency."""
+        self._ring[self._number % len(self._ring)] = nanoseconds
+        self._number += 1
+
+    def values(self):
+        """Diagnostic values; none where there are none."""
+        if not self._number:
+            return {}
+        p50, p99 = np.percentile(self._ring[:self._number], [50, 99]) * 1e-6
+        return {'latency p50 [ms]': f'{p50:.3f}', 'latency p99 [ms]': f'{p99:.3f}'}
+
 
 def _on_interrupt(end):
     """Call end() from a thread at SIGINT or SIGTERM, whatever the main thread waits for; a second one exits at once."""
@@ -99,6 +125,75 @@ def _init(args):
         raise StartError(str(error).partition(', at /')[0]) from None
 
 
+class ManagedNode(LifecycleNode):
+    """Node with the lifecycle of ROS 2 that brings itself up, unless its parameter autostart is false.
+
+    It has its topics from configure on, and takes messages between activate and deactivate. open() makes what
+    configure makes, begin() what activate does; end() and close() take them back, in whatever state they are.
+    """
+
+    def __init__(self, name):
+        super().__init__(name)
+        self._autostart = declare(self, 'autostart', True, 'configure and activate the node at its start; false: that '
+                                  'is left to whoever manages the lifecycle')
+        self.failed = False
+
+    def bring_up(self):
+        """Configure and activate the node where it does so by itself."""
+        if self._autostart:
+            self.trigger_configure()
+            self.trigger_activate()
+
+    def fail(self, text):
+        """End the node for a fault of its own, told with a text."""
+        self.get_logger().fatal(text)
+        self.failed = True
+        rclpy.try_shutdown()
+
+    def on_configure(self, state):
+        self.open()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_activate(self, state):
+        super().on_activate(state)
+        self.begin()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_deactivate(self, state):
+        self.end()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state):
+        self.close()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state):
+        self.stop()
+        return TransitionCallbackReturn.SUCCESS
+
+    def stop(self):
+        """Take everything down: the node is to go."""
+        self.end()
+        self.close()
+
+
+def deafness(reader, sentences):
+    """Sentence for every topic {topic: sentence} on which nothing can come to a StreamReader, or None; told too."""
+    found = {} if reader is None else reader.incompatible()
+    for sentence in found.values():
+        sentences.warn(sentence)
+    return found
+
+
+def fluoroscopes_of(node, least=1):
+    """Declare the parameter fluoroscopes; returns the names. Raises StartError."""
+    names = list(declare(node, 'fluoroscopes', ['a', 'b'], 'names of the fluoroscopes'))
+    if len(names) < least or len(set(names)) != len(names) or not all(names):
+        raise StartError(f'parameter fluoroscopes: {names} is not a list of different names'
+                         + (f', {least} or more' if least > 1 else ''))
+    return names
+
+
 def run(make_node, args=None):
     """Run a node until it is interrupted, or has ended by rclpy.shutdown(); exit status 1 and one sentence where it
     cannot start, exit status 1 where its flag `failed` is set.
@@ -118,6 +213,7 @@ def run(make_node, args=None):
         _on_interrupt(end)
         node = make_node()
         executor.add_node(node)
+        getattr(node, 'bring_up', lambda: None)()
         try:
             while rclpy.ok() and not ended.is_set():
                 executor.spin_once()
@@ -152,6 +248,13 @@ def subscribe_observations(node, name, on_frame, on_deaf):
     node.create_subscription(TargetObservations, topic, lambda message: on_frame(name, message), OBSERVATIONS,
                              event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
                              qos_overriding_options=overridable())
+
+
+def end_when_taken(publishers, seconds=10.0):
+    """End the process once all that was published has arrived; what is not acknowledged is lost when it goes."""
+    for publisher in publishers:
+        publisher.wait_for_all_acked(Duration(seconds=seconds))
+    rclpy.try_shutdown()
 
 
 class StartError(RuntimeError):

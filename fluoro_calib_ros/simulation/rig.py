@@ -20,6 +20,8 @@ SURVEY_SD_MM = 0.1
 DECIMALS = 4   # of an observed pixel, as target extraction writes it; also hides last-bit differences of CPUs
 START_NS = 1_767_225_600_000_000_000   # stamp of the first frame [ns]
 FRAME_ID = '{}_optical'
+CLUSTER = 6   # markers of a rigid cluster
+GRID = (52, 39)   # points of a calibration grid across and down
 
 
 @dataclass(frozen=True)
@@ -162,12 +164,15 @@ class SimulatedTracking:
     ideal: dict
 
 
-def simulate_tracking(rig, seconds=4.0, rate_hz=120.0, seed=0, noise_px=0.25, start_ns=START_NS, first_number=1):
-    """Markers on the two bones of a joint that bends and straightens: four rigid clusters of six."""
+def simulate_tracking(rig, seconds=4.0, rate_hz=120.0, seed=0, noise_px=0.25, start_ns=START_NS, first_number=1,
+                      clusters=4):
+    """Markers on the two bones of a joint that bends and straightens: up to eight rigid clusters of six, of which the
+    first two are on the one bone."""
     rng = np.random.default_rng([seed, 3])
-    clusters = [rng.uniform(-22, 22, (6, 3)) for _ in range(4)]
-    places = np.array([[-8, 0, 85], [12, 10, 40], [-10, -8, -35], [10, 5, -80]], dtype=float)
-    ids = np.arange(1001, 1025)
+    places = np.array([[-8, 0, 85], [12, 10, 40], [-10, -8, -35], [10, 5, -80], [30, -25, -55], [-35, 30, -60],
+                       [35, 30, -20], [-35, -30, -10]], dtype=float)[:clusters]
+    clusters = [rng.uniform(-22, 22, (CLUSTER, 3)) for _ in places]
+    ids = np.arange(1001, 1001 + CLUSTER * len(clusters))
     count = round(seconds * rate_hz)
     points = np.empty((count, len(ids), 3))
     for k in range(count):
@@ -176,7 +181,7 @@ def simulate_tracking(rig, seconds=4.0, rate_hz=120.0, seed=0, noise_px=0.25, st
         sway = 70 * np.array([np.sin(2 * np.pi * 0.31 * t), np.cos(2 * np.pi * 0.23 * t), 0.6 * np.sin(t)])
         for number, (cluster, place) in enumerate(zip(clusters, places)):
             turn = matrix_from_vector([bend if number < 2 else -bend, 0.3 * np.sin(1.1 * t + number), 0])
-            points[k, 6 * number:6 * number + 6] = (cluster + place) @ turn.T + sway
+            points[k, CLUSTER * number:CLUSTER * (number + 1)] = (cluster + place) @ turn.T + sway
     frames, ideal = {}, {}
     for fluoroscope in rig.fluoroscopes:
         uv = fluoroscope.ideal(points.reshape(-1, 3)).reshape(count, len(ids), 2)
@@ -187,3 +192,18 @@ def simulate_tracking(rig, seconds=4.0, rate_hz=120.0, seed=0, noise_px=0.25, st
             Frame(fluoroscope.name, first_number + k, ids, observed[k], fluoroscope.image_size, None,
                   start_ns + round(k / rate_hz * 1e9), FRAME_ID.format(fluoroscope.name)) for k in range(count)]
     return SimulatedTracking(frames, ids, points, ideal)
+
+
+def simulate_grid(rig, count, seed=0, noise_px=0.25, start_ns=START_NS, rate_hz=30.0):
+    """Frames {fluoroscope: [Frame, ...]} of a grid of 2,028 points in front of the detector, count of each."""
+    rng = np.random.default_rng([seed, 5])
+    frames = {}
+    for fluoroscope in rig.fluoroscopes:
+        across, down = (np.linspace(0.08, 0.92, n) * size for n, size in zip(GRID, fluoroscope.image_size))
+        ideal = np.stack(np.meshgrid(across, down), axis=-1).reshape(-1, 2)
+        bent, ids = fluoroscope.distortion.distort(ideal), np.arange(2001, 2001 + len(ideal))
+        frames[fluoroscope.name] = [
+            Frame(fluoroscope.name, 1 + k, ids, np.round(bent + rng.normal(0, noise_px, bent.shape), DECIMALS),
+                  fluoroscope.image_size, None, start_ns + round(k / rate_hz * 1e9),
+                  FRAME_ID.format(fluoroscope.name)) for k in range(count)]
+    return frames

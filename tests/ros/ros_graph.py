@@ -15,12 +15,14 @@ import numpy as np
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.action import SelfCalibrate
-from fluoro_calib_msgs.msg import (CalibrationStatus, CorrectedObservations, FluoroscopeCalibration,
-                                   TargetObservations)
+from fluoro_calib_msgs.msg import (CalibrationStatus, CorrectedObservations, DriftStatus, FluoroscopeCalibration,
+                                   ReconstructedPoints, RigOrientation, TargetObservations)
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
-from sensor_msgs.msg import CameraInfo
+from sensor_msgs.msg import CameraInfo, PointCloud2
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import MarkerArray
 
 from fluoro_calib_ros.nodes.conversion import message_from_frame
 from fluoro_calib_ros.nodes.qos import LATCHED, OBSERVATIONS
@@ -34,7 +36,9 @@ SUCCEEDED, CANCELED, ABORTED = GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CA
 TOPICS = {'target_observations': (TargetObservations, OBSERVATIONS),
           'corrected_observations': (CorrectedObservations, OBSERVATIONS),
           'calibration': (FluoroscopeCalibration, LATCHED), 'camera_info': (CameraInfo, LATCHED),
-          'calibration_status': (CalibrationStatus, 10)}
+          'calibration_status': (CalibrationStatus, 10), 'rig_orientation': (RigOrientation, LATCHED),
+          'points_with_covariance': (ReconstructedPoints, OBSERVATIONS), 'points': (PointCloud2, OBSERVATIONS),
+          'markers': (MarkerArray, OBSERVATIONS), 'drift': (DriftStatus, 10), 'tf_static': (TFMessage, LATCHED)}
 
 
 def free_domain():
@@ -126,6 +130,22 @@ class Graph:
         for name, process in nodes.items():
             self.client.connect(name, process)
         return nodes
+
+    def whole_chain(self, directory, reconstruction=None, **parameters):
+        """Start the three nodes with the calibrations and the orientation of a folder, and wait until points can come
+        out; returns the processes by name."""
+        nodes = {**self.both_nodes(directory, **parameters),
+                 'reconstruction_node': self.start('reconstruction_node', reconstruction)}
+        for name in NAMES:
+            self.client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'), name)
+        self.client.wait_for_diagnostics('reconstruction_node', lambda s: value_of(s, 'orientation'), 'reconstruction')
+        self.wait_for_readers(1)
+        return nodes
+
+    def wait_for_readers(self, count):
+        """Wait until the correction node knows so many readers of every output: what it publishes now reaches them."""
+        for name in NAMES:
+            self.client.wait_for_diagnostics('correction_node', lambda s: int(value_of(s, 'readers') or 0) >= count, name)
 
     def play(self, bag, readers, rate=10.0):
         """Play a bag to the end."""
@@ -284,6 +304,11 @@ class Client(Node):
     def close(self):
         self._spinner.shutdown()
         self.destroy_node()
+
+
+def value_of(status, key):
+    """Value of a key of a DiagnosticStatus, '' where there is none."""
+    return next((v.value for v in status.values if v.key == key), '')
 
 
 def standing(frame, count, first=1, rate=60.0, shift=0.0, noise=0.02, start_ns=10 ** 18):

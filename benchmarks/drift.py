@@ -1,0 +1,238 @@
+"""The drift watch, end to end on virtual rigs: false alarms against the stated rate, delays, and what is told of a drift.
+
+A rig is calibrated with 15 exposures, its orientation taken from the same; then 30 markers in five rigid clusters move
+through it, are corrected, checked by their epipolar residuals and intersected as in the stream. The motions repeat,
+the noise does not. Frames are handed over block by block, which is the same for the watch and faster than real time.
+"""
+
+import argparse
+import copy
+import multiprocessing
+import sys
+from dataclasses import dataclass
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from fluoro_calib_ros.calibration.job import calibrate
+from fluoro_calib_ros.calibration.orientation import orientation_of_capture, orientation_of_exposures
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.reconstruction.clusters import Cluster
+from fluoro_calib_ros.reconstruction.drift import ERROR, OK, WARN, DriftOptions, DriftWatch
+from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
+from fluoro_calib_ros.reconstruction.intersection import Intersector
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+
+from .timing import table
+
+RATE_HZ, NOISE_PX, FALSE_MATCHES, REJECT = 120, 0.25, 0.01, 4.0
+FRAMES = 30   # of a block of 0.25 s
+CLUSTERS, BEADS = 5, 6
+PERIOD_S = 60   # of one motion
+MOTIONS = 3
+IDS = np.arange(1001, 1001 + CLUSTERS * BEADS)
+SIZE = 1024
+QUARTERS = {'upper left': (0, 0), 'upper right': (1, 0), 'lower left': (0, 1), 'lower right': (1, 1)}
+WITHIN_S = 5.0   # in which a drift is to be found
+AFTER_S = 20.0   # after which it is given up
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A calibrated rig and its markers: observed pixels without noise by fluoroscope (frames, markers, 2)."""
+
+    names: tuple
+    calibrations: dict
+    orientation: object
+    geometry: EpipolarGeometry
+    intersector: Intersector
+    pixels: dict
+
+    @property
+    def clusters(self):
+        """The Clusters, their distances unknown."""
+        return tuple(Cluster(f'bone {i + 1}', IDS[BEADS * i:BEADS * (i + 1)]) for i in range(CLUSTERS))
+
+    def watch(self, options=DriftOptions(), clusters=True):
+        """A DriftWatch of the scene."""
+        o = self.orientation
+        return DriftWatch({n: (SIZE, SIZE) for n in self.names}, options, self.clusters if clusters else (),
+                          (o.interior, o.rotation, o.position_mm))
+
+
+def markers(rng, beads, seconds):
+    """Positions (frames, 30, 3) [mm] of rigid clusters, beads (5, 6, 3) [mm], on the bones of a joint that bends,
+    straightens and sways."""
+    places = np.array([[-8, 0, 85], [12, 10, 40], [0, -5, 0], [-10, -8, -35], [10, 5, -80]], dtype=float)
+    t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
+    speed, phase = rng.uniform(0.7, 1.3, 4), rng.uniform(0, 2 * np.pi, 4)
+    bend = np.deg2rad(25) * np.sin(2 * np.pi * 0.5 * speed[0] * t + phase[0])
+    middle = rng.uniform(-10, 10, 3)
+    sway = middle + np.stack([70 * np.sin(2 * np.pi * 0.31 * speed[1] * t + phase[1]),
+                              70 * np.cos(2 * np.pi * 0.23 * speed[2] * t + phase[2]),
+                              42 * np.sin(speed[3] * t + phase[3])], axis=1)
+    out = []
+    for number, (cluster, place) in enumerate(zip(beads, places)):
+        turn = np.stack([bend * (1, 1, 0.3, -1, -1)[number], 0.3 * np.sin(1.1 * t + number), np.zeros_like(t)], axis=1)
+        out.append((cluster + place) @ matrix_from_vector(turn).transpose(0, 2, 1) + sway[:, None])
+    return np.concatenate(out, axis=1)
+
+
+def scene(seed, source='exposures'):
+    """The Scene of a rig; source of its orientation: the exposures of the calibration, or a 'capture' of the phantom."""
+    rig = virtual_rig(seed)
+    exposures = simulate_exposures(rig, 15, seed).frames
+    calibrations = calibrate(exposures, rig.phantom).calibrations
+    if source == 'capture':
+        still = simulate_exposures(rig, 1, seed + 10_000).frames
+        orientation = orientation_of_capture(still, rig.phantom, calibrations)
+    else:
+        orientation = orientation_of_exposures(exposures, rig.phantom, calibrations)
+    rng = np.random.default_rng([seed, 4])
+    beads = rng.uniform(-22, 22, (CLUSTERS, BEADS, 3))
+    points = np.concatenate([markers(rng, beads, PERIOD_S) for _ in range(MOTIONS)])
+    pixels = {f.name: f.distortion.distort(f.ideal(points.reshape(-1, 3))).reshape(*points.shape[:2], 2)
+              for f in rig.fluoroscopes}
+    return Scene(tuple(pixels), calibrations, orientation, EpipolarGeometry(orientation, *pixels),
+                 Intersector(orientation, None), pixels)
+
+
+def false_matches(rng, uv):
+    """Pixels with FALSE_MATCHES of them some pixels away, where another bead may have been."""
+    wrong = rng.random(uv.shape[:2]) < FALSE_MATCHES
+    uv[wrong] += rng.uniform(-12, 12, (int(wrong.sum()), 2))
+    return uv
+
+
+def blocks(scene_, rng, first, count, drift=None):
+    """Blocks of the stream: pixels by fluoroscope (FRAMES, markers, 2), corrected points, their systematic sd, stamps.
+
+    first: number of the block to begin with; drift(name, uv, t): shift (k, 2) [px] of observed pixels (k, 2) at t [s].
+    """
+    total = next(iter(scene_.pixels.values())).shape[0] // FRAMES
+    for number in range(first, first + count):
+        rows = slice(FRAMES * (number % total), FRAMES * (number % total + 1))
+        seen, corrected, systematic = {}, {}, {}
+        for name in scene_.names:
+            uv = scene_.pixels[name][rows] + rng.normal(0, NOISE_PX, (FRAMES, len(IDS), 2))
+            uv = false_matches(rng, uv)
+            if drift is not None:
+                uv = uv + drift(name, uv.reshape(-1, 2), number * FRAMES / RATE_HZ).reshape(uv.shape)
+            found = scene_.calibrations[name].correct(uv.reshape(-1, 2), np.zeros(uv[..., 0].size))
+            seen[name], corrected[name], systematic[name] = uv.reshape(-1, 2), found.uv, found.sigma
+        yield seen, corrected, systematic, (np.arange(FRAMES) + number * FRAMES) * 1_000_000_000 // RATE_HZ
+
+
+def feed(scene_, watch, block, clusters=True):
+    """Hand a block of the stream to the watch; returns its state."""
+    seen, corrected, systematic, stamps = block
+    a, b = scene_.names
+    noise = [scene_.calibrations[name].image_sd for name in scene_.names]
+    found = scene_.geometry.residuals(corrected[a], corrected[b], systematic[a], systematic[b])
+    sd_noise = np.hypot(found.factor_a * noise[0], found.factor_b * noise[1])
+    good = np.abs(found.residual) <= REJECT * np.hypot(sd_noise, found.sd_total)
+    state = watch.add(stamps[0], a, b, np.tile(IDS, FRAMES)[good], *(x[good] for x in (
+        seen[a], seen[b], found.residual, sd_noise, found.sd_total, found.normal_a, found.normal_b, found.factor_a,
+        found.factor_b)))
+    if clusters:
+        uv = np.stack([corrected[a], corrected[b]])
+        uv[:, ~good] = np.nan
+        points = scene_.intersector.intersect(uv, np.repeat(np.array(noise)[:, None], uv.shape[1], axis=1))
+        where, sd = np.stack([seen[a], seen[b]]), np.stack([systematic[a], systematic[b]])
+        for k, stamp in enumerate(stamps):
+            rows = slice(k * len(IDS), (k + 1) * len(IDS))
+            state = watch.add_points(stamp, IDS, points.xyz_mm[rows], points.covariance_noise[rows], where[:, rows],
+                                     sd[:, rows])
+    return state
+
+
+def step_of(fluoroscope, quarter, size, direction, begin, ramp_s=0.0):
+    """A drift for `blocks`: size [px] in a direction [deg] over a quarter of an image from begin [s] on, after ramp_s
+    at its full size."""
+    vector = size * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
+    column, row = QUARTERS[quarter]
+
+    def drift(name, uv, t):
+        if name != fluoroscope or t < begin:
+            return np.zeros_like(uv)
+        inside = ((uv[:, 0] >= SIZE / 2) == column) & ((uv[:, 1] >= SIZE / 2) == row)
+        return inside[:, None] * vector * (min(1.0, (t - begin) / ramp_s) if ramp_s else 1.0)
+    return drift
+
+
+def false_alarms(seed, hours=0.5, source='exposures', options=DriftOptions(), clusters=True):
+    """Alarms of a stream without drift: dict of hours, the number of WARNs and ERRORs that began, the largest evidence
+    over the threshold of WARN, and the sentences of the alarms."""
+    scene_ = scene(seed, source)
+    watch, rng = scene_.watch(options, clusters), np.random.default_rng([seed, 5])
+    count, level, largest, said = [0, 0, 0], OK, 0.0, []
+    for block in blocks(scene_, rng, 0, round(hours * 3600 * RATE_HZ / FRAMES)):
+        state = feed(scene_, watch, block, clusters)
+        largest = max(largest, state.evidence / state.threshold_warn)
+        if state.level > level:
+            said.append(state.message)
+            for passed in range(level + 1, state.level + 1):
+                count[passed] += 1
+        level = state.level
+    return {'seed': seed, 'source': source, 'hours': hours, 'warn': count[WARN], 'error': count[ERROR],
+            'largest': largest, 'said': said}
+
+
+def right_place(state, quarter):
+    """Whether the area of a state is the quarter, or a part of it."""
+    u0, v0, u1, v1 = np.array(state.area) / SIZE
+    column, row = QUARTERS[quarter]
+    return bool(abs((u0 + u1) / 2 - 0.25 - 0.5 * column) < 0.2 and abs((v0 + v1) / 2 - 0.25 - 0.5 * row) < 0.2)
+
+
+def detection(scene_, watch, first, fluoroscope, quarter, size, direction, rng, clusters=True, ramp_s=0.0,
+              after_s=AFTER_S):
+    """One drift from block first on: delays of WARN and ERROR [s] (inf: not found), and what was told of it."""
+    begin = first * FRAMES / RATE_HZ
+    drift = step_of(fluoroscope, quarter, size, direction, begin, ramp_s)
+    out = {'fluoroscope': fluoroscope, 'quarter': quarter, 'size': size, 'direction': direction, 'warn': np.inf,
+           'error': np.inf, 'message': ''}
+    for number, block in enumerate(blocks(scene_, rng, first, round(after_s * RATE_HZ / FRAMES), drift)):
+        state = feed(scene_, watch, block, clusters)
+        # A block is judged when the next one begins: that is the time of the alarm.
+        delay = number * FRAMES / RATE_HZ
+        if state.level >= WARN:
+            out['warn'] = min(out['warn'], delay)
+        if state.level == ERROR:
+            out['error'] = min(out['error'], delay)
+            if delay >= min(WITHIN_S, after_s - 1) or ramp_s:   # what is told is judged then, or when it is found later
+                vector = size * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
+                out.update(message=state.message, named=state.fluoroscope, place=right_place(state, quarter),
+                           source=state.source, sd=state.sd, since=state.since_s - delay,
+                           size_error=state.size - float(vector @ state.direction))
+                break
+    return out
+
+
+def detections(seed, size=0.5, clusters=True, source='exposures', directions=8):
+    """Drifts over every quarter of both images in so many directions: a list of dicts of `detection`."""
+    scene_ = scene(seed, source)
+    watch, rng = scene_.watch(clusters=clusters), np.random.default_rng([seed, 6])
+    learned = round(15 * RATE_HZ / FRAMES)
+    for block in blocks(scene_, rng, 0, learned):
+        feed(scene_, watch, block, clusters)
+    out, total = [], PERIOD_S * MOTIONS * RATE_HZ // FRAMES
+    for name in scene_.names:
+        for quarter in QUARTERS:
+            for k in range(directions):
+                first = learned + int(rng.integers(total))   # the motion from anywhere on
+                out.append(dict(detection(scene_, copy.deepcopy(watch), first, name, quarter, size, 360 * k / directions,
+                                          rng, clusters), seed=seed, clusters=clusters))
+    return out
+
+
+def slow(seed, size=0.5, hours=1.0, clusters=True):
+    """A drift that takes hours to its size, in a quarter and a direction drawn at random: dict of `detection`."""
+    scene_ = scene(seed)
+    watch, rng = scene_.watch(clusters=clusters), np.random.default_rng([seed, 7])
+    learned = round(15 * RATE_HZ / FRAMES)
+    for block in blocks(scene_, rng, 0, learned):
+        feed(scene_, watch, block, clusters)
+    return dict(detection(scene_, watch, learned, str(rng.choice(scene_.names)), str(rng.choice(list(QUARTERS))), size,
+                          45 * int(rng.integers(8)), rng, clusters, hours * 3600, 1.2 * hours * 3600), seed=seed,
+                clusters=clusters, hours=hours)

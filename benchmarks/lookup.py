@@ -1,0 +1,132 @@
+"""The lookup grid of the correction: points a second, frames of 30 points beside scikit-learn, building, accuracy.
+
+    python -m benchmarks.lookup             all correction models
+    python -m benchmarks.lookup knn auto    these only
+"""
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from sklearn.neighbors import KNeighborsRegressor
+from threadpoolctl import threadpool_limits
+
+from fluoro_calib_ros.calibration.job import calibrate
+from fluoro_calib_ros.calibration.self_calibration import Options
+from fluoro_calib_ros.distortion.grid import CorrectionGrid
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+
+from .timing import section, timed
+
+MODELS = ('knn', 'local_linear', 'hybrid', 'parametric', 'collocation')
+POINTS = 2 ** 20   # of a large array
+FRAME = 30   # points of a frame
+ROUNDS = 41   # in each, ours and theirs one after the other
+HEADER = ['model', 'cell [px]', 'largest difference [px]', 'built in', 'points a second', f'{FRAME} points',
+          f'{FRAME} points corrected', 'KNeighborsRegressor.predict', 'faster by']
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What was measured of one correction model.
+
+    kind and k; cell_px; error_px: largest difference of a coordinate from the exact model at 20,000 random pixels of
+    the calibrated area, stated_px: what the grid says of itself; build_s; points_per_s of a large array on one core;
+    look_up_s, correct_s and predict_s of a frame, and ratio of predict_s to look_up_s.
+    """
+
+    kind: str
+    k: int
+    cell_px: float
+    error_px: float
+    stated_px: float
+    build_s: float
+    points_per_s: float
+    look_up_s: float
+    correct_s: float
+    predict_s: float
+    ratio: float
+
+
+def mean_time(function, calls):
+    """Mean wall time [s] of a call."""
+    began = time.perf_counter()
+    for _ in range(calls):
+        function()
+    return (time.perf_counter() - began) / calls
+
+
+def beside_each_other(ours, correct, theirs):
+    """Median times [s] of calls of three functions, and median ratio of the third to the first, in rounds of all
+    three: what else the machine does hits all of them."""
+    rounds = np.array([[mean_time(ours, 100), mean_time(correct, 100), mean_time(theirs, 5)] for _ in range(ROUNDS)])
+    return *np.median(rounds, axis=0), float(np.median(rounds[:, 2] / rounds[:, 0]))
+
+
+def points_per_second(grid, rng):
+    """Points of a large array that are looked up in a second of a core: du, dv, standard deviation and status of
+    pixels in random order, which is the worst for the cache. Median of 15."""
+    u, v = rng.uniform(-0.5, np.array(grid.image_size)[:, None] - 0.5, (2, POINTS))
+    values, status, seconds = np.empty((3, POINTS)), np.empty(POINTS, dtype=np.uint8), []
+    for _ in range(15):
+        began = time.thread_time()
+        grid.look_up(u, v, values, status)
+        seconds.append(time.thread_time() - began)
+    return float(POINTS / np.median(seconds))
+
+
+def measure(model):
+    """Figures of a correction model (of Options), of a calibration of the virtual rig with 15 exposures."""
+    rig, rng = virtual_rig(1), np.random.default_rng(0)
+    frames = {'a': simulate_exposures(rig, 15, 1, matched=(130, 134)).frames['a']}
+    calibration = calibrate(frames, rig.phantom, Options(model)).calibrations['a']
+    exact = calibration.model
+    grid, build_s = timed(lambda: CorrectionGrid(exact, calibration.image_size), 3)
+    uv = rng.uniform(-0.5, np.array(calibration.image_size) - 0.5, (20_000, 2))
+    found = grid.look_up(*uv.T)[0][:2].T
+    error = np.abs(found - exact.predict(uv))[~exact.outside(uv)].max()
+
+    calibration.prepare()
+    frame = rng.uniform(80, 940, (FRAME, 2))
+    u, v = np.ascontiguousarray(frame.T)
+    # A model without neighbours stands beside the paper's: the regressor with k = 3.
+    peer = KNeighborsRegressor(exact.k or 3, algorithm='kd_tree').fit(exact.train_uv, exact.train_duv)
+    times = beside_each_other(lambda: grid.look_up(u, v), lambda: calibration.correct_arrays(u, v),
+                              lambda: peer.predict(frame))
+    return Figures(exact.kind, exact.k, grid.cell_px, float(error), grid.error_px, build_s,
+                   points_per_second(grid, rng), *times)
+
+
+def row(f):
+    """The row of the table for Figures."""
+    return [f'{f.kind}, k = {f.k}' if f.k else f.kind, f'{f.cell_px:g}', f'{f.error_px:.4f}', f'{f.build_s:.2f} s',
+            f'{f.points_per_s / 1e6:.0f} million', f'{f.look_up_s * 1e6:.1f} us', f'{f.correct_s * 1e6:.1f} us',
+            f'{f.predict_s * 1e6:.0f} us', f'{f.ratio:.0f}']
+
+
+def lookup_section(models=MODELS):
+    """The lookup grid by correction model."""
+    return section(
+        'Lookup of the correction',
+        'From the grid that is built when a calibration arrives: du, dv, standard deviation and status. Points a '
+        f'second are those of {POINTS:,} pixels in random order, a second being one of a core. Corrected: u, v, '
+        'standard deviation with that of the observation, and status, as the node needs them. Beside them '
+        'scikit-learn with the same training points and the same k (3 for a model without neighbours) in the same '
+        'rounds. The difference from the exact model is that of 20,000 random pixels of the calibrated area; knn is '
+        'piecewise constant, and its lookups lie between the values at the corners of a cell.',
+        HEADER, [row(measure(model)) for model in models])
+
+
+def main(arguments=None):
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog='python -m benchmarks.lookup', description=__doc__.splitlines()[0])
+    parser.add_argument('model', nargs='*', help=f'correction models (default: {", ".join(MODELS)})')
+    models = parser.parse_args(arguments).model or MODELS
+    with threadpool_limits(1):
+        sys.stdout.write(lookup_section(models) + '\n')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,201 @@
+"""The online path at lab rates: nodes as processes of their own, beside relays that do nothing with the same messages.
+
+    python -m benchmarks.online [--seconds 60] [--only NAME]      printed; with --write also docs/online.md
+
+The simulator, the nodes under test and the reader (this process) share the machine. A frame is lost when it does not
+come out; latency is from the stamp of the simulator, set just before it publishes, to the time stamp that DDS gives
+the output when it is published: the way through DDS to the node is in it.
+"""
+
+import argparse
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from fluoro_calib_msgs.msg import (CorrectedObservations, FluoroscopeCalibration, ReconstructedPoints, RigOrientation,
+                                   TargetObservations)
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo
+
+from fluoro_calib_ros.calibration.job import calibrate
+from fluoro_calib_ros.calibration.orientation import orientation_of_exposures
+from fluoro_calib_ros.nodes.conversion import message_from_calibration
+from fluoro_calib_ros.nodes.graph import isolate
+from fluoro_calib_ros.nodes.qos import LATCHED, OBSERVATIONS
+from fluoro_calib_ros.nodes.spatial import message_from_orientation
+from fluoro_calib_ros.nodes.streams import StreamReader
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+
+from .timing import table
+
+NAMES = ('a', 'b')
+CASES = {   # name: (scene, rate, nodes under test)
+    'markers 250 Hz': ('markers', 250, ('correction_node', 'relay_plain', 'relay_streams')),
+    'grid 30 Hz': ('grid', 30, ('correction_node', 'relay_plain', 'relay_streams')),
+    'markers 1000 Hz': ('markers', 1000, ('correction_node',)),
+    'markers 1000 Hz with relay': ('markers', 1000, ('correction_node', 'relay_plain')),
+    'whole chain 250 Hz': ('markers', 250, ('correction_node', 'reconstruction_node')),
+    'whole chain 1000 Hz': ('markers', 1000, ('correction_node', 'reconstruction_node'))}
+OUTPUTS = {'correction_node': ('corrected_observations', CorrectedObservations),
+           'relay_plain': ('relayed_plain', TargetObservations),
+           'relay_streams': ('relayed_streams', TargetObservations)}
+TICK = os.sysconf('SC_CLK_TCK')
+
+
+class Reader(Node):
+    """Publishes the calibration, and counts what the nodes put out."""
+
+    def __init__(self, calibrations, orientation):
+        super().__init__('reader')
+        self.spinner = SingleThreadedExecutor()
+        self.spinner.add_node(self)
+        for name, calibration in calibrations.items():
+            self.create_publisher(FluoroscopeCalibration, f'{name}/calibration', LATCHED).publish(
+                message_from_calibration(calibration))
+        self.create_publisher(RigOrientation, 'rig_orientation', LATCHED).publish(message_from_orientation(orientation))
+        self.ready = set()   # fluoroscopes that are corrected
+        for name in NAMES:
+            self.create_subscription(CameraInfo, f'{name}/camera_info', lambda _, name=name: self.ready.add(name), LATCHED)
+        self.came = {}   # (node, fluoroscope): [(frame number, latency [ns]), ...]
+        self.reader = None
+
+    def listen(self, nodes):
+        """Count the outputs of nodes anew."""
+        self.came = {}
+        self.reader = StreamReader(self, self.get_logger().fatal, self.get_logger().fatal)
+        for node in nodes:
+            if node == 'reconstruction_node':
+                self._listen(node, 'ab', 'reconstruction/points_with_covariance', ReconstructedPoints)
+                continue
+            topic, kind = OUTPUTS[node]
+            for name in NAMES:
+                self._listen(node, name, f'{name}/{topic}', kind)
+        self.reader.start()
+
+    def _listen(self, node, name, topic, kind):
+        came = self.came[node, name] = []
+        self.reader.subscribe(kind, topic, lambda data, info: came.append(_number_and_latency(data, info)),
+                              OBSERVATIONS, raw=True)
+
+    def wait(self, condition, seconds, what):
+        """Spin until condition() is true."""
+        end = time.monotonic() + seconds
+        while not condition():
+            if time.monotonic() > end:
+                raise SystemExit(f'waited {seconds} s for {what}')
+            self.spinner.spin_once(timeout_sec=0.1)
+
+
+def _number_and_latency(data, info):
+    """Frame number and latency [ns] of the CDR bytes of a message that begins with header and frame_number."""
+    seconds, nanoseconds, length = struct.unpack_from('<iII', data, 4)
+    at = 4 + (12 + length + 3) // 4 * 4
+    return struct.unpack_from('<I', data, at)[0], info['source_timestamp'] - seconds * 10 ** 9 - nanoseconds
+
+
+def _cpu(process):
+    """CPU time [s] that a process has used, all its threads together."""
+    fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICK
+
+
+def _command(node, **parameters):
+    module = ['benchmarks.relay', node.removeprefix('relay_')] if node.startswith('relay') else [
+        f'fluoro_calib_ros.nodes.{node}']
+    command = [sys.executable, '-m', *module, '--ros-args']
+    for key, value in parameters.items():
+        command += ['-p', f'{key}:={value}']
+    return command
+
+
+def measured(reader, scene, rate, nodes, seconds, log):
+    """[{node, lost, p50, p99, max [ms], cpu [us a message]}] of a case."""
+    processes = {node: subprocess.Popen(_command(node), stdout=log, stderr=log) for node in nodes}
+    frames = round(rate * seconds)
+    reader.listen(nodes)
+    reader.ready.clear()
+    reader.wait(lambda: len(reader.ready) == len(NAMES), 60, 'the correction node')
+    simulator = subprocess.Popen(_command('simulator_node', scene=scene, rate=float(rate), clusters=5, frames=frames,
+                                          wait_for_readers=len(nodes) - ('reconstruction_node' in nodes)),
+                                 stdout=log, stderr=log)
+    try:
+        reader.wait(lambda: all(reader.came.values()), 60, 'the first frames')
+        began = {node: _cpu(p) for node, p in processes.items()} | {'simulator_node': _cpu(simulator)}
+        first = {key: len(of_one) for key, of_one in reader.came.items()}
+        reader.wait(lambda: simulator.poll() is not None or _nearly(reader.came, frames), seconds + 60, 'the stream')
+        used = {node: _cpu(p) - began[node] for node, p in processes.items()}
+        counted = {key: len(of_one) - first[key] for key, of_one in reader.came.items()}
+        reader.wait(lambda: simulator.poll() is not None, 60, 'the end of the simulator')
+    finally:
+        for process in (*processes.values(), simulator):
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+        for process in (*processes.values(), simulator):
+            process.wait(20)
+        reader.reader.stop()
+    return [_figures(reader, node, frames, used[node], counted) for node in nodes]
+
+
+def _nearly(came, frames):
+    """Whether the stream is over but for its last frames: the CPU of what is ending is not that of the stream."""
+    return all(of_one[-1][0] >= frames - 10 for of_one in came.values())
+
+
+def _figures(reader, node, frames, used, counted):
+    of_node = {key: np.array(of_one) for key, of_one in reader.came.items() if key[0] == node}
+    latency = np.concatenate([of_one[:, 1] for of_one in of_node.values()]) * 1e-6
+    lost = sum(frames - len(np.unique(of_one[:, 0])) for of_one in of_node.values())
+    twice = sum(len(of_one) - len(np.unique(of_one[:, 0])) for of_one in of_node.values())
+    messages = sum(counted[key] for key in of_node) * (2 if node == 'reconstruction_node' else 1)
+    return {'node': node, 'frames': frames * len(of_node), 'lost': lost, 'twice': twice,
+            'p50': np.percentile(latency, 50), 'p99': np.percentile(latency, 99), 'max': latency.max(),
+            'cpu_us': used / messages * 1e6}
+
+
+def rig_of_the_simulator():
+    """Calibrations and orientation of the rig that the simulator shows."""
+    rig = virtual_rig(1)
+    frames = simulate_exposures(rig, 15, 1).frames
+    job = calibrate(frames, rig.phantom)
+    return job.calibrations, orientation_of_exposures(frames, rig.phantom, job.calibrations)
+
+
+def run(seconds, only=''):
+    """{case: figures of its nodes}."""
+    isolate()
+    rclpy.init(args=[])
+    reader, out = Reader(*rig_of_the_simulator()), {}
+    with open(os.environ.get('ONLINE_LOG', os.devnull), 'ab') as log:
+        for case, (scene, rate, nodes) in CASES.items():
+            if only in case:
+                out[case] = measured(reader, scene, rate, nodes, seconds, log)
+                print(case, *(' '.join(f'{k} {v:.3f}' if isinstance(v, float) else f'{k} {v}' for k, v in f.items())
+                              for f in out[case]), sep='\n   ', flush=True)
+    reader.destroy_node()
+    rclpy.shutdown()
+    return out
+
+
+def text_of(results):
+    """Markdown table of the results."""
+    rows = []
+    for case, figures in results.items():
+        for f in figures:
+            rows.append([f'{case}: {f["node"]}', str(f['frames']), str(f['lost']), f'{f["p50"]:.2f}', f'{f["p99"]:.2f}',
+                         f'{f["max"]:.1f}', f'{f["cpu_us"]:.0f}'])
+    return table(['case: node', 'frames', 'lost', 'p50 [ms]', 'p99 [ms]', 'max [ms]', 'CPU a message [us]'], rows)
+
+
+if __name__ == '__main__':
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--seconds', type=float, default=60.0)
+    parser.add_argument('--only', default='', help='cases whose name contains this')
+    options = parser.parse_args()
+    print(text_of(run(options.seconds, options.only)))

@@ -1,0 +1,1 @@
+"""Whole images without distortion: where each pixel comes from, found once, and encoded images."""

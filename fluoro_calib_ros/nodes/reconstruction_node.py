@@ -1,0 +1,331 @@
+"""Node that intersects the corrected views of a rig: points in space, with how good they are, live."""
+
+import time
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+from fluoro_calib_msgs.msg import CorrectedObservations, DriftStatus, ReconstructedPoints, RigOrientation
+from fluoro_calib_msgs.srv import Reset
+from sensor_msgs.msg import CameraInfo, PointCloud2
+from tf2_msgs.msg import TFMessage
+from visualization_msgs.msg import MarkerArray
+
+from ..calibration.collector import FramePairer
+from ..files.orientation import load_orientation
+from ..photogrammetry.observations import DataError
+from ..reconstruction.drift import DriftOptions
+from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, Intersector
+from ..reconstruction.matching import matched
+from ..reconstruction.watching import RigWatch, clusters_of
+from . import support
+from .checks import Refused, check_corrected
+from .conversion import to_nanoseconds
+from .qos import LATCHED, OBSERVATIONS, overridable
+from .spatial import (MocapMarkers, cloud_message, drift_message, ellipsoids_message, message_from_orientation,
+                      mocap_message, orientation_from_message, points_message, transforms_of)
+from .streams import StreamReader
+from .support import StartError, declare
+
+KINDS = ('undecodable', 'lengths', 'repeated target')   # of refused messages
+ORIENTATIONS = 4   # that are kept: frames of the calibration before may still come
+
+
+class _View(NamedTuple):
+    """A corrected frame that waits for its partners."""
+
+    fluoroscope: str
+    number: int
+    stamp_ns: int
+    message: CorrectedObservations
+
+
+class _Rig(NamedTuple):
+    """An orientation that arrived, and what is made of it once; watch: RigWatch, None while there is none."""
+
+    orientation_id: str
+    orientation: object
+    intersector: Intersector
+    watch: RigWatch | None
+
+
+class ReconstructionNode(support.ManagedNode):
+    """Publishes points in space for every exposure of which all fluoroscopes have come."""
+
+    def __init__(self):
+        super().__init__('reconstruction_node')
+        self._names = support.fluoroscopes_of(self, least=2)
+        self._pairing = (declare(self, 'pair_by', 'frame_number', 'how frames are paired: frame_number or stamp'),
+                         round(1e9 * declare(self, 'pair_tolerance', 0.002,
+                                             'largest difference of the stamps of a pair [s]', 0.0, 1.0)),
+                         declare(self, 'waiting', 64, 'frames of a fluoroscope that wait for their partners', 1, 10000))
+        self._reject = declare(self, 'reject', 4.0, 'epipolar distance above which image points do not belong '
+                               'together [standard deviations]', 1.0, 1000.0)
+        self._file = declare(self, 'orientation_file', '', 'rig_orientation.npz to begin with; empty: the orientation '
+                             'comes from the topic rig_orientation')
+        self._sigmas = declare(self, 'ellipsoid_sigmas', 10.0, 'half axes of the ellipsoids for RViz [standard '
+                               'deviations]', 0.1, 1000.0)
+        self._every_ns = round(1e9 / declare(self, 'ellipsoid_rate', 30.0, 'most MarkerArrays a second', 0.1, 1000.0))
+        self._read_watch()
+        try:
+            FramePairer(self._names, *self._pairing)
+        except ValueError as error:
+            raise StartError(f'parameter {error}') from None
+        self._sentences = support.Sentences(self.get_logger())
+        self._outputs, self._subscriptions, self._reader = {}, [], None
+        self._forget()
+
+    def _read_watch(self):
+        """Parameters of the drift watch. Raises StartError."""
+        self._watching = declare(self, 'drift_watch', True, 'look in the stream for a drift of the calibration')
+        hours = [declare(self, f'drift_{level}_interval', default, 'mean time between two false alarms of the level '
+                         f'{level.upper()} [h of stream]', 0.01, 1e6)
+                 for level, default in (('warn', 10.0), ('error', 1000.0))]
+        self._watch_rate = declare(self, 'drift_rate', 120.0, 'most exposures a second that the drift watch looks at',
+                                   1.0, 10000.0)
+        clusters = declare(self, 'clusters', [''], "rigid clusters of targets, whose distances must not change: "
+                           "'tibia: 1001 1002 1003', ...")
+        self._collect_on_drift = declare(self, 'collect_on_drift', False, 'at a drift of level ERROR call the service '
+                                         'collect_anew of the calibration node')
+        try:
+            self._clusters = clusters_of([text for text in clusters if text])
+            self._watch_options = DriftOptions(warn_interval_h=hours[0], error_interval_h=hours[1])
+        except ValueError as error:
+            raise StartError(f'parameter clusters or drift_warn_interval, drift_error_interval: {error}') from None
+
+    def _forget(self):
+        self._rigs = {}   # calibration ids: _Rig; replaced as a whole
+        self._pairer = FramePairer(self._names, *self._pairing)
+        self._received, self._refused, self._points = Counter(), Counter(), Counter()
+        self._exposures = self._reconstructed = self._without_orientation = 0
+        self._last_fault = ''
+        self._latencies, self._drawn = support.Latencies(), 0
+        self._sizes, self._newest, self._alarmed = {}, None, False
+
+    # -- lifecycle
+
+    def open(self):
+        """Make outputs, and take orientations."""
+        kinds = {'points_with_covariance': ReconstructedPoints, 'points': PointCloud2, 'markers': MarkerArray}
+        if MocapMarkers is not None:
+            kinds['mocap_markers'] = MocapMarkers
+        for name, kind in kinds.items():
+            self._outputs[name] = self.create_lifecycle_publisher(
+                kind, f'reconstruction/{name}', OBSERVATIONS, qos_overriding_options=overridable())
+        self._outputs['drift'] = self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)
+        self._outputs['tf'] = self.create_publisher(TFMessage, '/tf_static', LATCHED)
+        self._diagnostics = support.Diagnostics(self)
+        self._subscriptions = [self.create_subscription(RigOrientation, 'rig_orientation', self._on_orientation, LATCHED)]
+        self._subscriptions += [self.create_subscription(
+            CameraInfo, f'{name}/camera_info', lambda message, name=name: self._on_info(name, message), LATCHED)
+            for name in self._names]
+        self._collect_anew = self.create_client(Reset, 'collect_anew')
+        self._timer = self.create_timer(1.0, self._on_timer)
+        if self._file:
+            try:
+                self._on_orientation(message_from_orientation(load_orientation(self._file)))
+            except DataError as error:
+                self.get_logger().error(str(error))
+                self._last_fault = str(error)
+
+    def begin(self):
+        """Take corrected observations."""
+        self._reader = StreamReader(self, self._on_undecodable, self.fail)
+        for name in self._names:
+            self._reader.subscribe(CorrectedObservations, f'{name}/corrected_observations',
+                                   lambda message, info, name=name: self._on_view(name, message, info),
+                                   OBSERVATIONS)
+        self._reader.start()
+
+    def end(self):
+        """Take no more of them."""
+        if self._reader is not None:
+            self._reader.stop()
+            self._reader = None
+
+    def close(self):
+        """Take the outputs back, and forget what was received."""
+        if self._outputs:
+            self.destroy_timer(self._timer)
+            self.destroy_client(self._collect_anew)
+            self._diagnostics.close()
+        for subscription in self._subscriptions:
+            self.destroy_subscription(subscription)
+        for publisher in self._outputs.values():
+            self.destroy_publisher(publisher)
+        self._subscriptions, self._outputs = [], {}
+        self._forget()
+
+    # -- orientation
+
+    def _on_orientation(self, message):
+        """Take an orientation over, and tell TF."""
+        try:
+            orientation = orientation_from_message(message).subset(self._names)
+            rig = _Rig(message.orientation_id, orientation, Intersector(orientation, self._reject),
+                       self._watch_of(orientation))
+        except DataError as error:
+            self._last_fault = str(error)
+            self.get_logger().error(f'orientation refused, the running one stays: {error}')
+            return
+        kept = list(self._rigs.items())[-(ORIENTATIONS - 1):]
+        self._rigs = {**{ids: old for ids, old in kept if ids != orientation.calibration_ids},
+                      orientation.calibration_ids: rig}
+        self._outputs['tf'].publish(transforms_of(message))
+        self.get_logger().info(f'orientation {message.orientation_id} now, by {message.source} '
+                               f'({message.exposures} exposures), in frame {message.header.frame_id}')
+
+    def _watch_of(self, orientation):
+        """RigWatch of an orientation, None where none is wanted or the sizes of the images are not known yet."""
+        if not self._watching or any(name not in self._sizes for name in self._names):
+            return None
+        return RigWatch(orientation, self._sizes, self._watch_options, self._clusters, self._watch_rate)
+
+    def _on_info(self, name, message):
+        """Take the size of a fluoroscope's images, which the drift watch needs."""
+        size = message.width, message.height
+        if self._sizes.get(name) != size:
+            self._sizes = {**self._sizes, name: size}
+            self._rigs = {ids: rig._replace(watch=self._watch_of(rig.orientation)) for ids, rig in self._rigs.items()}
+
+    # -- corrected observations
+
+    def _on_undecodable(self, topic):
+        name = topic.split('/')[-2]
+        self._received[name] += 1
+        self._refuse(Refused('undecodable', f'fluoroscope {name}: a message on {topic} cannot be decoded'))
+
+    def _refuse(self, error):
+        self._refused[error.kind] += 1
+        self._last_fault = str(error)
+        self._sentences.warn(f'frame refused: {error}')
+
+    def _on_view(self, name, message, info):
+        """Take a corrected frame; once its partners are there the points are intersected."""
+        self._received[name] += 1
+        try:
+            check_corrected(name, message)
+        except Refused as error:
+            self._refuse(error)
+            return
+        exposure = self._pairer.add(_View(name, message.frame_number, to_nanoseconds(message.header.stamp), message))
+        if exposure is not None:
+            self._exposures += 1
+            views = [exposure[n] for n in self._names]
+            rig = self._rigs.get(tuple(view.message.calibration_id for view in views))
+            if rig is None:
+                self._without_orientation += 1
+                return
+            self._newest = rig, views[0].message.header.stamp
+            self._reconstruct(rig, views[0].stamp_ns, [view.message for view in views])
+            self._latencies.add(time.time_ns() - info['received_timestamp'])
+
+    def _reconstruct(self, rig, stamp_ns, views):
+        """Intersect the views of an exposure and publish the points."""
+        ids = [np.frombuffer(view.target_id, dtype=np.uint32) for view in views]
+        places = [np.array([view.u, view.v]).T for view in views]
+        target_id, uv, sigma, outside = matched(
+            ids, places, [np.frombuffer(view.sigma) for view in views],
+            [np.frombuffer(view.status, dtype=np.uint8) == OUTSIDE for view in views])
+        points = rig.intersector.intersect(uv, sigma, outside)
+        message = points_message(views[0], rig, target_id, points)
+        self._outputs['points_with_covariance'].publish(message)
+        self._reconstructed += 1
+        self._count(points)
+        self._publish_views(message, points)
+        if rig.watch is not None and rig.watch.wants(stamp_ns):
+            _, _, correction_sd, _ = matched(ids, places, [np.frombuffer(view.correction_sd) for view in views])
+            rig.watch.take(stamp_ns, target_id, uv, sigma, correction_sd, points)
+
+    def _count(self, points):
+        """Count the points by status."""
+        self._points['points'] += len(points.status)
+        if points.status.any():
+            for status, name in ((OUTSIDE, 'outside'), (REJECTED, 'rejected'), (FAILED, 'failed'),
+                                 (SINGLE_VIEW, 'in a single view')):
+                self._points[name] += int(np.count_nonzero(points.status == status))
+
+    def _publish_views(self, message, points):
+        """Publish the other forms of the points, where somebody listens."""
+        cloud, markers, mocap = (self._outputs.get(name) for name in ('points', 'markers', 'mocap_markers'))
+        wanted = [output is not None and output.get_subscription_count() > 0 for output in (cloud, markers, mocap)]
+        if not any(wanted):
+            return
+        good = np.flatnonzero(points.status <= OUTSIDE)
+        if wanted[0]:
+            cloud.publish(cloud_message(message, good))
+        if wanted[2]:
+            mocap.publish(mocap_message(message, good.tolist()))
+        now = time.monotonic_ns()
+        if wanted[1] and now - self._drawn >= self._every_ns:
+            self._drawn = now
+            markers.publish(ellipsoids_message(message, good.tolist(), self._sigmas))
+
+    # -- diagnostics
+
+    def _on_timer(self):
+        unpaired, late = (sum(counts.values()) for counts in (self._pairer.unpaired, self._pairer.late))
+        rig = next(reversed(self._rigs.values()), None)
+        values = {**{f'frames received of {name}': self._received[name] for name in self._names},
+                  'exposures': self._exposures, 'exposures reconstructed': self._reconstructed,
+                  'exposures without orientation': self._without_orientation,
+                  'frames unpaired': unpaired, 'frames late': late, 'frames refused': self._refused.total(),
+                  **{f'refused: {kind}': self._refused[kind] for kind in KINDS},
+                  **{f'points {name}' if name != 'points' else name: self._points[name]
+                     for name in ('points', 'outside', 'rejected', 'failed', 'in a single view')},
+                  'last fault': self._last_fault, 'orientation': rig.orientation_id if rig else '',
+                  'source of the orientation': rig.orientation.source if rig else '',
+                  **self._latencies.values()}
+        self._diagnostics.publish([('reconstruction', *self._verdict(unpaired), values), *self._drift()])
+
+    def _drift(self):
+        """Publish the state of the drift watch; returns its diagnostics, none where nothing is watched."""
+        newest = self._newest
+        if newest is None or newest[0].watch is None:
+            return []
+        state = newest[0].watch.state
+        message = drift_message(state, newest[1], newest[0].orientation)
+        self._outputs['drift'].publish(message)
+        alarmed = state.level == DriftStatus.ERROR
+        if alarmed and not self._alarmed:
+            self.get_logger().error(state.message)
+            if self._collect_on_drift and self._collect_anew.service_is_ready():
+                self._collect_anew.call_async(Reset.Request())
+        self._alarmed = alarmed
+        level = (support.OK, support.WARN, support.ERROR)[state.level]
+        return [('drift', level, state.message, {
+            'fluoroscope': state.fluoroscope, 'place': state.place, 'source': state.source,
+            'size [px]': f'{state.size:.2f}', 'sd [px]': f'{state.sd:.2f}', 'evidence': f'{state.evidence:.1f}',
+            'threshold of WARN': f'{state.threshold_warn:.1f}', 'threshold of ERROR': f'{state.threshold_error:.1f}',
+            'since [s]': f'{state.since_s:.1f}', 'observations': state.observations})]
+
+    def _verdict(self, unpaired):
+        """Level and message of the diagnostics."""
+        deaf = support.deafness(self._reader, self._sentences)
+        if deaf:
+            return support.WARN, next(iter(deaf.values()))
+        if not self._rigs:
+            return support.WARN, self._last_fault or ('no orientation of the rig yet: calibrate with all fluoroscopes, '
+                                                      'or capture the phantom with the service orient')
+        if self._reader is None:
+            return support.WARN, 'the node is not active'
+        silent = [n for n in self._names if self.count_publishers(f'{n}/corrected_observations') == 0]
+        if silent:
+            return support.WARN, f'nobody publishes corrected observations of {", ".join(silent)}'
+        if self._without_orientation:
+            return support.WARN, (f'{self._without_orientation} exposures were corrected with calibrations to which no '
+                                  'orientation of the rig belongs')
+        if self._refused:
+            return support.WARN, f'{self._refused.total()} frames refused: {self._last_fault}'
+        if unpaired:
+            return support.WARN, f'{unpaired} frames without partner of the other fluoroscopes'
+        return support.OK, 'reconstructing'
+
+
+def main(args=None):
+    """Entry point."""
+    support.run(ReconstructionNode, args)
+
+
+if __name__ == '__main__':
+    main()

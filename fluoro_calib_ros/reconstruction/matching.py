@@ -1,0 +1,28 @@
+"""Bringing together the image points of one exposure that bear the same id in several views."""
+
+import numpy as np
+
+
+def matched(target_ids, uv, sigma, outside=None):
+    """Image points of F views by target: ids (n,), uv (F, n, 2) and sigma (F, n) [px], and outside (F, n).
+
+    target_ids, uv, sigma and outside: for each view its ids (n_f,), each once, image points (n_f, 2), standard
+    deviations (n_f,) [px] and, True or False, what lies beyond the calibrated area (n_f,); outside None: None is
+    returned. A view has NaN and False where it does not have a target. Ids are ascending, or where all views have the
+    same in the same order, in that order.
+    """
+    target_ids = [np.asarray(ids) for ids in target_ids]
+    first = target_ids[0]
+    if all(len(ids) == len(first) and (ids == first).all() for ids in target_ids[1:]):
+        return (first, np.array(uv, dtype=float).reshape(len(uv), -1, 2), np.array(sigma, dtype=float),
+                None if outside is None else np.array(outside, dtype=bool))
+    every = np.unique(np.concatenate(target_ids))
+    shape = (len(target_ids), len(every))
+    out_uv, out_sigma = np.full(shape + (2,), np.nan), np.full(shape, np.nan)
+    out_outside = None if outside is None else np.zeros(shape, dtype=bool)
+    for view, ids in enumerate(target_ids):
+        rows = np.searchsorted(every, ids)
+        out_uv[view, rows], out_sigma[view, rows] = uv[view], sigma[view]
+        if outside is not None:
+            out_outside[view, rows] = outside[view]
+    return every, out_uv, out_sigma, out_outside

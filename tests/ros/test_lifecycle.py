@@ -1,0 +1,100 @@
+"""The lifecycle of the streaming nodes, their parameters, and several rigs side by side."""
+
+from dataclasses import replace
+
+import pytest
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.srv import DescribeParameters, ListParameters
+from ros_graph import NAMES, Graph, value_of
+
+NODES = ('correction_node', 'reconstruction_node')
+
+
+def change(client, node, transition):
+    return client.call(ChangeState, f'{node}/change_state', transition=Transition(id=transition)).success
+
+
+def state(client, node):
+    return client.call(GetState, f'{node}/get_state').current_state.id
+
+
+def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, tracking):
+    client = graph.client
+    graph.calibration_node(by_command[0])
+    node = graph.start('correction_node', {'autostart': 'false'}, wait=False)
+    corrected = client.listen('a/corrected_observations')
+    client.wait_until(lambda: any(n == 'correction_node' for n, _ in client.get_node_names_and_namespaces()),
+                      what='the node')
+    assert state(client, 'correction_node') == State.PRIMARY_STATE_UNCONFIGURED
+    assert not client.count_publishers('a/corrected_observations')
+    frame = tracking['a'][0]
+    for turn in range(2):   # the second time after it was taken down altogether
+        assert change(client, 'correction_node', Transition.TRANSITION_CONFIGURE)
+        assert state(client, 'correction_node') == State.PRIMARY_STATE_INACTIVE
+        client.wait_for_diagnostics('correction_node', lambda s: 'the node is not active' in s.message)
+        client.publish(replace(frame, number=100 * turn + 1))   # to nobody
+        assert change(client, 'correction_node', Transition.TRANSITION_ACTIVATE)
+        assert state(client, 'correction_node') == State.PRIMARY_STATE_ACTIVE
+        client.wait_until(lambda: client.subscriptions_matched('correction_node'), what='the reader')
+        client.publish(replace(frame, number=100 * turn + 2))
+        client.wait_until(lambda: corrected and corrected[-1].frame_number == 100 * turn + 2, what='the frame')
+        assert change(client, 'correction_node', Transition.TRANSITION_DEACTIVATE)
+        client.publish(replace(frame, number=100 * turn + 3))
+        assert change(client, 'correction_node', Transition.TRANSITION_CLEANUP)
+        client.wait_until(lambda: not client.count_publishers('a/corrected_observations'), what='its outputs to be gone')
+        client.statuses.clear()
+    assert [m.frame_number for m in corrected] == [2, 102]
+    assert node.end() == 0 and 'Traceback' not in node.log
+
+
+def test_shutdown_by_the_lifecycle(graph, by_command):
+    graph.both_nodes(by_command[0])
+    assert change(graph.client, 'correction_node', Transition.TRANSITION_ACTIVE_SHUTDOWN)
+    assert state(graph.client, 'correction_node') == State.PRIMARY_STATE_FINALIZED
+    assert graph.processes[-1].end() == 0 and 'Traceback' not in graph.processes[-1].log
+
+
+@pytest.mark.parametrize('node', NODES)
+def test_every_parameter_says_what_it_is(graph, node):
+    graph.start(node)
+    client = graph.client
+    names = client.call(ListParameters, f'{node}/list_parameters').result.names
+    own = [n for n in names if not n.startswith('qos_overrides') and n not in ('use_sim_time', 'start_type_description_'
+                                                                               'service')]
+    described = client.call(DescribeParameters, f'{node}/describe_parameters', names=own).descriptors
+    assert 'autostart' in own and 'fluoroscopes' in own
+    for descriptor in described:
+        assert len(descriptor.description) > 10, descriptor.name
+        number = descriptor.type in (2, 3)   # integer, double
+        assert bool(descriptor.integer_range or descriptor.floating_point_range) == number, descriptor.name
+    assert any(n.startswith('qos_overrides.') and n.endswith('.depth') for n in names)
+
+
+def test_two_rigs_side_by_side(ros, request, graph, by_command, tracking, tmp_path):
+    """Two namespaces, one of them with simulated time: what comes to the one does not come to the other."""
+    other = Graph(tmp_path)
+    request.node.graphs = [*getattr(request.node, 'graphs', ()), other]
+    try:
+        graph.whole_chain(by_command[0])
+        other.both_nodes(by_command[0])
+        simulated = other.start('reconstruction_node', {'use_sim_time': 'true'})
+        for one in (graph, other):
+            one.points = one.client.listen('reconstruction/points_with_covariance')
+            one.client.wait_until(lambda: one.client.count_publishers('reconstruction/points_with_covariance'),
+                                  what='the nodes')
+            one.wait_for_readers(1)
+        other.client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'))
+        other.client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'), 'b')
+        other.client.wait_until(lambda: 'orientation rig-' in simulated.log, what='the orientation')
+        for row in range(20):
+            for name in NAMES:
+                graph.client.publish(tracking[name][row])
+                if row < 10:
+                    other.client.publish(replace(tracking[name][row], number=500 + row))
+        for one, count in ((graph, 20), (other, 10)):
+            one.client.wait_until(lambda: len(one.points) >= count, what='the points')
+        assert [m.frame_number for m in graph.points] == [f.number for f in tracking['a'][:20]]
+        assert [m.frame_number for m in other.points] == list(range(500, 510))
+    finally:
+        other.close()

@@ -1,4 +1,4 @@
-"""The drift watch, end to end on virtual rigs: false alarms against the stated rate, delays, and what is told of a drift.
+"""The drift watch, end to end on virtual rigs: false alarms against the stated rate, delays, what is told of a drift.
 
 A rig is calibrated with 15 exposures, its orientation taken from the same; then 30 markers in five rigid clusters move
 through it, are corrected, checked by their epipolar residuals and intersected as in the stream. The motions repeat,
@@ -9,6 +9,7 @@ import argparse
 import copy
 import multiprocessing
 import sys
+import warnings
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,6 +34,7 @@ MOTIONS = 3
 IDS = np.arange(1001, 1001 + CLUSTERS * BEADS)
 SIZE = 1024
 QUARTERS = {'upper left': (0, 0), 'upper right': (1, 0), 'lower left': (0, 1), 'lower right': (1, 1)}
+WHOLE = 'whole image'
 WITHIN_S = 5.0   # in which a drift is to be found
 AFTER_S = 20.0   # after which it is given up
 
@@ -79,7 +81,7 @@ def markers(rng, beads, seconds):
 
 
 def scene(seed, source='exposures'):
-    """The Scene of a rig; source of its orientation: the exposures of the calibration, or a 'capture' of the phantom."""
+    """The Scene of a rig; source of its orientation: 'exposures' of the calibration, or a 'capture' of the phantom."""
     rig = virtual_rig(seed)
     exposures = simulate_exposures(rig, 15, seed).frames
     calibrations = calibrate(exposures, rig.phantom).calibrations
@@ -150,12 +152,13 @@ def step_of(fluoroscope, quarter, size, direction, begin, ramp_s=0.0):
     """A drift for `blocks`: size [px] in a direction [deg] over a quarter of an image from begin [s] on, after ramp_s
     at its full size."""
     vector = size * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
-    column, row = QUARTERS[quarter]
+    column, row = QUARTERS.get(quarter, (None, None))
 
     def drift(name, uv, t):
         if name != fluoroscope or t < begin:
             return np.zeros_like(uv)
-        inside = ((uv[:, 0] >= SIZE / 2) == column) & ((uv[:, 1] >= SIZE / 2) == row)
+        inside = np.ones(len(uv), dtype=bool) if column is None else (
+            ((uv[:, 0] >= SIZE / 2) == column) & ((uv[:, 1] >= SIZE / 2) == row))
         return inside[:, None] * vector * (min(1.0, (t - begin) / ramp_s) if ramp_s else 1.0)
     return drift
 
@@ -181,6 +184,8 @@ def false_alarms(seed, hours=0.5, source='exposures', options=DriftOptions(), cl
 def right_place(state, quarter):
     """Whether the area of a state is the quarter, or a part of it."""
     u0, v0, u1, v1 = np.array(state.area) / SIZE
+    if quarter == WHOLE:
+        return (u1 - u0) * (v1 - v0) >= 0.49
     column, row = QUARTERS[quarter]
     return bool(abs((u0 + u1) / 2 - 0.25 - 0.5 * column) < 0.2 and abs((v0 + v1) / 2 - 0.25 - 0.5 * row) < 0.2)
 
@@ -209,30 +214,140 @@ def detection(scene_, watch, first, fluoroscope, quarter, size, direction, rng, 
     return out
 
 
-def detections(seed, size=0.5, clusters=True, source='exposures', directions=8):
-    """Drifts over every quarter of both images in so many directions: a list of dicts of `detection`."""
+def started(seed, clusters=True, source='exposures'):
+    """Scene, its watch after the start, the generator and the number of blocks that the start took."""
     scene_ = scene(seed, source)
-    watch, rng = scene_.watch(clusters=clusters), np.random.default_rng([seed, 6])
-    learned = round(15 * RATE_HZ / FRAMES)
+    watch, rng, learned = scene_.watch(clusters=clusters), np.random.default_rng([seed, 6]), 60
     for block in blocks(scene_, rng, 0, learned):
         feed(scene_, watch, block, clusters)
+    return scene_, watch, rng, learned
+
+
+def detections(seed, size=0.5, clusters=True, source='exposures', quarters=tuple(QUARTERS), directions=8):
+    """Drifts over every quarter of both images in so many directions: a list of dicts of `detection`."""
+    scene_, watch, rng, learned = started(seed, clusters, source)
     out, total = [], PERIOD_S * MOTIONS * RATE_HZ // FRAMES
     for name in scene_.names:
-        for quarter in QUARTERS:
+        for quarter in quarters:
             for k in range(directions):
                 first = learned + int(rng.integers(total))   # the motion from anywhere on
-                out.append(dict(detection(scene_, copy.deepcopy(watch), first, name, quarter, size, 360 * k / directions,
-                                          rng, clusters), seed=seed, clusters=clusters))
+                out.append(detection(scene_, copy.deepcopy(watch), first, name, quarter, size, 360 * k / directions, rng,
+                                     clusters))
     return out
 
 
-def slow(seed, size=0.5, hours=1.0, clusters=True):
-    """A drift that takes hours to its size, in a quarter and a direction drawn at random: dict of `detection`."""
-    scene_ = scene(seed)
-    watch, rng = scene_.watch(clusters=clusters), np.random.default_rng([seed, 7])
-    learned = round(15 * RATE_HZ / FRAMES)
-    for block in blocks(scene_, rng, 0, learned):
-        feed(scene_, watch, block, clusters)
-    return dict(detection(scene_, watch, learned, str(rng.choice(scene_.names)), str(rng.choice(list(QUARTERS))), size,
-                          45 * int(rng.integers(8)), rng, clusters, hours * 3600, 1.2 * hours * 3600), seed=seed,
-                clusters=clusters, hours=hours)
+def from_the_start(seed, size=0.5, directions=8):
+    """Drifts that are there before the watch starts, so that it can only hold them against the calibration."""
+    scene_, rng = scene(seed), np.random.default_rng([seed, 8])
+    return [detection(scene_, scene_.watch(), int(rng.integers(700)), name, quarter, size, 360 * k / directions, rng)
+            for name in scene_.names for quarter in QUARTERS for k in range(directions)]
+
+
+def slow(seed, size=0.5, hours=1.0):
+    """A drift that takes hours to its size, in a quarter drawn at random, in one of 8 directions: list of one dict."""
+    scene_, watch, rng, learned = started(seed)
+    place, direction = str(rng.choice(list(QUARTERS))), 45 * int(rng.integers(8))
+    return [detection(scene_, watch, learned, str(rng.choice(scene_.names)), place, size, direction, rng, True,
+                      hours * 3600, 1.1 * hours * 3600)]
+
+
+# Title of a row, function, its arguments but the seed.
+CASES = (
+    ('0.5 px, with clusters', detections, {}),
+    ('0.5 px, orientation from one capture', detections, {'source': 'capture'}),
+    ('0.5 px, without clusters', detections, {'clusters': False}),
+    ('0.25 px, with clusters', detections, {'size': 0.25}),
+    ('1 px, with clusters', detections, {'size': 1.0}),
+    ('0.5 px over the whole image', detections, {'quarters': (WHOLE,)}),
+    ('0.5 px, there before the start', from_the_start, {}),
+    ('0.5 px in an hour', slow, {}))
+SECTORS = {'across': (90, 270), 'oblique': (45, 135, 225, 315), 'along': (0, 180)}   # to the epipolar lines, in degrees
+HEADER = ['drift', 'direction', 'drifts', 'ERROR in 5 s', 'WARN in 5 s', 'found', 'median delay [s]', '95 % [s]',
+          'size error, RMS [px]', 'over its sd', 'right image', 'either', 'right place']
+
+
+def row(title, sector, found):
+    """A line of the table of detections: of dicts of `detection`."""
+    delay = np.array([f['error'] for f in found])
+    told = [f for f in found if 'named' in f]
+    error = np.array([f['size_error'] for f in told])
+    normalised = error / np.array([f['sd'] for f in told])
+
+    def part(values):
+        return f'{100 * np.mean(values):.0f} %' if len(values) else '-'
+
+    def figure(value):
+        return f'{value:.2f}' if np.isfinite(value) else '-'
+    return [title, sector, str(len(found)), part(delay <= WITHIN_S), part([f['warn'] <= WITHIN_S for f in found]),
+            part(np.isfinite(delay)), figure(np.quantile(delay, 0.5, method='higher')),
+            figure(np.quantile(delay, 0.95, method='higher')),
+            figure(np.sqrt(np.mean(error ** 2)) if len(told) else np.nan),
+            figure(np.sqrt(np.mean(normalised ** 2)) if len(told) else np.nan),
+            part([f['named'] == f['fluoroscope'] for f in told]),
+            part([' or ' in f['named'] and f['fluoroscope'] in f['named'] for f in told]),
+            part([f['place'] for f in told])]
+
+
+def _call(task):
+    function, arguments = task
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter('error')
+        return function(**arguments)
+
+
+def measure(rigs=3, alarm_rigs=10, hours=0.5, processes=1, chosen=None):
+    """All figures: {'alarms': dicts of false_alarms, 'cases': {title: dicts of detection}}.
+
+    rigs: of each case of drifts; alarm_rigs: without drift, hours [h] each, every third with the orientation of a
+    capture; chosen: titles of cases, None: all.
+    """
+    tasks = [('alarms', false_alarms, {'seed': s, 'hours': hours, 'source': 'capture' if s % 3 == 2 else 'exposures'})
+             for s in range(alarm_rigs)]
+    tasks += [(title, function, {'seed': 100 + s, **more}) for title, function, more in CASES
+              for s in range(rigs) if chosen is None or title in chosen]
+    with multiprocessing.get_context('spawn').Pool(processes) as pool:
+        results = []
+        for n, result in enumerate(pool.imap(_call, [(f, a) for _, f, a in tasks])):
+            results.append(result)
+            print(f'{n + 1} of {len(tasks)}: {tasks[n][0]}', file=sys.stderr, flush=True)
+    cases = {}
+    for (title, *_), result in zip(tasks, results):
+        if title != 'alarms':
+            cases.setdefault(title, []).extend(result)
+    return {'alarms': [r for t, r in zip(tasks, results) if t[0] == 'alarms'], 'cases': cases}
+
+
+def report(figures, options=DriftOptions()):
+    """The figures of `measure` as text."""
+    alarms = figures['alarms']
+    hours = sum(a['hours'] for a in alarms)
+    lines = []
+    if alarms:
+        lines += [f'{hours:g} h of stream without drift on {len(alarms)} rigs, 120 Hz, 30 markers: '
+                  f'{sum(a["error"] for a in alarms)} false ERRORs (stated: {hours / options.error_interval_h:.2g} at most '
+                  f'on average), {sum(a["warn"] for a in alarms)} false WARNs (stated: '
+                  f'{hours / options.warn_interval_h:.2g}); largest evidence '
+                  f'{max(a["largest"] for a in alarms):.2f} of the threshold of WARN.']
+        lines += [text for a in alarms for text in a['said']]
+    rows = []
+    for title, found in figures['cases'].items():
+        for sector, degrees in SECTORS.items():
+            own = [f for f in found if f['direction'] in degrees]
+            rows += [row(title, sector, own)] if own else []
+    return '\n'.join(lines) + '\n\n' + table(HEADER, rows)
+
+
+def main(arguments=None):
+    """Print the table."""
+    parser = argparse.ArgumentParser(prog='python -m benchmarks.drift', description=__doc__.splitlines()[0])
+    parser.add_argument('--rigs', type=int, default=3, help='of each case of drifts (3)')
+    parser.add_argument('--alarm-rigs', type=int, default=10, help='rigs without drift (10)')
+    parser.add_argument('--hours', type=float, default=0.5, help='of stream of each of them (0.5)')
+    parser.add_argument('--processes', type=int, default=1)
+    parser.add_argument('--case', action='append', help='only these cases of drifts, by their titles')
+    a = parser.parse_args(arguments)
+    print(report(measure(a.rigs, a.alarm_rigs, a.hours, a.processes, a.case)))
+
+
+if __name__ == '__main__':
+    main()

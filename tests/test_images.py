@@ -55,16 +55,17 @@ def random_image(dtype, size=SIZE):
     return np.rint((waves - waves.min()) / np.ptp(waves) * np.iinfo(dtype).max).astype(dtype)
 
 
-def off(image, uv, reach=9):
-    """Distances (n, 2) [px] of the blobs in an image (h, w) from pixels uv (n, 2) near them: least squares of a Gaussian
-    with its first and second moments, on a plane."""
+def off(image, light, uv, reach=9):
+    """Distances (n, 2) [px] of the blobs in an image (h, w), beside light (h, w) without them, from pixels uv (n, 2)
+    near them: least squares of a Gaussian with its first and second moments, on a plane."""
+    taken = 1 - image / light
     out = []
     for u, v in uv:
         part = np.s_[round(v) - reach:round(v) + reach + 1, round(u) - reach:round(u) + reach + 1]
         y, x = np.mgrid[part].reshape(2, -1) - [[v], [u]]
         blob, one = np.exp(-0.5 * (x * x + y * y) / BEAD_PX ** 2), np.ones_like(x)
         columns = np.stack([*(blob * p for p in (one, x, y, x * x, y * y, x * y)), one, x, y], axis=1)
-        found = np.linalg.lstsq(columns, image[part].ravel().astype(float), rcond=None)[0]
+        found = np.linalg.lstsq(columns, taken[part].ravel(), rcond=None)[0]
         out.append(found[1:3] / found[0] * BEAD_PX ** 2)
     return np.array(out)
 
@@ -93,19 +94,22 @@ def test_beads_go_where_points_go(dtype, interpolation):
     wanted = calibration().correct(observed).uv
     assert np.abs(wanted - observed).max() > 10
     image = bead_image(observed, SIZE, dtype, noise=0.0)
-    error = off(corrector(interpolation).correct(image), wanted)
+    light = corrector().correct(bead_image([], SIZE, np.uint16, noise=0.0)) / (65_535 / np.iinfo(dtype).max)
+    with np.errstate(divide='ignore', invalid='ignore'):   # at the rim, where there is nothing
+        error = off(corrector(interpolation).correct(image), light, wanted)
     assert np.sqrt(np.mean(error ** 2)) < 0.01 and np.abs(error).max() < 0.03
 
 
-def test_map_is_as_exact_as_said():
-    """On an image that tells where its pixels are: within 1/64 px, which OpenCV's 1/32 px leave, and rounding."""
-    this = corrector()
+@pytest.mark.parametrize('interpolation, limit', [('linear', 1 / 64), ('cubic', 1 / 45)])
+def test_map_is_as_exact_as_said(interpolation, limit):
+    """On an image that tells where its pixels are: within what OpenCV's 1/32 px leave, and rounding."""
+    this = corrector(interpolation)
     inner = this.mask & np.all((this.source > 1) & (this.source < 1022), axis=0)
     for axis, ramp in enumerate(np.mgrid[:1024, :1024][::-1] * 60):
         seen = this.correct(ramp.astype(np.uint16))[inner] / 60
         error = np.abs(seen - this.source[axis][inner])
-        assert error.max() < 1 / 64 + 0.5 / 60 + 1e-3
-        assert np.sqrt(np.mean(error ** 2)) < 0.011
+        assert error.max() < limit + 0.5 / 60 + 1e-3
+        assert np.sqrt(np.mean(error ** 2)) < 0.012
 
 
 @pytest.mark.parametrize('interpolation, order', [('linear', 1), ('cubic', 3)])
@@ -119,19 +123,20 @@ def test_beside_scipy(dtype, interpolation, order):
     slope = np.hypot(*np.gradient(image.astype(float))).max()
     difference = np.abs(this.correct(image) - wanted)[this.mask]
     assert difference.max() < slope / 45 + 0.01 * np.ptp(image) * (order == 3) + 1
-    assert difference.mean() < slope / 80 + 0.5
+    assert difference.mean() < slope / 100 + 0.5
 
 
-def test_there_and_back():
-    """An image bent by the correction, and corrected, is the image again."""
-    this, image = corrector(), random_image(np.uint16)
+@pytest.mark.parametrize('interpolation, limit', [('linear', 0.02), ('cubic', 0.005)])
+def test_there_and_back(interpolation, limit):
+    """An image bent by the correction, and corrected, is the image again, but for what interpolation takes."""
+    this, image = corrector(interpolation), random_image(np.uint16)
     v, u = np.mgrid[:1024, :1024].astype(float)
     straight = calibration().correct(np.stack([u.ravel(), v.ravel()], axis=1)).uv.T.reshape(2, 1024, 1024)
     bent = np.rint(map_coordinates(image.astype(float), straight[::-1], order=3, mode='nearest')).astype(np.uint16)
     inner = this.mask & np.all((this.source > 2) & (this.source < 1021), axis=0)
-    inner[[0, -1]] = inner[:, [0, -1]] = False
+    inner[:3] = inner[-3:] = inner[:, :3] = inner[:, -3:] = False
     before, after = (np.sqrt(np.mean((np.float64(x) - image)[inner] ** 2)) for x in (bent, this.correct(bent)))
-    assert after < 0.01 * before
+    assert after < limit * before
 
 
 # ---- rims, folds and holes
@@ -276,7 +281,7 @@ def test_virtual_image(dtype):
     clean = bead_image(uv, size, dtype, noise=0.0)
     light = background(size) * np.iinfo(dtype).max
     assert clean.shape == size[::-1] and clean.dtype == dtype
-    assert np.abs(off(clean, uv[:2])).max() < 0.01
+    assert np.abs(off(clean, light, uv[:2])).max() < 0.01
     far = np.ones(clean.shape, bool)
     far[30:120, :], far[:80, 170:230] = False, False
     assert np.abs(clean[far] - light[far]).max() <= 0.51

@@ -16,9 +16,12 @@ from fluoro_calib_ros.distortion.models import no_correction
 from fluoro_calib_ros.files.calibration import save_calibration
 from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.orientation import FIELDS, load_orientation, save_orientation
+from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.observations import DataError, Frame, Phantom
 from fluoro_calib_ros.photogrammetry.relative import vector_of
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import OK, Intersector
+from fluoro_calib_ros.reconstruction.orientation import datum_map, held_to
 from fluoro_calib_ros.reconstruction.recording import reconstruct_recording
 from fluoro_calib_ros.simulation.rig import (VirtualRig, phantom_poses, seen_beads, simulate_exposures,
                                              simulate_tracking, virtual_rig)
@@ -155,8 +158,8 @@ def test_a_capture_that_will_not_do_is_refused_in_a_sentence(change, sentence):
 # ---- from the exposures of a calibration
 
 def test_covariance_of_a_relative_orientation_against_monte_carlo():
-    """In the frame of the first fluoroscope, which has no errors there but those of its interior orientation."""
-    squares = []
+    """In the datum of points where the phantom was: 12 of the 18 unknowns are left when their frame is fixed."""
+    squares, points = [], np.random.default_rng(0).uniform(-100, 100, (60, 3)) + [0, 0, 1500]
     for seed in range(12):
         still = without_distortion(seed)
         held = drawn_calibrations(still, seed)
@@ -164,11 +167,43 @@ def test_covariance_of_a_relative_orientation_against_monte_carlo():
         found = orientation_of_exposures(frames, still.phantom, held)
         a, b = still.fluoroscopes
         step = np.concatenate([
-            found.interior[0] - a.interior, found.position_mm[1] - a.rotation @ (b.position_mm - a.position_mm),
+            np.zeros(6), found.interior[0] - a.interior,
+            found.position_mm[1] - a.rotation @ (b.position_mm - a.position_mm),
             vector_of(found.rotation[1] @ (b.rotation @ a.rotation.T).T), found.interior[1] - b.interior])
-        assert not found.position_mm[0].any() and not found.covariance[:6].any()
-        squares.append(normalised(step, found.covariance[6:, 6:]))
+        assert not found.position_mm[0].any() and np.array_equal(found.rotation[0], np.eye(3))
+        s = datum_map(found, points)
+        squares.append(step @ s.T @ np.linalg.pinv(s @ found.covariance @ s.T, rcond=1e-12, hermitian=True) @ s @ step / 12)
     assert np.mean(squares) == pytest.approx(1, abs=0.3)
+
+
+def test_the_datum_takes_out_what_moves_points_together_and_nothing_else():
+    """Distances keep their variances, and the points' centre and attitude have none; once is as good as twice."""
+    found = orientation_of_exposures(exposures(), rig().phantom, calibrations())
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-80, 80, (40, 3)) + [0, 0, 1500]
+    s = datum_map(found, points)
+    np.testing.assert_allclose(s @ s, s, atol=1e-6)
+    again = held_to(held_to(found, points), points).covariance
+    np.testing.assert_allclose(again, held_to(found, points).covariance, atol=1e-9)
+    uv = np.stack([project(np.broadcast_to(r, (40, 3, 3)), np.broadcast_to(t, (40, 3)), points, i)
+                   for r, t, i in zip(found.rotation, found.position_mm, found.interior)])
+    step = 1e-3 * found.root() @ rng.normal(size=18)
+    ways = [moved_orientation(found, change) for change in (step, s @ step)]
+    sigma = np.full((2, 40), 0.1)
+    moved = [Intersector(way, None).intersect(uv, sigma).xyz_mm for way in ways]
+    distance = [np.linalg.norm(m[:, None] - m, axis=2) for m in moved]
+    np.testing.assert_allclose(distance[0], distance[1], atol=1e-7)
+    off, arm = moved[1] - points, points - points.mean(axis=0)
+    far = np.abs(moved[0] - points).max()
+    assert np.abs(off.mean(axis=0)).max() < 1e-3 * far and np.abs(np.cross(arm, off).mean(axis=0)).max() < 0.1 * far
+
+
+def moved_orientation(orientation, step):
+    """The orientation with its unknowns moved by step (18,)."""
+    step = step.reshape(-1, 9)
+    return replace(orientation, position_mm=orientation.position_mm + step[:, :3],
+                   rotation=matrix_from_vector(step[:, 3:6]) @ orientation.rotation,
+                   interior=orientation.interior + step[:, 6:])
 
 
 def test_orientation_of_the_exposures_of_a_calibration():

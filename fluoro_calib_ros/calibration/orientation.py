@@ -17,11 +17,12 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.collinearity import to_sensor
 from ..photogrammetry.normal import normal_equations
 from ..photogrammetry.observations import DataError, Frame, Phantom, check_frame
 from ..photogrammetry.precision import covariance_blocks, solved
 from ..photogrammetry.relative import Relative, discrepancies, discrepancies_with_jacobian, mean_pose
-from ..reconstruction.orientation import UNKNOWNS, RigOrientation
+from ..reconstruction.orientation import UNKNOWNS, RigOrientation, held_to
 from .collector import displacement
 from .job import SEEN_FOR_NOISE, held_corrections
 from .joint import pairs_of
@@ -79,6 +80,8 @@ def orientation_of_capture(frames, phantom, calibrations, frame_id='rig', loss='
 def orientation_of_exposures(frames, phantom, calibrations, loss='student_t', check=None):
     """RigOrientation in the optical frame of the first fluoroscope, from the exposures that all took of the phantom.
 
+    The frame is the sensor's as it was estimated, and its covariance is held to where the phantom stood (held_to).
+
     frames {fluoroscope: [Frame, ...]}, those of the same number belong together; calibrations {fluoroscope:
     FluoroscopeCalibration}, held. The relative orientation is the weighted mean of those of the exposures; where they
     scatter by more than their standard deviations, its covariance grows accordingly. Raises DataError as
@@ -103,9 +106,18 @@ def orientation_of_exposures(frames, phantom, calibrations, loss='student_t', ch
         known = growth[:, None] * (operator @ _all_exposures(held) @ operator.T) * growth
     by_interior = operator @ held.by_interior.reshape(operator.shape[1], -1)
     first = held.measured.fluoroscopes[0]
-    return _orientation(held, rotation, position, known, by_interior, calibrations,
-                        calibrations[first].frame_id or f'{first}_optical', 'joint calibration', _last_stamp(paired),
-                        min(used))
+    found = _orientation(held, rotation, position, known, by_interior, calibrations,
+                         calibrations[first].frame_id or f'{first}_optical', 'joint calibration', _last_stamp(paired),
+                         min(used))
+    return held_to(found, _seen_by_first(held))
+
+
+def _seen_by_first(held):
+    """Object points (n, 3) [mm] of all image points of the first fluoroscope, in its sensor frame."""
+    network, parameters = held.measured.network, held.after.parameters
+    rows = network.rows(0)
+    exposure, points = network.exposure[rows], parameters.points_mm[network.point[rows]]
+    return to_sensor(parameters.rotation[exposure], parameters.position_mm[exposure], points)
 
 
 def phantom_of(targets):

@@ -168,7 +168,8 @@ class ClusterWatch:
         own = np.sqrt(np.sum((response * ends[:, :, 12 + 2 * f:, None]) ** 2, axis=(1, 2, 3))
                       + self._distance_sd[pair] ** 2)
         limit = np.zeros((len(starts), len(self._of)))
-        limit[chunk, pair] = self._options.clip * np.sqrt(variance) + self._options.band_start * own + self._most(response)
+        limit[chunk, pair] = (self._options.clip * np.sqrt(variance) + self._options.band_start * own
+                              + self._most(response))
         limit = np.repeat(limit, np.diff(starts, append=len(frames)), axis=0)
         off = length - self.distances
         off = np.where(np.isnan(self.distances), length, np.clip(off, -limit, limit))

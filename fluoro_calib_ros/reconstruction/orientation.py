@@ -5,11 +5,13 @@ whole, from one fluoroscope to the other too.
 """
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.observations import DataError
+from ..photogrammetry.rotations import cross_matrix
 
 UNKNOWNS = 9   # of a fluoroscope: T [mm], w [rad], xp, yp, c [px]
 SOURCES = ('capture', 'joint calibration')
@@ -127,6 +129,42 @@ class RigOrientation:
         scale = np.where(sd > 0, sd, 1.0)   # mm, rad and px are of very different size
         values, vectors = np.linalg.eigh(self.covariance / np.outer(scale, scale))
         return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0))
+
+
+def held_to(orientation, points_mm):
+    """The RigOrientation with its covariance in the datum of points (n, 3) [mm]: their centre and attitude are what the
+    rig frame is fixed to.
+
+    A rig frame that was taken from the images themselves is a convention, and where it is held matters: held to a sensor
+    whose principal point is uncertain, all points together turn about the source. An S-transformation (Baarda,
+    "S-transformations and criterion matrices", Delft 1973; Foerstner and Wrobel, "Photogrammetric Computer Vision",
+    Springer 2016, 4.5) takes out what errors of the orientation move the points together, as a rigid body. Nothing
+    else changes: distances and angles have the variances that they had.
+    """
+    s = datum_map(orientation, points_mm)
+    covariance = s @ orientation.covariance @ s.T
+    return replace(orientation, covariance=(covariance + covariance.T) / 2)
+
+
+def datum_map(orientation, points_mm):
+    """Matrix S (9F, 9F) that takes errors of an orientation into the datum of points (n, 3) [mm], see held_to."""
+    points = np.asarray(points_mm, dtype=float)
+    count, middle = len(orientation.fluoroscopes), points.mean(axis=0)
+    a, b = np.empty((len(points), 2 * count, 3)), np.zeros((len(points), 2 * count, UNKNOWNS * count))
+    datum = np.zeros((UNKNOWNS * count, 6))
+    for f, (r, t, interior) in enumerate(zip(orientation.rotation, orientation.position_mm, orientation.interior)):
+        rows, first = slice(2 * f, 2 * f + 2), UNKNOWNS * f
+        _, by_exterior, a[:, rows], by_interior = project_with_jacobian(
+            np.broadcast_to(r, (len(points), 3, 3)), np.broadcast_to(t, points.shape), points, interior)
+        b[:, rows, first:first + UNKNOWNS] = np.concatenate([by_exterior, by_interior], axis=2)
+        # Of the unknowns, when the frame is moved back by a shift and a small rotation about the middle.
+        datum[first:first + 3] = np.concatenate([-np.eye(3), cross_matrix(t - middle)], axis=1)
+        datum[first + 3:first + 6, 3:] = r
+    turned = a.transpose(0, 2, 1)
+    moved = -np.linalg.solve(turned @ a, turned @ b)   # of the points, by the unknowns
+    rigid = np.concatenate([np.broadcast_to(np.eye(3), moved.shape[:1] + (3, 3)), -cross_matrix(points - middle)], axis=2)
+    together = np.linalg.lstsq(rigid.reshape(-1, 6), moved.reshape(-1, UNKNOWNS * count), rcond=None)[0]
+    return np.eye(UNKNOWNS * count) + datum @ together
 
 
 def _array(orientation, name, shape):

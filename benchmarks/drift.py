@@ -231,8 +231,8 @@ def detections(seed, size=0.5, clusters=True, source='exposures', quarters=tuple
         for quarter in quarters:
             for k in range(directions):
                 first = learned + int(rng.integers(total))   # the motion from anywhere on
-                out.append(detection(scene_, copy.deepcopy(watch), first, name, quarter, size, 360 * k / directions, rng,
-                                     clusters))
+                out.append(detection(scene_, copy.deepcopy(watch), first, name, quarter, size, 360 * k / directions,
+                                     rng, clusters))
     return out
 
 
@@ -324,8 +324,8 @@ def report(figures, options=DriftOptions()):
     lines = []
     if alarms:
         lines += [f'{hours:g} h of stream without drift on {len(alarms)} rigs, 120 Hz, 30 markers: '
-                  f'{sum(a["error"] for a in alarms)} false ERRORs (stated: {hours / options.error_interval_h:.2g} at most '
-                  f'on average), {sum(a["warn"] for a in alarms)} false WARNs (stated: '
+                  f'{sum(a["error"] for a in alarms)} false ERRORs (stated: {hours / options.error_interval_h:.2g} at '
+                  f'most on average), {sum(a["warn"] for a in alarms)} false WARNs (stated: '
                   f'{hours / options.warn_interval_h:.2g}); largest evidence '
                   f'{max(a["largest"] for a in alarms):.2f} of the threshold of WARN.']
         lines += [text for a in alarms for text in a['said']]

@@ -4,6 +4,10 @@ import argparse
 import sys
 from pathlib import Path
 
+from .cli_images import EXAMPLE as OF_IMAGES
+from .cli_images import TEXT as ABOUT_CORRECT
+from .cli_images import add_correct
+from .cli_images import correct as run_correct
 from .cli_reconstruct import EXAMPLES as OF_SPACE
 from .cli_reconstruct import TEXTS, add_orient, add_reconstruct, orientation_of_calibration, write_orientation
 from .cli_reconstruct import orient as run_orient
@@ -16,7 +20,7 @@ EXAMPLES = {
     'simulate': 'fluoro-calib simulate --out rig --seed 1 --exposures 15',
     'calibrate': 'fluoro-calib calibrate bags/calibration --phantom bags/phantom.csv --out result',
     'adjust': 'fluoro-calib adjust test --phantom phantom.csv --calibration result --out check',
-    'correct': 'fluoro-calib correct points.csv --calibration result --out corrected.csv',
+    'correct': OF_IMAGES,
     'validate': EXAMPLE,
     **OF_SPACE}
 
@@ -81,10 +85,7 @@ def make_parser():
     _add_source(sub)
     sub.add_argument('--calibration', required=True, type=Path, metavar='DIR', help='folder that calibrate has written')
     _add_loss(sub)
-    sub = command('correct', 'Add undistorted coordinates to the image points of a CSV file.', correct)
-    sub.add_argument('points', type=Path, metavar='POINTS.csv', help='columns u, v [px], perhaps fluoroscope, sigma')
-    sub.add_argument('--calibration', required=True, type=Path, metavar='DIR', help='folder that calibrate has written')
-    sub.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
+    add_correct(command('correct', ABOUT_CORRECT, lambda o: run_correct(o, _calibrations_in, _report)))
     add_validate(command('validate', TEXT, validate), image_size)
     add_orient(command('orient', TEXTS['orient'], lambda o: run_orient(o, _report)), image_size)
     add_reconstruct(command('reconstruct', TEXTS['reconstruct'], lambda o: run_reconstruct(o, _report)), image_size,
@@ -245,19 +246,6 @@ def _write_job(options, job):
 def validate(options):
     """Validate a calibration with the observations it was made of."""
     run_validate(options, lambda o: _frames_of(o, o.collect), _report)
-
-
-def correct(options):
-    """Correct the image points of a CSV file."""
-    from .files.points import correct_points, read_points, write_points
-    calibrations = _calibrations_in(options.calibration)
-    points = read_points(options.points)
-    corrected = correct_points(points, calibrations)
-    write_points(options.out, points, corrected)
-    counts = {name: int((corrected.status == status).sum()) for status, name in enumerate(('OK', 'OUTSIDE', 'INVALID'))}
-    _report(options, {'out': str(options.out), 'points': len(corrected.uv), 'status': counts},
-            f'{len(corrected.uv)} points written to {options.out}: '
-            + ', '.join(f'{count} {name}' for name, count in counts.items()))
 
 
 def _calibrations_in(directory):

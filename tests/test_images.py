@@ -132,7 +132,8 @@ def test_there_and_back(interpolation, limit):
     this, image = corrector(interpolation), random_image(np.uint16)
     v, u = np.mgrid[:1024, :1024].astype(float)
     straight = calibration().correct(np.stack([u.ravel(), v.ravel()], axis=1)).uv.T.reshape(2, 1024, 1024)
-    bent = np.rint(map_coordinates(image.astype(float), straight[::-1], order=3, mode='nearest')).astype(np.uint16)
+    bent = map_coordinates(image.astype(float), straight[::-1], order=3, mode='nearest')
+    bent = np.clip(np.rint(bent), 0, 65_535).astype(np.uint16)
     inner = this.mask & np.all((this.source > 2) & (this.source < 1021), axis=0)
     inner[:3] = inner[-3:] = inner[:, :3] = inner[:, -3:] = False
     before, after = (np.sqrt(np.mean((np.float64(x) - image)[inner] ** 2)) for x in (bent, this.correct(bent)))

@@ -17,11 +17,13 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.qos import QoSCompatibility, qos_check_compatible
+from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
 from .qos import overridable
 
 WAIT_NS = 50_000_000   # after which the thread looks whether it is to end
+MOST_AT_ONCE = 100   # messages of a topic that are handled before the next one has its turn
 
 
 class _LeftToReader(CallbackGroup):
@@ -112,14 +114,18 @@ class StreamReader:
 
     def _drain(self, subscription, handle, callback):
         """Handle what has come on a subscription; no more than a queue of it, for the others to have their turn."""
-        for _ in range(100):
+        for _ in range(MOST_AT_ONCE):
             if self._ending.is_set():
                 return
-            try:
-                taken = handle.take_message(subscription.msg_type, subscription.raw)
-            except RCLError:   # bytes that are no such message
-                self._on_undecodable(subscription.topic_name)
-                continue
+            # As bytes: of a message that cannot be decoded, taking the message itself tells nothing but 'none there'.
+            taken = handle.take_message(subscription.msg_type, True)
             if taken is None:
                 return
-            callback(*taken)
+            message, info = taken
+            if not subscription.raw:
+                try:
+                    message = deserialize_message(message, subscription.msg_type)
+                except (RCLError, RuntimeError, MemoryError):   # as the middleware sees fit
+                    self._on_undecodable(subscription.topic_name)
+                    continue
+            callback(message, info)

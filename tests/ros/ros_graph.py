@@ -188,12 +188,20 @@ class Client(Node):
     def wait_until(self, condition, seconds=DEADLINE, what='the condition'):
         """Spin until condition() is true; returns its value. Fails when the time is up."""
         end = time.monotonic() + seconds
+        self._spinner.spin_once(timeout_sec=0)
         while True:
             value = condition()
             if value:
                 return value
             assert time.monotonic() < end, f'waited {seconds:g} s for {what}'
             self._spinner.spin_once(timeout_sec=0.1)
+
+    def publish_in_step(self, messages, came, ahead=OBSERVATIONS.depth // 4):
+        """Publish (fluoroscope, message) one after the other, never more than so many ahead of came(), the number that
+        has come back or never will: what is lost is then not lost in a queue."""
+        for number, (name, message) in enumerate(messages):
+            self.wait_until(lambda: number - came() < ahead, what='the nodes to keep up')
+            self.publish_message(name, message)
 
     def result_of(self, future, seconds=DEADLINE, what='an answer'):
         """Result of a future."""

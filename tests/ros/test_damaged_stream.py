@@ -9,7 +9,6 @@ from rclpy.serialization import deserialize_message, serialize_message
 from ros_graph import NAMES, value_of
 
 from fluoro_calib_ros.nodes.conversion import doubles, message_from_frame
-from fluoro_calib_ros.nodes.qos import OBSERVATIONS
 
 
 def shorter(message):
@@ -55,17 +54,12 @@ def stream(module_graph, by_command, tracking):
     graph.points = client.listen('reconstruction/points_with_covariance')
     client.wait_until(lambda: client.count_publishers('reconstruction/points_with_covariance'), what='the points')
     graph.wait_for_readers(2)
-    kinds, graph.damaged = itertools.cycle(KINDS), {}
-    for number in range(COUNT):
-        if number % 10 == 5:
-            graph.damaged[number] = next(kinds)
-        for name in NAMES:
-            client.publish_message(name, message_of(tracking[name][number % 360], number,
-                                                    graph.damaged.get(number) if name == 'a' else None))
-        lag = max(number - len(of_one) for of_one in graph.corrected.values()) - len(graph.damaged)
-        if lag > OBSERVATIONS.depth // 2:   # as fast as the nodes can, but never more than half a queue ahead
-            client.wait_until(lambda: all(number - len(of_one) - len(graph.damaged) < OBSERVATIONS.depth // 4
-                                          for of_one in graph.corrected.values()), what='the nodes')
+    kinds = itertools.cycle(KINDS)
+    graph.damaged = {number: next(kinds) for number in range(5, COUNT, 10)}
+    messages = [(name, message_of(tracking[name][number % 360], number, graph.damaged.get(number) if name == 'a' else None))
+                for number in range(COUNT) for name in NAMES]
+    last = graph.corrected['b'], graph.points
+    client.publish_in_step(messages, lambda: 2 * min(of_one[-1].frame_number if of_one else 0 for of_one in last))
     graph.good = [n for n in range(COUNT) if graph.damaged.get(n, 'NaN') in ONE_POINT]
     client.wait_until(lambda: all(of_one and of_one[-1].frame_number == COUNT - 1
                                   for of_one in graph.corrected.values()), what='the last corrected frames')

@@ -27,16 +27,16 @@ def rig(module_graph, by_command, tracking):
     client.listen('/tf_static')
     publish(client, tracking, range(FRAMES))
     graph.points = client.messages['reconstruction/points_with_covariance']
-    client.wait_until(lambda: len(graph.points) >= FRAMES, what='all exposures')
     return graph
 
 
-def publish(client, tracking, rows, change=lambda frame: frame):
-    """Publish frames of both fluoroscopes, a few at a time."""
-    for row in rows:
-        for name in NAMES:
-            client.publish(change(tracking[name][row]))
-        client.wait_until(lambda: True)
+def publish(client, tracking, rows, change=lambda frame: frame, answer='reconstruction/points_with_covariance'):
+    """Publish frames of both fluoroscopes, in step with the messages on a topic that answer them one by one."""
+    came = client.messages[answer]
+    before = len(came)
+    messages = [(name, message_from_frame(change(tracking[name][row]))) for row in rows for name in NAMES]
+    client.publish_in_step(messages, lambda: 2 * (len(came) - before))
+    client.wait_until(lambda: len(came) >= before + len(messages) // 2, what='the answers')
 
 
 def truth():
@@ -104,9 +104,9 @@ def test_the_command_line_gives_the_same_numbers(rig, by_command, tmp_path):
 
 
 def test_cloud_and_ellipsoids_are_the_same_points(rig):
-    clouds = {(m.header.stamp.sec, m.header.stamp.nanosec): m for m in rig.client.messages['reconstruction/points']}
-    message = rig.points[-1]
-    cloud = clouds[message.header.stamp.sec, message.header.stamp.nanosec]
+    message = rig.points[FRAMES - 1]
+    cloud = rig.client.wait_until(lambda: [m for m in rig.client.messages['reconstruction/points']
+                                           if m.header.stamp == message.header.stamp], what='the cloud')[0]
     points = np.frombuffer(bytes(cloud.data), dtype=CLOUD)
     good = np.array(message.status) <= 1
     assert cloud.width == len(points) == good.sum() and cloud.point_step == CLOUD.itemsize
@@ -115,7 +115,7 @@ def test_cloud_and_ellipsoids_are_the_same_points(rig):
     _, covariance = coordinates(message)
     sigma = np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 3)[good] / 1e3
     assert np.allclose(points['sigma'], sigma, rtol=1e-5)
-    array = rig.client.messages['reconstruction/markers'][-1]
+    array = rig.client.wait_until(lambda: rig.client.messages['reconstruction/markers'], what='the ellipsoids')[-1]
     assert {m.id for m in array.markers} <= set(message.target_id) and len(array.markers) > 20
     marker = array.markers[0]
     turn = np.array([marker.pose.orientation.w, marker.pose.orientation.x, marker.pose.orientation.y,
@@ -165,9 +165,12 @@ def test_unpaired_and_late_frames_are_counted(rig, tracking):
     client = rig.client
     before = {key: int(value_of(client.statuses['reconstruction_node: reconstruction'], key))
               for key in ('frames unpaired', 'frames late')}
+    received = int(value_of(client.statuses['reconstruction_node: reconstruction'], 'frames received of a'))
     for number in range(100_001, 100_101):
         client.publish(replace(tracking['a'][0], number=number))
-        client.wait_until(lambda: True)
+        if number % 20 == 0:   # unpaired are those of the 100 that have dropped out of the 64 that wait
+            client.wait_for_diagnostics('reconstruction_node', lambda s: int(value_of(s, 'frames received of a')) >=
+                                        received + number - 100_000, 'reconstruction')
     client.publish(replace(tracking['b'][0], number=100_002))   # its partner has been given up
     status = client.wait_for_diagnostics('reconstruction_node', lambda s: int(
         value_of(s, 'frames late')) == before['frames late'] + 1, 'reconstruction', 'a late frame')

@@ -1,0 +1,183 @@
+"""Corrected images: how fast one core is, and the node live beside a relay that does nothing with the same images.
+
+    python -m benchmarks.images [--seconds 10] [--calibration DIR]      printed as the tables of docs/images.md
+
+Camera, node, relay and the reader (this process) share the machine. An image is lost when it does not come out;
+latency is from the stamp of the camera, set just before it publishes, to the time stamp that DDS gives the output.
+"""
+
+import argparse
+import os
+import signal
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.ndimage import map_coordinates
+
+from fluoro_calib_ros.calibration.job import calibrate
+from fluoro_calib_ros.files.calibration import load_calibration
+from fluoro_calib_ros.images.undistortion import ImageCorrector
+from fluoro_calib_ros.simulation.images import bead_image
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+
+from .timing import table, timed
+
+TICK = os.sysconf('SC_CLK_TCK')
+LARGE = {'FASTDDS_BUILTIN_TRANSPORTS': 'LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true'}
+CASES = {   # name: (encoding, rate, nodes, environment of all processes)
+    'mono8 120 Hz': ('mono8', 120, ('image_node',), {}),
+    'mono8 120 Hz, relay': ('mono8', 120, ('relay',), {}),
+    'mono8 60 Hz': ('mono8', 60, ('image_node',), {}),
+    'mono16 60 Hz': ('mono16', 60, ('image_node',), {})}
+OUTPUTS = {'image_node': 'a/image_corrected', 'relay': 'a/relayed'}
+
+
+def calibration_of_the_rig():
+    """Calibration and frames of fluoroscope a of the rig that the camera shows."""
+    rig = virtual_rig(1)
+    frames = simulate_exposures(rig, 15, 1).frames['a']
+    return calibrate({'a': frames}, rig.phantom).calibrations['a'], frames
+
+
+# ---- one core
+
+def on_one_core(calibration, frames, repeats=200):
+    """[{depth, interpolation, ms: median wall time, cpu_ms, rate: images a second of CPU}] of the correction alone, and
+    scipy's map_coordinates with the same map."""
+    cv2.setNumThreads(1)
+    out = []
+    for interpolation, order in (('linear', 1), ('cubic', 3)):
+        (corrector, seconds) = timed(lambda: ImageCorrector(calibration, interpolation))
+        for dtype in (np.uint8, np.uint16):
+            image = bead_image(frames[0].uv, calibration.image_size, dtype)
+            into = np.empty_like(image)
+            began = time.process_time()
+            _, wall = timed(lambda: corrector.correct(image, into), repeats)
+            cpu = (time.process_time() - began) / repeats
+            source = np.nan_to_num(corrector.source)[::-1]
+            _, of_scipy = timed(lambda: map_coordinates(image, source, order=order, mode='nearest'), 3)
+            out.append({'depth': 8 * image.itemsize, 'interpolation': interpolation, 'ms': 1e3 * wall,
+                        'cpu_ms': 1e3 * cpu, 'rate': 1 / cpu, 'scipy_ms': 1e3 * of_scipy, 'map_s': seconds})
+    return out
+
+
+# ---- live
+
+class Reader:
+    """Publishes the calibration, and takes what the nodes put out."""
+
+    def __init__(self, calibration):
+        import rclpy
+        from fluoro_calib_msgs.msg import FluoroscopeCalibration
+
+        from fluoro_calib_ros.nodes.conversion import message_from_calibration
+        from fluoro_calib_ros.nodes.qos import LATCHED
+        self.node = rclpy.create_node('reader')
+        self._latched = self.node.create_publisher(FluoroscopeCalibration, 'a/calibration', LATCHED)
+        self._latched.publish(message_from_calibration(calibration))
+        self.came, self.reader = [], None
+
+    def listen(self, topic):
+        """Collect (stamp, latency) [ns] of a topic anew, with the images unread."""
+        from sensor_msgs.msg import Image
+
+        from fluoro_calib_ros.nodes.qos import IMAGES
+        from fluoro_calib_ros.nodes.streams import StreamReader
+        self.came, fatal = [], self.node.get_logger().fatal
+        came = self.came
+
+        def take(data, info):
+            seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
+            stamp = seconds * 10 ** 9 + nanoseconds
+            came.append((stamp, info['source_timestamp'] - stamp))
+        self.reader = StreamReader(self.node, fatal, fatal)
+        self.reader.subscribe(Image, topic, take, IMAGES, raw=True)
+        self.reader.start()
+
+
+def wait(condition, seconds, what):
+    """Wait until condition() is true."""
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            raise SystemExit(f'waited {seconds} s for {what}')
+        time.sleep(0.02)
+
+
+def _cpu(process):
+    """CPU time [s] that a process has used, all its threads together."""
+    fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICK
+
+
+def _start(*command, log, **parameters):
+    arguments = [word for key, value in parameters.items() for word in ('-p', f'{key}:={value}')]
+    return subprocess.Popen([sys.executable, '-m', *command, '--ros-args', '-p', 'fluoroscopes:=[a]', *arguments],
+                            stdout=log, stderr=log)
+
+
+def measured(reader, encoding, rate, node, seconds, log):
+    """{images, lost, p50, p99, max [ms], cpu_ms an image} of a node at a rate."""
+    frames = round(rate * seconds)
+    under_test = _start(*(['fluoro_calib_ros.nodes.image_node'] if node == 'image_node' else
+                          ['benchmarks.image_processes', 'relay']), log=log)
+    reader.listen(OUTPUTS[node])
+    path = Path(log.name)
+    if node == 'image_node':
+        wait(lambda: 'images corrected with calibration' in path.read_text(errors='replace'), 60, 'the calibration')
+    camera = _start('benchmarks.image_processes', 'camera', log=log, encoding=encoding, rate=float(rate), frames=frames)
+    try:
+        wait(lambda: reader.came, 60, 'the first image')
+        began, first = _cpu(under_test), len(reader.came)
+        wait(lambda: camera.poll() is not None or len(reader.came) >= frames, seconds * 2 + 30, 'the stream')
+        used, counted = _cpu(under_test) - began, len(reader.came) - first
+        wait(lambda: camera.poll() is not None, 30, 'the end of the camera')
+    finally:
+        for process in (camera, under_test):
+            if process.poll() is None:
+                process.send_signal(signal.SIGINT)
+            process.wait(20)
+        reader.reader.stop()
+    came = np.array(reader.came)
+    latency = came[:, 1] * 1e-6
+    span = (came[-1, 0] - came[0, 0]) * 1e-9
+    return {'images': frames, 'lost': frames - len(np.unique(came[:, 0])), 'rate': (len(came) - 1) / span,
+            'p50': np.percentile(latency, 50), 'p99': np.percentile(latency, 99), 'max': latency.max(),
+            'cpu_ms': 1e3 * used / max(counted, 1)}
+
+
+def live(calibration, seconds, only=''):
+    """{case: figures}. The environment of DDS is this process's own, see CASES."""
+    import rclpy
+
+    from fluoro_calib_ros.nodes.graph import isolate
+    isolate()
+    rclpy.init(args=[])
+    reader, out = Reader(calibration), {}
+    folder = Path(os.environ.get('IMAGES_LOG') or f'/tmp/fluoro_calib_images.{os.getpid()}')
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, (case, (encoding, rate, nodes, _)) in enumerate(CASES.items()):
+        if only in case:
+            with open(folder / f'{number}.log', 'wb') as log:
+                out[case] = measured(reader, encoding, rate, nodes[0], seconds, log)
+            print(case, *(f'{k} {v:.3f}' if isinstance(v, float) else f'{k} {v}' for k, v in out[case].items()),
+                  flush=True)
+    reader.node.destroy_node()
+    rclpy.shutdown()
+    return out
+
+
+if __name__ == '__main__':
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--seconds', type=float, default=10.0)
+    parser.add_argument('--only', default='')
+    options = parser.parse_args()
+    calibration, frames = calibration_of_the_rig()
+    for f in on_one_core(calibration, frames):
+        print(f)
+    live(calibration, options.seconds, options.only)

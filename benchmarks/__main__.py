@@ -11,8 +11,6 @@ import sys
 from importlib.metadata import version
 from pathlib import Path
 
-import numpy as np
-from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.calibration.job import calibrate
@@ -21,6 +19,7 @@ from fluoro_calib_ros.calibration.self_calibration import Options
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 from . import adjustments, profiling, scaling
+from .lookup import lookup_section
 from .peers import self_calibrate_with_peers
 from .timing import section, timed
 
@@ -89,31 +88,6 @@ def scaling_section():
                    'fresh process.', scaling.HEADER, list(scaling.rows()))
 
 
-def correction_rows(calibration):
-    """Rows: time of a correction of one frame, prepared and not, beside scikit-learn's k nearest neighbours."""
-    rng, model = np.random.default_rng(0), calibration.model
-    calibration.prepare()
-    # A model without neighbours stands beside the paper's: the regressor with k = 3.
-    peer = KNeighborsRegressor(model.k or 3).fit(model.train_uv, model.train_duv)
-    for targets in (30, 503, 2028):
-        uv = rng.uniform(80, 940, (targets, 2))
-        ours, direct, theirs = (timed(function, repeats)[1] for function, repeats in (
-            (lambda: calibration.correct(uv), 200), (lambda: model.evaluate(uv), 50), (lambda: peer.predict(uv), 50)))
-        yield [f'{model.kind}, k = {model.k}' if model.k else model.kind, str(targets), f'{ours * 1e3:.3f} ms',
-               f'{direct / ours:.1f}', f'{theirs / ours:.1f}']
-
-
-def correction_section():
-    """The correction of a frame."""
-    rig, frames = exposures()
-    rows = []
-    for model in ('auto', 'local_linear', 'knn'):
-        rows += correction_rows(calibrate(frames, rig.phantom, Options(model)).calibrations['a'])
-    return section('Correction of a frame', 'Exact: the sum over the nearest training points, or of the series, with '
-                   'standard deviation and status.',
-                   ['model', 'targets', 'median time', 'as fast as a search of all training points', 'as KNeighborsRegressor.predict'], rows)
-
-
 def profile_section():
     """Where the time of the self-calibration goes."""
     rig, frames = exposures()
@@ -126,7 +100,7 @@ def profile_section():
 
 
 SECTIONS = {'calibration': calibration_section, 'adjustment': adjustment_section, 'scaling': scaling_section,
-            'correction': correction_section, 'profile': profile_section}
+            'correction': lookup_section, 'profile': profile_section}
 
 
 def machine():

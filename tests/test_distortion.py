@@ -138,8 +138,6 @@ def test_local_linear_beats_the_mean_at_the_rim():
 def test_no_correction_corrects_nothing_and_knows_no_outside():
     found = no_correction().evaluate(pixels(50))
     assert not found.duv.any() and not found.sd.any() and not found.outside.any()
-    again = no_correction().at_frame_rate(SIZE).evaluate(pixels(50))
-    assert not again.duv.any() and not again.sd.any() and not again.outside.any()
 
 
 @pytest.mark.parametrize('arguments, said', [
@@ -165,7 +163,6 @@ def test_outside_is_what_lies_beyond_the_convex_hull():
     wanted = Delaunay(uv).find_simplex(query) < 0
     assert 100 < wanted.sum() < len(query) - 100
     np.testing.assert_array_equal(model.outside(query), wanted)
-    np.testing.assert_array_equal(model.at_frame_rate(SIZE).evaluate(query).outside, wanted)
     inner = uv[np.setdiff1d(np.arange(300), ConvexHull(uv).vertices)]
     assert not model.outside(inner).any()
 
@@ -192,73 +189,6 @@ def test_standard_deviations_against_monte_carlo(kind, k):
     np.testing.assert_allclose(scatter / sd, 1, atol=0.15)
     with_bias = CorrectionModel(kind, k, uv, duv, noise_px=0.3, bias_px=0.4).evaluate(query).sd
     np.testing.assert_allclose(with_bias, np.hypot(sd, 0.4), rtol=1e-12)
-
-
-# ---- at frame rate
-
-def training_sets():
-    """Training points as they come: even, few, in clusters with a void between, many in one place."""
-    rng = np.random.default_rng(7)
-    even, values = training(800)
-    clusters = np.concatenate([rng.normal(c, 12, (150, 2)) for c in ([80, 80], [560, 90], [320, 400])])
-    clusters = np.clip(clusters, 0, np.array(SIZE) - 1)
-    return {'even': (even, values), 'few': (even[:60], values[:60]),
-            'clusters': (clusters, np.cos(clusters / 40)),
-            'one_corner': (even * 0.1, values)}
-
-
-@pytest.mark.parametrize('points', ['even', 'few', 'clusters', 'one_corner'])
-@pytest.mark.parametrize('kind, k', [('knn', 1), ('knn', 5), ('knn', 48), ('local_linear', 6), ('local_linear', 23),
-                                     ('local_linear', 60)])
-def test_the_frame_rate_form_predicts_as_the_model_everywhere(kind, k, points):
-    """Inside, on the rim and in the corners of the image, on the borders of cells, far from any training point."""
-    model = CorrectionModel(kind, k, *training_sets()[points], noise_px=0.2, bias_px=0.05)
-    query = pixels()
-    one, other = model.evaluate(query), model.at_frame_rate(SIZE).evaluate(query)
-    # Planes of neighbours that all lie far to one side are ill determined: so are the last digits.
-    certain = one.sd < 1
-    assert certain.mean() > 0.9 or points in ('clusters', 'one_corner')
-    np.testing.assert_allclose(other.duv[certain], one.duv[certain], rtol=1e-10, atol=1e-10)
-    np.testing.assert_allclose(other.sd[certain], one.sd[certain], rtol=1e-9)
-    np.testing.assert_allclose(other.duv, one.duv, rtol=1e-5, atol=1e-6)
-    np.testing.assert_array_equal(other.outside, one.outside)
-
-
-@pytest.mark.parametrize('kind', ['knn', 'local_linear'])
-@pytest.mark.parametrize('k', [9, 14, 33])
-def test_the_frame_rate_form_finds_the_farthest_candidates(kind, k):
-    """Training points in a grid as fine as the cells, hardly disturbed: every cell needs all its candidates."""
-    rng = np.random.default_rng(15)
-    grid = np.stack(np.meshgrid(np.arange(-60.5, 700, 8.0), np.arange(-60.5, 540, 8.0)), axis=2).reshape(-1, 2)
-    uv = grid + rng.uniform(-0.3, 0.3, grid.shape)
-    model = CorrectionModel(kind, k, uv, rng.normal(size=uv.shape))
-    query = pixels()
-    np.testing.assert_allclose(model.at_frame_rate(SIZE).evaluate(query).duv, model.predict(query), rtol=0, atol=1e-10)
-
-
-@pytest.mark.parametrize('k', [6, 20, 59])
-def test_the_frame_rate_form_bears_duplicates_of_training_points(k):
-    """The same pixel in several exposures: equally distant neighbours, at the pixel itself and elsewhere."""
-    uv, duv = training(40)
-    uv, duv = np.repeat(uv, 3, axis=0), np.repeat(duv, 3, axis=0)
-    query = np.concatenate([pixels(300), uv[::3]])
-    model = CorrectionModel('local_linear', k, uv, duv + np.random.default_rng(8).normal(0, 0.2, duv.shape), 0.2)
-    one, other = model.evaluate(query), model.at_frame_rate(SIZE).evaluate(query)
-    assert np.isfinite(one.duv).all() and np.isfinite(one.sd).all()
-    np.testing.assert_allclose(other.duv, one.duv, rtol=0, atol=1e-9 * np.abs(one.duv).max())
-    knn = CorrectionModel('knn', k, uv, duv)
-    one, other = knn.evaluate(query), knn.at_frame_rate(SIZE).evaluate(query)
-    # Of equally distant neighbours the model takes any and the frame-rate form shares: with equal values one.
-    np.testing.assert_allclose(other.duv, one.duv, rtol=0, atol=3 / k * 10)
-    if k % 3 == 0:
-        np.testing.assert_allclose(other.duv, one.duv, rtol=0, atol=1e-10)
-
-
-def test_frames_of_any_length_are_corrected():
-    model = CorrectionModel('local_linear', 30, *training())
-    prepared = model.at_frame_rate(SIZE)
-    assert prepared.evaluate(np.zeros((0, 2))).duv.shape == (0, 2)
-    np.testing.assert_allclose(prepared.evaluate(np.array([[5.0, 7.0]])).duv, model.predict([[5.0, 7.0]]), atol=1e-10)
 
 
 # ---- choice of k

@@ -5,7 +5,6 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError, cKDTree
 
-from .cells import CellPredictor
 from .series import Series
 from .smoothers import KINDS, SMALLEST_K, SMOOTHERS, Neighbourhoods
 from .trend import Trend, least_squares_map
@@ -75,10 +74,6 @@ class CorrectionModel:
         object.__setattr__(self, 'left', left if self.series is None else left - self.series.predict(uv))
         object.__setattr__(self, '_hull', _half_planes(uv))
 
-    def at_frame_rate(self, image_size):
-        """The same model prepared for frames of an image of image_size (width, height): FrameModel."""
-        return FrameModel(self, image_size)
-
     def predict(self, uv):
         """Corrections (n, 2) [px] at pixels uv (n, 2)."""
         return self._evaluate(uv, with_sd=False)[0]
@@ -122,26 +117,6 @@ class CorrectionModel:
             if with_sd:
                 norm2[part] = np.einsum('nk,nk->n', weights, weights)
         return duv + self.global_part(uv), norm2
-
-
-class FrameModel:
-    """A correction model with the neighbours of every part of the image looked up beforehand.
-
-    Predictions are those of the model but for rounding. Built once per calibration, in tenths of a second.
-    """
-
-    def __init__(self, model, image_size):
-        self._model = model
-        self._predictor = None if model.kind not in SMOOTHERS else CellPredictor(
-            model.kind, model.k, model.tree, model.left, image_size)
-
-    def evaluate(self, uv):
-        """Correction at pixels uv (n, 2) of the image, with standard deviations and what lies outside."""
-        if self._predictor is None:
-            return self._model.evaluate(uv)
-        duv, norm2 = self._predictor(uv)
-        duv += self._model.global_part(uv)
-        return Correction(duv, self._model.sd(norm2, uv), self._model.outside(uv))
 
 
 def neighbours_and_weights(tree, kind, uv, k):

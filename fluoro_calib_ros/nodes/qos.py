@@ -5,8 +5,8 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 
 # A fluoroscope at 1000 frames a second and a reader that is busy for a tenth of one.
 OBSERVATIONS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE)
-# Images of a megabyte and more: few are held, and who does not keep up gets the newest ones.
-IMAGES = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=5, reliability=ReliabilityPolicy.RELIABLE)
+# Images of a megabyte and more: few are held, a twelfth of a second of 120 Hz, and who is slower gets the newest ones.
+IMAGES = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
 

@@ -11,7 +11,7 @@ PNG = b'\x89PNG\r\n\x1a\n'
 PNG_LEVEL = 1   # of compression: higher ones take several times as long for a few per cent of an image with noise
 
 # What is wrong is told by who decodes, in one sentence: OpenCV's own lines beside it would be a second one.
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
 def decode(content):

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import subprocess
 import sys
 
@@ -49,5 +50,17 @@ class Graph:
 
 def isolate():
     """Keep this process and its children on this machine and off the graph of others, unless told otherwise."""
-    os.environ.setdefault('ROS_DOMAIN_ID', str(1 + os.getpid() % 100))
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
+    if 'ROS_DOMAIN_ID' not in os.environ:
+        domains = [1 + (os.getpid() + i) % 100 for i in range(100)]
+        os.environ['ROS_DOMAIN_ID'] = str(next((d for d in domains if _is_free(d)), domains[0]))
+
+
+def _is_free(domain):
+    """Whether nobody on this machine is in a ROS domain: the first participant has this port (DDSI-RTPS 9.6.1.1)."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
+        try:
+            port.bind(('', 7400 + 250 * domain + 10))
+        except OSError:
+            return False
+    return True

@@ -72,12 +72,11 @@ class Pictures:
         found = self._out.get((encoding, shape))
         if found is None:
             dtype = np.dtype(ENCODINGS[encoding])
-            data = array('B', bytes(shape[0] * shape[1] * dtype.itemsize))
             message = Image(height=shape[0], width=shape[1], encoding=encoding, step=shape[1] * dtype.itemsize)
-            message.data = data
+            message.data = array('B', bytes(shape[0] * message.step))   # this may copy: the view is of what it has
             # One at a time: a stream has one encoding.
-            self._out = {(encoding, shape): (message, np.frombuffer(data, dtype).reshape(shape))}
-            found = message, _ = self._out[encoding, shape]
+            self._out = {(encoding, shape): (message, np.frombuffer(message.data, dtype).reshape(shape))}
+            found = self._out[encoding, shape]
         found[0].header = header
         return found
 

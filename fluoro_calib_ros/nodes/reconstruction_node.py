@@ -2,6 +2,7 @@
 
 import time
 from collections import Counter
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,8 @@ KINDS = ('undecodable', 'lengths', 'repeated target')   # of refused messages
 ORIENTATIONS = 4   # that are kept: frames of the calibration before may still come
 
 
-class _View(NamedTuple):
+@dataclass(frozen=True)
+class _View:
     """A corrected frame that waits for its partners."""
 
     fluoroscope: str
@@ -72,7 +74,7 @@ class ReconstructionNode(support.ManagedNode):
         except ValueError as error:
             raise StartError(f'parameter {error}') from None
         self._sentences = support.Sentences(self.get_logger())
-        self._outputs, self._subscriptions, self._reader = {}, [], None
+        self._outputs, self._inputs, self._reader = {}, [], None
         self._forget()
 
     def _read_watch(self):
@@ -91,7 +93,7 @@ class ReconstructionNode(support.ManagedNode):
             self._clusters = clusters_of([text for text in clusters if text])
             self._watch_options = DriftOptions(warn_interval_h=hours[0], error_interval_h=hours[1])
         except ValueError as error:
-            raise StartError(f'parameter clusters or drift_warn_interval, drift_error_interval: {error}') from None
+            raise StartError(f'parameter clusters, drift_warn_interval or drift_error_interval: {error}') from None
 
     def _forget(self):
         self._rigs = {}   # calibration ids: _Rig; replaced as a whole
@@ -115,8 +117,8 @@ class ReconstructionNode(support.ManagedNode):
         self._outputs['drift'] = self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)
         self._outputs['tf'] = self.create_publisher(TFMessage, '/tf_static', LATCHED)
         self._diagnostics = support.Diagnostics(self)
-        self._subscriptions = [self.create_subscription(RigOrientation, 'rig_orientation', self._on_orientation, LATCHED)]
-        self._subscriptions += [self.create_subscription(
+        self._inputs = [self.create_subscription(RigOrientation, 'rig_orientation', self._on_orientation, LATCHED)]
+        self._inputs += [self.create_subscription(
             CameraInfo, f'{name}/camera_info', lambda message, name=name: self._on_info(name, message), LATCHED)
             for name in self._names]
         self._collect_anew = self.create_client(Reset, 'collect_anew')
@@ -149,11 +151,11 @@ class ReconstructionNode(support.ManagedNode):
             self.destroy_timer(self._timer)
             self.destroy_client(self._collect_anew)
             self._diagnostics.close()
-        for subscription in self._subscriptions:
+        for subscription in self._inputs:
             self.destroy_subscription(subscription)
         for publisher in self._outputs.values():
             self.destroy_publisher(publisher)
-        self._subscriptions, self._outputs = [], {}
+        self._inputs, self._outputs = [], {}
         self._forget()
 
     # -- orientation
@@ -164,7 +166,7 @@ class ReconstructionNode(support.ManagedNode):
             orientation = orientation_from_message(message).subset(self._names)
             rig = _Rig(message.orientation_id, orientation, Intersector(orientation, self._reject),
                        self._watch_of(orientation))
-        except DataError as error:
+        except ValueError as error:   # DataError among them
             self._last_fault = str(error)
             self.get_logger().error(f'orientation refused, the running one stays: {error}')
             return
@@ -186,7 +188,12 @@ class ReconstructionNode(support.ManagedNode):
         size = message.width, message.height
         if self._sizes.get(name) != size:
             self._sizes = {**self._sizes, name: size}
-            self._rigs = {ids: rig._replace(watch=self._watch_of(rig.orientation)) for ids, rig in self._rigs.items()}
+            try:
+                self._rigs = {ids: rig._replace(watch=self._watch_of(rig.orientation))
+                              for ids, rig in self._rigs.items()}
+            except ValueError as error:   # DataError among them
+                self._last_fault = f'no drift watch: {error}'
+                self.get_logger().error(self._last_fault)
 
     # -- corrected observations
 
@@ -281,8 +288,11 @@ class ReconstructionNode(support.ManagedNode):
     def _drift(self):
         """Publish the state of the drift watch; returns its diagnostics, none where nothing is watched."""
         newest = self._newest
-        if newest is None or newest[0].watch is None:
+        if not self._watching or newest is None:
             return []
+        if newest[0].watch is None:
+            silent = [name for name in self._names if name not in self._sizes]
+            return [('drift', support.WARN, 'nothing is watched: there is no camera_info of ' + ', '.join(silent), {})]
         state = newest[0].watch.state
         message = drift_message(state, newest[1], newest[0].orientation)
         self._outputs['drift'].publish(message)
@@ -291,6 +301,8 @@ class ReconstructionNode(support.ManagedNode):
             self.get_logger().error(state.message)
             if self._collect_on_drift and self._collect_anew.service_is_ready():
                 self._collect_anew.call_async(Reset.Request())
+            elif self._collect_on_drift:
+                self.get_logger().error('nobody offers the service collect_anew: no exposures are collected')
         self._alarmed = alarmed
         level = (support.OK, support.WARN, support.ERROR)[state.level]
         return [('drift', level, state.message, {

@@ -4,6 +4,7 @@ The noise of an image point and the error of its correction are told apart: the 
 other the same every time at a place, and does not average out.
 """
 
+from collections import Counter
 from itertools import combinations
 
 import numpy as np
@@ -84,4 +85,8 @@ def clusters_of(texts):
         out.append(Cluster(name.strip(), numbers))
     if len({cluster.name for cluster in out}) < len(out):
         raise ValueError('two clusters have the same name')
+    targets = Counter(i for cluster in out for i in cluster.target_id)
+    twice = [i for i, count in targets.items() if count > 1]
+    if twice:
+        raise ValueError(f'target {twice[0]} is in two clusters')
     return tuple(out)

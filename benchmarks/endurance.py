@@ -1,0 +1,113 @@
+"""An hour of the stream, faster than real time: what comes in comes out, and memory stays what it was.
+
+    python -m benchmarks.endurance [--hours 1] [--rate 120]
+
+The frames of 2 x 120 Hz x 30 markers of an hour go through correction and reconstruction (with the drift watch and a
+subscriber of the point cloud) as fast as they are taken: never more than a fraction of a queue ahead of the points that
+come out. Every minute of the stream the resident memory of both nodes is noted.
+"""
+
+import argparse
+import itertools
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import rclpy
+from fluoro_calib_msgs.msg import TargetObservations
+
+from fluoro_calib_ros.nodes.conversion import message_from_frame
+from fluoro_calib_ros.nodes.graph import isolate
+from fluoro_calib_ros.nodes.qos import OBSERVATIONS
+from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
+
+from .online import NAMES, Reader, _command, rig_of_the_simulator
+
+NODES = ('correction_node', 'reconstruction_node')
+AHEAD = OBSERVATIONS.depth // 4
+PAGE_MB = os.sysconf('SC_PAGE_SIZE') / 2 ** 20
+
+
+def resident_mb(process):
+    """Resident memory [MB] of a process."""
+    return int(Path(f'/proc/{process.pid}/statm').read_text().split()[1]) * PAGE_MB
+
+
+def stream(reader, frames, rate_hz, note):
+    """Publish frames exposures in step with the points that come out; note(number) at every minute of the stream."""
+    outputs = {n: reader.create_publisher(TargetObservations, f'{n}/target_observations', OBSERVATIONS) for n in NAMES}
+    tracking = simulate_tracking(virtual_rig(1), 10.0, rate_hz, 1, clusters=5).frames
+    messages = [[(n, message_from_frame(tracking[n][k])) for n in NAMES] for k in range(len(tracking['a']))]
+    reader.wait(lambda: all(o.get_subscription_count() for o in outputs.values()), 30, 'the readers')
+    came = reader.came['reconstruction_node', 'ab']
+    start_ns = time.time_ns()
+    for number, pair in zip(range(1, frames + 1), itertools.cycle(messages)):
+        end = time.monotonic() + 60
+        while number - len(came) > AHEAD:
+            if time.monotonic() > end:
+                raise SystemExit(f'{number} exposures went in, {len(came)} came out, and nothing more for a minute')
+            time.sleep(0.0005)
+        for name, message in pair:
+            message.frame_number = number
+            seconds, nanoseconds = divmod(start_ns + round(number / rate_hz * 1e9), 10 ** 9)
+            message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
+            outputs[name].publish(message)
+        if number % round(60 * rate_hz) == 0:
+            note(number)
+    reader.wait(lambda: len(came) >= frames, 30, 'the last points')
+
+
+def run(hours, rate_hz):
+    """Figures: exposures, frames in and out, seconds, and memory {node: [MB by minute]}."""
+    isolate()
+    rclpy.init(args=[])
+    reader, frames = Reader(*rig_of_the_simulator()), round(3600 * hours * rate_hz)
+    processes = {node: subprocess.Popen(_command(node), stderr=subprocess.DEVNULL) for node in NODES}
+    memory = {node: [] for node in NODES}
+
+    def note(number):
+        for node, process in processes.items():
+            memory[node].append(resident_mb(process))
+        print(f'{number / rate_hz / 60:.0f} min: ' + ', '.join(f'{n} {m[-1]:.1f} MB' for n, m in memory.items()),
+              flush=True)
+    try:
+        reader.listen(NODES)
+        reader.ready.clear()
+        reader.wait(lambda: len(reader.ready) == len(NAMES), 60, 'the correction node')
+        began = time.monotonic()
+        stream(reader, frames, rate_hz, note)
+        seconds = time.monotonic() - began
+    finally:
+        for process in processes.values():
+            process.send_signal(signal.SIGINT)
+        for process in processes.values():
+            process.wait(20)
+        reader.reader.stop()
+    out = {key: len({number for number, _ in of_one}) for key, of_one in reader.came.items()}
+    reader.destroy_node()
+    rclpy.shutdown()
+    return {'exposures': frames, 'out': out, 'seconds': seconds, 'memory': memory}
+
+
+def text_of(figures):
+    """Sentences of the figures."""
+    frames = figures['exposures']
+    lines = [f'{frames} exposures of 2 x 30 markers in {figures["seconds"]:.0f} s.',
+             f'In: 2 x {frames} frames. Out: ' + ', '.join(
+                 f'{node} {name} {count}' for (node, name), count in figures['out'].items())]
+    for node, of_one in figures['memory'].items():
+        slope = np.polyfit(np.arange(len(of_one)), of_one, 1)[0] * 60 if len(of_one) > 2 else float('nan')
+        lines.append(f'{node}: {of_one[0]:.1f} MB after a minute of the stream, {of_one[-1]:.1f} MB at the end, '
+                     f'largest {max(of_one):.1f} MB, trend {slope:+.2f} MB an hour')
+    return '\n'.join(lines)
+
+
+if __name__ == '__main__':
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--hours', type=float, default=1.0)
+    parser.add_argument('--rate', type=float, default=120.0)
+    options = parser.parse_args()
+    print(text_of(run(options.hours, options.rate)))

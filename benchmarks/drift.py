@@ -133,9 +133,8 @@ def feed(scene_, watch, block, clusters=True):
     found = scene_.geometry.residuals(corrected[a], corrected[b], systematic[a], systematic[b])
     sd_noise = np.hypot(found.factor_a * noise[0], found.factor_b * noise[1])
     good = np.abs(found.residual) <= REJECT * np.hypot(sd_noise, found.sd_total)
-    state = watch.add(stamps[0], a, b, np.tile(IDS, FRAMES)[good], *(x[good] for x in (
-        seen[a], seen[b], found.residual, sd_noise, found.sd_total, found.normal_a, found.normal_b, found.factor_a,
-        found.factor_b)))
+    state = watch.add(stamps[0], a, b, np.tile(IDS, FRAMES), seen[a], seen[b], found.residual, sd_noise, found.sd_total,
+                      found.normal_a, found.normal_b, found.factor_a, found.factor_b)
     if clusters:
         uv = np.stack([corrected[a], corrected[b]])
         uv[:, ~good] = np.nan
@@ -207,9 +206,12 @@ def detection(scene_, watch, first, fluoroscope, quarter, size, direction, rng, 
             out['error'] = min(out['error'], delay)
             if delay >= min(WITHIN_S, after_s - 1) or ramp_s:   # what is told is judged then, or when it is found later
                 vector = size * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
+                along = float(vector @ state.direction)
+                if ' or ' in state.fluoroscope:   # down in one is up in the other
+                    along = abs(along)
                 out.update(message=state.message, named=state.fluoroscope, place=right_place(state, quarter),
                            source=state.source, sd=state.sd, since=state.since_s - delay,
-                           size_error=state.size - float(vector @ state.direction))
+                           size_error=state.size - along)
                 break
     return out
 
@@ -258,6 +260,7 @@ CASES = (
     ('0.5 px, without clusters', detections, {'clusters': False}),
     ('0.25 px, with clusters', detections, {'size': 0.25}),
     ('1 px, with clusters', detections, {'size': 1.0}),
+    ('3 px, with clusters', detections, {'size': 3.0}),
     ('0.5 px over the whole image', detections, {'quarters': (WHOLE,)}),
     ('0.5 px, there before the start', from_the_start, {}),
     ('0.5 px in an hour', slow, {}))

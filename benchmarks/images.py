@@ -1,17 +1,21 @@
 """Corrected images: how fast one core is, and the node live beside a relay that does nothing with the same images.
 
-    python -m benchmarks.images [--seconds 10] [--calibration DIR]      printed as the tables of docs/images.md
+    python -m benchmarks.images [--seconds 10] [--only NAME]      printed as the tables of docs/images.md
 
-Camera, node, relay and the reader (this process) share the machine. An image is lost when it does not come out;
-latency is from the stamp of the camera, set just before it publishes, to the time stamp that DDS gives the output.
+Camera, node and the reader (this process, or one of its own for another transport) share the machine. An image is lost
+when it does not come out; latency is from the stamp of the camera, set just before it publishes, to the time stamp that
+DDS gives the output. A segment of shared memory of Fast DDS is smaller than an image by default: the cases `wide` are
+measured with one of 32 MB, as docs/images.md tells to make it.
 """
 
 import argparse
+import json
 import os
 import signal
 import struct
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -20,7 +24,6 @@ import numpy as np
 from scipy.ndimage import map_coordinates
 
 from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.files.calibration import load_calibration
 from fluoro_calib_ros.images.undistortion import ImageCorrector
 from fluoro_calib_ros.simulation.images import bead_image
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
@@ -28,12 +31,28 @@ from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 from .timing import table, timed
 
 TICK = os.sysconf('SC_CLK_TCK')
-LARGE = {'FASTDDS_BUILTIN_TRANSPORTS': 'LARGE_DATA?max_msg_size=2MB&sockets_size=2MB&non_blocking=true'}
-CASES = {   # name: (encoding, rate, nodes, environment of all processes)
-    'mono8 120 Hz': ('mono8', 120, ('image_node',), {}),
-    'mono8 120 Hz, relay': ('mono8', 120, ('relay',), {}),
-    'mono8 60 Hz': ('mono8', 60, ('image_node',), {}),
-    'mono16 60 Hz': ('mono16', 60, ('image_node',), {})}
+WIDE = """<?xml version="1.0" encoding="UTF-8"?>
+<profiles xmlns="http://www.eprosima.com">
+  <transport_descriptors>
+    <transport_descriptor>
+      <transport_id>wide</transport_id><type>SHM</type>
+      <segment_size>33554432</segment_size><maxMessageSize>4194304</maxMessageSize>
+    </transport_descriptor>
+    <transport_descriptor><transport_id>udp</transport_id><type>UDPv4</type></transport_descriptor>
+  </transport_descriptors>
+  <participant profile_name="images" is_default_profile="true">
+    <rtps>
+      <userTransports><transport_id>wide</transport_id><transport_id>udp</transport_id></userTransports>
+      <useBuiltinTransports>false</useBuiltinTransports>
+    </rtps>
+  </participant>
+</profiles>
+"""
+CASES = {   # name: (encoding, rate, node)
+    'mono8 120 Hz': ('mono8', 120, 'image_node'),
+    'mono8 120 Hz, relay': ('mono8', 120, 'relay'),
+    'mono16 60 Hz': ('mono16', 60, 'image_node'),
+    'mono16 60 Hz, relay': ('mono16', 60, 'relay')}
 OUTPUTS = {'image_node': 'a/image_corrected', 'relay': 'a/relayed'}
 
 
@@ -124,12 +143,13 @@ def _start(*command, log, **parameters):
 def measured(reader, encoding, rate, node, seconds, log):
     """{images, lost, p50, p99, max [ms], cpu_ms an image} of a node at a rate."""
     frames = round(rate * seconds)
-    under_test = _start(*(['fluoro_calib_ros.nodes.image_node'] if node == 'image_node' else
-                          ['benchmarks.image_processes', 'relay']), log=log)
+    command = ['fluoro_calib_ros.nodes.image_node'] if node == 'image_node' else ['benchmarks.image_processes', 'relay']
+    under_test = _start(*command, log=log)
     reader.listen(OUTPUTS[node])
     path = Path(log.name)
     if node == 'image_node':
         wait(lambda: 'images corrected with calibration' in path.read_text(errors='replace'), 60, 'the calibration')
+    wait(lambda: reader.node.count_publishers(OUTPUTS[node]), 60, 'the node')
     camera = _start('benchmarks.image_processes', 'camera', log=log, encoding=encoding, rate=float(rate), frames=frames)
     try:
         wait(lambda: reader.came, 60, 'the first image')
@@ -146,38 +166,63 @@ def measured(reader, encoding, rate, node, seconds, log):
     came = np.array(reader.came)
     latency = came[:, 1] * 1e-6
     span = (came[-1, 0] - came[0, 0]) * 1e-9
-    return {'images': frames, 'lost': frames - len(np.unique(came[:, 0])), 'rate': (len(came) - 1) / span,
-            'p50': np.percentile(latency, 50), 'p99': np.percentile(latency, 99), 'max': latency.max(),
-            'cpu_ms': 1e3 * used / max(counted, 1)}
+    return {'images': frames, 'lost': int(frames - len(np.unique(came[:, 0]))), 'rate': float((len(came) - 1) / span),
+            'p50': float(np.percentile(latency, 50)), 'p99': float(np.percentile(latency, 99)),
+            'max': float(latency.max()), 'cpu_ms': 1e3 * used / max(counted, 1)}
 
 
 def live(calibration, seconds, only=''):
-    """{case: figures}. The environment of DDS is this process's own, see CASES."""
+    """{case: figures} of those whose name contains only, with the transports of this process's environment."""
     import rclpy
 
     from fluoro_calib_ros.nodes.graph import isolate
     isolate()
     rclpy.init(args=[])
     reader, out = Reader(calibration), {}
-    folder = Path(os.environ.get('IMAGES_LOG') or f'/tmp/fluoro_calib_images.{os.getpid()}')
-    folder.mkdir(parents=True, exist_ok=True)
-    for number, (case, (encoding, rate, nodes, _)) in enumerate(CASES.items()):
+    for case, (encoding, rate, node) in CASES.items():
         if only in case:
-            with open(folder / f'{number}.log', 'wb') as log:
-                out[case] = measured(reader, encoding, rate, nodes[0], seconds, log)
-            print(case, *(f'{k} {v:.3f}' if isinstance(v, float) else f'{k} {v}' for k, v in out[case].items()),
-                  flush=True)
+            with tempfile.NamedTemporaryFile('wb', suffix='.log') as log:
+                out[case] = measured(reader, encoding, rate, node, seconds, log)
     reader.node.destroy_node()
     rclpy.shutdown()
     return out
 
 
+def live_wide(seconds, only=''):
+    """The same in a process of its own, with large segments of shared memory."""
+    with tempfile.NamedTemporaryFile('w', suffix='.xml') as profile:
+        profile.write(WIDE)
+        profile.flush()
+        done = subprocess.run(
+            [sys.executable, '-m', 'benchmarks.images', '--live', '--seconds', str(seconds), '--only', only],
+            env={**os.environ, 'FASTRTPS_DEFAULT_PROFILES_FILE': profile.name}, stdout=subprocess.PIPE, check=True)
+    return {f'{case}, wide': figures for case, figures in json.loads(done.stdout).items()}
+
+
+def run(seconds=10.0, only=''):
+    """(figures of one core, {case: figures} live)."""
+    calibration, frames = calibration_of_the_rig()
+    return on_one_core(calibration, frames), live(calibration, seconds, only) | live_wide(seconds, only)
+
+
+def text_of(core, cases):
+    """The tables."""
+    rows = [[f'mono{f["depth"]} {f["interpolation"]}', f'{f["ms"]:.1f}', f'{f["cpu_ms"]:.1f}', f'{f["rate"]:.0f}',
+             f'{f["scipy_ms"] / f["ms"]:.0f}'] for f in core]
+    first = table(['1024 x 1024', 'median [ms]', 'CPU [ms]', 'images a second a core', 'as fast as scipy'], rows)
+    rows = [[case, str(f['images']), str(f['lost']), f'{f["p50"]:.1f}', f'{f["p99"]:.1f}', f'{f["max"]:.0f}',
+             f'{f["cpu_ms"]:.1f}'] for case, f in cases.items()]
+    return first + '\n\n' + table(['live', 'images', 'lost', 'p50 [ms]', 'p99 [ms]', 'max [ms]',
+                                    'CPU an image [ms]'], rows)
+
+
 if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=10.0)
-    parser.add_argument('--only', default='')
+    parser.add_argument('--only', default='', help='live cases whose name contains this')
+    parser.add_argument('--live', action='store_true', help='the live cases alone, as JSON')
     options = parser.parse_args()
-    calibration, frames = calibration_of_the_rig()
-    for f in on_one_core(calibration, frames):
-        print(f)
-    live(calibration, options.seconds, options.only)
+    if options.live:
+        print(json.dumps(live(calibration_of_the_rig()[0], options.seconds, options.only)))
+    else:
+        print(text_of(*run(options.seconds, options.only)))

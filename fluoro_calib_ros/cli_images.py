@@ -1,6 +1,7 @@
 """The command fluoro-calib correct, for image points and for images: by the ending of the source."""
 
 import os
+import shutil
 import sys
 from pathlib import Path
 
@@ -97,7 +98,9 @@ class _Progress:
     def __call__(self, done, total):
         if self._bar is None:
             from tqdm import tqdm
-            self._bar = tqdm(desc=self._name, total=total or None, unit=' images', disable=None, leave=False)
+            # A terminal that does not tell its width would show nothing.
+            self._bar = tqdm(desc=self._name, total=total or None, unit=' images', disable=None, leave=False,
+                             ncols=shutil.get_terminal_size().columns)
         self._bar.update(done - self._bar.n)
 
     def __enter__(self):

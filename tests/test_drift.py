@@ -79,8 +79,7 @@ def quarter_of(side, size, begin_s=0.0, quarter='upper left'):
 def test_mean_time_to_a_false_alarm_of_a_chart_is_at_least_the_bound(correlation):
     """400 charts with the mean at the edge of their dead band, and more noise than predicted."""
     rng, threshold, series, band = np.random.default_rng(1), 6.0, 400, 0.2
-    options = DriftOptions()
-    charts = Charts(series, 1, options, 1.5 * threshold)
+    charts = Charts(series, 1, DriftOptions().step_px, 1.5 * threshold)
     noise, alarms, blocks_seen, last = 1.3, 0, 0, rng.normal(size=series)
     information = np.full((series, 1), 900 * FACTOR ** 2 / 0.25 ** 2 / 4)
     for number in range(1200):

@@ -15,6 +15,7 @@ from fluoro_calib_ros.reconstruction.intersection import (FAILED, OK, OUTSIDE, R
 from fluoro_calib_ros.reconstruction.matching import matched
 from fluoro_calib_ros.reconstruction.orientation import RigOrientation
 from fluoro_calib_ros.reconstruction.recording import reconstruct_recording
+from fluoro_calib_ros.reconstruction.watching import clusters_of
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 SIGMA = 0.25
@@ -386,3 +387,19 @@ def test_wrong_recordings_are_refused_in_a_sentence():
             reconstruct_recording(wrong, calibrations, intersector)
     with pytest.raises(DataError, match='there are no frames of fluoroscope b, only of a'):
         reconstruct_recording({'a': frames['a']}, calibrations, intersector)
+
+
+@pytest.mark.parametrize('texts, sentence', [
+    (['1001 1002'], "does not declare a cluster, as 'tibia: 1001 1002 1003' does"),
+    (['tibia:'], 'does not declare a cluster'), (['tibia: 1 x'], 'does not declare a cluster'),
+    (['tibia: 1'], 'cluster tibia: it is two beads or more'),
+    (['tibia: 1 2', 'tibia: 3 4'], 'two clusters have the same name'),
+    (['tibia: 1 2', 'femur: 2 3'], 'target 2 is in two clusters')])
+def test_declared_clusters_that_are_none(texts, sentence):
+    with pytest.raises(ValueError, match=sentence):
+        clusters_of(texts)
+
+
+def test_declared_clusters():
+    assert [(c.name, c.target_id) for c in clusters_of(['tibia: 1 2,3', 'my femur :4 5'])] == [
+        ('tibia', (1, 2, 3)), ('my femur', (4, 5))]

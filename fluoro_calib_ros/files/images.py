@@ -28,6 +28,8 @@ AT_ONCE = 64_000_000   # bytes of pages that are read at once
 LOST = 0.01   # part of the frames a video may have fewer than it says, which for some containers is an estimate
 GREY_16 = b'Y1\0\x10'   # OpenCV's name of the pixels of a video with 16 bits
 
+os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')   # nothing: what is wrong is said here, in one sentence
+
 
 @dataclass(frozen=True)
 class CorrectedImages:
@@ -151,7 +153,6 @@ def _pages_of(path, pages):
 def _read_video(path):
     if not os.path.isfile(path):
         read_bytes(path)   # says why
-    os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')   # what is wrong is said in one sentence, here
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
         raise DataError(f'{path}: this is no video that can be read, or it is damaged')

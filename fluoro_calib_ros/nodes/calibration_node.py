@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from fluoro_calib_msgs.action import SelfCalibrate
-from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration, RigOrientation
-from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Orient, Reset, SaveCalibration
+from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration
+from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Reset, SaveCalibration
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
@@ -25,35 +25,19 @@ from ..bags.reader import frame_from_message
 from ..calibration.beside import calibrate_beside
 from ..calibration.collector import ExposureCollector, FramePairer, StillOptions
 from ..calibration.network import MIN_TARGETS_OF_EXPOSURE
-from ..calibration.orientation import orientation_of_capture
 from ..calibration.self_calibration import MODELS, Options
 from ..files.calibration import SUFFIX, load_calibrations, save_calibration
-from ..files.orientation import load_orientation, orientation_path, save_orientation
+from ..files.orientation import save_orientation
 from ..files.phantom import read_phantom
 from ..files.validation import write_sources, write_validation
 from ..photogrammetry.observations import DataError, check_frame
 from . import support
 from .conversion import message_from_calibration
+from .orienting import Orienting
 from .qos import LATCHED
-from .spatial import message_from_orientation
 from .support import StartError, declare
 
 COLLECT = ('still', 'request')
-
-
-class _Orienting:
-    """A capture of the phantom in the rig frame: pairs of frames until there are enough."""
-
-    def __init__(self, names, count):
-        self.frames, self._count, self.done = {name: [] for name in names}, count, Future()
-
-    def take(self, pair):
-        """Take a pair; true once there are enough."""
-        for name, frame in pair.items():
-            self.frames[name].append(frame)
-        if len(self.frames[frame.fluoroscope]) == self._count and not self.done.done():
-            self.done.set_result(True)
-        return self.done.done()
 
 
 class Cancelled(Exception):
@@ -79,7 +63,6 @@ class CalibrationNode(Node):
         self._stopping = threading.Event()
         self._rounds, self._calibrations, self._made_at = {}, {}, {}
         self._busy, self._job = (), None   # fluoroscopes of the running job, and the thread that waits for it
-        self._orienting, self._orientation = None, None
         self._make_interfaces()
         self._load_at_start()
 
@@ -133,10 +116,11 @@ class CalibrationNode(Node):
                                                                     LATCHED)
             self._status[name] = self.create_publisher(CalibrationStatus, f'{name}/calibration_status', 10)
             support.subscribe_observations(self, name, self._on_frame, self._on_deaf)
-        self._orientation_output = self.create_publisher(RigOrientation, 'rig_orientation', LATCHED)
+        self._orienting = Orienting(self, self._names, self._phantom, self._rig_frame, self._capture_timeout,
+                                    lambda: self._directory, lambda: self._calibrations, services)
         for kind, name, callback in ((Calibrate, 'calibrate', self._on_calibrate),
                                      (Capture, 'capture', self._on_capture), (Reset, 'reset', self._on_reset),
-                                     (Reset, 'collect_anew', self._on_collect_anew), (Orient, 'orient', self._on_orient),
+                                     (Reset, 'collect_anew', self._on_collect_anew),
                                      (SaveCalibration, 'save_calibration', self._on_save),
                                      (LoadCalibration, 'load_calibration', self._on_load)):
             self.create_service(kind, name, callback, callback_group=services)
@@ -190,8 +174,7 @@ class CalibrationNode(Node):
 
     def _collect_pair(self, pair):
         """Collect a pair, for the capture that has waited longest or because the phantom stands still."""
-        if self._orienting is not None and self._orienting.take(pair):
-            self._orienting = None
+        self._orienting.take(pair)
         if self._captures:
             refused = self._not_captured = self._collector.take(pair)
             if not refused:
@@ -244,60 +227,6 @@ class CalibrationNode(Node):
         self.get_logger().info(response.message)
         return response
 
-    async def _on_orient(self, request, response):
-        """Answer with the orientation of a rig in which the phantom stands."""
-        try:
-            orientation = await self._captured_orientation(request)
-            save_orientation(self._directory, orientation)
-        except (DataError, ValueError, OSError) as error:
-            response.message = f'the orientation of the rig stays as it is: {error}'
-            self.get_logger().error(response.message)
-            return response
-        self._publish_orientation(orientation)
-        response.success, response.orientation_id = True, orientation.orientation_id
-        sd = 1000 * orientation.sd_mm.max()
-        response.message = (f'{", ".join(orientation.fluoroscopes)} oriented in frame {orientation.frame_id} from '
-                            f'{orientation.exposures} captures of the phantom, sources within {sd:.0f} um')
-        self.get_logger().info(response.message)
-        return response
-
-    async def _captured_orientation(self, request):
-        """RigOrientation from the next frames of all fluoroscopes. Raises DataError and ValueError."""
-        timeout, count = request.timeout_sec or self._capture_timeout, request.frames or 1
-        if not 0 < timeout < np.inf:
-            raise ValueError(f'timeout_sec is a time in seconds, not {timeout}')
-        missing = [name for name in self._names if name not in self._calibrations]
-        if missing:
-            raise DataError(f'there is no calibration of fluoroscope {missing[0]} yet')
-        if self._orienting is not None:
-            raise DataError('another capture is waiting for its frames')
-        waiting = self._orienting = _Orienting(self._names, count)
-        calibrations = dict(self._calibrations)
-        timer = self.create_timer(timeout, lambda: waiting.done.done() or waiting.done.set_result(False),
-                                  clock=Clock(clock_type=ClockType.STEADY_TIME))
-        came = await waiting.done
-        self.destroy_timer(timer)
-        if not came:
-            self._orienting = None
-            raise DataError(f'{len(waiting.frames[self._names[0]])} of {count} frames of all fluoroscopes '
-                            f'({", ".join(self._names)}) came within {timeout:g} s')
-        return await self._beside(lambda: orientation_of_capture(
-            waiting.frames, self._phantom, calibrations, self._rig_frame))
-
-    def _beside(self, function):
-        """Future of the result of a function that is called in a thread of its own."""
-        done = Future()
-
-        def work():
-            try:
-                done.set_result(function())
-            except Exception as error:
-                done.set_exception(error)
-            if self.executor is not None:
-                self.executor.wake()   # to look at what has been awaited
-        threading.Thread(target=work, daemon=True).start()
-        return done
-
     def _on_save(self, request, response):
         directory = Path(request.directory).expanduser() if request.directory else self._directory
         try:
@@ -305,8 +234,7 @@ class CalibrationNode(Node):
                 raise DataError('there is no calibration to save')
             for calibration in self._calibrations.values():
                 save_calibration(directory, calibration)
-            if self._orientation is not None:
-                save_orientation(directory, self._orientation)
+            self._orienting.save(directory)
         except (DataError, OSError) as error:
             response.message = f'not saved: {error}'
             self.get_logger().error(response.message)
@@ -321,7 +249,7 @@ class CalibrationNode(Node):
             found = self._read_calibrations(directory)
             if not found:
                 raise DataError(f'{directory}: there is no calibration of {", ".join(self._names)}')
-            orientation = self._read_orientation(directory, found)
+            orientation = self._orienting.read(directory, found)
         except (DataError, OSError) as error:
             response.message = f'not loaded, the running calibration stays: {error}'
             self.get_logger().error(response.message)
@@ -333,24 +261,12 @@ class CalibrationNode(Node):
     def _read_calibrations(self, directory):
         return {n: c for n, c in load_calibrations(directory).items() if n in self._names}
 
-    def _read_orientation(self, directory, calibrations):
-        """RigOrientation in a directory that belongs to calibrations, or None. Raises DataError."""
-        path = Path(orientation_path(directory))
-        if not path.exists():
-            return None
-        orientation = load_orientation(path)
-        ids = {name: calibrations[name].calibration_id for name in orientation.fluoroscopes if name in calibrations}
-        if tuple(ids.values()) == orientation.calibration_ids:
-            return orientation
-        self.get_logger().warning(f'{path}: the orientation of the rig belongs to other calibrations, it is not used')
-        return None
-
     def _load_at_start(self):
         if not any(self._directory.glob('*' + SUFFIX)):
             return
         try:
             found = self._read_calibrations(self._directory)
-            orientation = self._read_orientation(self._directory, found)
+            orientation = self._orienting.read(self._directory, found)
         except (DataError, OSError) as error:
             self._load_fault = str(error)
             self.get_logger().error(f'no calibration loaded: {error}')
@@ -396,10 +312,8 @@ class CalibrationNode(Node):
             calibrations = {n: replace(c, seconds=job.seconds) for n, c in job.calibrations.items()}
             for calibration in calibrations.values():
                 save_calibration(self._directory, calibration)
-            if isinstance(orientation, str):
-                self.get_logger().warning(f'no new orientation of the rig: {orientation}')
-                orientation = None
-            else:
+            orientation = self._orienting.after(calibrations, orientation)
+            if orientation is not None:
                 save_orientation(self._directory, orientation)
             write_sources(self._directory, *sources)
             if validation is not None:
@@ -450,7 +364,8 @@ class CalibrationNode(Node):
 
         def wait():
             try:
-                done.set_result((*calibrate_beside(*sources, on_round, check, request.validate, others), sources))
+                done.set_result((*calibrate_beside(*sources, on_round, check, request.validate, others, self._names),
+                                 sources))
             except Exception as error:
                 done.set_exception(error)
             if self.executor is not None:
@@ -481,16 +396,11 @@ class CalibrationNode(Node):
     def _publish(self, calibrations, orientation=None):
         """Take calibrations and, where there is one, the orientation that belongs to them over, and publish them."""
         # First, so that it is there when the first points come that are corrected with the new calibrations.
-        if orientation is not None:
-            self._publish_orientation(orientation)
+        self._orienting.publish(orientation)
         for name, calibration in calibrations.items():
             self._calibrations[name], self._made_at[name] = calibration, time.monotonic()
             self._load_fault = ''
             self._calibration_outputs[name].publish(message_from_calibration(calibration))
-
-    def _publish_orientation(self, orientation):
-        self._orientation = orientation
-        self._orientation_output.publish(message_from_orientation(orientation))
 
     # -- status
 

@@ -39,6 +39,7 @@ NUGGET = 0.35   # part of the systematic standard deviation that a field of thes
 # Part of the systematic standard deviation that distances in an area have in common: a fifth to two fifths measured, as
 # what they were at the start is their reference, and beads some centimetres apart have errors of their own.
 COMMON = 0.5
+CLUSTER_STEP = 2.0   # of step_px in the charts of the clusters, which have less information
 PRIOR_DIFFERENCES = 20   # pairs of blocks that the variance of all areas counts for in that of one
 LAGS = (1, 2, 4)   # frames, over which the noise is compared
 MOST_CORRELATION = 0.97   # of the noise of a marker in successive frames
@@ -169,11 +170,14 @@ class Areas:
 
 
 class Charts:
-    """CUSUM charts of K series in A areas and both directions, with the variance that their blocks turn out to have."""
+    """CUSUM charts of K series in A areas and both directions, with the variance that their blocks turn out to have.
 
-    def __init__(self, series, areas, options, cap):
+    step_px: excess over the dead band for which they are most sensitive; cap: largest evidence.
+    """
+
+    def __init__(self, series, areas, step_px, cap):
         shape = (series, areas)
-        self._options, self._cap = options, cap
+        self._step, self._cap = step_px, cap
         self.evidence, self.begin = np.zeros((2, *shape)), np.zeros((2, *shape), dtype=np.int64)
         self._run = np.zeros((2, 2, *shape))   # score and information of the runs, by direction
         self._squares, self._count = np.zeros(shape), np.zeros(shape)
@@ -193,7 +197,7 @@ class Charts:
         where it counts; stamp_ns of its begin."""
         seen = information > 0
         factor = self._learn(score, information, seen)
-        step, sign = self._options.step_px, np.array([1.0, -1.0])[:, None, None]
+        step, sign = self._step, np.array([1.0, -1.0])[:, None, None]
         with np.errstate(invalid='ignore'):
             gain = step * (sign * score - band * information - step / 2 * information) / factor
         gain = np.where(seen & testing, np.minimum(gain, self._cap / CAP / STEPS_TO_ALARM), 0.0)
@@ -408,8 +412,8 @@ class DriftWatch:
         options, cap = self.options, CAP * self.thresholds[1]
         areas = len(self._areas.member)
         self._watches = [PairWatch([self._sizes[name] for name in pair], self._areas, options) for pair in self._pairs]
-        self._charts = [Charts(4 * len(self._pairs), areas, options, cap),
-                        Charts(2 * len(self._names), areas, options, cap)]
+        self._charts = [Charts(4 * len(self._pairs), areas, options.step_px, cap),
+                        Charts(2 * len(self._names), areas, CLUSTER_STEP * options.step_px, cap)]
         window = max(4, round(WINDOW_S / options.block_s))
         self._rings = [deque(maxlen=window), deque(maxlen=window)]
         self._rows = [[] for _ in self._pairs]
@@ -426,7 +430,8 @@ class DriftWatch:
 
         stamp_ns; names a, b; target_id (n,); uv_a, uv_b (n, 2): where the markers are in the images [px]; residual
         (n,), its sd_noise and sd_systematic (that of correction and orientation) (n,) or numbers [px]; normal_a,
-        normal_b (n, 2) and factor_a, factor_b (n,) as in EpipolarResiduals. What is not finite is left out. Raises
+        normal_b (n, 2) and factor_a, factor_b (n,) as in EpipolarResiduals. What is not finite is left out. Residuals
+        that are too large for a match belong to it too: they are clipped here, and a large drift has no others. Raises
         ValueError for an unknown pair of fluoroscopes, and for arrays that do not belong together.
         """
         number, turned = self._number(a, b)

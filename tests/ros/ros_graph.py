@@ -17,6 +17,7 @@ from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.action import SelfCalibrate
 from fluoro_calib_msgs.msg import (CalibrationStatus, CorrectedObservations, DriftStatus, FluoroscopeCalibration,
                                    ReconstructedPoints, RigOrientation, TargetObservations)
+from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Orient, Reset, SaveCalibration
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -39,6 +40,9 @@ TOPICS = {'target_observations': (TargetObservations, OBSERVATIONS),
           'calibration_status': (CalibrationStatus, 10), 'rig_orientation': (RigOrientation, LATCHED),
           'points_with_covariance': (ReconstructedPoints, OBSERVATIONS), 'points': (PointCloud2, OBSERVATIONS),
           'markers': (MarkerArray, OBSERVATIONS), 'drift': (DriftStatus, 10), 'tf_static': (TFMessage, LATCHED)}
+
+SERVICES = {'calibrate': Calibrate, 'capture': Capture, 'collect_anew': Reset, 'load_calibration': LoadCalibration,
+            'orient': Orient, 'reset': Reset, 'save_calibration': SaveCalibration}
 
 
 def free_domain():
@@ -174,7 +178,9 @@ class Client(Node):
         self.messages, self.statuses, self.feedback = {}, {}, []
         self._spinner = SingleThreadedExecutor()
         self._spinner.add_node(self)
-        self._callers = {}
+        # Made before the nodes are: a service that hears of its client in the same moment as of its request may not
+        # know yet where the answer goes.
+        self._callers = {service: self.create_client(kind, service) for service, kind in SERVICES.items()}
         self._outputs = {n: self.create_publisher(TargetObservations, f'{n}/target_observations', OBSERVATIONS)
                          for n in NAMES}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)

@@ -3,10 +3,12 @@
 from dataclasses import replace
 
 import pytest
+from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import DescribeParameters, ListParameters
 from ros_graph import NAMES, Graph, value_of
+from rosgraph_msgs.msg import Clock
 
 NODES = ('correction_node', 'reconstruction_node')
 
@@ -48,6 +50,16 @@ def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, 
     assert node.end() == 0 and 'Traceback' not in node.log
 
 
+@pytest.mark.parametrize('node', NODES)
+def test_every_transition_and_a_clean_end(graph, node):
+    process, client = graph.start(node), graph.client
+    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE,
+                       Transition.TRANSITION_CLEANUP, Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+        assert change(client, node, transition), transition
+    assert state(client, node) == State.PRIMARY_STATE_ACTIVE
+    assert process.end() == 0 and 'Traceback' not in process.log
+
+
 def test_shutdown_by_the_lifecycle(graph, by_command):
     graph.both_nodes(by_command[0])
     assert change(graph.client, 'correction_node', Transition.TRANSITION_ACTIVE_SHUTDOWN)
@@ -78,7 +90,7 @@ def test_two_rigs_side_by_side(ros, request, graph, by_command, tracking, tmp_pa
     try:
         graph.whole_chain(by_command[0])
         other.both_nodes(by_command[0])
-        simulated = other.start('reconstruction_node', {'use_sim_time': 'true'})
+        simulated = other.start('reconstruction_node', {'use_sim_time': 'true', 'pair_by': 'stamp'})
         for one in (graph, other):
             one.points = one.client.listen('reconstruction/points_with_covariance')
             one.client.wait_until(lambda: one.client.count_publishers('reconstruction/points_with_covariance'),
@@ -95,6 +107,13 @@ def test_two_rigs_side_by_side(ros, request, graph, by_command, tracking, tmp_pa
         for one, count in ((graph, 20), (other, 10)):
             one.client.wait_until(lambda: len(one.points) >= count, what='the points')
         assert [m.frame_number for m in graph.points] == [f.number for f in tracking['a'][:20]]
-        assert [m.frame_number for m in other.points] == list(range(500, 510))
+        assert [m.frame_number for m in other.points] == list(range(500, 510))   # paired by stamp, numbered as they came
+        clock = other.client.create_publisher(Clock, '/clock', 10)
+        ticks = iter(range(1, 10 ** 6))   # the timers of the node go by the simulated clock, and by nothing else
+        def ticking():
+            clock.publish(Clock(clock=Time(sec=next(ticks))))
+            return 'reconstruction_node: reconstruction' in other.client.statuses
+        other.client.wait_until(ticking, what='diagnostics at simulated time')
+        other.client.destroy_publisher(clock)
     finally:
         other.close()

@@ -2,7 +2,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench validation precision convergence bags clean
+.PHONY: help setup demo test bench online endurance validation precision convergence bags clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
@@ -12,6 +12,8 @@ help:
 	@echo 'make test    run all tests (sets up first)'
 	@echo 'make setup   make or refresh .venv: packages, ROS 2, messages; nothing is done twice'
 	@echo 'make bench   run the benchmarks'
+	@echo 'make online  the nodes at lab rates beside relays that do nothing, points in space, images (10 minutes)'
+	@echo 'make endurance   an hour of the stream, faster than real time: counts and memory (15 minutes)'
 	@echo 'make validation  the experiment of the paper, and more, against the truth: docs/validation.md (10 minutes)'
 	@echo 'make precision   errors of 200 simulated calibrations over what is claimed: docs/precision.md (5 minutes)'
 	@echo 'make convergence 200 random rigs with bad start values: docs/convergence.md (15 minutes)'
@@ -32,6 +34,14 @@ test: setup
 
 bench: setup
 	@$(RUN) -m benchmarks $(ARGS)
+
+online: setup
+	@$(RUN) -m benchmarks.online $(ARGS)
+	@$(RUN) -m benchmarks.reconstruction
+	@$(RUN) -m benchmarks.images
+
+endurance: setup
+	@$(RUN) -m benchmarks.endurance $(ARGS)
 
 validation: setup
 	@$(RUN) -m benchmarks.validation $(ARGS)

@@ -3,8 +3,8 @@
     python -m benchmarks.image_processes camera --ros-args -p rate:=120.0 -p frames:=600
     python -m benchmarks.image_processes relay
 
-The camera publishes bytes that are serialised already, as a driver that does not copy its images would: what the machine
-has is left to the node under test.
+The camera publishes bytes that are serialised already, as a driver that does not copy its images would: what the
+machine has is left to the node under test.
 """
 
 import struct

@@ -1,6 +1,7 @@
 """Corrected images: how fast one core is, and the node live beside a relay that does nothing with the same images.
 
     python -m benchmarks.images [--seconds 10] [--only NAME]      printed as the tables of docs/images.md
+    python -m benchmarks.images --picture docs/images/corrected_image.png
 
 Camera, node and the reader (this process, or one of its own for another transport) share the machine. An image is lost
 when it does not come out; latency is from the stamp of the camera, set just before it publishes, to the time stamp that
@@ -21,6 +22,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.ndimage import map_coordinates
 
 from fluoro_calib_ros.calibration.job import calibrate
@@ -205,6 +207,25 @@ def run(seconds=10.0, only=''):
     return on_one_core(calibration, frames), live(calibration, seconds, only) | live_wide(seconds, only)
 
 
+def draw(path, lines=15):
+    """Draw a square pattern of beads through the fluoroscope of the rig, and corrected, with straight lines."""
+    fluoroscope, calibration = virtual_rig(1).fluoroscopes[0], calibration_of_the_rig()[0]
+    at = np.linspace(24, 999, lines)
+    observed = fluoroscope.distortion.distort(np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2))
+    seen = np.all((observed > 4) & (observed < 1019), axis=1)[:, None]
+    image = bead_image(observed, bead_px=4.5, contrast=0.8)
+    figure = Figure(figsize=(8.4, 4.5), dpi=120, layout='constrained')
+    for axes, name, shown, uv in zip(figure.subplots(1, 2), ('observed', 'corrected'),
+                                     (image, ImageCorrector(calibration).correct(image)),
+                                     (observed, calibration.correct(observed).uv)):
+        axes.imshow(shown, cmap='gray', vmin=0, vmax=255, interpolation='antialiased')
+        uv = np.where(seen, uv, np.nan).reshape(lines, lines, 2)
+        for line in (uv[1], uv[-2], uv[:, 1], uv[:, -2]):
+            axes.plot(*line[np.isfinite(line[:, 0])][[0, -1]].T, color='#D55E00', linewidth=1)
+        axes.set(title=name, xticks=[], yticks=[], xlim=(-0.5, 1023.5), ylim=(1023.5, -0.5))
+    figure.savefig(path)
+
+
 def text_of(core, cases):
     """The tables."""
     rows = [[f'mono{f["depth"]} {f["interpolation"]}', f'{f["ms"]:.1f}', f'{f["cpu_ms"]:.1f}', f'{f["rate"]:.0f}',
@@ -221,8 +242,11 @@ if __name__ == '__main__':
     parser.add_argument('--seconds', type=float, default=10.0)
     parser.add_argument('--only', default='', help='live cases whose name contains this')
     parser.add_argument('--live', action='store_true', help='the live cases alone, as JSON')
+    parser.add_argument('--picture', metavar='FILE', help='draw docs/images/corrected_image.png anew, nothing else')
     options = parser.parse_args()
-    if options.live:
+    if options.picture:
+        draw(options.picture)
+    elif options.live:
         print(json.dumps(live(calibration_of_the_rig()[0], options.seconds, options.only)))
     else:
         print(text_of(*run(options.seconds, options.only)))

@@ -62,7 +62,8 @@ class Reader(Node):
         self.create_publisher(RigOrientation, 'rig_orientation', LATCHED).publish(message_from_orientation(orientation))
         self.ready = set()   # fluoroscopes that are corrected
         for name in NAMES:
-            self.create_subscription(CameraInfo, f'{name}/camera_info', lambda _, name=name: self.ready.add(name), LATCHED)
+            self.create_subscription(CameraInfo, f'{name}/camera_info',
+                                     lambda _, name=name: self.ready.add(name), LATCHED)
         self.came = {}   # (node, fluoroscope): [(frame number, latency [ns]), ...]
         self.reader = None
 

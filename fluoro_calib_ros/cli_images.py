@@ -16,8 +16,8 @@ POINTS = ('.csv', '.txt', '')   # endings of files with image points
 def add_correct(sub):
     """Arguments of the command."""
     sub.add_argument('source', type=Path, metavar='SOURCE',
-                     help='CSV file with columns u, v [px], perhaps fluoroscope, sigma; or a grey image (png, tif, jpg, '
-                     'bmp, pgm), a folder of images, or a video (avi, mkv, mp4)')
+                     help='CSV file with columns u, v [px], perhaps fluoroscope, sigma; or a grey image (png, tif, '
+                     'jpg, bmp, pgm), a folder of images, or a video (avi, mkv, mp4)')
     sub.add_argument('--calibration', required=True, type=Path, metavar='DIR', help='folder that calibrate has written')
     sub.add_argument('--out', required=True, type=Path, metavar='OUT',
                      help='file to write, for a folder the folder; its ending is the format')
@@ -85,8 +85,8 @@ def _correct_images(options, calibrations, report):
                      'image_size': list(calibration.image_size), 'interpolation': options.interpolation,
                      'empty_pixels': empty, 'passed_over': list(done.passed_over)},
            f'{done.images} {"image" if done.images == 1 else "images"} of {size} px corrected with '
-           f'{calibration.calibration_id}, written to {options.out}; {empty} pixels of each are empty, nothing was seen '
-           'there')
+           f'{calibration.calibration_id}, written to {options.out}; {empty} pixels of each are empty, nothing was '
+           'seen there')
 
 
 class _Progress:

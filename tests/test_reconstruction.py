@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pycolmap
 import pytest
 from rigs import calibrated
 from scipy.optimize import least_squares
@@ -89,7 +90,6 @@ def test_intersection_is_the_least_squares_solution(names):
 
 def test_pycolmap_triangulates_the_same_points():
     """An independent program; it minimises angles, which for equal weights differs by less than the noise does."""
-    pycolmap = pytest.importorskip('pycolmap')
     orientation = orientation_of()
     xyz, uv, sigma = seen(orientation, 10)
     found = Intersector(orientation).intersect(uv, sigma)

@@ -1,8 +1,8 @@
 """Image files, stacks, folders of images and videos that are corrected and written anew.
 
-Whatever is written appears under its name when it is whole. Images are grey; they keep their 8 or 16 bits, and where the
-new file cannot hold them, that is said and nothing is written. Videos are written without loss (FFV1), but for MP4,
-which players know with lossy codecs only.
+Whatever is written appears under its name when it is whole. Images are grey; they keep their 8 or 16 bits, and where
+the new file cannot hold them, that is said and nothing is written. Videos are written without loss (FFV1), but for
+MP4, which players know with lossy codecs only.
 """
 
 import os

@@ -1,8 +1,8 @@
 """Stacks of grey images in TIFF files: written page by page, and looked through before they are read.
 
-OpenCV writes a stack from a list of all its images and reads what is left of a cut one without a word. A baseline file of
-uncompressed pages (TIFF 6.0; BigTIFF from 4 GB on) needs neither much memory nor time, and its directories tell how
-many pages there are.
+OpenCV writes a stack from a list of all its images and reads what is left of a cut one without a word. A baseline
+file of uncompressed pages (TIFF 6.0; BigTIFF from 4 GB on) needs neither much memory nor time, and its directories
+tell how many pages there are.
 """
 
 import os

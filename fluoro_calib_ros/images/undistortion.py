@@ -3,7 +3,8 @@
 The correction is a function of the observed pixel; an image is made the other way round, by asking for each of its own
 pixels where that was observed. That is the inverse of undistorted = observed - (du, dv)(observed), which has no
 formula. It is iterated once for every pixel, from the lookup grid that corrects points too, so that a bead in a
-corrected image lies where the corrected bead of the observed image lies. What is left for a frame is one remap of OpenCV.
+corrected image lies where the corrected bead of the observed image lies. What is left for a frame is one remap of
+OpenCV.
 """
 
 import cv2

@@ -1,17 +1,16 @@
 """Node that removes the distortion from every observation of the fluoroscopes, live."""
 
-import threading
 import time
 from collections import Counter
 
 import numpy as np
-from fluoro_calib_msgs.msg import CorrectedObservations, FluoroscopeCalibration, TargetObservations
+from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from sensor_msgs.msg import CameraInfo
 
-from ..photogrammetry.observations import DataError
 from . import support
+from .calibrations import Calibrations
 from .checks import KINDS, FrameChecks, Refused
-from .conversion import calibration_from_message, camera_info, fill_corrected
+from .conversion import camera_info, fill_corrected
 from .qos import LATCHED, OBSERVATIONS, overridable
 from .streams import StreamReader
 
@@ -20,9 +19,6 @@ class _Stream:
     """What the node holds of one fluoroscope."""
 
     def __init__(self, name):
-        self.newest = 0   # number of the last calibration that arrived
-        self.preparing = None   # thread that prepares it
-        self.calibration = None   # replaced as a whole: a frame sees one or the other, never half of each
         self.checks, self.out = FrameChecks(name), CorrectedObservations()
         self.received = self.corrected = self.waiting = self.invalid_points = 0
         self.refused = Counter()   # by kind
@@ -38,8 +34,8 @@ class CorrectionNode(support.ManagedNode):
         super().__init__('correction_node')
         self._streams = {name: _Stream(name) for name in support.fluoroscopes_of(self)}
         self._sentences = support.Sentences(self.get_logger())
-        self._corrected, self._info, self._calibrations = {}, {}, []
-        self._reader = self._diagnostics = self._timer = None
+        self._corrected, self._info = {}, {}
+        self._calibrations = self._reader = self._diagnostics = self._timer = None
 
     # -- lifecycle
 
@@ -50,9 +46,7 @@ class CorrectionNode(support.ManagedNode):
                 CorrectedObservations, f'{name}/corrected_observations', OBSERVATIONS,
                 qos_overriding_options=overridable())
             self._info[name] = self.create_publisher(CameraInfo, f'{name}/camera_info', LATCHED)
-            self._calibrations.append(self.create_subscription(
-                FluoroscopeCalibration, f'{name}/calibration',
-                lambda message, name=name: self._on_calibration(name, message), LATCHED))
+        self._calibrations = Calibrations(self, self._streams, self._prepared, self._on_taken, self._on_refused)
         self._diagnostics = support.Diagnostics(self)
         self._timer = self.create_timer(1.0, self._on_timer)
 
@@ -73,53 +67,36 @@ class CorrectionNode(support.ManagedNode):
 
     def close(self):
         """Take the outputs back, and forget the calibrations."""
-        for stream in self._streams.values():
-            if stream.preparing is not None:
-                stream.preparing.join()   # it needs the outputs
         if self._timer is not None:
+            self._calibrations.close()
             self.destroy_timer(self._timer)
             self._diagnostics.close()
-        for subscription in self._calibrations:
-            self.destroy_subscription(subscription)
         for publisher in (*self._corrected.values(), *self._info.values()):
             self.destroy_publisher(publisher)
-        self._timer, self._calibrations, self._corrected, self._info = None, [], {}, {}
+        self._timer, self._calibrations, self._corrected, self._info = None, None, {}, {}
         self._streams = {name: _Stream(name) for name in self._streams}
 
     # -- calibrations
 
-    def _on_calibration(self, name, message):
-        """Prepare a calibration beside the stream, and take it over when it is ready."""
-        stream = self._streams[name]
-        stream.newest += 1
-        stream.preparing = threading.Thread(target=self._prepare, args=(name, message, stream.newest), daemon=True)
-        stream.preparing.start()
+    @staticmethod
+    def _prepared(calibration):
+        calibration.prepare()
+        return calibration
 
-    def _prepare(self, name, message, number):
-        stream = self._streams[name]
-        try:
-            calibration = calibration_from_message(message)
-            if calibration.fluoroscope != name:
-                raise DataError(f'the calibration on topic {name}/calibration is of fluoroscope '
-                                f'{calibration.fluoroscope}')
-            calibration.prepare()
-        except (DataError, ValueError) as error:
-            stream.last_fault = str(error)
-            self.get_logger().error(f'calibration refused, the running one stays: {error}')
-            return
-        if number < stream.newest:
-            return   # a newer one has come meanwhile
-        stream.calibration = calibration
+    def _on_refused(self, name, error):
+        self._streams[name].last_fault = str(error)
+
+    def _on_taken(self, name, calibration):
         self._publish_info(name)
         grid = calibration.grid
         self.get_logger().info(f'fluoroscope {name}: corrected with calibration {calibration.calibration_id} now '
                                f'(grid of {grid.cell_px:g} px cells, within {grid.error_px:.4f} px of the model)')
 
     def _publish_info(self, name):
-        stream = self._streams[name]
-        if stream.calibration is not None:
-            stamp = stream.stamp or self.get_clock().now().to_msg()
-            self._info[name].publish(camera_info(stream.calibration, stamp))
+        calibration = self._calibrations.of(name)
+        if calibration is not None:
+            stamp = self._streams[name].stamp or self.get_clock().now().to_msg()
+            self._info[name].publish(camera_info(calibration, stamp))
 
     # -- observations
 
@@ -139,7 +116,7 @@ class CorrectionNode(support.ManagedNode):
         stream = self._streams[name]
         stream.received += 1
         stream.stamp = message.header.stamp
-        calibration = stream.calibration
+        calibration = self._calibrations.of(name)
         if calibration is None:
             stream.waiting += 1
             return
@@ -174,7 +151,7 @@ class CorrectionNode(support.ManagedNode):
         parts, deaf = [], support.deafness(self._reader, self._sentences)
         for name, stream in self._streams.items():
             self._publish_info(name)
-            calibration = stream.calibration
+            calibration = self._calibrations.of(name)
             values = {'frames received': stream.received, 'frames corrected': stream.corrected,
                       'frames without calibration': stream.waiting, 'frames refused': stream.refused.total(),
                       **{f'refused: {kind}': stream.refused[kind] for kind in KINDS},
@@ -190,7 +167,7 @@ class CorrectionNode(support.ManagedNode):
         """Level and message of the diagnostics of a fluoroscope."""
         if deaf:
             return support.WARN, deaf
-        if stream.calibration is None:
+        if self._calibrations.of(name) is None:
             return support.WARN, f'no calibration yet: {stream.waiting} frames were not corrected'
         if self._reader is None:
             return support.WARN, 'the node is not active'

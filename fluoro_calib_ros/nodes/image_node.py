@@ -4,21 +4,19 @@ Images of a fluoroscope are taken and corrected by a thread of its own: what cos
 out of DDS, is done beside the other fluoroscopes as far as Python's lock allows.
 """
 
-import threading
 import time
 from collections import Counter
 
 from builtin_interfaces.msg import Time
-from fluoro_calib_msgs.msg import FluoroscopeCalibration
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from ..images.undistortion import INTERPOLATIONS, ImageCorrector
-from ..photogrammetry.observations import DataError
 from . import support
+from .calibrations import Calibrations
 from .checks import Refused
-from .conversion import calibration_from_message, camera_info
+from .conversion import camera_info
 from .pictures import COMPRESSIONS, IMAGE_KINDS, Pictures, compressed, one_thread
-from .qos import IMAGES, LATCHED, overridable
+from .qos import IMAGES, overridable
 from .streams import StreamReader
 from .support import StartError, declare
 
@@ -40,9 +38,6 @@ class _Stream:
     """What the node holds of one fluoroscope."""
 
     def __init__(self, name):
-        self.newest = 0   # number of the last calibration that arrived
-        self.preparing = None   # thread that prepares it
-        self.calibrated = None   # replaced as a whole: an image sees one or the other, never half of each
         self.pictures, self.reader = Pictures(name), None
         self.received = self.corrected = self.compressed = self.waiting = 0
         self.refused = Counter()   # by kind
@@ -56,17 +51,17 @@ class ImageNode(support.ManagedNode):
     def __init__(self):
         super().__init__('image_node')
         self._names = support.fluoroscopes_of(self)
-        self._interpolation = self._one_of('interpolation', 'linear', INTERPOLATIONS, 'between the pixels of the observed '
-                                           'image: linear, or cubic, which is sharper and takes twice as long')
-        self._inputs = self._one_of('inputs', 'both', INPUTS, 'what is subscribed to: raw, compressed or both; a camera '
-                                    'that offers both is to be taken in one form')
-        self._format = self._one_of('compressed_format', 'png', COMPRESSIONS, 'format of compressed corrected images: png '
-                                    '(without loss) or jpeg; images of 16 bits are png')
+        self._interpolation = self._one_of('interpolation', 'linear', INTERPOLATIONS, 'between the pixels of the '
+                                           'observed image: linear, or cubic, which is sharper and takes longer')
+        self._inputs = self._one_of('inputs', 'both', INPUTS, 'what is subscribed to: raw, compressed or both; a '
+                                    'camera that offers both is to be taken in one form')
+        self._format = self._one_of('compressed_format', 'png', COMPRESSIONS, 'format of compressed corrected images: '
+                                    'png (without loss) or jpeg; images of 16 bits are png')
         self._quality = declare(self, 'jpeg_quality', 95, 'quality of jpeg', 1, 100)
         self._streams = {name: _Stream(name) for name in self._names}
         self._sentences = support.Sentences(self.get_logger())
-        self._images, self._compressed, self._infos, self._calibrations = {}, {}, {}, []
-        self._diagnostics = self._timer = None
+        self._images, self._compressed, self._infos = {}, {}, {}
+        self._calibrations = self._diagnostics = self._timer = None
         one_thread()
 
     def _one_of(self, name, default, values, description):
@@ -85,9 +80,9 @@ class ImageNode(support.ManagedNode):
                                             (self._infos, CameraInfo, f'{CORRECTED}/camera_info')):
                 publishers[name] = self.create_lifecycle_publisher(kind, f'{name}/{topic}', IMAGES,
                                                                    qos_overriding_options=overridable())
-            self._calibrations.append(self.create_subscription(
-                FluoroscopeCalibration, f'{name}/calibration',
-                lambda message, name=name: self._on_calibration(name, message), LATCHED))
+        self._calibrations = Calibrations(
+            self, self._names, lambda calibration: _Calibrated(calibration, self._interpolation), self._on_taken,
+            self._on_refused)
         self._diagnostics = support.Diagnostics(self)
         self._timer = self.create_timer(1.0, self._on_timer)
 
@@ -109,48 +104,27 @@ class ImageNode(support.ManagedNode):
 
     def close(self):
         """Take the outputs back, and forget the calibrations."""
-        for stream in self._streams.values():
-            if stream.preparing is not None:
-                stream.preparing.join()
         if self._timer is not None:
+            self._calibrations.close()
             self.destroy_timer(self._timer)
             self._diagnostics.close()
-        for subscription in self._calibrations:
-            self.destroy_subscription(subscription)
         for publishers in (self._images, self._compressed, self._infos):
             for publisher in publishers.values():
                 self.destroy_publisher(publisher)
             publishers.clear()
-        self._timer, self._calibrations = None, []
+        self._timer = self._calibrations = None
         self._streams = {name: _Stream(name) for name in self._names}
 
     # -- calibrations
 
-    def _on_calibration(self, name, message):
-        """Prepare a calibration beside the stream, and take it over when it is ready."""
-        stream = self._streams[name]
-        stream.newest += 1
-        stream.preparing = threading.Thread(target=self._prepare, args=(name, message, stream.newest), daemon=True)
-        stream.preparing.start()
+    def _on_refused(self, name, error):
+        self._streams[name].last_fault = str(error)
 
-    def _prepare(self, name, message, number):
-        stream = self._streams[name]
-        try:
-            calibration = calibration_from_message(message)
-            if calibration.fluoroscope != name:
-                raise DataError(f'the calibration on topic {name}/calibration is of fluoroscope '
-                                f'{calibration.fluoroscope}')
-            calibrated = _Calibrated(calibration, self._interpolation)
-        except (DataError, ValueError) as error:
-            stream.last_fault = str(error)
-            self.get_logger().error(f'calibration refused, the running one stays: {error}')
-            return
-        if number < stream.newest:
-            return   # a newer one has come meanwhile
-        stream.calibrated = calibrated
+    def _on_taken(self, name, calibrated):
         empty = int((~calibrated.corrector.mask).sum())
-        self.get_logger().info(f'fluoroscope {name}: images corrected with calibration {calibration.calibration_id} '
-                               f'now ({empty} pixels are empty, nothing was seen there)')
+        self.get_logger().info(f'fluoroscope {name}: images corrected with calibration '
+                               f'{calibrated.calibration.calibration_id} now ({empty} pixels are empty, nothing was seen '
+                               'there)')
 
     # -- images
 
@@ -168,7 +142,7 @@ class ImageNode(support.ManagedNode):
         """Correct an image and publish it."""
         stream = self._streams[name]
         stream.received += 1
-        calibrated = stream.calibrated
+        calibrated = self._calibrations.of(name)
         if calibrated is None:
             stream.waiting += 1
             return
@@ -193,7 +167,7 @@ class ImageNode(support.ManagedNode):
     def _on_timer(self):
         parts = []
         for name, stream in self._streams.items():
-            calibrated = stream.calibrated
+            calibrated = self._calibrations.of(name)
             values = {'images received': stream.received, 'images corrected': stream.corrected,
                       'images compressed': stream.compressed, 'images without calibration': stream.waiting,
                       'images refused': stream.refused.total(),
@@ -210,7 +184,7 @@ class ImageNode(support.ManagedNode):
         deaf = support.deafness(stream.reader, self._sentences)
         if deaf:
             return support.WARN, next(iter(deaf.values()))
-        if stream.calibrated is None:
+        if self._calibrations.of(name) is None:
             return support.WARN, f'no calibration yet: {stream.waiting} images were not corrected'
         if stream.reader is None:
             return support.WARN, 'the node is not active'

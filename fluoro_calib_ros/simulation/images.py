@@ -1,4 +1,4 @@
-"""Images of the virtual fluoroscope: beads as dark blobs where they are observed, on a smooth background, with noise."""
+"""Images of the virtual fluoroscope: dark beads where they are observed, on a smooth background, with noise."""
 
 import numpy as np
 

@@ -6,10 +6,12 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
+from fluoro_calib_msgs.msg import FluoroscopeCalibration
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from fluoro_calib_msgs.msg import FluoroscopeCalibration
 from fluoro_calib_ros.distortion.models import no_correction
 from fluoro_calib_ros.files.calibration import load_calibrations
 from fluoro_calib_ros.images.encoded import decode, encode
@@ -213,6 +215,25 @@ def test_bad_images_are_counted_by_kind(after_bad_ones):
     assert int(values['images received']) == int(values['images corrected']) + len(kinds)
     assert float(values['latency p50 [ms]']) > 0
     assert after_bad_ones.node.running and 'Traceback' not in after_bad_ones.node.log
+
+
+def test_lifecycle(after_bad_ones, pictures):
+    """Deactivated it takes nothing, cleaned up it has no topics; brought up again it has the latched calibration."""
+    eyes, image = after_bad_ones, pictures['mono8']
+
+    def change(transition):
+        return eyes.client.call(ChangeState, 'image_node/change_state', transition=Transition(id=transition)).success
+    assert change(Transition.TRANSITION_DEACTIVATE)
+    eyes.client.wait_until(lambda: not eyes.raw.get_subscription_count(), what='no subscription')
+    eyes.diagnostics(lambda v, s: s.message == 'the node is not active')
+    assert change(Transition.TRANSITION_CLEANUP)
+    eyes.client.wait_until(lambda: not eyes.client.count_publishers('a/image_corrected'), what='no publisher')
+    assert change(Transition.TRANSITION_CONFIGURE) and change(Transition.TRANSITION_ACTIVATE)
+    eyes.client.wait_until(eyes.connected, what='the image node')
+    values = eyes.diagnostics(lambda v, s: v['calibration'] and v['images received'] == '0')
+    assert values['images refused'] == '0'
+    out, _ = eyes.answer(eyes.raw, eyes.message(image))
+    assert np.array_equal(pixels_of(out), eyes.corrector.correct(image))
 
 
 # ---- calibrations

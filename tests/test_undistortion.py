@@ -248,7 +248,8 @@ def test_images_of_the_wrong_kind():
                             (image.astype('>u2'), 'pixels of >u2, not of')):
         with pytest.raises(DataError, match=sentence):
             this.correct(wrong)
-    for out in (np.zeros((1024, 1023), np.uint8), np.zeros((1024, 1024), np.uint16), np.zeros((2048, 1024), np.uint8)[::2]):
+    for out in (np.zeros((1024, 1023), np.uint8), np.zeros((1024, 1024), np.uint16),
+                np.zeros((2048, 1024), np.uint8)[::2]):
         with pytest.raises(DataError, match='array for the corrected image'):
             this.correct(image, out)
     with pytest.raises(DataError, match="one of linear, cubic, not 'nearest'"):
@@ -269,7 +270,7 @@ def test_threads_share_a_corrector():
     for thread in threads:
         thread.join()
     wanted = [corrector(i).correct(image) for i in ('linear', 'cubic') for _ in range(3)]
-    assert len(results) == 4 and all(np.array_equal(r, w) for of_one in results.values() for r, w in zip(of_one, wanted))
+    assert len(results) == 4 and all(np.array_equal(of_one, wanted) for of_one in results.values())
 
 
 # ---- the renderer

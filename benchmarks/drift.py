@@ -206,7 +206,7 @@ def detection(scene_, watch, first, fluoroscope, quarter, size, direction, rng, 
             out['error'] = min(out['error'], delay)
             if delay >= min(WITHIN_S, after_s - 1) or ramp_s:   # what is told is judged then, or when it is found later
                 vector = size * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
-                along = float(vector @ state.direction)
+                along = float(vector @ state.direction) * (min(1.0, delay / ramp_s) if ramp_s else 1.0)
                 if ' or ' in state.fluoroscope:   # down in one is up in the other
                     along = abs(along)
                 out.update(message=state.message, named=state.fluoroscope, place=right_place(state, quarter),

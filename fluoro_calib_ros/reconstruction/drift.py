@@ -105,10 +105,12 @@ class DriftState:
 
     level: OK, WARN or ERROR; fluoroscope: name of the one that has drifted, 'a or b' where they cannot be told apart,
     '' without a drift; area (u0, v0, u1, v1): its place in the image [px] and place, the same in words; size of the
-    drift and its sd [px], its component along direction (2,), a unit vector in the image; against: 'calibration' or
-    'start'; source: 'epipolar' or 'cluster NAME'; evidence: the largest log-likelihood ratio of all charts, and the
-    thresholds of it for WARN and ERROR; since_s: time since the drift began, as estimated [s]; observations: residuals
-    and distances taken in since the last reset; learning: the start is still being learned; message: one sentence.
+    drift and its sd [px], its component along direction (2,), a unit vector in the image: normal to the epipolar lines,
+    or along u or v from clusters. As residuals are clipped, a size of more than a pixel is a lower bound; against:
+    'calibration' or 'start'; source: 'epipolar' or 'cluster NAME'; evidence: the largest log-likelihood ratio of all
+    charts, and the thresholds of it for WARN and ERROR; since_s: time since the drift began, as estimated [s];
+    observations: residuals and distances taken in since the last reset; learning: the start is still being learned;
+    message: one sentence.
     Without a drift size, sd, since_s, area and direction are NaN.
     """
 

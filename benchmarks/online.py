@@ -4,9 +4,9 @@
 
 The simulator, the nodes under test and the reader (this process) share the machine. A frame is lost when it does not
 come out. Latency is told twice: within the node, from the arrival of the input (of the last view, for points) to the
-publication of the output, as the node's diagnostics have it (the median of its medians, and the largest of its 99 %, each
-of 2,000 frames); and from the stamp of the simulator, set just before it publishes, to the time stamp that DDS gives the
-output when it is published, with the way through DDS in it.
+publication of the output, as the node's diagnostics have it (the median of its medians, and the largest of its 99 %,
+each of 2,000 frames); and from the stamp of the simulator, set just before it publishes, to the time stamp that DDS
+gives the output when it is published, with the way through DDS in it.
 """
 
 import argparse
@@ -40,12 +40,18 @@ from .timing import table
 
 NAMES = ('a', 'b')
 CASES = {   # name: (scene, rate, nodes under test)
-    'markers 250 Hz': ('markers', 250, ('correction_node', 'relay_plain', 'relay_streams')),
-    'grid 30 Hz': ('grid', 30, ('correction_node', 'relay_plain', 'relay_streams')),
+    'markers 250 Hz': ('markers', 250, ('correction_node', 'relay_plain')),
+    'grid 30 Hz': ('grid', 30, ('correction_node', 'relay_plain')),
     'markers 1000 Hz': ('markers', 1000, ('correction_node',)),
+    'markers 1000 Hz, relay': ('markers', 1000, ('relay_plain',)),
+    'markers 1000 Hz, streams': ('markers', 1000, ('relay_streams',)),
+    'grid 30 Hz, streams': ('grid', 30, ('relay_streams',)),
     'whole chain 250 Hz': ('markers', 250, ('correction_node', 'reconstruction_node')),
     'whole chain 700 Hz': ('markers', 700, ('correction_node', 'reconstruction_node')),
-    'whole chain 1000 Hz': ('markers', 1000, ('correction_node', 'reconstruction_node'))}
+    'whole chain 1000 Hz': ('markers', 1000, ('correction_node', 'reconstruction_node')),
+    'whole chain 1000 Hz, deep': ('markers', 1000, ('correction_node', 'reconstruction_node'))}
+DEEP = {f'qos_overrides./{name}/corrected_observations.{end}.depth': 1000 for name in 'ab'
+        for end in ('publisher', 'subscription')}   # queues of a second instead of a tenth
 OUTPUTS = {'correction_node': ('corrected_observations', CorrectedObservations),
            'relay_plain': ('relayed_plain', TargetObservations),
            'relay_streams': ('relayed_streams', TargetObservations)}
@@ -128,13 +134,14 @@ def _command(node, **parameters):
     return command
 
 
-def measured(reader, scene, rate, nodes, seconds, log):
+def measured(reader, scene, rate, nodes, seconds, log, parameters):
     """[{node, lost, p50, p99, max [ms], cpu [us a message]}] of a case."""
-    processes = {node: subprocess.Popen(_command(node), stdout=log, stderr=log) for node in nodes}
+    processes = {node: subprocess.Popen(_command(node, **parameters), stdout=log, stderr=log) for node in nodes}
     frames = round(rate * seconds)
     reader.listen(nodes)
     reader.ready.clear()
-    reader.wait(lambda: len(reader.ready) == len(NAMES), 60, 'the correction node')
+    if 'correction_node' in nodes:
+        reader.wait(lambda: len(reader.ready) == len(NAMES), 60, 'the correction node')
     simulator = subprocess.Popen(_command('simulator_node', scene=scene, rate=float(rate), clusters=5, frames=frames,
                                           wait_for_readers=len(nodes) - ('reconstruction_node' in nodes)),
                                  stdout=log, stderr=log)
@@ -169,7 +176,8 @@ def _figures(reader, node, frames, used, counted):
     messages = sum(counted[key] for key in of_node) * (2 if node == 'reconstruction_node' else 1)
     within = np.array(reader.within.get(node, [(np.nan, np.nan)]))
     return {'node': node, 'frames': frames * len(of_node), 'lost': lost, 'twice': twice,
-            'within_p50': np.median(within[:, 0]), 'within_p99': within[:, 1].max(), 'p50': np.percentile(latency, 50), 'p99': np.percentile(latency, 99), 'max': latency.max(),
+            'within_p50': np.median(within[:, 0]), 'within_p99': within[:, 1].max(),
+            'p50': np.percentile(latency, 50), 'p99': np.percentile(latency, 99), 'max': latency.max(),
             'cpu_us': used / messages * 1e6}
 
 
@@ -189,7 +197,7 @@ def run(seconds, only=''):
     with open(os.environ.get('ONLINE_LOG', os.devnull), 'ab') as log:
         for case, (scene, rate, nodes) in CASES.items():
             if only in case:
-                out[case] = measured(reader, scene, rate, nodes, seconds, log)
+                out[case] = measured(reader, scene, rate, nodes, seconds, log, DEEP if 'deep' in case else {})
                 print(case, *(' '.join(f'{k} {v:.3f}' if isinstance(v, float) else f'{k} {v}' for k, v in f.items())
                               for f in out[case]), sep='\n   ', flush=True)
     reader.destroy_node()

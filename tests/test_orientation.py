@@ -172,7 +172,8 @@ def test_covariance_of_a_relative_orientation_against_monte_carlo():
             vector_of(found.rotation[1] @ (b.rotation @ a.rotation.T).T), found.interior[1] - b.interior])
         assert not found.position_mm[0].any() and np.array_equal(found.rotation[0], np.eye(3))
         s = datum_map(found, points)
-        squares.append(step @ s.T @ np.linalg.pinv(s @ found.covariance @ s.T, rcond=1e-12, hermitian=True) @ s @ step / 12)
+        left = s @ step
+        squares.append(left @ np.linalg.pinv(s @ found.covariance @ s.T, rcond=1e-12, hermitian=True) @ left / 12)
     assert np.mean(squares) == pytest.approx(1, abs=0.3)
 
 

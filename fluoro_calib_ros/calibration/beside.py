@@ -20,9 +20,9 @@ def calibrate_beside(frames, phantom, options, joint, principal_distance, progre
     None unless validated, and the RigOrientation or the sentence that says why there is none.
 
     progress(fluoroscope, Round) after every round; check() is called all the time and may raise to end it at
-    once; others: (frames, calibration) of each fluoroscope that is not calibrated now, but belongs to the rig; order: names
-    of the fluoroscopes of the rig, None: as they come. Raises DataError as calibrate() does, and RuntimeError where it
-    failed otherwise.
+    once; others: (frames, calibration) of each fluoroscope that is not calibrated now, but belongs to the rig; order:
+    names of the fluoroscopes of the rig, None: as they come. Raises DataError as calibrate() does, and RuntimeError
+    where it failed otherwise.
     """
     context = multiprocessing.get_context('spawn')   # a fork would take locks of other threads along
     here, there = context.Pipe(duplex=False)

@@ -23,8 +23,8 @@ def adjust_in_turns(measured, before, model, max_rounds, report, check=None):
     before: Adjustment without correction; model: a Collocation or Terms, with with_additional (plain network -> with
     additional parameters), zeros (coefficients of no correction), on_the_way (decrease of F that an adjustment before
     the last may leave) and renew (network, Solved normal matrix, Adjustment -> whether nothing changed, coefficients
-    to go on with); report(Adjustment, change) after every adjustment, change the RMS change of the correction [px]. Raises
-    numpy.linalg.LinAlgError where the network does not determine the unknowns.
+    to go on with); report(Adjustment, change) after every adjustment, change the RMS change of the correction [px].
+    Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
     """
     correction = np.zeros_like(measured.network.uv)
     zero, parameters, noise = correction, replace(before.parameters, additional=model.zeros()), before.noise

@@ -4,7 +4,7 @@ from array import array
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from fluoro_calib_msgs.msg import FluoroscopeCalibration, TargetObservations
+from fluoro_calib_msgs.msg import CorrectedObservations, FluoroscopeCalibration, TargetObservations
 from sensor_msgs.msg import CameraInfo
 
 from ..calibration import result as calibration_result
@@ -45,15 +45,20 @@ def message_from_frame(frame):
     return message
 
 
+_INVALID = bytes([CorrectedObservations.INVALID])
+
+
 def fill_corrected(message, source, calibration_id, corrected):
     """Fill in a CorrectedObservations message: that of the TargetObservations message source, corrected to arrays u, v,
-    sigma, correction_sd and status (n,)."""
+    sigma, correction_sd and status (n,). Returns whether one of these is INVALID."""
     u, v, sigma, correction_sd, status = corrected
     message.header, message.frame_number = source.header, source.frame_number
     message.calibration_id, message.target_id = calibration_id, source.target_id
     message.u, message.v = array('d', u.tobytes()), array('d', v.tobytes())
     message.sigma, message.correction_sd = array('d', sigma.tobytes()), array('d', correction_sd.tobytes())
-    message.status = array('B', status.tobytes())
+    status = status.tobytes()
+    message.status = array('B', status)
+    return _INVALID in status   # looking through the array would box every number
 
 
 def message_from_calibration(calibration):

@@ -126,11 +126,11 @@ class CorrectionNode(support.ManagedNode):
             self._refuse(stream, error)
             return
         out = stream.out   # publishing copies it
-        fill_corrected(out, message, calibration.calibration_id, calibration.correct_arrays(u, v, sigma))
+        invalid = fill_corrected(out, message, calibration.calibration_id, calibration.correct_arrays(u, v, sigma))
         self._corrected[name].publish(out)
         stream.corrected += 1
         stream.latencies.add(time.time_ns() - info['received_timestamp'])
-        if CorrectedObservations.INVALID in out.status or not out.status:
+        if invalid or not out.status:
             self._remark(name, stream, out)
 
     def _remark(self, name, stream, out):

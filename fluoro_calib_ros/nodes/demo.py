@@ -129,7 +129,7 @@ def run_graph(bags, out, names):
             client.wait(lambda: len(client.ready) == len(names), 20, 'the correction node to take up the calibration')
             client.wait(lambda: client.orientations and all(client.readers.get(n, 0) > 1 for n in names), 20,
                         'the reconstruction node')
-            print('3  player -> correction node -> reconstruction node: markers in motion, corrected and in space, live')
+            print('3  player -> correction node -> reconstruction node: markers in motion, live')
             client.sent.clear()
             graph.start('player_node', {'bag': bags / 'tracking', 'wait_for_readers': 3})
             client.wait(lambda: len(client.corrected) >= sum(tracked.values()) or graph.ended(), 60,
@@ -235,9 +235,9 @@ def report(bags, out, client, began):
              markdown_table(['fluoroscope', 'observed RMSE [px]', 'corrected RMSE [px]', 'frames in', 'frames out'], [
                  [n, f'{truth[n][0]:.3f}', f'{truth[n][1]:.3f}', str(sum(k[0] == n for k in client.sent)),
                   str(sum(k[0] == n for k in client.corrected))] for n in client.names]), '',
-             f'In space: {space["exposures"]} exposures, {100 * space["good"]:.1f} % of the points; RMSE against the truth '
-             f'{space["rmse_mm"]:.3f} mm (3-D), squared error over its variance {space["normalised"]:.2f}; latency '
-             f'{space["latency_ms"]:.1f} ms (median)', '',
+             f'In space: {space["exposures"]} exposures, {100 * space["good"]:.1f} % of the points; RMSE against the '
+             f'truth {space["rmse_mm"]:.3f} mm (3-D), squared error over its variance {space["normalised"]:.2f}; '
+             f'latency {space["latency_ms"]:.1f} ms (median)', '',
              'Calibration through the nodes and without ROS the same to the last bit: '
              + ', '.join(f'{n} {"yes" if ok else "NO"}' for n, ok in same.items()),
              f'Figures: {out / "figures"} ({len(figures)} pictures), calibration: {out / "calibration"}',

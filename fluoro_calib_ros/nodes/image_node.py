@@ -123,8 +123,8 @@ class ImageNode(support.ManagedNode):
     def _on_taken(self, name, calibrated):
         empty = int((~calibrated.corrector.mask).sum())
         self.get_logger().info(f'fluoroscope {name}: images corrected with calibration '
-                               f'{calibrated.calibration.calibration_id} now ({empty} pixels are empty, nothing was seen '
-                               'there)')
+                               f'{calibrated.calibration.calibration_id} now ({empty} pixels are empty, nothing was '
+                               'seen there)')
 
     # -- images
 

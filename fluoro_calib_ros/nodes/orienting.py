@@ -75,8 +75,8 @@ class Orienting:
         return None
 
     def after(self, calibrations, found):
-        """RigOrientation that belongs to new calibrations: the present one if it is a capture that still does, else what
-        was found, or None where that is the sentence why there is none."""
+        """RigOrientation that belongs to new calibrations: the present one if it is a capture that still does, else
+        what was found, or None where that is the sentence why there is none."""
         now = self._present
         fits = now is not None and _belongs(now, {**self._calibrations(), **calibrations})
         if fits and now.source == 'capture':

@@ -28,8 +28,8 @@ class SimulatorNode(Node):
     def __init__(self):
         super().__init__('simulator_node')
         names = support.fluoroscopes_of(self)
-        self._scene = declare(self, 'scene', 'phantom', 'what is seen: phantom (set up in pose after pose), standing (the '
-                              'phantom in the rig frame), markers (a joint in motion) or grid (2,028 points)')
+        self._scene = declare(self, 'scene', 'phantom', 'what is seen: phantom (set up in pose after pose), standing '
+                              '(the phantom in the rig frame), markers (a joint in motion) or grid (2,028 points)')
         if self._scene not in SCENES:
             raise StartError(f'parameter scene is one of {", ".join(SCENES)}, not {self._scene!r}')
         self._rate = declare(self, 'rate', 60.0, 'frames a second', 0.1, 2000.0)

@@ -135,8 +135,8 @@ def held_to(orientation, points_mm):
     """The RigOrientation with its covariance in the datum of points (n, 3) [mm]: their centre and attitude are what the
     rig frame is fixed to.
 
-    A rig frame that was taken from the images themselves is a convention, and where it is held matters: held to a sensor
-    whose principal point is uncertain, all points together turn about the source. An S-transformation (Baarda,
+    A rig frame that was taken from the images themselves is a convention, and where it is held matters: held to a
+    sensor whose principal point is uncertain, all points together turn about the source. An S-transformation (Baarda,
     "S-transformations and criterion matrices", Delft 1973; Foerstner and Wrobel, "Photogrammetric Computer Vision",
     Springer 2016, 4.5) takes out what errors of the orientation move the points together, as a rigid body. Nothing
     else changes: distances and angles have the variances that they had.
@@ -162,7 +162,8 @@ def datum_map(orientation, points_mm):
         datum[first + 3:first + 6, 3:] = r
     turned = a.transpose(0, 2, 1)
     moved = -np.linalg.solve(turned @ a, turned @ b)   # of the points, by the unknowns
-    rigid = np.concatenate([np.broadcast_to(np.eye(3), moved.shape[:1] + (3, 3)), -cross_matrix(points - middle)], axis=2)
+    shifts = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    rigid = np.concatenate([shifts, -cross_matrix(points - middle)], axis=2)
     together = np.linalg.lstsq(rigid.reshape(-1, 6), moved.reshape(-1, UNKNOWNS * count), rcond=None)[0]
     return np.eye(UNKNOWNS * count) + datum @ together
 

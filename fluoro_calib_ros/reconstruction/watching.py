@@ -22,8 +22,8 @@ FALSE_SD, FALSE_PX = 4.0, 3.0
 class RigWatch:
     """A DriftWatch for a RigOrientation, built anew with every orientation.
 
-    image_sizes {fluoroscope: (width, height)} [px]; options: DriftOptions; clusters: Cluster, ...; rate_hz: most exposures
-    a second that are looked at. Raises ValueError as DriftWatch, DataError for a rig of sources in one place.
+    image_sizes {fluoroscope: (width, height)} [px]; options: DriftOptions; clusters: Cluster, ...; rate_hz: most
+    exposures a second that are looked at. Raises ValueError as DriftWatch, DataError for a rig of sources in one place.
     """
 
     def __init__(self, orientation, image_sizes, options=DriftOptions(), clusters=(), rate_hz=120.0):
@@ -48,8 +48,8 @@ class RigWatch:
     def take(self, stamp_ns, target_id, uv, sigma, correction_sd, points):
         """Take in an exposure; returns the DriftState.
 
-        target_id (n,); uv (F, n, 2), sigma and correction_sd (F, n) [px], NaN where a fluoroscope does not see a target;
-        points: the IntersectedPoints of them.
+        target_id (n,); uv (F, n, 2), sigma and correction_sd (F, n) [px], NaN where a fluoroscope does not see a
+        target; points: the IntersectedPoints of them.
         """
         self._last = stamp_ns
         noise2 = np.maximum(sigma * sigma - correction_sd * correction_sd, 0)

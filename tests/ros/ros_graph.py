@@ -149,7 +149,8 @@ class Graph:
     def wait_for_readers(self, count):
         """Wait until the correction node knows so many readers of every output: what it publishes now reaches them."""
         for name in NAMES:
-            self.client.wait_for_diagnostics('correction_node', lambda s: int(value_of(s, 'readers') or 0) >= count, name)
+            self.client.wait_for_diagnostics('correction_node',
+                                             lambda s: int(value_of(s, 'readers') or 0) >= count, name)
 
     def play(self, bag, readers, rate=10.0):
         """Play a bag to the end."""

@@ -10,7 +10,7 @@ from rcl_interfaces.srv import DescribeParameters, ListParameters
 from ros_graph import NAMES, Graph, value_of
 from rosgraph_msgs.msg import Clock
 
-NODES = ('correction_node', 'reconstruction_node')
+NODES = ('correction_node', 'reconstruction_node', 'image_node')
 
 
 def change(client, node, transition):
@@ -44,7 +44,7 @@ def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, 
         assert change(client, 'correction_node', Transition.TRANSITION_DEACTIVATE)
         client.publish(replace(frame, number=100 * turn + 3))
         assert change(client, 'correction_node', Transition.TRANSITION_CLEANUP)
-        client.wait_until(lambda: not client.count_publishers('a/corrected_observations'), what='its outputs to be gone')
+        client.wait_until(lambda: not client.count_publishers('a/corrected_observations'), what='its end')
         client.statuses.clear()
     assert [m.frame_number for m in corrected] == [2, 102]
     assert node.end() == 0 and 'Traceback' not in node.log
@@ -53,8 +53,9 @@ def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, 
 @pytest.mark.parametrize('node', NODES)
 def test_every_transition_and_a_clean_end(graph, node):
     process, client = graph.start(node), graph.client
-    for transition in (Transition.TRANSITION_DEACTIVATE, Transition.TRANSITION_ACTIVATE, Transition.TRANSITION_DEACTIVATE,
-                       Transition.TRANSITION_CLEANUP, Transition.TRANSITION_CONFIGURE, Transition.TRANSITION_ACTIVATE):
+    T = Transition
+    for transition in (T.TRANSITION_DEACTIVATE, T.TRANSITION_ACTIVATE, T.TRANSITION_DEACTIVATE, T.TRANSITION_CLEANUP,
+                       T.TRANSITION_CONFIGURE, T.TRANSITION_ACTIVATE):
         assert change(client, node, transition), transition
     assert state(client, node) == State.PRIMARY_STATE_ACTIVE
     assert process.end() == 0 and 'Traceback' not in process.log
@@ -107,7 +108,7 @@ def test_two_rigs_side_by_side(ros, request, graph, by_command, tracking, tmp_pa
         for one, count in ((graph, 20), (other, 10)):
             one.client.wait_until(lambda: len(one.points) >= count, what='the points')
         assert [m.frame_number for m in graph.points] == [f.number for f in tracking['a'][:20]]
-        assert [m.frame_number for m in other.points] == list(range(500, 510))   # paired by stamp, numbered as they came
+        assert [m.frame_number for m in other.points] == list(range(500, 510))   # though they were paired by stamp
         clock = other.client.create_publisher(Clock, '/clock', 10)
         ticks = iter(range(1, 10 ** 6))   # the timers of the node go by the simulated clock, and by nothing else
         def ticking():

@@ -1,4 +1,4 @@
-"""Points in space from two corrected streams: where they are, how good they are said to be, and what is told of faults."""
+"""Points in space from two corrected streams: where they are, how good they are said to be, what is told of faults."""
 
 import csv
 import subprocess

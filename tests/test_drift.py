@@ -16,6 +16,8 @@ from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.orientation import RigOrientation
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
+pytestmark = pytest.mark.long
+
 sys.path.append(str(Path(__file__).resolve().parent.parent))   # benchmarks are not installed
 from benchmarks.drift import (  # noqa: E402
     BEADS, FRAMES, IDS, QUARTERS, RATE_HZ, WHOLE, Scene, blocks, detection, feed, markers)

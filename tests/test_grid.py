@@ -18,6 +18,8 @@ from fluoro_calib_ros.distortion.grid import CHUNK, LIMIT_PX, CorrectionGrid
 from fluoro_calib_ros.distortion.models import CorrectionModel, no_correction
 from fluoro_calib_ros.photogrammetry.observations import points_on_image
 
+pytestmark = pytest.mark.long
+
 KINDS = ('none', 'knn', 'local_linear', 'parametric', 'hybrid', 'collocation')
 SMOOTH = tuple(kind for kind in KINDS if kind != 'knn')
 SIZE = (120, 93)

@@ -26,6 +26,8 @@ from fluoro_calib_ros.reconstruction.recording import reconstruct_recording
 from fluoro_calib_ros.simulation.rig import (VirtualRig, phantom_poses, seen_beads, simulate_exposures,
                                              simulate_tracking, virtual_rig)
 
+pytestmark = pytest.mark.long
+
 NOISE_PX = 0.25
 
 

@@ -138,6 +138,7 @@ def test_calibrate_writes_result_and_calibrations(result):
         'rig_orientation.npz']
 
 
+@pytest.mark.long
 def test_a_bag_and_its_csv_give_the_same_numbers(rig, tmp_path):
     """To the last digit, and again as a process of its own with two threads."""
     more = ('--max-iterations', 1, '--fluoroscopes', 'a')

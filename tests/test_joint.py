@@ -69,6 +69,7 @@ def test_exposures_are_paired_by_number():
         calibrate({'a': FRAMES['a']}, PHANTOM, Options(relative_orientation='soft', **PLAIN), joint=True)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('model', ['none', 'collocation', 'local_linear'])
 def test_a_free_network_is_calibrated(model):
     """Its shape is that of the phantom; targets that it does not determine are left out, with a sentence."""

@@ -40,6 +40,7 @@ def plain(scene):
     return calibrate({'a': frames['a']}, phantom, Options(model='none'))
 
 
+@pytest.mark.long
 def test_figures_are_whole_pictures(job, tmp_path):
     """Every figure is there under its name, can be read, is no empty sheet, and nothing else is left."""
     paths = write_figures(job, tmp_path / 'new' / 'folder')
@@ -63,6 +64,7 @@ def test_figures_are_the_same_again(plain, tmp_path, monkeypatch):
     assert {key: matplotlib.rcParams[key] for key in settings} == settings
 
 
+@pytest.mark.long
 def test_figures_of_joint_run_with_interior_held(scene, tmp_path):
     """A joint run has one cost figure; a name cannot lead out of the folder."""
     phantom, frames = scene

@@ -72,6 +72,7 @@ def off(image, light, uv, reach=9):
 
 # ---- where things go
 
+@pytest.mark.long
 @pytest.mark.parametrize('kind', ['auto', 'local_linear', 'parametric'])
 def test_every_pixel_shows_what_belongs_to_it(kind):
     """The source of a pixel, corrected as points are, is that pixel."""

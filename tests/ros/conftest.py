@@ -50,13 +50,12 @@ def module_graph(ros, request, tmp_path_factory):
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item):
-    """Show what the nodes printed when a test fails."""
+    """Show what the nodes said last, and where they were, when a test fails."""
     report = (yield).get_result()
     if report.failed:
         for node in item.listchain():
             for graph in getattr(node, 'graphs', ()):
-                for name, log in graph.logs():
-                    report.sections.append((f'log of {name}', log))
+                report.sections.extend(graph.last_words(end=node is item))   # others still need theirs
 
 
 @pytest.fixture(scope='session')

@@ -18,6 +18,7 @@ from fluoro_calib_msgs.action import SelfCalibrate
 from fluoro_calib_msgs.msg import (CalibrationStatus, CorrectedObservations, DriftStatus, FluoroscopeCalibration,
                                    ReconstructedPoints, RigOrientation, TargetObservations)
 from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Orient, Reset, SaveCalibration
+from rcl_interfaces.srv import GetParameterTypes
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
@@ -71,7 +72,8 @@ class Process:
     def __init__(self, command, path):
         self.path = path
         with open(path, 'wb') as out:
-            self._process = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=out, start_new_session=True)
+            self._process = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=out, start_new_session=True,
+                                             env={**os.environ, 'PYTHONFAULTHANDLER': '1'})
 
     @property
     def log(self):
@@ -87,6 +89,12 @@ class Process:
 
     def interrupt(self):
         self._process.send_signal(signal.SIGINT)
+
+    def abort(self):
+        """End the process so that it prints where its threads are."""
+        if self.running:
+            self._process.send_signal(signal.SIGABRT)
+            self.wait()
 
     def end(self, seconds=10.0):
         """Interrupt the process, and kill it if that is not enough; returns its exit status."""
@@ -158,9 +166,14 @@ class Graph:
         self.client.wait_until(lambda: not player.running, what='the end of the player')
         assert player.wait() == 0, player.log
 
-    def logs(self):
-        """What the nodes printed, by node."""
-        return [(p.path.name, p.log) for p in self.processes]
+    def last_words(self, end):
+        """(title, text): what the client heard last of every node, and what the nodes printed; where they are to end,
+        with the places where their threads are."""
+        for process in self.processes if end else ():
+            process.abort()
+        heard = [(key, f'{status.message}\n' + '\n'.join(f'{v.key}: {v.value}' for v in status.values))
+                 for key, status in self.client.statuses.items()]
+        return heard + [(f'log of {p.path.name}', p.log) for p in self.processes]
 
     def close(self):
         running = [p for p in self.processes if p.running]
@@ -179,9 +192,9 @@ class Client(Node):
         self.messages, self.statuses, self.feedback = {}, {}, []
         self._spinner = SingleThreadedExecutor()
         self._spinner.add_node(self)
-        # Made before the nodes are: a service that hears of its client in the same moment as of its request may not
-        # know yet where the answer goes.
-        self._callers = {service: self.create_client(kind, service) for service, kind in SERVICES.items()}
+        self._callers = {}
+        for service, kind in SERVICES.items():
+            self.expect(kind, service)
         self._outputs = {n: self.create_publisher(TargetObservations, f'{n}/target_observations', OBSERVATIONS)
                          for n in NAMES}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
@@ -227,6 +240,22 @@ class Client(Node):
                     self.count_publishers(f'{n}/corrected_observations') for n in NAMES)
             return any(name == node for name, _ in self.get_node_names_and_namespaces())
         self.wait_until(connected, what=f'{node} to come up')
+        self.wait_until_known_to(node)
+
+    def wait_until_known_to(self, node):
+        """Wait until a node knows all that the client has made so far: what it publishes before may be lost, and answers
+        to what it asks. DDS tells of endpoints in the order in which they are made, so that a node which answers
+        a question of the newest knows the others too."""
+        newest, answers, asked = self.create_client(GetParameterTypes, f'{node}/get_parameter_types'), [], 0.0
+
+        def answered():
+            nonlocal asked
+            if newest.service_is_ready() and time.monotonic() > asked + 0.2:
+                answers.append(newest.call_async(GetParameterTypes.Request()))
+                asked = time.monotonic()
+            return any(answer.done() for answer in answers)
+        self.wait_until(answered, what=f'{node} to know the client')
+        self.destroy_client(newest)
 
     def subscriptions_matched(self, node):
         """Whether a node listens to the observations, and what is published now reaches all who listen."""
@@ -296,10 +325,12 @@ class Client(Node):
 
     # -- services and action
 
+    def expect(self, kind, service):
+        """Make the client of a service, before its node is started: see wait_until_known_to()."""
+        self._callers[service] = self.create_client(kind, service)
+
     def call_async(self, kind, service, **fields):
-        """Future of the answer of a service."""
-        if service not in self._callers:
-            self._callers[service] = self.create_client(kind, service)
+        """Future of the answer of a service that was expected."""
         self.wait_until(self._callers[service].service_is_ready, what=f'the service {service}')
         return self._callers[service].call_async(kind.Request(**fields))
 

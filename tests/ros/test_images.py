@@ -88,11 +88,13 @@ def pixels_of(message):
 def eyes(module_graph, by_command):
     """The image node with the calibration that a calibration node has published."""
     module_graph.calibration_node(by_command[0], wait=False)
+    module_graph.client.expect(ChangeState, 'image_node/change_state')
     module_graph.node = module_graph.start('image_node', {'fluoroscopes': '[a]'})
     eyes = Eyes(module_graph)
     eyes.calibration = load_calibrations(by_command[0])['a']
     eyes.corrector, eyes.node = ImageCorrector(eyes.calibration), module_graph.node
     eyes.client.wait_until(eyes.connected, what='the image node')
+    eyes.client.wait_until_known_to('image_node')
     eyes.diagnostics(lambda v, _: v['calibration'] == eyes.calibration.calibration_id)
     return eyes
 
@@ -230,6 +232,7 @@ def test_lifecycle(after_bad_ones, pictures):
     eyes.client.wait_until(lambda: not eyes.client.count_publishers('a/image_corrected'), what='no publisher')
     assert change(Transition.TRANSITION_CONFIGURE) and change(Transition.TRANSITION_ACTIVATE)
     eyes.client.wait_until(eyes.connected, what='the image node')
+    eyes.client.wait_until_known_to('image_node')
     values = eyes.diagnostics(lambda v, s: v['calibration'] and v['images received'] == '0')
     assert values['images refused'] == '0'
     out, _ = eyes.answer(eyes.raw, eyes.message(image))
@@ -245,6 +248,7 @@ def test_calibrations_change_between_two_images(graph, by_command, pictures):
     eyes, image = Eyes(graph), pictures['mono8']
     latched = eyes.client.create_publisher(FluoroscopeCalibration, 'a/calibration', LATCHED)
     eyes.client.wait_until(lambda: eyes.connected() and latched.get_subscription_count(), what='the image node')
+    eyes.client.wait_until_known_to('image_node')
     first = load_calibrations(by_command[0])['a']
     second = replace(first, model=no_correction(), train_exposure=np.zeros(0, dtype=np.int64))
     results = [ImageCorrector(c).correct(image).tobytes() for c in (first, second)]

@@ -13,6 +13,13 @@ from rosgraph_msgs.msg import Clock
 NODES = ('correction_node', 'reconstruction_node', 'image_node')
 
 
+def expect(client, node):
+    """Make what asks a node, before it is started."""
+    for kind, service in ((ChangeState, 'change_state'), (GetState, 'get_state'), (ListParameters, 'list_parameters'),
+                          (DescribeParameters, 'describe_parameters')):
+        client.expect(kind, f'{node}/{service}')
+
+
 def change(client, node, transition):
     return client.call(ChangeState, f'{node}/change_state', transition=Transition(id=transition)).success
 
@@ -23,11 +30,11 @@ def state(client, node):
 
 def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, tracking):
     client = graph.client
+    expect(client, 'correction_node')
     graph.calibration_node(by_command[0])
     node = graph.start('correction_node', {'autostart': 'false'}, wait=False)
     corrected = client.listen('a/corrected_observations')
-    client.wait_until(lambda: any(n == 'correction_node' for n, _ in client.get_node_names_and_namespaces()),
-                      what='the node')
+    client.wait_until_known_to('correction_node')
     assert state(client, 'correction_node') == State.PRIMARY_STATE_UNCONFIGURED
     assert not client.count_publishers('a/corrected_observations')
     frame = tracking['a'][0]
@@ -39,6 +46,7 @@ def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, 
         assert change(client, 'correction_node', Transition.TRANSITION_ACTIVATE)
         assert state(client, 'correction_node') == State.PRIMARY_STATE_ACTIVE
         client.wait_until(lambda: client.subscriptions_matched('correction_node'), what='the reader')
+        client.wait_until_known_to('correction_node')
         client.publish(replace(frame, number=100 * turn + 2))
         client.wait_until(lambda: corrected and corrected[-1].frame_number == 100 * turn + 2, what='the frame')
         assert change(client, 'correction_node', Transition.TRANSITION_DEACTIVATE)
@@ -52,6 +60,7 @@ def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, 
 
 @pytest.mark.parametrize('node', NODES)
 def test_every_transition_and_a_clean_end(graph, node):
+    expect(graph.client, node)
     process, client = graph.start(node), graph.client
     T = Transition
     for transition in (T.TRANSITION_DEACTIVATE, T.TRANSITION_ACTIVATE, T.TRANSITION_DEACTIVATE, T.TRANSITION_CLEANUP,
@@ -62,6 +71,7 @@ def test_every_transition_and_a_clean_end(graph, node):
 
 
 def test_shutdown_by_the_lifecycle(graph, by_command):
+    expect(graph.client, 'correction_node')
     graph.both_nodes(by_command[0])
     assert change(graph.client, 'correction_node', Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert state(graph.client, 'correction_node') == State.PRIMARY_STATE_FINALIZED
@@ -70,8 +80,9 @@ def test_shutdown_by_the_lifecycle(graph, by_command):
 
 @pytest.mark.parametrize('node', NODES)
 def test_every_parameter_says_what_it_is(graph, node):
-    graph.start(node)
     client = graph.client
+    expect(client, node)
+    graph.start(node)
     names = client.call(ListParameters, f'{node}/list_parameters').result.names
     own = [n for n in names if not n.startswith('qos_overrides') and n not in ('use_sim_time', 'start_type_description_'
                                                                                'service')]

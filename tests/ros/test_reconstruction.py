@@ -191,6 +191,7 @@ def test_damaged_corrected_frames_are_counted_by_kind(rig, tracking):
     client = rig.client
     output = client.create_publisher(CorrectedObservations, 'a/corrected_observations', 10)
     client.wait_until(lambda: output.get_subscription_count() > 0, what='the reader')
+    client.wait_until_known_to('reconstruction_node')
     source = message_from_frame(tracking['a'][0])
     for change in ({'u': source.u[:-1]}, {'status': []}, {'target_id': [source.target_id[0]] * len(source.target_id)}):
         message = CorrectedObservations(header=source.header, frame_number=95_000, target_id=source.target_id,

@@ -14,6 +14,7 @@ import time
 from array import array
 
 import numpy as np
+import rclpy
 from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
@@ -52,9 +53,7 @@ class Camera(Node):
         self._worker.start()
 
     def _run(self):
-        while self._output.get_subscription_count() < self._wait:
-            if self._ending.wait(0.05):
-                return
+        support.wait_for_readers(self, [self._output], self._wait, self._ending)
         began = time.monotonic()
         for number in range(self._frames):
             if self._ending.wait(max(0.0, began + number / self._rate - time.monotonic())):
@@ -63,7 +62,8 @@ class Camera(Node):
             struct.pack_into('<iI', message, 4, *divmod(time.time_ns(), 10 ** 9))   # behind the head of CDR
             self._output.publish(bytes(message))
         self.get_logger().info(f'{self._frames} images in {time.monotonic() - began:.2f} s')
-        support.end_when_taken([self._output])
+        support.wait_until_taken([self._output], self._ending)
+        rclpy.try_shutdown()
 
     def stop(self):
         """End publishing."""

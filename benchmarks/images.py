@@ -117,7 +117,7 @@ class Reader:
             stamp = seconds * 10 ** 9 + nanoseconds
             came.append((stamp, info['source_timestamp'] - stamp))
         self.reader = StreamReader(self.node, fatal, fatal)
-        self.reader.subscribe(Image, topic, take, IMAGES, raw=True)
+        self.reader.subscribe(Image, topic, take, IMAGES, decode=bytes)
         self.reader.start()
 
 

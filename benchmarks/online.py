@@ -101,7 +101,7 @@ class Reader(Node):
     def _listen(self, node, name, topic, kind):
         came = self.came[node, name] = []
         self.reader.subscribe(kind, topic, lambda data, info: came.append(_number_and_latency(data, info)),
-                              OBSERVATIONS, raw=True)
+                              OBSERVATIONS, decode=bytes)
 
     def wait(self, condition, seconds, what):
         """Spin until condition() is true."""

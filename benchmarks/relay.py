@@ -5,6 +5,7 @@
 """
 
 import sys
+import time
 
 from fluoro_calib_msgs.msg import TargetObservations
 
@@ -19,6 +20,7 @@ class Relay(support.ManagedNode):
     def __init__(self, kind):
         super().__init__(f'relay_{kind}')
         self._kind, self._reader = kind, None
+        self._latencies = {name: support.Latencies() for name in 'ab'}
 
     def begin(self):
         """Take and publish."""
@@ -26,13 +28,20 @@ class Relay(support.ManagedNode):
         for name in 'ab':
             publisher = self.create_publisher(TargetObservations, f'{name}/relayed_{self._kind}', OBSERVATIONS)
             topic = f'{name}/target_observations'
+
+            def relay(message, info, publisher=publisher, latencies=self._latencies[name]):
+                publisher.publish(message)
+                latencies.add(time.time_ns() - info['received_timestamp'])
             if self._kind == 'plain':
-                self.create_subscription(TargetObservations, topic, publisher.publish, OBSERVATIONS)
+                self.create_subscription(TargetObservations, topic, lambda message, info, relay=relay:
+                                         relay(message, info), OBSERVATIONS)
             else:
-                self._reader.subscribe(TargetObservations, topic, lambda message, _, publisher=publisher:
-                                       publisher.publish(message), OBSERVATIONS)
+                self._reader.subscribe(TargetObservations, topic, relay, OBSERVATIONS)
         if self._kind == 'streams':
             self._reader.start()
+        diagnostics = support.Diagnostics(self)
+        self.create_timer(1.0, lambda: diagnostics.publish(
+            [(name, support.OK, '', latencies.values()) for name, latencies in self._latencies.items()]))
 
     def end(self):
         """Take no more."""

@@ -9,7 +9,8 @@ from .cli_images import TEXT as ABOUT_CORRECT
 from .cli_images import add_correct
 from .cli_images import correct as run_correct
 from .cli_reconstruct import EXAMPLES as OF_SPACE
-from .cli_reconstruct import TEXTS, add_orient, add_reconstruct, orientation_of_calibration, write_orientation
+from .cli_reconstruct import (TEXTS, add_orient, add_reconstruct, check_reconstruct, orientation_of_calibration,
+                              write_orientation)
 from .cli_reconstruct import orient as run_orient
 from .cli_reconstruct import reconstruct as run_reconstruct
 from .cli_validate import EXAMPLE, TEXT, add_validate
@@ -162,6 +163,8 @@ def main(arguments=None):
         parser.error('--relative-orientation needs --joint: the fluoroscopes in one adjustment')
     if getattr(options, 'interior_sd', None) and (options.interior == 'fixed' or options.principal_distance is None):
         parser.error('--interior-sd needs --principal-distance and --interior estimated')
+    if options.command == 'reconstruct':
+        check_reconstruct(options, parser.error)
     try:
         options.run(options)
     except (DataError, OSError) as error:

@@ -51,6 +51,25 @@ def add_reconstruct(sub, image_size, number_in):
                      help='what the frames of one exposure have in common (default: frame_number)')
     sub.add_argument('--reject', type=number_in(0.1, 1e6), default=4.0, metavar='S',
                      help='standard deviations of the epipolar distance from which a match is false (default: 4)')
+    sub.add_argument('--cluster', action='append', default=[], metavar="'NAME: ID ID ...'",
+                     help="rigid cluster of targets, whose distances the drift watch looks at too, such as "
+                          "'tibia: 1001 1002 1003'; may be given again")
+    sub.add_argument('--no-drift-watch', action='store_true',
+                     help='do not look in the recording for a drift of the calibration, which takes a part of the time')
+
+
+def check_reconstruct(options, error):
+    """Read the clusters of the command line; error(sentence) is called where the options do not go together."""
+    from .reconstruction.watching import clusters_of
+    try:
+        options.clusters = clusters_of(options.cluster)
+    except ValueError as fault:
+        error(f'--cluster: {fault}')
+    if options.clusters and options.no_drift_watch:
+        error('--cluster is for the drift watch, it does not go with --no-drift-watch')
+    if options.clusters and options.source.suffix.lower() == '.csv':
+        error(f'--cluster is for the drift watch, and {options.source}, a CSV file, does not tell the time of its '
+              'exposures')
 
 
 def _add_source(sub, image_size):
@@ -107,9 +126,10 @@ def reconstruct(options, report):
         orientation.check_calibrations({name: c.calibration_id for name, c in calibrations.items()})
     except DataError as error:
         raise DataError(f'{path}: {error}') from None
+    watch, drift = _watch_of(options, orientation, calibrations)
     try:
         found, unpaired = reconstruct_recording(frames, calibrations, Intersector(orientation, options.reject),
-                                                options.pair_by)
+                                                options.pair_by, watch)
     except DataError as error:
         raise DataError(f'{options.source}: {error}') from None
     if not found:
@@ -117,13 +137,50 @@ def reconstruct(options, report):
     write_reconstruction(options.out, found)
     status = np.bincount(np.concatenate([frame.points.status for frame in found]), minlength=len(STATUS))
     counts = dict(zip(STATUS, status.tolist()))
+    incomplete = sum(len(frame.fluoroscopes) < len(names) for frame in found)
+    drift = watch.verdict() if watch else drift
     lost = {name: count for name, count in unpaired.items() if count}
     if lost:
         print(f'{options.source}: frames without partner of the other fluoroscopes, not used: {lost}', file=sys.stderr)
-    report(options, {'out': str(options.out), 'frames': len(found), 'points': int(status.sum()), 'status': counts,
-                     'unpaired': unpaired, 'orientation': orientation_document(orientation)},
+    report(options, {'out': str(options.out), 'frames': len(found), 'incomplete': incomplete,
+                     'points': int(status.sum()), 'status': counts, 'unpaired': unpaired,
+                     'drift': drift_document(drift, found[0].stamp_ns),
+                     'orientation': orientation_document(orientation)},
            f'{status.sum()} points of {len(found)} frames written to {options.out}: '
-           + ', '.join(f'{count} {name}' for name, count in counts.items() if count))
+           + ', '.join(f'{count} {name}' for name, count in counts.items() if count)
+           + (f'\n{incomplete} of the frames without all fluoroscopes ({", ".join(names)})' if incomplete else '')
+           + (f'\ndrift watch: {drift.message}' if drift else ''))
+
+
+def _watch_of(options, orientation, calibrations):
+    """RecordingWatch of a recording, or None and the DriftVerdict that says why there is none; None and None where it
+    is not wanted."""
+    from .reconstruction.watching import DriftVerdict, RecordingWatch
+    if options.no_drift_watch:
+        return None, None
+    if options.source.suffix.lower() == '.csv':
+        return None, DriftVerdict('unknown', 'a CSV file does not tell the time of its exposures, no drift can be told')
+    try:
+        return RecordingWatch(orientation, {name: calibrations[name].image_size for name in orientation.fluoroscopes},
+                              clusters=options.clusters), None
+    except DataError as error:
+        return None, DriftVerdict('unknown', f'no drift can be told: {error}')
+
+
+def drift_document(verdict, begin_ns):
+    """A DriftVerdict as a dict, None where there is none; times [s] after the exposure at begin_ns."""
+    if verdict is None:
+        return None
+    out = {'level': verdict.level, 'message': verdict.message, 'level_at_end': verdict.level_at_end,
+           'watched_s': verdict.watched_s}
+    names = {'fluoroscope': 'fluoroscope', 'place': 'place', 'area_px': 'area', 'size_px': 'size', 'sd_px': 'sd',
+             'direction': 'direction', 'against': 'against', 'source': 'source', 'evidence': 'evidence',
+             'threshold_warn': 'threshold_warn', 'threshold_error': 'threshold_error', 'observations': 'observations'}
+    out.update({key: getattr(verdict.state, name) if verdict.state else None for key, name in names.items()})
+    for key, stamp_ns in (('found', verdict.found_ns), ('began', verdict.began_ns)):
+        out[f'{key}_stamp_ns'] = stamp_ns
+        out[f'{key}_s'] = None if stamp_ns is None else (stamp_ns - begin_ns) / 1e9
+    return out
 
 
 def orientation_of_calibration(frames, phantom, job):

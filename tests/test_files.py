@@ -328,6 +328,10 @@ def test_a_calibration_that_is_cut_off_or_changed_by_a_byte_is_refused(tmp_path)
     content, good = open(path, 'rb').read(), load_calibration(path)
     for length in (1, 10, 200, len(content) // 2, len(content) - 100, len(content) - 1):
         assert path in message_of(load_calibration, text_file(tmp_path, 'a.calibration.npz', content[:length]))
+    directory = bytearray(content)   # is said to lie further behind than it does: its members before the file
+    directory[-6:-2] = (int.from_bytes(content[-6:-2], 'little') + 999).to_bytes(4, 'little')
+    assert 'or it is damaged' in message_of(load_calibration, text_file(tmp_path, 'a.calibration.npz',
+                                                                        bytes(directory)))
     for place in np.linspace(0, len(content) - 1, 300).astype(int):
         damaged = bytearray(content)
         damaged[place] ^= 0x55

@@ -342,6 +342,33 @@ def test_outputs_that_cannot_be(one, both, tmp_path, capfd):
     assert len(os.listdir(tmp_path)) == 6
 
 
+def test_names_that_are_no_text(one, tmp_path, capfd):
+    """An image may have one; what OpenCV reads or writes by its name may not: it would end the process."""
+    odd = [tmp_path / os.fsdecode(b'\xff' + ending) for ending in (b'.png', b'.tif', b'.avi')]
+    odd[0].write_bytes(encode(image_of(), '.png'))
+    cv2.imwritemulti(str(tmp_path / 's.tif'), stack_of(3))
+    video_of(tmp_path / 'v.avi', stack_of(3))
+    assert correct(odd[0], one, tmp_path / 'out.png') == 0 and correct(tmp_path / 's.tif', one, odd[1]) == 0
+    capfd.readouterr()
+    os.replace(tmp_path / 's.tif', odd[1])
+    assert 'the name is not UTF-8 text, rename it' in said(capfd, odd[1], one, tmp_path / 'x.tif')
+    assert 'the name is not UTF-8 text, rename it' in said(capfd, tmp_path / 'v.avi', one, odd[2])
+    os.replace(tmp_path / 'v.avi', odd[2])
+    assert 'the name is not UTF-8 text, rename it' in said(capfd, odd[2], one, tmp_path / 'x.avi')
+    assert sorted(os.listdir(tmp_path)) == sorted(['out.png', *(p.name for p in odd)])
+
+
+def test_folder_in_the_way_of_an_image(one, tmp_path, capfd):
+    """All or nothing: no image is replaced where one of them cannot be."""
+    (tmp_path / 'in').mkdir()
+    (tmp_path / 'out' / 'b.png').mkdir(parents=True)
+    for name in ('a.png', 'b.png'):
+        (tmp_path / 'in' / name).write_bytes(encode(image_of(), '.png'))
+    assert f'{tmp_path / "out" / "b.png"}: cannot be written, this is a folder' in said(
+        capfd, tmp_path / 'in', one, tmp_path / 'out')
+    assert os.listdir(tmp_path / 'out') == ['b.png'] and sorted(os.listdir(tmp_path)) == ['in', 'out']
+
+
 def test_odd_sizes_of_videos(tmp_path):
     """OpenCV would cut the last row off."""
     calibration = replace(a_calibration('a'), image_size=(128, 95))

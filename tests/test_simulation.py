@@ -53,6 +53,18 @@ def test_sources_stand_where_they_are_said_to(seed):
     assert np.linalg.norm(a.position_mm - b.position_mm) == pytest.approx(2000, abs=150)
 
 
+def test_rigs_of_more_fluoroscopes():
+    """The default is what it was; of three, neighbours look across each other by the angle that is given."""
+    same = virtual_rig(3, between_deg=84.0).fluoroscopes
+    for one, other in zip(virtual_rig(3).fluoroscopes, same):
+        np.testing.assert_array_equal(one.rotation, other.rotation)
+        np.testing.assert_array_equal(one.position_mm, other.position_mm)
+    three = virtual_rig(3, names=('a', 'b', 'c'), between_deg=60.0)
+    axes = np.array([f.rotation[2] for f in three.fluoroscopes])
+    np.testing.assert_allclose(np.rad2deg(np.arccos((axes @ axes.T)[[0, 1, 0], [1, 2, 2]])), [60, 60, 120], atol=6)
+    assert all(len(of_one[0].target_id) > 100 for of_one in simulate_exposures(three, 1).frames.values())
+
+
 def test_looking_at_the_origin_puts_it_on_the_axis():
     rotation = looking_at_origin(np.array([300.0, -900.0, 400.0]))
     there = rotation @ -np.array([300.0, -900.0, 400.0])

@@ -98,9 +98,9 @@ class FramePairer:
 class StillOptions:
     """When the phantom counts as standing still in a new pose.
 
-    still_time_s: no frame of that time before may show it displaced by more than still_px; new_px: median
-    displacement from every collected exposure. Frames further apart than still_time_s are single shots,
-    each of which counts.
+    still_time_s: no frame of that time before may show it displaced by more than still_px, and those there are have
+    to go back half of it; new_px: median displacement from every collected exposure. Frames further apart than
+    still_time_s are single shots, each of which counts; but not after a gap in a stream, up to ten times as long.
     """
 
     still_time_s: float = 0.1
@@ -118,21 +118,33 @@ class ExposureCollector:
     def __init__(self, fluoroscopes, still=StillOptions()):
         self.fluoroscopes, self.still = tuple(fluoroscopes), still
         self.exposures, self.coverage = [], {}
-        self._recent = deque(maxlen=1000)
+        self._recent, self._streaming = deque(maxlen=1000), False
 
     def offer(self, pair):
         """Take the pair if the phantom stands still in a new pose; returns '' if taken, else why not."""
         first = self.fluoroscopes[0]
-        now = pair[first].stamp_ns
-        window = [p for p in self._recent if 0 <= now - p[first].stamp_ns <= self.still.still_time_s * 1e9]
+        now, still_ns = pair[first].stamp_ns, self.still.still_time_s * 1e9
+        window = [p for p in self._recent if 0 <= now - p[first].stamp_ns <= still_ns]
         moved = max((displacement(pair[n], p[n]) for p in window for n in self.fluoroscopes), default=0.0)
+        span = max((now - p[first].stamp_ns for p in window), default=0)
+        self._notice_stream(now, bool(window), still_ns)
         self._recent.append(pair)
         if moved > self.still.still_px:
             return 'the phantom moves'
+        if self._streaming and span < still_ns / 2:
+            return 'too few frames tell whether the phantom stands still'
         for known in self.exposures:
             if max(displacement(pair[n], known[n]) for n in self.fluoroscopes) < self.still.new_px:
                 return 'the phantom stands in a pose that is collected already'
         return self.take(pair)
+
+    def _notice_stream(self, now, follows, still_ns):
+        """Note whether frames come as a stream: since one has followed another, until a long gap."""
+        before = self._recent[-1][self.fluoroscopes[0]].stamp_ns if self._recent else None
+        if follows:
+            self._streaming = True
+        elif before is None or not 0 <= now - before <= 10 * still_ns:
+            self._streaming = False
 
     def take(self, pair):
         """Take the pair as an exposure; returns '' if taken, else why not."""
@@ -149,6 +161,7 @@ class ExposureCollector:
         """Forget the exposures."""
         self.exposures, self.coverage = [], {}
         self._recent.clear()
+        self._streaming = False
 
     def frames(self, fluoroscopes=None):
         """{fluoroscope: [Frame, ...]} of the exposures. Raises DataError for an unknown fluoroscope."""

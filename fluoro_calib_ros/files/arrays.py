@@ -5,6 +5,7 @@ is read, and the same when it is written; the same arrays give the same bytes.
 """
 
 import io
+import struct
 import zipfile
 import zlib
 from dataclasses import dataclass
@@ -60,7 +61,10 @@ def read_arrays(path, fields, readable, what, known=None):
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             arrays = _read_members(path, archive, fields, readable, what, known or {})
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError):   # last: unknown compression
+    except DataError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError, struct.error):
+        # RuntimeError: unknown compression; ValueError: places before the file, names that are no text
         raise DataError(f'{path}: this is not {what} file, or it is damaged') from None
     return {name: _checked(path, name, arrays[name], field) for name, field in fields.items()}
 

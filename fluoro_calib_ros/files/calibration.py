@@ -67,11 +67,18 @@ def save_calibration(directory, calibration):
     written or holds something that could not be read again; a file that was there is then left as it was.
     """
     path = calibration_path(directory, calibration.fluoroscope)
-    arrays = {name: array_of(path, name, _value_of(calibration, name), field) for name, field in FIELDS.items()}
-    _check_lengths(path, arrays)
+    arrays = checked_arrays(path, calibration)
     make_folder(directory)
     write_arrays(path, VERSION, arrays)
     return path
+
+
+def checked_arrays(where, calibration):
+    """The arrays {name: array} of a FluoroscopeCalibration. Raises DataError, beginning with where, for one that holds
+    what a calibration cannot hold, such as NaN."""
+    arrays = {name: array_of(where, name, _value_of(calibration, name), field) for name, field in FIELDS.items()}
+    _check_lengths(where, arrays)
+    return arrays
 
 
 def load_calibration(path):

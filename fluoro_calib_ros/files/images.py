@@ -100,6 +100,9 @@ def _correct_folder(source, out, corrector, progress):
             _write(temporary / path.name, kind, count, None, _corrected(images, corrector), lambda *_: None)
             progress(number + 1, len(wanted))
         make_folder(out)
+        for path in wanted:   # before anything is moved: all or nothing
+            if (out / path.name).is_dir():
+                raise DataError(f'{out / path.name}: cannot be written, this is a folder')
         for path in wanted:
             os.replace(temporary / path.name, out / path.name)
         sync_folder(out)
@@ -118,8 +121,17 @@ def _read(path):
                         f'({_listed(VIDEOS)})')
     pages = count_pages(path) if ending in STACKS else 1
     if pages > 1:
+        _check_text(path)
         return 'stack', pages, _pages_of(path, pages), None
     return 'image', 1, _image_of(path), None
+
+
+def _check_text(path):
+    """Raise DataError for a name that OpenCV cannot be told: it would end the process."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise DataError(f'{path}: the name is not UTF-8 text, rename it') from None
 
 
 def _image_of(path):
@@ -153,6 +165,7 @@ def _pages_of(path, pages):
 def _read_video(path):
     if not os.path.isfile(path):
         read_bytes(path)   # says why
+    _check_text(path)
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
         raise DataError(f'{path}: this is no video that can be read, or it is damaged')
@@ -229,6 +242,7 @@ def _write_video(out, count, rate, images, progress):
         raise DataError(f'{out}: a video cannot have images of {width} x {height} px, both have to be even')
     if deep and VIDEOS[ending_of(out)] != 'FFV1':
         raise DataError(f'{out}: grey values of 16 bits cannot be written as {ending_of(out)[1:]}, take avi or mkv')
+    _check_text(out.absolute())
     with _temporary(out) as temporary:
         video = cv2.VideoWriter(str(temporary), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*VIDEOS[ending_of(out)]), rate,
                                 (width, height), [cv2.VIDEOWRITER_PROP_IS_COLOR, 0, cv2.VIDEOWRITER_PROP_DEPTH,

@@ -9,7 +9,6 @@ import threading
 import time
 from collections import deque
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from fluoro_calib_msgs.action import SelfCalibrate
@@ -72,12 +71,12 @@ class CalibrationNode(Node):
         if not phantom:
             raise StartError('parameter phantom is not set: it names the file phantom.csv')
         try:
-            self._phantom = read_phantom(Path(phantom).expanduser())
+            self._phantom = read_phantom(support.path_of(phantom))
         except DataError as error:
             raise StartError(str(error)) from None
-        self._directory = declare(self, 'calibration_directory', '~/.ros/fluoro_calib',
-                                  'folder where calibrations are saved, and from which they are read at the start')
-        self._directory = Path(self._directory).expanduser()
+        self._directory = support.path_of(declare(
+            self, 'calibration_directory', '~/.ros/fluoro_calib',
+            'folder where calibrations are saved, and from which they are read at the start'))
         self._collect = declare(self, 'collect', 'still', 'how exposures are collected: still (by itself, when '
                                 'the phantom stands still in a new pose) or request (by the service capture)')
         if self._collect not in COLLECT:
@@ -192,8 +191,10 @@ class CalibrationNode(Node):
 
     async def _on_capture(self, request, response):
         timeout, captured = request.timeout_sec or self._capture_timeout, Future()
-        if not 0 < timeout < np.inf:
-            response.message = f'timeout_sec is a time in seconds, not {timeout}'
+        try:
+            support.check_timeout(timeout)
+        except ValueError as error:
+            response.message = str(error)
             return response
         self._not_captured = ''
         self._captures.append(captured)
@@ -228,8 +229,8 @@ class CalibrationNode(Node):
         return response
 
     def _on_save(self, request, response):
-        directory = Path(request.directory).expanduser() if request.directory else self._directory
         try:
+            directory = support.path_of(request.directory) if request.directory else self._directory
             if not self._calibrations:
                 raise DataError('there is no calibration to save')
             for calibration in self._calibrations.values():
@@ -244,8 +245,8 @@ class CalibrationNode(Node):
         return response
 
     def _on_load(self, request, response):
-        directory = Path(request.directory).expanduser() if request.directory else self._directory
         try:
+            directory = support.path_of(request.directory) if request.directory else self._directory
             found = self._read_calibrations(directory)
             if not found:
                 raise DataError(f'{directory}: there is no calibration of {", ".join(self._names)}')

@@ -5,13 +5,14 @@ import numpy as np
 from ..photogrammetry.observations import DataError
 
 KINDS = ('undecodable', 'lengths', 'image size', 'frame id', 'repeated target', 'sigma')   # of refused messages
+LONGEST = 500   # characters of a sentence: names in a message may have any length, and go into log and diagnostics
 
 
 class Refused(DataError):
     """Why a message is refused: its kind, one of KINDS, and the sentence."""
 
     def __init__(self, kind, sentence):
-        super().__init__(sentence)
+        super().__init__(sentence if len(sentence) <= LONGEST else f'{sentence[:LONGEST]}...')
         self.kind = kind
 
 
@@ -22,48 +23,56 @@ class FrameChecks:
     """
 
     def __init__(self, fluoroscope):
-        self._fluoroscope, self._unique = fluoroscope, None   # target ids that were looked through last
+        self._fluoroscope, self._unique = fluoroscope, None   # target ids that were looked through last, as bytes
 
-    def arrays_of(self, message, calibration):
-        """u, v (n,) and sigma (n,) or None of a TargetObservations message for a calibration; the message keeps the
-        memory. Raises Refused where it cannot be corrected as a whole."""
-        ids, count = message.target_id, len(message.target_id)
-        for name, field in (('u', message.u), ('v', message.v), ('sigma', message.sigma)):
-            if len(field) != count and (name != 'sigma' or len(field)):
-                raise self._refused('lengths', message, f'{count} target ids, but {len(field)} values of {name}')
-        width, height = calibration.image_size
-        if message.image_width != width or message.image_height != height:
-            raise self._refused('image size', message, f'the image is {message.image_width} x {message.image_height} '
-                                f'px, but the calibration is for {width} x {height} px')
-        frame_id = message.header.frame_id
+    def arrays_of(self, frame, calibration):
+        """u, v (n,) and sigma (n,) or None of the Observations of a frame for a calibration. Raises Refused where they
+        cannot be corrected as a whole."""
+        sigma, count = frame.sigma, len(frame.target_id) // 4
+        if len(frame.u) != count or len(frame.v) != count or len(sigma) not in (0, count):
+            name, values = next((name, values) for name, values in (('u', frame.u), ('v', frame.v), ('sigma', sigma))
+                                if len(values) != count)
+            raise self._refused('lengths', frame, f'{count} target ids, but {len(values)} values of {name}')
+        if frame.image_size != calibration.image_size:
+            (width, height), (w, h) = frame.image_size, calibration.image_size
+            raise self._refused('image size', frame, f'the image is {width} x {height} px, but the calibration is for '
+                                f'{w} x {h} px')
+        frame_id = frame.frame_id
         if frame_id != calibration.frame_id and frame_id and calibration.frame_id:
-            raise self._refused('frame id', message, f'the frame id is {frame_id}, but the calibration is of '
+            raise self._refused('frame id', frame, f'the frame id is {frame_id}, but the calibration is of '
                                 f'{calibration.frame_id}')
-        if ids != self._unique:
-            values, counts = np.unique(np.asarray(ids), return_counts=True)
-            if len(values) < count:
-                raise self._refused('repeated target', message,
-                                    f'target {values[counts > 1][0]} is there {counts.max()} times')
-            self._unique = ids
-        if not len(message.sigma):
-            return np.frombuffer(message.u), np.frombuffer(message.v), None
-        sigma = np.frombuffer(message.sigma)
+        if frame.target_id != self._unique:
+            self._check_unique(frame)
+        if not len(sigma):
+            return frame.u, frame.v, None
         if not (sigma.min() > 0 and sigma.max() < np.inf):   # NaN is neither
             wrong = ~(np.isfinite(sigma) & (sigma > 0))
-            raise self._refused('sigma', message,
-                                f'sigma of target {ids[int(wrong.argmax())]} is not a positive number')
-        return np.frombuffer(message.u), np.frombuffer(message.v), sigma
+            number = np.frombuffer(frame.target_id, np.uint32)[wrong.argmax()]
+            raise self._refused('sigma', frame, f'sigma of target {number} is not a positive number')
+        return frame.u, frame.v, sigma
 
-    def _refused(self, kind, message, what):
-        return Refused(kind, f'fluoroscope {self._fluoroscope}, frame {message.frame_number}: {what}')
+    def _check_unique(self, frame):
+        values, counts = np.unique(np.frombuffer(frame.target_id, np.uint32), return_counts=True)
+        if len(counts) and counts.max() > 1:
+            raise self._refused('repeated target', frame,
+                                f'target {values[counts > 1][0]} is there {counts[counts > 1][0]} times')
+        self._unique = frame.target_id
+
+    def _refused(self, kind, frame, what):
+        return Refused(kind, f'fluoroscope {self._fluoroscope}, frame {frame.frame_number}: {what}')
 
 
-def check_corrected(fluoroscope, message):
-    """Raise Refused for a CorrectedObservations message whose arrays do not belong together."""
-    count = len(message.target_id)
-    where = f'fluoroscope {fluoroscope}, frame {message.frame_number}'
+def check_corrected(fluoroscope, frame):
+    """Raise Refused for a Corrected frame of which arrays do not belong together, or a standard deviation is none; it
+    may be NaN, as at points that are INVALID."""
+    count = len(frame.target_id)
+    where = f'fluoroscope {fluoroscope}, frame {frame.frame_number}'
     for name in ('u', 'v', 'sigma', 'correction_sd', 'status'):
-        if len(getattr(message, name)) != count:
-            raise Refused('lengths', f'{where}: {count} target ids, but {len(getattr(message, name))} values of {name}')
-    if len(set(message.target_id)) < count:
+        if len(getattr(frame, name)) != count:
+            raise Refused('lengths', f'{where}: {count} target ids, but {len(getattr(frame, name))} values of {name}')
+    if len(set(frame.target_id.tolist())) < count:
         raise Refused('repeated target', f'{where}: a target is there more than once')
+    for name, wrong in (('sigma', frame.sigma <= 0), ('correction_sd', frame.correction_sd < 0)):   # NaN is neither
+        if wrong.any():
+            raise Refused('sigma', f'{where}: {name} of target {frame.target_id[wrong.argmax()]} is no standard '
+                                   'deviation')

@@ -4,12 +4,13 @@ from array import array
 
 import numpy as np
 from builtin_interfaces.msg import Time
-from fluoro_calib_msgs.msg import CorrectedObservations, FluoroscopeCalibration, TargetObservations
+from fluoro_calib_msgs.msg import FluoroscopeCalibration, TargetObservations
 from sensor_msgs.msg import CameraInfo
 
 from ..calibration import result as calibration_result
 from ..distortion.models import CorrectionModel
 from ..distortion.series import SD_GRID, packed, unpacked
+from ..files.calibration import checked_arrays
 from ..photogrammetry.observations import DataError
 
 
@@ -43,22 +44,6 @@ def message_from_frame(frame):
     message.u, message.v = doubles(frame.uv[:, 0]), doubles(frame.uv[:, 1])
     message.sigma = doubles([] if frame.sigma is None else frame.sigma)
     return message
-
-
-_INVALID = bytes([CorrectedObservations.INVALID])
-
-
-def fill_corrected(message, source, calibration_id, corrected):
-    """Fill in a CorrectedObservations message: that of the TargetObservations message source, corrected to arrays u, v,
-    sigma, correction_sd and status (n,). Returns whether one of these is INVALID."""
-    u, v, sigma, correction_sd, status = corrected
-    message.header, message.frame_number = source.header, source.frame_number
-    message.calibration_id, message.target_id = calibration_id, source.target_id
-    message.u, message.v = array('d', u.tobytes()), array('d', v.tobytes())
-    message.sigma, message.correction_sd = array('d', sigma.tobytes()), array('d', correction_sd.tobytes())
-    status = status.tobytes()
-    message.status = array('B', status)
-    return _INVALID in status   # looking through the array would box every number
 
 
 def message_from_calibration(calibration):
@@ -115,6 +100,7 @@ def calibration_from_message(message):
         **{name: getattr(message, name) for name in SAME_NAME})
     if calibration.calibration_id != message.calibration_id:
         raise DataError(f'{where}: its content does not belong to its id {message.calibration_id}')
+    checked_arrays(where, calibration)
     return calibration
 
 

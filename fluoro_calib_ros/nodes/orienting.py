@@ -3,7 +3,6 @@
 import threading
 from pathlib import Path
 
-import numpy as np
 from fluoro_calib_msgs.msg import RigOrientation
 from fluoro_calib_msgs.srv import Orient
 from rclpy.clock import Clock, ClockType
@@ -14,6 +13,7 @@ from ..files.orientation import load_orientation, orientation_path, save_orienta
 from ..photogrammetry.observations import DataError
 from .qos import LATCHED
 from .spatial import message_from_orientation
+from .support import check_timeout
 
 
 class _Capture:
@@ -107,8 +107,7 @@ class Orienting:
     async def _captured(self, request):
         """RigOrientation from the next frames of all fluoroscopes. Raises DataError and ValueError."""
         timeout, count, calibrations = request.timeout_sec or self._timeout, request.frames or 1, self._calibrations()
-        if not 0 < timeout < np.inf:
-            raise ValueError(f'timeout_sec is a time in seconds, not {timeout}')
+        check_timeout(timeout)
         missing = [name for name in self._names if name not in calibrations]
         if missing:
             raise DataError(f'there is no calibration of fluoroscope {missing[0]} yet')
@@ -123,8 +122,12 @@ class Orienting:
             self._capture = None
             raise DataError(f'{len(waiting.frames[self._names[0]])} of {count} frames of all fluoroscopes '
                             f'({", ".join(self._names)}) came within {timeout:g} s')
-        return await self._beside(lambda: orientation_of_capture(waiting.frames, self._phantom, dict(calibrations),
-                                                                 self._rig_frame))
+        calibrations = dict(calibrations)
+        orientation = await self._beside(lambda: orientation_of_capture(waiting.frames, self._phantom, calibrations,
+                                                                        self._rig_frame))
+        if not _belongs(orientation, self._calibrations()):
+            raise DataError('the calibrations have changed meanwhile, capture the phantom again')
+        return orientation
 
     def _beside(self, function):
         """Future of the result of a function that is called in a thread of its own."""

@@ -54,7 +54,9 @@ class Pictures:
             raise self._refused('image size', message, f'{size} bytes in rows of {step} are not an image of {width} x '
                                 f'{height} px of {message.encoding}')
         image = np.ndarray((height, width), dtype, message.data, strides=(step, np.dtype(dtype).itemsize))
-        return image.byteswap() if dtype == np.uint16 and message.is_bigendian else image
+        if dtype == np.uint16 and message.is_bigendian:
+            return image.byteswap()
+        return image if step % image.itemsize == 0 else image.copy()   # OpenCV takes no row that begins within a pixel
 
     def _decoded(self, message):
         try:

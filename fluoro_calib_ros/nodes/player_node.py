@@ -2,18 +2,19 @@
 
 import threading
 import time
+import traceback
 from importlib import import_module
 
 import rclpy
-from rclpy._rclpy_pybind11 import RCLError
-from rclpy.duration import Duration
+from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
+from rclpy.type_support import check_for_type_support
 
 from ..bags.reader import iterate_messages, topics_of
 from ..photogrammetry.observations import DataError
 from . import support
-from .qos import OBSERVATIONS, overridable
-from .support import StartError, declare
+from .qos import LATCHED_RECORDED, OBSERVATIONS, overridable
+from .support import StartError, declare, sentence_of
 
 
 class PlayerNode(Node):
@@ -33,53 +34,53 @@ class PlayerNode(Node):
             found = topics_of(self._bag)
         except DataError as error:
             raise StartError(str(error)) from None
-        self._outputs = {topic: self._output(topic, info.type) for topic, info in found.items()
+        self._outputs = {topic: self._output(topic, info.type, is_latched(info)) for topic, info in found.items()
                          if wanted in ([''], []) or topic in wanted}
         self._outputs = {topic: output for topic, output in self._outputs.items() if output is not None}
         if not self._outputs:
             raise StartError(f'{self._bag}: there is nothing to play among its topics {", ".join(found) or "(none)"}')
+        if not any(found[topic].count for topic in self._outputs):
+            raise StartError(f'{self._bag}: there are no messages on {", ".join(self._outputs)}')
         self.failed = False
         self._stopping = threading.Event()
         self._worker = threading.Thread(target=self._play, daemon=True)
         self._worker.start()
 
-    def _output(self, topic, type_name):
+    def _output(self, topic, type_name, latched):
         """Publisher of a recorded topic, relative so that it can be remapped; None for a type that is not here."""
         package, _, name = type_name.partition('/msg/')
         try:
-            message_type = getattr(import_module(f'{package}.msg'), name)
+            message_type = getattr(import_module(f'{package or "no"}.msg'), name)
+            check_for_type_support(message_type)
         except (ImportError, AttributeError):
-            self.get_logger().warning(f'{topic} is not played: the type {type_name} is not installed')
+            self.get_logger().warning(f'{topic} is not played: the type {type_name or "(none)"} is not installed')
             return None
         relative = topic.removeprefix(self._namespace).lstrip('/')
-        return self.create_publisher(message_type, relative, OBSERVATIONS, qos_overriding_options=overridable())
+        try:
+            return self.create_publisher(message_type, relative, LATCHED_RECORDED if latched else OBSERVATIONS,
+                                         qos_overriding_options=overridable())
+        except NameValidationException as error:
+            raise StartError(f'{topic} cannot be played as {relative!r}: {sentence_of(error)}') from None
 
     def _play(self):
         try:
-            self._wait_for_readers()
+            support.wait_for_readers(self, self._outputs.values(), self._readers, self._stopping)
             while not self._stopping.is_set():
                 self._play_once()
                 if not self._loop:
                     break
-            self._wait_until_taken()
+            if not support.wait_until_taken(self._outputs.values(), self._stopping) and not self._stopping.is_set():
+                self.get_logger().warning('not all messages have arrived: a reader does not answer')
         except DataError as error:
             self.get_logger().fatal(str(error))
             self.failed = True
-        except RCLError:
+        except Exception:
             if rclpy.ok():   # else the node has been ended between two messages
-                raise
+                self.get_logger().fatal(traceback.format_exc())
+                self.failed = True
         finally:
             if rclpy.ok():
                 rclpy.shutdown()
-
-    def _wait_for_readers(self):
-        while not self._stopping.is_set():
-            missing = [t for t, p in self._outputs.items() if p.get_subscription_count() < self._readers]
-            if not missing:
-                return
-            self.get_logger().info(f'waiting for {self._readers} readers of {", ".join(missing)}',
-                                   throttle_duration_sec=5.0)
-            self._stopping.wait(0.05)
 
     def _play_once(self):
         """Publish every message at its time."""
@@ -93,15 +94,15 @@ class PlayerNode(Node):
             count += 1
         self.get_logger().info(f'{count} messages played in {time.monotonic() - start:.1f} s')
 
-    def _wait_until_taken(self):
-        """Wait until all messages have arrived; what is not acknowledged is lost when the node goes."""
-        for output in self._outputs.values():
-            output.wait_for_all_acked(Duration(seconds=10))
-
     def stop(self):
         """End playing: the node is to go."""
         self._stopping.set()
         self._worker.join(2.0)
+
+
+def is_latched(info):
+    """Whether what was recorded on a topic is heard by those too who come later."""
+    return any(profile.get('durability') == 'transient_local' for profile in info.offered_qos)
 
 
 def main(args=None):

@@ -9,6 +9,9 @@ OBSERVATIONS = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliabilit
 IMAGES = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=10, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.RELIABLE,
                      durability=DurabilityPolicy.TRANSIENT_LOCAL)
+# What many have latched on a topic, as on /tf_static, comes from one player.
+LATCHED_RECORDED = QoSProfile(history=HistoryPolicy.KEEP_LAST, depth=100, reliability=ReliabilityPolicy.RELIABLE,
+                              durability=DurabilityPolicy.TRANSIENT_LOCAL)
 
 
 def overridable():

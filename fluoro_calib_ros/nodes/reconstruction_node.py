@@ -12,23 +12,23 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from ..calibration.collector import FramePairer
 from ..files.orientation import load_orientation
 from ..photogrammetry.observations import DataError
 from ..reconstruction.drift import DriftOptions
 from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, Intersector
-from ..reconstruction.matching import matched
+from ..reconstruction.pairing import PATIENCE, exposure_pairer
+from ..reconstruction.recording import CorrectedView, intersect_views, watch_views
 from ..reconstruction.watching import RigWatch, clusters_of
 from . import support
 from .checks import Refused, check_corrected
-from .conversion import to_nanoseconds
-from .qos import LATCHED, OBSERVATIONS, overridable
+from .conversion import to_stamp
+from .qos import LATCHED, OBSERVATIONS
 from .spatial import (MocapMarkers, cloud_message, drift_message, ellipsoids_message, message_from_orientation,
                       mocap_message, orientation_from_message, points_message, transforms_of)
-from .streams import StreamReader
 from .support import StartError, declare
+from .wire import Corrected, corrected_of
 
-KINDS = ('undecodable', 'lengths', 'repeated target')   # of refused messages
+KINDS = ('undecodable', 'lengths', 'repeated target', 'sigma')   # of refused messages
 ORIENTATIONS = 4   # that are kept: frames of the calibration before may still come
 
 
@@ -39,7 +39,7 @@ class _View:
     fluoroscope: str
     number: int
     stamp_ns: int
-    message: CorrectedObservations
+    frame: Corrected
 
 
 class _Rig(NamedTuple):
@@ -51,8 +51,8 @@ class _Rig(NamedTuple):
     watch: RigWatch | None
 
 
-class ReconstructionNode(support.ManagedNode):
-    """Publishes points in space for every exposure of which all fluoroscopes have come."""
+class ReconstructionNode(support.StreamNode):
+    """Publishes points in space for every exposure of which two fluoroscopes have come, or more."""
 
     def __init__(self):
         super().__init__('reconstruction_node')
@@ -60,7 +60,9 @@ class ReconstructionNode(support.ManagedNode):
         self._pairing = (declare(self, 'pair_by', 'frame_number', 'how frames are paired: frame_number or stamp'),
                          round(1e9 * declare(self, 'pair_tolerance', 0.002,
                                              'largest difference of the stamps of a pair [s]', 0.0, 1.0)),
-                         declare(self, 'waiting', 64, 'frames of a fluoroscope that wait for their partners', 1, 10000))
+                         declare(self, 'waiting', 64, 'frames of a fluoroscope that wait for their partners', 1, 10000),
+                         declare(self, 'patience', PATIENCE, 'frames of two others for which a silent one of three or '
+                                 'more fluoroscopes is waited for', 1, 10000))
         self._reject = declare(self, 'reject', 4.0, 'epipolar distance above which image points do not belong '
                                'together [standard deviations]', 1.0, 1000.0)
         self._file = declare(self, 'orientation_file', '', 'rig_orientation.npz to begin with; empty: the orientation '
@@ -70,12 +72,10 @@ class ReconstructionNode(support.ManagedNode):
         self._every_ns = round(1e9 / declare(self, 'ellipsoid_rate', 30.0, 'most MarkerArrays a second', 0.1, 1000.0))
         self._read_watch()
         try:
-            FramePairer(self._names, *self._pairing)
+            exposure_pairer(self._names, *self._pairing)
         except ValueError as error:
             raise StartError(f'parameter {error}') from None
-        self._sentences = support.Sentences(self.get_logger())
-        self._outputs, self._inputs, self._reader = {}, [], None
-        self._forget()
+        self.forget()
 
     def _read_watch(self):
         """Parameters of the drift watch. Raises StartError."""
@@ -95,9 +95,10 @@ class ReconstructionNode(support.ManagedNode):
         except ValueError as error:
             raise StartError(f'parameter clusters, drift_warn_interval or drift_error_interval: {error}') from None
 
-    def _forget(self):
+    def forget(self):
+        """Begin to count, without an orientation."""
         self._rigs = {}   # calibration ids: _Rig; replaced as a whole
-        self._pairer = FramePairer(self._names, *self._pairing)
+        self._pairer = exposure_pairer(self._names, *self._pairing)
         self._received, self._refused, self._points = Counter(), Counter(), Counter()
         self._exposures = self._reconstructed = self._without_orientation = 0
         self._last_fault = ''
@@ -106,23 +107,24 @@ class ReconstructionNode(support.ManagedNode):
 
     # -- lifecycle
 
-    def open(self):
+    def make(self):
         """Make outputs, and take orientations."""
         kinds = {'points_with_covariance': ReconstructedPoints, 'points': PointCloud2, 'markers': MarkerArray}
         if MocapMarkers is not None:
             kinds['mocap_markers'] = MocapMarkers
-        for name, kind in kinds.items():
-            self._outputs[name] = self.create_lifecycle_publisher(
-                kind, f'reconstruction/{name}', OBSERVATIONS, qos_overriding_options=overridable())
-        self._outputs['drift'] = self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)
-        self._outputs['tf'] = self.create_publisher(TFMessage, '/tf_static', LATCHED)
-        self._diagnostics = support.Diagnostics(self)
-        self._inputs = [self.create_subscription(RigOrientation, 'rig_orientation', self._on_orientation, LATCHED)]
-        self._inputs += [self.create_subscription(
+        self._outputs = {name: self.publisher(kind, f'reconstruction/{name}', OBSERVATIONS)
+                         for name, kind in kinds.items()}
+        for name, made in (('drift', self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)),
+                           ('tf', self.create_publisher(TFMessage, '/tf_static', LATCHED))):
+            self._outputs[name] = self.kept(made, self.destroy_publisher, made)
+        self._collect_anew = client = self.create_client(Reset, 'collect_anew')
+        self.kept(client, self.destroy_client, client)
+        inputs = [self.create_subscription(RigOrientation, 'rig_orientation', self._on_orientation, LATCHED)]
+        inputs += [self.create_subscription(
             CameraInfo, f'{name}/camera_info', lambda message, name=name: self._on_info(name, message), LATCHED)
             for name in self._names]
-        self._collect_anew = self.create_client(Reset, 'collect_anew')
-        self._timer = self.create_timer(1.0, self._on_timer)
+        for subscription in inputs:
+            self.kept(subscription, self.destroy_subscription, subscription)
         if self._file:
             try:
                 self._on_orientation(message_from_orientation(load_orientation(self._file)))
@@ -130,33 +132,13 @@ class ReconstructionNode(support.ManagedNode):
                 self.get_logger().error(str(error))
                 self._last_fault = str(error)
 
-    def begin(self):
-        """Take corrected observations."""
-        self._reader = StreamReader(self, self._on_undecodable, self.fail)
+    def listen(self):
+        """Take corrected observations, all in one thread."""
+        reader = self.reader(self._on_undecodable)
         for name in self._names:
-            self._reader.subscribe(CorrectedObservations, f'{name}/corrected_observations',
-                                   lambda message, info, name=name: self._on_view(name, message, info),
-                                   OBSERVATIONS)
-        self._reader.start()
-
-    def end(self):
-        """Take no more of them."""
-        if self._reader is not None:
-            self._reader.stop()
-            self._reader = None
-
-    def close(self):
-        """Take the outputs back, and forget what was received."""
-        if self._outputs:
-            self.destroy_timer(self._timer)
-            self.destroy_client(self._collect_anew)
-            self._diagnostics.close()
-        for subscription in self._inputs:
-            self.destroy_subscription(subscription)
-        for publisher in self._outputs.values():
-            self.destroy_publisher(publisher)
-        self._inputs, self._outputs = [], {}
-        self._forget()
+            reader.subscribe(CorrectedObservations, f'{name}/corrected_observations',
+                             lambda frame, info, name=name: self._on_view(name, frame, info), OBSERVATIONS,
+                             corrected_of)
 
     # -- orientation
 
@@ -198,51 +180,55 @@ class ReconstructionNode(support.ManagedNode):
     # -- corrected observations
 
     def _on_undecodable(self, topic):
-        name = topic.split('/')[-2]
+        name = topic.partition('/')[0]
         self._received[name] += 1
         self._refuse(Refused('undecodable', f'fluoroscope {name}: a message on {topic} cannot be decoded'))
 
     def _refuse(self, error):
         self._refused[error.kind] += 1
         self._last_fault = str(error)
-        self._sentences.warn(f'frame refused: {error}')
+        self.sentences.warn(f'frame refused: {error}')
 
-    def _on_view(self, name, message, info):
-        """Take a corrected frame; once its partners are there the points are intersected."""
+    def _on_view(self, name, frame, info):
+        """Take a corrected frame; once it is known what belongs to an exposure the points are intersected."""
         self._received[name] += 1
         try:
-            check_corrected(name, message)
+            check_corrected(name, frame)
         except Refused as error:
             self._refuse(error)
             return
-        exposure = self._pairer.add(_View(name, message.frame_number, to_nanoseconds(message.header.stamp), message))
-        if exposure is not None:
+        stamp_ns = 1_000_000_000 * frame.sec + frame.nanosec
+        for exposure in self._pairer.add(_View(name, frame.frame_number, stamp_ns, frame)):
             self._exposures += 1
-            views = [exposure[n] for n in self._names]
-            rig = self._rigs.get(tuple(view.message.calibration_id for view in views))
+            rig = self._rig_of(exposure)
             if rig is None:
                 self._without_orientation += 1
-                return
-            self._newest = rig, views[0].message.header.stamp
-            self._reconstruct(rig, views[0].stamp_ns, [view.message for view in views])
+                continue
+            self._reconstruct(rig, exposure)
             self._latencies.add(time.time_ns() - info['received_timestamp'])
 
-    def _reconstruct(self, rig, stamp_ns, views):
+    def _rig_of(self, exposure):
+        """The newest _Rig of just the calibrations with which the views of an exposure were corrected, or None."""
+        rigs, ids = self._rigs, tuple(exposure[name].frame.calibration_id if name in exposure else None
+                                      for name in self._names)
+        if len(exposure) == len(ids):
+            return rigs.get(ids)
+        return next((rig for of_rig, rig in reversed(rigs.items())
+                     if all(own in (None, known) for own, known in zip(ids, of_rig))), None)
+
+    def _reconstruct(self, rig, exposure):
         """Intersect the views of an exposure and publish the points."""
-        ids = [np.frombuffer(view.target_id, dtype=np.uint32) for view in views]
-        places = [np.array([view.u, view.v]).T for view in views]
-        target_id, uv, sigma, outside = matched(
-            ids, places, [np.frombuffer(view.sigma) for view in views],
-            [np.frombuffer(view.status, dtype=np.uint8) == OUTSIDE for view in views])
-        points = rig.intersector.intersect(uv, sigma, outside)
-        message = points_message(views[0], rig, target_id, points)
+        views = [_corrected_view(exposure[name].frame) if name in exposure else None for name in self._names]
+        first = next(exposure[name] for name in self._names if name in exposure)
+        self._newest = rig, first.stamp_ns
+        found = intersect_views(views, rig.intersector)
+        message = points_message(first.stamp_ns, first.frame.frame_number, rig, found.target_id, found.points)
         self._outputs['points_with_covariance'].publish(message)
         self._reconstructed += 1
-        self._count(points)
-        self._publish_views(message, points)
-        if rig.watch is not None and rig.watch.wants(stamp_ns):
-            _, _, correction_sd, _ = matched(ids, places, [np.frombuffer(view.correction_sd) for view in views])
-            rig.watch.take(stamp_ns, target_id, uv, sigma, correction_sd, points)
+        self._count(found.points)
+        self._publish_views(message, found.points)
+        if rig.watch is not None:
+            watch_views(rig.watch, first.stamp_ns, views, found)
 
     def _count(self, points):
         """Count the points by status."""
@@ -270,11 +256,13 @@ class ReconstructionNode(support.ManagedNode):
 
     # -- diagnostics
 
-    def _on_timer(self):
+    def report(self):
+        """Diagnostics of the reconstruction and of the drift watch."""
         unpaired, late = (sum(counts.values()) for counts in (self._pairer.unpaired, self._pairer.late))
         rig = next(reversed(self._rigs.values()), None)
         values = {**{f'frames received of {name}': self._received[name] for name in self._names},
                   'exposures': self._exposures, 'exposures reconstructed': self._reconstructed,
+                  'exposures incomplete': self._pairer.incomplete,
                   'exposures without orientation': self._without_orientation,
                   'frames unpaired': unpaired, 'frames late': late, 'frames refused': self._refused.total(),
                   **{f'refused: {kind}': self._refused[kind] for kind in KINDS},
@@ -283,7 +271,7 @@ class ReconstructionNode(support.ManagedNode):
                   'last fault': self._last_fault, 'orientation': rig.orientation_id if rig else '',
                   'source of the orientation': rig.orientation.source if rig else '',
                   **self._latencies.values()}
-        self._diagnostics.publish([('reconstruction', *self._verdict(unpaired), values), *self._drift()])
+        return [('reconstruction', *self._verdict(unpaired), values), *self._drift()]
 
     def _drift(self):
         """Publish the state of the drift watch; returns its diagnostics, none where nothing is watched."""
@@ -294,7 +282,7 @@ class ReconstructionNode(support.ManagedNode):
             silent = [name for name in self._names if name not in self._sizes]
             return [('drift', support.WARN, 'nothing is watched: there is no camera_info of ' + ', '.join(silent), {})]
         state = newest[0].watch.state
-        message = drift_message(state, newest[1], newest[0].orientation)
+        message = drift_message(state, to_stamp(newest[1]), newest[0].orientation)
         self._outputs['drift'].publish(message)
         alarmed = state.level == DriftStatus.ERROR
         if alarmed and not self._alarmed:
@@ -313,17 +301,19 @@ class ReconstructionNode(support.ManagedNode):
 
     def _verdict(self, unpaired):
         """Level and message of the diagnostics."""
-        deaf = support.deafness(self._reader, self._sentences)
+        deaf = [sentence for reader in self.readers for sentence in support.deafness(reader, self.sentences).values()]
         if deaf:
-            return support.WARN, next(iter(deaf.values()))
+            return support.WARN, deaf[0]
         if not self._rigs:
             return support.WARN, self._last_fault or ('no orientation of the rig yet: calibrate with all fluoroscopes, '
                                                       'or capture the phantom with the service orient')
-        if self._reader is None:
+        if not self.readers:
             return support.WARN, 'the node is not active'
         silent = [n for n in self._names if self.count_publishers(f'{n}/corrected_observations') == 0]
         if silent:
             return support.WARN, f'nobody publishes corrected observations of {", ".join(silent)}'
+        if self._pairer.silent:
+            return support.WARN, f'nothing comes of {", ".join(sorted(self._pairer.silent))}, points are of the others'
         if self._without_orientation:
             return support.WARN, (f'{self._without_orientation} exposures were corrected with calibrations to which no '
                                   'orientation of the rig belongs')
@@ -331,7 +321,15 @@ class ReconstructionNode(support.ManagedNode):
             return support.WARN, f'{self._refused.total()} frames refused: {self._last_fault}'
         if unpaired:
             return support.WARN, f'{unpaired} frames without partner of the other fluoroscopes'
+        if self._pairer.incomplete:
+            return support.WARN, f'{self._pairer.incomplete} exposures without all fluoroscopes'
         return support.OK, 'reconstructing'
+
+
+def _corrected_view(frame):
+    """CorrectedView of a Corrected frame."""
+    return CorrectedView(frame.target_id, np.array([frame.u, frame.v]).T, frame.sigma, frame.correction_sd,
+                         frame.status == OUTSIDE)
 
 
 def main(args=None):

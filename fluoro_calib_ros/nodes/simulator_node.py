@@ -3,10 +3,11 @@ markers."""
 
 import threading
 import time
+import traceback
 
 import numpy as np
+import rclpy
 from fluoro_calib_msgs.msg import TargetObservations
-from rclpy._rclpy_pybind11 import RCLError
 from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 
@@ -49,7 +50,7 @@ class SimulatorNode(Node):
         self._outputs = {n: self.create_publisher(TargetObservations, f'{n}/target_observations', OBSERVATIONS,
                                                   qos_overriding_options=overridable()) for n in names}
         self._ready = self._made_before(seed, clusters)
-        self._ending = threading.Event()
+        self._ending, self.failed = threading.Event(), False
         self._worker = threading.Thread(target=self._run, args=(wait,), daemon=True)
         self._worker.start()
 
@@ -66,19 +67,20 @@ class SimulatorNode(Node):
     def _run(self, wait):
         """Publish frame after frame at its time, from a thread: a timer of an executor costs more than a frame."""
         try:
-            while any(output.get_subscription_count() < wait for output in self._outputs.values()):
-                if self._ending.wait(0.05):
-                    return
+            support.wait_for_readers(self, self._outputs.values(), wait, self._ending)
             began, number = time.monotonic(), 0
             while not (self._frames and number >= self._frames):
                 if self._ending.wait(max(0.0, began + number / self._rate - time.monotonic())):
                     return
                 number += 1
                 self._publish(number)
-            support.end_when_taken(self._outputs.values())
-        except RCLError:
+            support.wait_until_taken(self._outputs.values(), self._ending)
+            rclpy.try_shutdown()
+        except Exception:
             if not self._ending.is_set():   # else the node has been ended between two messages
-                raise
+                self.get_logger().fatal(traceback.format_exc())
+                self.failed = True
+                rclpy.try_shutdown()
 
     def _publish(self, number):
         if self._ready:

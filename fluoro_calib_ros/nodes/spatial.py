@@ -88,15 +88,14 @@ def transforms_of(message):
     return out
 
 
-def points_message(source, rig, target_id, points):
+def points_message(stamp_ns, frame_number, rig, target_id, points):
     """ReconstructedPoints message of IntersectedPoints with their target ids (n,).
 
-    source: the CorrectedObservations message from which stamp and frame number come; rig: orientation_id and
-    orientation with which they were intersected.
+    rig: orientation_id and orientation with which they were intersected.
     """
     message = ReconstructedPoints()
-    message.header.stamp, message.header.frame_id = source.header.stamp, rig.orientation.frame_id
-    message.frame_number, message.target_id = source.frame_number, unsigned(target_id)
+    message.header.stamp, message.header.frame_id = to_stamp(stamp_ns), rig.orientation.frame_id
+    message.frame_number, message.target_id = frame_number, unsigned(target_id)
     message.x, message.y, message.z = (doubles(column) for column in points.xyz_mm.T / 1000)
     terms = points.covariance.reshape(-1, 9).T * 1e-6
     for name, row in zip(('cov_xx', 'cov_xy', 'cov_xz', 'cov_yy', 'cov_yz', 'cov_zz'), (0, 1, 2, 4, 5, 8)):

@@ -23,7 +23,7 @@ from rclpy.subscription import Subscription
 from .qos import overridable
 
 WAIT_NS = 50_000_000   # after which the thread looks whether it is to end
-MOST_AT_ONCE = 100   # messages of a topic that are handled before the next one has its turn
+MOST_AT_ONCE = 8   # messages of a topic that are handled before the next one has its turn: views wait for each other
 
 
 class _LeftToReader(CallbackGroup):
@@ -42,24 +42,26 @@ class _LeftToReader(CallbackGroup):
 class StreamReader:
     """Subscriptions of a node that a thread of their own serves, between start() and stop().
 
-    on_undecodable(topic): called for a message that cannot be decoded. Where a callback fails, failed(text) is called
-    with the traceback, and nothing is taken any more.
+    on_undecodable(topic): called for a message that cannot be decoded, with the topic as it was subscribed to. Where a
+    callback fails, failed(text) is called with the traceback, and nothing is taken any more.
     """
 
     def __init__(self, node, on_undecodable, failed):
         self._node, self._group = node, _LeftToReader()
         self._on_undecodable, self._failed = on_undecodable, failed
-        self._routes = []   # (topic, Subscription, callback)
+        self._routes = []   # (topic, Subscription, decode, callback)
         self._ending, self._thread = threading.Event(), None
 
-    def subscribe(self, kind, topic, callback, qos, raw=False):
+    def subscribe(self, kind, topic, callback, qos, decode=None):
         """Call callback(message, info) for every message of a topic, with the times received_timestamp and
-        source_timestamp [ns, system clock] in info; raw: the message is its bytes.
+        source_timestamp [ns, system clock] in info.
+
+        decode(data): makes the message of its bytes, or raises ValueError; the default makes the one of ROS.
         """
         subscription = self._node.create_subscription(
             kind, topic, lambda _: None, qos, callback_group=self._group, qos_overriding_options=overridable(),
-            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False), raw=raw)
-        self._routes.append((topic, subscription, callback))
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False))
+        self._routes.append((topic, subscription, decode or (lambda data: deserialize_message(data, kind)), callback))
 
     def incompatible(self):
         """A sentence for every topic on which nothing can come from a publisher, as it offers less than is asked for.
@@ -67,7 +69,7 @@ class StreamReader:
         Topics are told as they were subscribed to: {topic: sentence}.
         """
         out = {}
-        for topic, subscription, _ in self._routes:
+        for topic, subscription, *_ in self._routes:
             for publisher in self._node.get_publishers_info_by_topic(subscription.topic_name):
                 found, why = qos_check_compatible(publisher.qos_profile, subscription.qos_profile)
                 if found == QoSCompatibility.ERROR:
@@ -88,7 +90,7 @@ class StreamReader:
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
         self._thread = None
-        for _, subscription, _ in self._routes:
+        for _, subscription, *_ in self._routes:
             self._node.destroy_subscription(subscription)
         self._routes = []
 
@@ -102,30 +104,30 @@ class StreamReader:
                 self._failed(traceback.format_exc())
 
     def _serve(self):
-        routes = {s.handle.pointer: (s, s.handle, callback) for _, s, callback in self._routes}
+        routes = {s.handle.pointer: (topic, s.msg_type, s.handle, decode, callback)
+                  for topic, s, decode, callback in self._routes}
         wait_set = rclpy_implementation.WaitSet(len(routes), 0, 0, 0, 0, 0, self._node.context.handle)
         while not self._ending.is_set() and self._node.context.ok():
             wait_set.clear_entities()
-            for _, handle, _ in routes.values():
+            for _, _, handle, *_ in routes.values():
                 wait_set.add_subscription(handle)
             wait_set.wait(WAIT_NS)
             for pointer in wait_set.get_ready_entities('subscription'):
                 self._drain(*routes[pointer])
 
-    def _drain(self, subscription, handle, callback):
-        """Handle what has come on a subscription; no more than a queue of it, for the others to have their turn."""
+    def _drain(self, topic, kind, handle, decode, callback):
+        """Handle what has come on a subscription, but so much of it at most that the others have their turn."""
         for _ in range(MOST_AT_ONCE):
             if self._ending.is_set():
                 return
             # As bytes: of a message that cannot be decoded, taking the message itself tells nothing but 'none there'.
-            taken = handle.take_message(subscription.msg_type, True)
+            taken = handle.take_message(kind, True)
             if taken is None:
                 return
-            message, info = taken
-            if not subscription.raw:
-                try:
-                    message = deserialize_message(message, subscription.msg_type)
-                except (RCLError, RuntimeError, MemoryError):   # as the middleware sees fit
-                    self._on_undecodable(subscription.topic_name)
-                    continue
+            data, info = taken
+            try:
+                message = decode(data)
+            except (ValueError, RCLError, RuntimeError, MemoryError):   # those of rclpy as the middleware sees fit
+                self._on_undecodable(topic)
+                continue
             callback(message, info)

@@ -107,7 +107,7 @@ def check_frame(frame, phantom=None, image_size=None):
         raise DataError(f'{where}: target {ids[bad][0]} is off the image of {width} x {height} px')
     values, counts = np.unique(ids, return_counts=True)
     if (counts > 1).any():
-        raise DataError(f'{where}: target {values[counts > 1][0]} is there {counts.max()} times')
+        raise DataError(f'{where}: target {values[counts > 1][0]} is there {counts[counts > 1][0]} times')
     if phantom is not None:
         unknown = phantom.index(ids) < 0
         if unknown.any():

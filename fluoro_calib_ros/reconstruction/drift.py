@@ -420,11 +420,17 @@ class DriftWatch:
         self._rings = [deque(maxlen=window), deque(maxlen=window)]
         self._rows = [[] for _ in self._pairs]
         self._blocks = [0] * (len(self._pairs) + 1)
+        self._told = 0
         self._start = self._newest = None
         self._offset, self._observations, self._level = 0, 0, OK
         if self._cluster_watch:
             self._cluster_watch.clear()
         self.state = self._state()
+
+    @property
+    def watched_s(self):
+        """Length of the blocks after the start in which a drift could be told somewhere [s]."""
+        return self._told * self.options.block_s
 
     def add(self, stamp_ns, a, b, target_id, uv_a, uv_b, residual, sd_noise, sd_systematic, normal_a, normal_b,
             factor_a, factor_b):
@@ -492,7 +498,7 @@ class DriftWatch:
         options, watch = self.options, self._cluster_watch
         shape = (4 * len(self._pairs), len(self._areas.member))
         values, testing = np.zeros((3, *shape)), np.zeros(shape, dtype=bool)
-        normals, seen = np.zeros((len(self._pairs), 2, shape[1], 2)), []
+        normals, seen, told = np.zeros((len(self._pairs), 2, shape[1], 2)), [], False
         for number in range(len(self._pairs)):
             rows = np.concatenate(self._rows[number]) if self._rows[number] else np.zeros((0, 14))
             self._rows[number] = []
@@ -509,17 +515,21 @@ class DriftWatch:
             self._charts[0].stretch[:, 0], self._charts[1].stretch[:] = np.repeat(stretch, 4), stretch.max()
             bands = np.tile(np.repeat([options.band_calibration, options.band_start], 2), len(self._pairs))
             self._take(0, values, bands[:, None], testing, normals)
+            told = testing.any()
             for number in seen:
                 self._learn(number)
         if watch:
             block = watch.block()
             if block is not None:
                 self._observations += block.count
+                testing = (block.pairs > 2 * options.block_s / CHUNK_S) & self._learned(-1)
                 self._take(1, [block.score.sum(axis=0), block.information.sum(axis=0), _common(block)],
-                           options.band_start, (block.pairs > 2 * options.block_s / CHUNK_S) & self._learned(-1), block)
+                           options.band_start, testing, block)
+                told = told or testing.any()
                 self._blocks[-1] += 1
                 if self._learned(-1):
                     watch.learn()
+        self._told += bool(told)
         self.state = self._state()
 
     def _learned(self, number):

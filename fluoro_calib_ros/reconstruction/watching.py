@@ -5,15 +5,15 @@ other the same every time at a place, and does not average out.
 """
 
 from collections import Counter
+from dataclasses import dataclass
 from itertools import combinations
 
 import numpy as np
 
 from .clusters import Cluster
-from .drift import DriftOptions, DriftWatch
+from .drift import ERROR, LEVEL, OK, STEPS_TO_ALARM, DriftOptions, DriftState, DriftWatch
 from .epipolar import EpipolarGeometry
-from .intersection import OK
-
+from .intersection import OK as INTERSECTED
 
 # Beyond both together a residual is one of a false match; up to there it may be that of a drift, rejected or not.
 FALSE_SD, FALSE_PX = 4.0, 3.0
@@ -41,6 +41,11 @@ class RigWatch:
         """The DriftState."""
         return self._watch.state
 
+    @property
+    def watched_s(self):
+        """Time after the start in which a drift could be told somewhere [s]."""
+        return self._watch.watched_s
+
     def wants(self, stamp_ns):
         """Whether an exposure is to be looked at."""
         return self._last is None or not 0 <= stamp_ns - self._last < self._every_ns
@@ -63,12 +68,79 @@ class RigWatch:
                             np.sqrt(np.maximum(found.sd_total ** 2 - noise, 0))[good], found.normal_a[good],
                             found.normal_b[good], found.factor_a[good], found.factor_b[good])
         if self.clusters:
-            part = np.nanmean(noise2 / (sigma * sigma), axis=0)   # of the covariance that is noise
-            good = np.flatnonzero(points.status == OK)
+            part = noise2 / (sigma * sigma)   # of the covariance that is noise
+            seen = np.isfinite(part)
+            part = np.where(seen, part, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+            good = np.flatnonzero(points.status == INTERSECTED)
             self._watch.add_points(stamp_ns, target_id[good], points.xyz_mm[good],
                                    (points.covariance_noise * part[:, None, None])[good], uv[:, good],
                                    correction_sd[:, good])
         return self.state
+
+
+@dataclass(frozen=True)
+class DriftVerdict:
+    """What the drift watch says of a whole recording.
+
+    level: 'ok', 'warn' or 'error', the highest that there was; 'learning' where the recording is too short to tell;
+    'unknown' where there is nothing to tell it from. message: one sentence. Of a drift, else None: state, the
+    DriftState with the largest evidence; found_ns: stamp of the exposure by which its level was found first [ns],
+    began_ns: of the begin of the drift, as estimated at last [ns]. level_at_end: 'ok', 'warn' or 'error'; watched_s:
+    time in which a drift could be told [s].
+    """
+
+    level: str
+    message: str
+    state: DriftState | None = None
+    found_ns: int | None = None
+    began_ns: int | None = None
+    level_at_end: str | None = None
+    watched_s: float = 0.0
+
+
+class RecordingWatch(RigWatch):
+    """A RigWatch that remembers what it has told: an alarm in the middle of a recording may have ended with it."""
+
+    def __init__(self, orientation, image_sizes, options=DriftOptions(), clusters=(), rate_hz=120.0):
+        super().__init__(orientation, image_sizes, options, clusters, rate_hz)
+        self._options, self._begin_ns = options, None
+        self._worst, self._worst_ns, self._found_ns = self.state, None, None
+
+    def take(self, stamp_ns, target_id, uv, sigma, correction_sd, points):
+        """Take in an exposure, as a RigWatch does; returns the DriftState."""
+        state = super().take(stamp_ns, target_id, uv, sigma, correction_sd, points)
+        if self._begin_ns is None:
+            self._begin_ns = stamp_ns
+        if state is not self._worst and (state.level, state.evidence) >= (self._worst.level, self._worst.evidence):
+            if state.level > self._worst.level:
+                self._found_ns = stamp_ns
+            self._worst, self._worst_ns = state, stamp_ns
+        return state
+
+    def verdict(self):
+        """The DriftVerdict on what was taken in."""
+        worst, watched = self._worst, self.watched_s
+        length = 0.0 if self._last is None else (self._last - self._begin_ns) / 1e9
+        at_end = LEVEL[self.state.level].lower()
+        if worst.level > OK:
+            return DriftVerdict(LEVEL[worst.level].lower(), self._sentence(worst), worst, self._found_ns,
+                                self._worst_ns - round(1e9 * worst.since_s), at_end, watched)
+        least = STEPS_TO_ALARM * self._options.block_s   # an alarm takes so long at least
+        if watched >= least:
+            return DriftVerdict('ok', f'no drift is seen in {watched:.1f} s', level_at_end=at_end, watched_s=watched)
+        learn = self._options.learn_s
+        if length < learn + least:
+            return DriftVerdict('learning', f'the recording is too short to tell a drift: it has {length:.1f} s, of '
+                                f'which the first {learn:g} s are learned', watched_s=watched)
+        return DriftVerdict('unknown', 'there are too few markers in two views to tell a drift', watched_s=watched)
+
+    def _sentence(self, worst):
+        """What to say of a drift."""
+        holds = ('the calibration no longer holds' if worst.level == ERROR else
+                 'it may be that the calibration no longer holds')
+        ended = '; it was gone at the end' if self.state.level == OK else ''
+        return (f'{worst.message}; found {(self._found_ns - self._begin_ns) / 1e9:.1f} s after the beginning{ended}: '
+                f'{holds}')
 
 
 def clusters_of(texts):

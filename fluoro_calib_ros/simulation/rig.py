@@ -21,6 +21,7 @@ DECIMALS = 4   # of an observed pixel, as target extraction writes it; also hide
 START_NS = 1_767_225_600_000_000_000   # stamp of the first frame [ns]
 FRAME_ID = '{}_optical'
 CLUSTER = 6   # markers of a rigid cluster
+BETWEEN_DEG = 84.0   # angle between the axes of neighbouring fluoroscopes
 GRID = (52, 39)   # points of a calibration grid across and down
 
 
@@ -88,15 +89,19 @@ def looking_at_origin(position_mm):
     return np.stack([x, np.cross(z, x), z])
 
 
-def virtual_rig(seed=0, strength=1.0, names=('a', 'b'), survey_sd_mm=SURVEY_SD_MM):
-    """A rig drawn at random: the same seed gives the same rig; strength scales the distortion."""
+def virtual_rig(seed=0, strength=1.0, names=('a', 'b'), survey_sd_mm=SURVEY_SD_MM, between_deg=BETWEEN_DEG):
+    """A rig drawn at random: the same seed gives the same rig; strength scales the distortion.
+
+    Of any number of fluoroscopes (names) each looks across the next one by between_deg, some 2 m apart at 84; of three,
+    60 leaves every two of them a good base.
+    """
     rng = np.random.default_rng([seed, 1])
     true_mm = bead_coordinates(rng)
     survey = np.round(true_mm + rng.normal(0, survey_sd_mm, true_mm.shape), 4)
     phantom = Phantom(np.arange(1, BEADS + 1), survey, np.full(BEADS, survey_sd_mm))
     fluoroscopes = []
     for number, name in enumerate(names):
-        angle = np.deg2rad(42.0) * (2 * number - (len(names) - 1)) + rng.uniform(-0.03, 0.03)
+        angle = np.deg2rad(between_deg / 2) * (2 * number - (len(names) - 1)) + rng.uniform(-0.03, 0.03)
         position = 1500 * np.array([np.sin(angle), -np.cos(angle), 0]) + rng.uniform(-30, 30, 3)
         tilt = matrix_from_vector(rng.uniform(-0.01, 0.01, 3))
         interior = np.array([511.5, 511.5, 4000.0]) + rng.uniform([-15, -15, -150], [15, 15, 150])

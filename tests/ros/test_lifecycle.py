@@ -7,8 +7,13 @@ from builtin_interfaces.msg import Time
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rclpy.lifecycle import TransitionCallbackReturn
 from ros_graph import NAMES, Graph, value_of
 from rosgraph_msgs.msg import Clock
+
+from fluoro_calib_ros.nodes.correction_node import CorrectionNode
+from fluoro_calib_ros.nodes.image_node import ImageNode
+from fluoro_calib_ros.nodes.reconstruction_node import ReconstructionNode
 
 NODES = ('correction_node', 'reconstruction_node', 'image_node')
 
@@ -78,6 +83,36 @@ def test_shutdown_by_the_lifecycle(graph, by_command):
     assert graph.processes[-1].end() == 0 and 'Traceback' not in graph.processes[-1].log
 
 
+def test_transition_that_fails_says_why_and_changes_nothing(graph):
+    """A wrong quality of service shows only when the topics are made."""
+    client, topic = graph.client, f'qos_overrides.{graph.namespace}/a/target_observations.subscription.reliability'
+    expect(client, 'correction_node')
+    node = graph.start('correction_node', {'autostart': 'false', topic: 'luck'}, wait=False)
+    client.wait_until_known_to('correction_node')
+    assert change(client, 'correction_node', Transition.TRANSITION_CONFIGURE)
+    for _ in range(2):
+        assert not change(client, 'correction_node', Transition.TRANSITION_ACTIVATE)
+        assert state(client, 'correction_node') == State.PRIMARY_STATE_INACTIVE
+    assert node.log.count('Unexpected QoS override for policy `reliability`: `luck`') == 2
+    assert node.end() == 0 and 'Traceback' not in node.log
+
+
+@pytest.mark.parametrize('kind', [CorrectionNode, ImageNode, ReconstructionNode])
+def test_nothing_is_left_of_what_was_taken_down(ros, kind):
+    """However often a manager brings a node up and takes it down."""
+    node = kind()
+    try:
+        before = len(list(node.publishers))
+        for _ in range(3):
+            for transition in (node.trigger_configure, node.trigger_activate, node.trigger_deactivate,
+                               node.trigger_cleanup):
+                assert transition() == TransitionCallbackReturn.SUCCESS
+        assert len(list(node.publishers)) == before
+        assert not any(map(len, (node._managed_entities, *map(list, (node.subscriptions, node.timers, node.clients)))))
+    finally:
+        node.destroy_node()
+
+
 @pytest.mark.parametrize('node', NODES)
 def test_every_parameter_says_what_it_is(graph, node):
     client = graph.client
@@ -97,7 +132,8 @@ def test_every_parameter_says_what_it_is(graph, node):
 
 def test_two_rigs_side_by_side(ros, request, graph, by_command, tracking, tmp_path):
     """Two namespaces, one of them with simulated time: what comes to the one does not come to the other."""
-    other = Graph(tmp_path)
+    (tmp_path / 'other').mkdir()
+    other = Graph(tmp_path / 'other')
     request.node.graphs = [*getattr(request.node, 'graphs', ()), other]
     try:
         graph.whole_chain(by_command[0])

@@ -193,7 +193,8 @@ def test_damaged_corrected_frames_are_counted_by_kind(rig, tracking):
     client.wait_until(lambda: output.get_subscription_count() > 0, what='the reader')
     client.wait_until_known_to('reconstruction_node')
     source = message_from_frame(tracking['a'][0])
-    for change in ({'u': source.u[:-1]}, {'status': []}, {'target_id': [source.target_id[0]] * len(source.target_id)}):
+    for change in ({'u': source.u[:-1]}, {'status': []}, {'target_id': [source.target_id[0]] * len(source.target_id)},
+                   {'sigma': -np.asarray(source.u)}, {'correction_sd': -np.asarray(source.u)}):
         message = CorrectedObservations(header=source.header, frame_number=95_000, target_id=source.target_id,
                                         u=source.u, v=source.v, sigma=source.u, correction_sd=source.u,
                                         status=bytes(len(source.u)))
@@ -204,6 +205,7 @@ def test_damaged_corrected_frames_are_counted_by_kind(rig, tracking):
     status = client.wait_for_diagnostics(
         'reconstruction_node', lambda s: value_of(s, 'refused: undecodable') == '1', 'reconstruction')
     assert value_of(status, 'refused: lengths') == '2' and value_of(status, 'refused: repeated target') == '1'
+    assert value_of(status, 'refused: sigma') == '2'
     client.destroy_publisher(output)
     publish(client, tracking, [9], lambda frame: replace(frame, number=95_001))
     client.wait_until(lambda: rig.points[-1].frame_number == 95_001, what='the next good exposure')

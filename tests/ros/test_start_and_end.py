@@ -4,9 +4,14 @@ import shutil
 
 import pytest
 from fluoro_calib_msgs.msg import TargetObservations
-from fluoro_calib_msgs.srv import Capture
+from fluoro_calib_msgs.srv import Capture, LoadCalibration, Orient, SaveCalibration
+from mcap.writer import Writer
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from ros_graph import BAGS, NAMES, standing
+from rclpy.serialization import serialize_message
+from ros_graph import BAGS, NAMES, standing, value_of
+
+from fluoro_calib_ros.files.calibration import load_calibrations
+from fluoro_calib_ros.nodes.conversion import message_from_calibration
 
 TROUBLE = ('Traceback', 'Exception', 'exception', 'Error:', 'never retrieved', 'never awaited')
 
@@ -34,6 +39,38 @@ def foreign_bag(folder):
     return {'bag': folder / 'bag'}
 
 
+def small_bag(folder, type_name='std_msgs/msg/Int64', topic='/x', messages=1, **how):
+    """A bag with one topic, parameters to play it."""
+    with open(folder / 'small.mcap', 'wb') as file:
+        writer = Writer(file)
+        writer.start('ros2', 'test')
+        schema = writer.register_schema(type_name, 'ros2msg', b'int64 data') if type_name else 0
+        channel = writer.register_channel(topic, 'cdr', schema)
+        for number in range(messages):
+            writer.add_message(channel, number, bytes((0, 1, 0, 0)) + bytes(8), number)
+        writer.finish()
+    return {'bag': folder / 'small.mcap', 'wait_for_readers': 0, **how}
+
+
+def bag_without_messages(folder):
+    return small_bag(folder, messages=0, loop='true')
+
+
+def bag_without_type(folder):
+    return small_bag(folder, type_name='')
+
+
+def bag_of_no_message_type(folder):
+    return small_bag(folder, type_name='std_msgs/msg/__file__')
+
+
+def bag_with_a_wrong_topic(folder):
+    return small_bag(folder, topic='/x y')
+
+
+PHANTOM = {'phantom': BAGS / 'phantom.csv'}
+
+
 @pytest.mark.parametrize('node, parameters, sentence', [
     ('calibration_node', {}, 'parameter phantom is not set'),
     ('calibration_node', {'phantom': '/nowhere/phantom.csv'}, '/nowhere/phantom.csv: '),
@@ -42,17 +79,37 @@ def foreign_bag(folder):
     ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'pair_by': 'luck'}, 'pair_by is'),
     ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'still_px': -1.0}, 'parameter still_px: '),
     ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'fluoroscopes': '[a, a]'}, 'parameter fluoroscopes: '),
+    ('calibration_node', {'phantom': '~nobody_of_that_name/x.csv'}, 'x.csv: there is no such home folder'),
+    ('calibration_node', {**PHANTOM, 'calibration_directory': '~nobody_of_that_name'}, 'there is no such home folder'),
+    ('calibration_node', {**PHANTOM, 'fluoroscopes': "['a b']"}, "'a b' cannot be part of the name of a topic"),
     ('correction_node', {'fluoroscopes': '[a, a]'}, 'parameter fluoroscopes: '),
+    ('correction_node', {'fluoroscopes': '[]'}, 'parameter fluoroscopes: [] is not a list of different names'),
+    ('correction_node', {'fluoroscopes': '[x/y]'}, "'x/y' cannot be part of the name of a topic"),
+    ('image_node', {'fluoroscopes': "['1']"}, "'1' cannot be part of the name of a topic"),
+    ('simulator_node', {'fluoroscopes': '[a-b]'}, "'a-b' cannot be part of the name of a topic"),
+    ('correction_node', {'qos_overrides./test/a/corrected_observations.publisher.reliability': 'luck',
+                         '__ns': '/test'}, 'Unexpected QoS override'),
+    ('correction_node', {'qos_overrides./test/a/target_observations.subscription.reliability': 'luck',
+                         '__ns': '/test'}, 'Unexpected QoS override'),
+    ('simulator_node', {'qos_overrides./test/a/target_observations.publisher.reliability': 'luck', '__ns': '/test'},
+     'Unexpected QoS override'),
     ('simulator_node', {'scene': 'cat'}, 'parameter scene is'),
     ('player_node', {}, 'parameter bag is not set'),
     ('player_node', {'bag': '/nowhere/bag'}, '/nowhere/bag: there is no such bag'),
     ('player_node', {'bag': BAGS / 'calibration', 'topics': '[/c/target_observations]'}, 'there is nothing to play'),
     ('player_node', {'bag': BAGS / 'calibration', 'rate': 5}, 'parameter rate: '),   # an integer, not 5.0
+    ('player_node', {'bag': BAGS / 'tracking', 'strip_prefix': '/a/target_observations'}, "cannot be played as ''"),
     ('player_node', foreign_bag, 'there is nothing to play'),
+    ('player_node', bag_without_messages, 'there are no messages on /x'),
+    ('player_node', bag_without_type, 'there is nothing to play'),
+    ('player_node', bag_of_no_message_type, 'there is nothing to play'),
+    ('player_node', bag_with_a_wrong_topic, "/x y cannot be played as 'x y'"),
     ('player_node', damaged_bag, 'is damaged')],
     ids=lambda value: value.__name__ if callable(value) else None)
 def test_node_that_cannot_start_says_why(graph, tmp_path, node, parameters, sentence):
-    process = graph.start(node, parameters(tmp_path) if callable(parameters) else parameters, wait=False)
+    parameters = dict(parameters(tmp_path) if callable(parameters) else parameters)
+    namespace = {'__ns': parameters.pop('__ns')} if '__ns' in parameters else None
+    process = graph.start(node, parameters, namespace, wait=False)
     assert process.wait() == 1
     lines = [line for line in process.log.splitlines() if '[FATAL]' in line]
     assert len(lines) == 1 and sentence in lines[0]
@@ -109,6 +166,38 @@ def test_two_rigs_in_namespaces_do_not_meet(graph, exposures, tmp_path):
     assert not any(r.node_namespace == '/elsewhere' and r.node_name == 'correction_node'
                    for r in client.get_subscriptions_info_by_topic(f'{graph.namespace}/a/target_observations'))
     assert other.end() == 0 and remapped.end() == 0
+
+
+def test_requests_that_nobody_can_fulfil_are_answered(graph, tmp_path):
+    """Times for which nobody can wait, and homes of nobody: the node says so, and stays."""
+    node, client = graph.calibration_node(tmp_path), graph.client
+    for seconds in (1e300, 1e10):
+        answer = client.call(Capture, 'capture', timeout_sec=seconds)
+        assert not answer.success and 'timeout_sec is a time in seconds, at most 86400, not' in answer.message
+        assert not client.call(Orient, 'orient', timeout_sec=seconds).success
+    for kind, service in ((SaveCalibration, 'save_calibration'), (LoadCalibration, 'load_calibration')):
+        answer = client.call(kind, service, directory='~nobody_of_that_name/x')
+        assert not answer.success and '~nobody_of_that_name/x: there is no such home folder' in answer.message
+    assert node.end() == 0 and not any(word in node.log for word in TROUBLE), node.log
+
+
+def test_player_latches_what_was_latched(graph, by_command):
+    """A recorded calibration is heard by a node that asks for latched ones."""
+    from fluoro_calib_ros.bags.qos import PROFILES, to_yaml
+    calibration = load_calibrations(by_command[0])['a']
+    with open(graph.directory / 'latched.mcap', 'wb') as file:
+        writer = Writer(file)
+        writer.start('ros2', 'test')
+        schema = writer.register_schema('fluoro_calib_msgs/msg/FluoroscopeCalibration', 'ros2msg', b'string id')
+        channel = writer.register_channel('/a/calibration', 'cdr', schema,
+                                          {'offered_qos_profiles': to_yaml([PROFILES['latched']])})
+        writer.add_message(channel, 1, bytes(serialize_message(message_from_calibration(calibration))), 1)
+        writer.finish()
+    graph.start('correction_node')
+    player = graph.start('player_node', {'bag': graph.directory / 'latched.mcap', 'wait_for_readers': 1}, wait=False)
+    graph.client.wait_for_diagnostics('correction_node',
+                                      lambda s: value_of(s, 'calibration') == calibration.calibration_id)
+    assert player.wait() == 0
 
 
 def test_incompatible_publisher_is_reported(graph, tmp_path):

@@ -1,0 +1,145 @@
+"""Observations as the bytes in which they come and go, without message objects between.
+
+Between two frames of a stream the caches of the processor go cold, and what a frame costs then is the code and the memory
+that are touched once: making an object of a message of 30 points takes 0.02 ms in a loop and 0.2 ms in a stream.
+So a stream's frames are read from their bytes, and written as bytes that begin as those of the input.
+
+The bytes are CDR, version 1, little-endian (OMG DDS-RTPS 2.5, 10.2; OMG Common Object Request Broker 3.4, part 2, 9.3):
+4 bytes that say so, then the fields one after the other; numbers are aligned to their size counted from behind
+these 4 bytes, strings and sequences begin with their length. What comes in another encoding is converted by rclpy first.
+"""
+
+from struct import Struct, error
+from typing import NamedTuple
+
+import numpy as np
+from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
+from rclpy.serialization import deserialize_message, serialize_message
+
+_LITTLE_ENDIAN_CDR = b'\0\1'
+_HEADER = Struct('<iII')   # seconds, nanoseconds, length of the frame id
+_IMAGE = Struct('<IIII')   # frame number, width, height, number of target ids
+_TWO, _ONE = Struct('<II'), Struct('<I')
+_NOTHING = np.zeros(0)
+
+
+class Observations(NamedTuple):
+    """A TargetObservations message: its stamp in seconds and nanoseconds, target ids as the bytes of uint32, arrays u, v
+    and sigma (of any lengths); start: its bytes up to the frame number, that of a CorrectedObservations message too."""
+
+    sec: int
+    nanosec: int
+    frame_id: str
+    frame_number: int
+    image_size: tuple
+    target_id: bytes
+    u: np.ndarray
+    v: np.ndarray
+    sigma: np.ndarray
+    start: bytes
+
+
+class Corrected(NamedTuple):
+    """A CorrectedObservations message: its stamp in seconds and nanoseconds; arrays target_id, u, v, sigma,
+    correction_sd and status (of any lengths)."""
+
+    sec: int
+    nanosec: int
+    frame_id: str
+    frame_number: int
+    calibration_id: str
+    target_id: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    sigma: np.ndarray
+    correction_sd: np.ndarray
+    status: np.ndarray
+
+
+def observations_of(data):
+    """Observations of the bytes of a TargetObservations message. Raises ValueError where they are none."""
+    data = _readable(data, TargetObservations)
+    try:
+        sec, nanosec, frame_id, at = _header(data)
+        number, width, height, count = _IMAGE.unpack_from(data, at)
+        end = at + 16 + 4 * count
+        u, behind = _doubles(data, end)
+        v, behind = _doubles(data, behind)
+        sigma, _ = _doubles(data, behind)
+    except error as why:   # beyond the end of the bytes
+        raise ValueError(str(why)) from None
+    return Observations(sec, nanosec, frame_id, number, (width, height), data[at + 16:end], u, v, sigma, data[:at + 4])
+
+
+def corrected_of(data):
+    """Corrected of the bytes of a CorrectedObservations message. Raises ValueError where they are none."""
+    data = _readable(data, CorrectedObservations)
+    try:
+        sec, nanosec, frame_id, at = _header(data)
+        number, length = _TWO.unpack_from(data, at)
+        calibration_id, at = _string(data, at + 8, length)
+        count, = _ONE.unpack_from(data, at)
+        at += 4
+        target_id, at = np.frombuffer(data[at:at + 4 * count], np.uint32), at + 4 * count
+        u, at = _doubles(data, at)
+        v, at = _doubles(data, at)
+        sigma, at = _doubles(data, at)
+        correction_sd, at = _doubles(data, at)
+        count, = _ONE.unpack_from(data, at)
+    except error as why:
+        raise ValueError(str(why)) from None
+    if at + 4 + count > len(data):
+        raise ValueError('the message is shorter than it says')
+    return Corrected(sec, nanosec, frame_id, number, calibration_id, target_id, u, v, sigma, correction_sd,
+                     np.frombuffer(data, np.uint8, count, at + 4))
+
+
+def corrected_bytes(source, calibration_id, corrected):
+    """Bytes of a CorrectedObservations message: that of Observations source, corrected to arrays u, v, sigma,
+    correction_sd (n,) of float64 and status (n,) of uint8, with n target ids in source."""
+    u, v, sigma, correction_sd, status = corrected
+    calibration_id = calibration_id.encode() + b'\0'
+    start = b''.join((source.start, _ONE.pack(len(calibration_id)), calibration_id, b'\0' * (-len(calibration_id) % 4)))
+    count = _ONE.pack(len(status))
+    if not len(status):
+        return start + 6 * count
+    # The first doubles begin behind their number, aligned; so do the others then, four bytes behind theirs.
+    ids_end = len(start) + 4 + len(source.target_id)
+    first, next_one = count + b'\0' * (-ids_end % 8), count + b'\0\0\0\0'
+    return b''.join((start, count, source.target_id, first, u, next_one, v, next_one, sigma, next_one, correction_sd,
+                     count, status))
+
+
+def _readable(data, kind):
+    """The bytes of a message in the encoding that is read here. Raises ValueError."""
+    if data[:2] == _LITTLE_ENDIAN_CDR:
+        return data
+    try:
+        return serialize_message(deserialize_message(data, kind))
+    except Exception as why:   # as the middleware sees fit
+        raise ValueError(str(why)) from None
+
+
+def _header(data):
+    """Seconds, nanoseconds and frame id of the header at the start of a message, and where the next number is."""
+    sec, nanosec, length = _HEADER.unpack_from(data, 4)
+    return sec, nanosec, *_string(data, 16, length)
+
+
+def _string(data, at, length):
+    """The string of a length (with the byte that ends it) at a place, and where the next number of 4 bytes is."""
+    end = at + length
+    return data[at:end].rstrip(b'\0').decode(errors='replace'), end + -end % 4
+
+
+def _doubles(data, at):
+    """The sequence of float64 at a place, and where it ends. Raises ValueError."""
+    count, = _ONE.unpack_from(data, at)
+    at += 4
+    if not count:
+        return _NOTHING, at
+    at += (4 - at) % 8
+    end = at + 8 * count
+    if end > len(data):
+        raise ValueError('the message is shorter than it says')
+    return np.frombuffer(data[at:end]), end   # copied: in the message they are not aligned in memory

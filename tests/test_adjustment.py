@@ -85,6 +85,7 @@ def test_gaussian_adjustment_equals_scipy_least_squares():
     assert result.cost - constant == pytest.approx(theirs.cost, rel=1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('loss', ['student_t', 'huber'])
 def test_no_better_solution_is_found_by_direct_minimisation(loss):
     """With the noise model held, scipy gains nothing from our solution, and from elsewhere comes back to it."""

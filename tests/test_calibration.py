@@ -128,6 +128,7 @@ def test_frames_of_another_image_size_are_not_adjusted_with_a_calibration():
         adjust_with({'a': other}, PHANTOM, {'a': rigs.calibrated().calibrations['a']})
 
 
+@pytest.mark.long
 def test_both_fluoroscopes_share_their_object_points_in_a_joint_adjustment():
     frames = {name: list(rigs.exposures()[name][:6]) for name in 'ab'}
     joint = calibrate(frames, PHANTOM, rounds(1), joint=True)

@@ -100,6 +100,7 @@ def test_wrong_options_are_refused(options):
         Options(**options)
 
 
+@pytest.mark.long
 def test_false_matches_and_a_moved_bead_are_in_the_result(jobs):
     """Image points of wrong number: those far off by the truth are found, and hardly others."""
     survey = PHANTOM.xyz_mm.copy()

@@ -153,6 +153,7 @@ def test_a_drift_of_a_recording_is_found_and_told():
     assert 18 < found.watched_s < 21
 
 
+@pytest.mark.long
 def test_the_state_is_that_of_a_watch_fed_frame_by_frame():
     """A RecordingWatch does what the RigWatch of the node does."""
     calibrations, orientation = known('ab')
@@ -162,6 +163,7 @@ def test_the_state_is_that_of_a_watch_fed_frame_by_frame():
     assert live.state == watched(frames, 'ab').state and live.state.level == ERROR
 
 
+@pytest.mark.long
 def test_a_drift_that_has_gone_by_the_end_is_told_all_the_same():
     frames = shifted(tracking(45.0, 30.0, 'ab').frames, 'b', 14.0, 20.0)
     found = watched(frames, 'ab').verdict()
@@ -189,6 +191,7 @@ def test_what_cannot_be_told_is_not_called_ok():
     assert watched({'a': [], 'b': []}, 'ab').verdict().level == 'learning'
 
 
+@pytest.mark.long
 def test_views_that_are_missing_are_no_drift_and_hide_none():
     """Of three fluoroscopes one is off for half of the time and loses frames: its pairs have a start of their own."""
     frames, rng = tracking(30.0, 30.0).frames, np.random.default_rng(1)
@@ -227,6 +230,7 @@ def document(capsys, *arguments):
     return json.loads(capsys.readouterr().out)
 
 
+@pytest.mark.long
 def test_reconstruct_tells_of_a_drift_and_of_missing_views(folder, capsys):
     """And writes the points all the same, with exit status 0."""
     said = document(capsys, *command(folder, 'drifted'))

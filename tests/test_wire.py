@@ -1,16 +1,19 @@
 """The bytes of observations, beside the serialization of rclpy."""
 
 from array import array
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from builtin_interfaces.msg import Time
-from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
+from fluoro_calib_msgs.msg import CorrectedObservations, ReconstructedPoints, TargetObservations
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
 from fluoro_calib_ros.nodes.conversion import doubles, unsigned
-from fluoro_calib_ros.nodes.wire import corrected_bytes, corrected_of, observations_of
+from fluoro_calib_ros.nodes.spatial import points_message
+from fluoro_calib_ros.nodes.wire import corrected_bytes, corrected_of, observations_of, points_bytes
+from fluoro_calib_ros.reconstruction.intersection import IntersectedPoints
 
 SIZES = [(n, frame_id, sigma) for n in (0, 1, 2, 3, 30, 2028) for frame_id in ('', 'a', 'a_optical', 'röntgen', 'x' * 256)
          for sigma in (False, True)]
@@ -85,6 +88,22 @@ def test_corrected_observations_are_read_as_rclpy_writes_them(n, frame_id, _):
     assert np.array_equal(found.target_id, message.target_id) and found.target_id.dtype == np.uint32
     for name, values in zip(('u', 'v', 'sigma', 'correction_sd', 'status'), arrays):
         assert np.array_equal(getattr(found, name), values, equal_nan=True)
+
+
+@pytest.mark.parametrize('n', [0, 1, 2, 3, 4, 5, 30])
+@pytest.mark.parametrize('frame_id, ids', [('rig', ('a-1', 'b-2')), ('a_optical', ('a-12', 'b-123', 'c')), ('', ())])
+def test_points_are_written_as_rclpy_reads_them(n, frame_id, ids):
+    rng = np.random.default_rng(n)
+    rays = rng.integers(0, 3, n)
+    points = IntersectedPoints(rng.normal(0, 100, (n, 3)), rng.normal(0, 1, (n, 3, 3)), rng.normal(0, 1, (n, 3, 3)),
+                               rng.random(n), rays, rng.random(n), rng.integers(0, 5, n).astype(np.uint8), rays - 1)
+    rig = SimpleNamespace(orientation_id='rig-60b34b648ddef0f3', orientation=SimpleNamespace(
+        frame_id=frame_id, calibration_ids=ids))
+    content = 1_700_000_000_123_456_789, 4_000_000_000, rig, rng.integers(0, 2 ** 32, n, dtype=np.uint32), points
+    expected = points_message(*content)
+    found = deserialize_message(points_bytes(*content), ReconstructedPoints)
+    assert found == expected and list(found.rays) == rays.tolist()
+    assert deserialize_message(serialize_message(expected), ReconstructedPoints) == found
 
 
 READERS = [(observations_of, lambda: serialize_message(observed(30))),

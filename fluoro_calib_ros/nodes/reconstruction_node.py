@@ -26,7 +26,7 @@ from .qos import LATCHED, OBSERVATIONS
 from .spatial import (MocapMarkers, cloud_message, drift_message, ellipsoids_message, message_from_orientation,
                       mocap_message, orientation_from_message, points_message, transforms_of)
 from .support import StartError, declare
-from .wire import Corrected, corrected_of
+from .wire import Corrected, corrected_of, points_bytes
 
 KINDS = ('undecodable', 'lengths', 'repeated target', 'sigma')   # of refused messages
 ORIENTATIONS = 4   # that are kept: frames of the calibration before may still come
@@ -222,11 +222,11 @@ class ReconstructionNode(support.StreamNode):
         first = next(exposure[name] for name in self._names if name in exposure)
         self._newest = rig, first.stamp_ns
         found = intersect_views(views, rig.intersector)
-        message = points_message(first.stamp_ns, first.frame.frame_number, rig, found.target_id, found.points)
-        self._outputs['points_with_covariance'].publish(message)
+        content = first.stamp_ns, first.frame.frame_number, rig, found.target_id, found.points
+        self._outputs['points_with_covariance'].publish(points_bytes(*content))
         self._reconstructed += 1
         self._count(found.points)
-        self._publish_views(message, found.points)
+        self._publish_views(content)
         if rig.watch is not None:
             watch_views(rig.watch, first.stamp_ns, views, found)
 
@@ -238,13 +238,13 @@ class ReconstructionNode(support.StreamNode):
                                  (SINGLE_VIEW, 'in a single view')):
                 self._points[name] += int(np.count_nonzero(points.status == status))
 
-    def _publish_views(self, message, points):
-        """Publish the other forms of the points, where somebody listens."""
+    def _publish_views(self, content):
+        """Publish the other forms of the points, the content of their message, where somebody listens."""
         cloud, markers, mocap = (self._outputs.get(name) for name in ('points', 'markers', 'mocap_markers'))
         wanted = [output is not None and output.get_subscription_count() > 0 for output in (cloud, markers, mocap)]
         if not any(wanted):
             return
-        good = np.flatnonzero(points.status <= OUTSIDE)
+        message, good = points_message(*content), np.flatnonzero(content[-1].status <= OUTSIDE)
         if wanted[0]:
             cloud.publish(cloud_message(message, good))
         if wanted[2]:

@@ -1,4 +1,4 @@
-"""Observations as the bytes in which they come and go, without message objects between.
+"""Observations and points as the bytes in which they come and go, without message objects between.
 
 Between two frames of a stream the caches of the processor go cold, and what a frame costs then is the code and the memory
 that are touched once: making an object of a message of 30 points takes 0.02 ms in a loop and 0.2 ms in a stream.
@@ -19,7 +19,7 @@ from rclpy.serialization import deserialize_message, serialize_message
 _LITTLE_ENDIAN_CDR = b'\0\1'
 _HEADER = Struct('<iII')   # seconds, nanoseconds, length of the frame id
 _IMAGE = Struct('<IIII')   # frame number, width, height, number of target ids
-_TWO, _ONE = Struct('<II'), Struct('<I')
+_TIME, _TWO, _ONE = Struct('<iI'), Struct('<II'), Struct('<I')
 _NOTHING = np.zeros(0)
 
 
@@ -97,17 +97,45 @@ def corrected_of(data):
 def corrected_bytes(source, calibration_id, corrected):
     """Bytes of a CorrectedObservations message: that of Observations source, corrected to arrays u, v, sigma,
     correction_sd (n,) of float64 and status (n,) of uint8, with n target ids in source."""
-    u, v, sigma, correction_sd, status = corrected
-    calibration_id = calibration_id.encode() + b'\0'
-    start = b''.join((source.start, _ONE.pack(len(calibration_id)), calibration_id, b'\0' * (-len(calibration_id) % 4)))
-    count = _ONE.pack(len(status))
-    if not len(status):
-        return start + 6 * count
+    *columns, status = corrected
+    return _message(source.start + _string_bytes(calibration_id), source.target_id, columns, (status,))
+
+
+def points_bytes(stamp_ns, frame_number, rig, target_id, points):
+    """Bytes of the ReconstructedPoints message that spatial.points_message makes of the same."""
+    sec, nanosec = divmod(stamp_ns, 1_000_000_000)
+    start = b''.join((_LITTLE_ENDIAN_CDR, b'\0\0', _TIME.pack(sec, nanosec), _string_bytes(rig.orientation.frame_id),
+                      _ONE.pack(frame_number)))
+    columns = (*np.divide(points.xyz_mm.T, 1000, order='C'),
+               *(points.covariance.reshape(-1, 9).T[[0, 1, 2, 4, 5, 8]] * 1e-6), points.residual)
+    ids = rig.orientation.calibration_ids
+    return _message(start, target_id.astype(np.uint32).tobytes(), columns, (points.rays.astype(np.uint8), points.status),
+                    b''.join((_string_bytes(rig.orientation_id), _ONE.pack(len(ids)), *map(_string_bytes, ids))))
+
+
+def _message(start, target_id, columns, octets, end=b''):
+    """Bytes of a message: its start, the bytes of uint32 target ids, columns of as many float64 and uint8, its end."""
+    number = len(target_id) // 4
+    count = _ONE.pack(number)
+    if not number:
+        return start + count * (1 + len(columns) + len(octets)) + end
+    parts = [start, count, target_id]
     # The first doubles begin behind their number, aligned; so do the others then, four bytes behind theirs.
-    ids_end = len(start) + 4 + len(source.target_id)
-    first, next_one = count + b'\0' * (-ids_end % 8), count + b'\0\0\0\0'
-    return b''.join((start, count, source.target_id, first, u, next_one, v, next_one, sigma, next_one, correction_sd,
-                     count, status))
+    before = count + b'\0' * (-(len(start) + 4 + len(target_id)) % 8)
+    for column in columns:
+        parts += before, column
+        before = count + b'\0\0\0\0'
+    behind = b'\0' * (-number % 4)
+    for column in octets:
+        parts += count, column, behind
+    parts[-1] = end and behind + end
+    return b''.join(parts)
+
+
+def _string_bytes(text):
+    """Bytes of a string, up to where the next number of 4 bytes is."""
+    data = text.encode() + b'\0'
+    return b''.join((_ONE.pack(len(data)), data, b'\0' * (-len(data) % 4)))
 
 
 def _readable(data, kind):

@@ -18,7 +18,8 @@ from fluoro_calib_ros.reconstruction.drift import ERROR, DriftOptions
 from fluoro_calib_ros.reconstruction.intersection import OK, SINGLE_VIEW, Intersector
 from fluoro_calib_ros.reconstruction.matching import matched
 from fluoro_calib_ros.reconstruction.orientation import RigOrientation
-from fluoro_calib_ros.reconstruction.recording import reconstruct_recording
+from fluoro_calib_ros.reconstruction.recording import (CorrectedView, intersect_views, reconstruct_recording,
+                                                       watch_views)
 from fluoro_calib_ros.reconstruction.watching import RecordingWatch, RigWatch, clusters_of
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
@@ -151,6 +152,20 @@ def test_a_drift_of_a_recording_is_found_and_told():
     assert found.message.endswith(f'found {(found.found_ns - start) / 1e9:.1f} s after the beginning: '
                                   'the calibration no longer holds')
     assert 18 < found.watched_s < 21
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('outside', [True, False])
+def test_what_lies_beyond_the_calibrated_area_is_no_drift(outside):
+    """There the correction is extrapolated: it may be wrong by a pixel, and by another one elsewhere."""
+    calibrations, orientation = known('ab')
+    watch = RecordingWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
+    frames = shifted(tracking(20, 120, 'ab').frames, 'a', 12.0)
+    for exposure in zip(*(frames[name] for name in 'ab')):
+        views = [CorrectedView(f.target_id, f.uv, np.full(len(f.uv), NOISE_PX), np.full(len(f.uv), 0.02),
+                               outside & (f.fluoroscope == 'a') & (f.uv[:, 0] < 520)) for f in exposure]
+        watch_views(watch, exposure[0].stamp_ns, views, intersect_views(views, Intersector(orientation)))
+    assert watch.verdict().level == ('ok' if outside else 'error')
 
 
 @pytest.mark.long

@@ -30,11 +30,13 @@ class CorrectedView:
 @dataclass(frozen=True)
 class IntersectedViews:
     """The points of an exposure: target_id (n,), uv (F, n, 2) and sigma (F, n) [px] of the views, NaN where a
-    fluoroscope does not see a target; points: IntersectedPoints."""
+    fluoroscope does not see a target; outside (F, n): True for what lies beyond the calibrated area; points:
+    IntersectedPoints."""
 
     target_id: np.ndarray
     uv: np.ndarray
     sigma: np.ndarray
+    outside: np.ndarray
     points: IntersectedPoints
 
 
@@ -44,16 +46,21 @@ def intersect_views(views, intersector):
     target_id, uv, sigma, outside = matched(*(
         [None if view is None else getattr(view, name) for view in views]
         for name in ('target_id', 'uv', 'sigma', 'outside')))
-    return IntersectedViews(target_id, uv, sigma, intersector.intersect(uv, sigma, outside))
+    return IntersectedViews(target_id, uv, sigma, outside, intersector.intersect(uv, sigma, outside))
 
 
 def watch_views(watch, stamp_ns, views, found):
     """Give a RigWatch the CorrectedViews of an exposure, None for a missing one, with their IntersectedViews, if it
-    wants it."""
+    wants it.
+
+    Image points beyond the calibrated area are left out: there the correction is extrapolated, and markers that come
+    to other places there would look like a drift.
+    """
     if watch.wants(stamp_ns):
         correction_sd = matched(*([None if view is None else getattr(view, name) for view in views]
                                   for name in ('target_id', 'uv', 'correction_sd')))[2]
-        watch.take(stamp_ns, found.target_id, found.uv, found.sigma, correction_sd, found.points)
+        inside = np.where(found.outside[:, :, None], np.nan, found.uv)
+        watch.take(stamp_ns, found.target_id, inside, found.sigma, correction_sd, found.points)
 
 
 @dataclass(frozen=True)

@@ -17,6 +17,7 @@ from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.calibration.job import calibrate
 from fluoro_calib_ros.calibration.orientation import orientation_of_capture, orientation_of_exposures
+from fluoro_calib_ros.distortion.grid import OUTSIDE
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.clusters import Cluster
 from fluoro_calib_ros.reconstruction.drift import ERROR, OK, WARN, DriftOptions, DriftWatch
@@ -121,7 +122,9 @@ def blocks(scene_, rng, first, count, drift=None):
             if drift is not None:
                 uv = uv + drift(name, uv.reshape(-1, 2), number * FRAMES / RATE_HZ).reshape(uv.shape)
             found = scene_.calibrations[name].correct(uv.reshape(-1, 2), np.zeros(uv[..., 0].size))
-            seen[name], corrected[name], systematic[name] = uv.reshape(-1, 2), found.uv, found.sigma
+            # What lies beyond the calibrated area is not looked at, as by watch_views.
+            inside = np.where(found.status[:, None] == OUTSIDE, np.nan, found.uv)
+            seen[name], corrected[name], systematic[name] = uv.reshape(-1, 2), inside, found.sigma
         yield seen, corrected, systematic, (np.arange(FRAMES) + number * FRAMES) * 1_000_000_000 // RATE_HZ
 
 

@@ -22,6 +22,7 @@ from rcl_interfaces.srv import GetParameterTypes
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.qos import QoSProfile, ReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, PointCloud2
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
@@ -195,7 +196,9 @@ class Client(Node):
         self._callers = {}
         for service, kind in SERVICES.items():
             self.expect(kind, service)
-        self._outputs = {n: self.create_publisher(TargetObservations, f'{n}/target_observations', OBSERVATIONS)
+        # A queue for a machine that is too busy for the rate.
+        deep = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
+        self._outputs = {n: self.create_publisher(TargetObservations, f'{n}/target_observations', deep)
                          for n in NAMES}
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
         for name in NAMES:

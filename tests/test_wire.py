@@ -15,8 +15,8 @@ from fluoro_calib_ros.nodes.spatial import points_message
 from fluoro_calib_ros.nodes.wire import corrected_bytes, corrected_of, observations_of, points_bytes
 from fluoro_calib_ros.reconstruction.intersection import IntersectedPoints
 
-SIZES = [(n, frame_id, sigma) for n in (0, 1, 2, 3, 30, 2028) for frame_id in ('', 'a', 'a_optical', 'röntgen', 'x' * 256)
-         for sigma in (False, True)]
+SIZES = [(n, frame_id, sigma) for n in (0, 1, 2, 3, 30, 2028) for sigma in (False, True)
+         for frame_id in ('', 'a', 'a_optical', 'röntgen', 'x' * 256)]
 
 
 def observed(n, frame_id='a_optical', sigma=True):

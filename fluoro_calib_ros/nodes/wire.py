@@ -1,12 +1,12 @@
 """Observations and points as the bytes in which they come and go, without message objects between.
 
-Between two frames of a stream the caches of the processor go cold, and what a frame costs then is the code and the memory
-that are touched once: making an object of a message of 30 points takes 0.02 ms in a loop and 0.2 ms in a stream.
+Between two frames of a stream the caches of the processor go cold, and what a frame costs then is the code and the
+memory that are touched once: making an object of a message of 30 points takes 0.02 ms in a loop and 0.2 ms in a stream.
 So a stream's frames are read from their bytes, and written as bytes that begin as those of the input.
 
-The bytes are CDR, version 1, little-endian (OMG DDS-RTPS 2.5, 10.2; OMG Common Object Request Broker 3.4, part 2, 9.3):
-4 bytes that say so, then the fields one after the other; numbers are aligned to their size counted from behind
-these 4 bytes, strings and sequences begin with their length. What comes in another encoding is converted by rclpy first.
+The bytes are CDR, version 1, little-endian (OMG DDSI-RTPS 2.5, section 10; OMG CORBA 3.4, part 2, section 9.3): 4 bytes
+that say so, then the fields one after the other; numbers are aligned to their size, counted from behind these 4 bytes,
+strings and sequences begin with their length. What comes in another encoding is converted by rclpy first.
 """
 
 from struct import Struct, error
@@ -24,8 +24,8 @@ _NOTHING = np.zeros(0)
 
 
 class Observations(NamedTuple):
-    """A TargetObservations message: its stamp in seconds and nanoseconds, target ids as the bytes of uint32, arrays u, v
-    and sigma (of any lengths); start: its bytes up to the frame number, that of a CorrectedObservations message too."""
+    """A TargetObservations message: its stamp in seconds and nanoseconds; target ids as the bytes of uint32; arrays u,
+    v and sigma (of any lengths); start: its bytes up to the frame number, as a CorrectedObservations message begins."""
 
     sec: int
     nanosec: int
@@ -108,8 +108,8 @@ def points_bytes(stamp_ns, frame_number, rig, target_id, points):
                       _ONE.pack(frame_number)))
     columns = (*np.divide(points.xyz_mm.T, 1000, order='C'),
                *(points.covariance.reshape(-1, 9).T[[0, 1, 2, 4, 5, 8]] * 1e-6), points.residual)
-    ids = rig.orientation.calibration_ids
-    return _message(start, target_id.astype(np.uint32).tobytes(), columns, (points.rays.astype(np.uint8), points.status),
+    octets, ids = (points.rays.astype(np.uint8), points.status), rig.orientation.calibration_ids
+    return _message(start, target_id.astype(np.uint32).tobytes(), columns, octets,
                     b''.join((_string_bytes(rig.orientation_id), _ONE.pack(len(ids)), *map(_string_bytes, ids))))
 
 

@@ -246,9 +246,9 @@ class Client(Node):
         self.wait_until_known_to(node)
 
     def wait_until_known_to(self, node):
-        """Wait until a node knows all that the client has made so far: what it publishes before may be lost, and answers
-        to what it asks. DDS tells of endpoints in the order in which they are made, so that a node which answers
-        a question of the newest knows the others too."""
+        """Wait until a node knows all that the client has made so far: what it publishes before may be lost, and the
+        answers to what it asks. DDS tells of endpoints in the order in which they are made, so that a node which
+        answers a question of the newest knows the others too."""
         newest, answers, asked = self.create_client(GetParameterTypes, f'{node}/get_parameter_types'), [], 0.0
 
         def answered():

@@ -325,7 +325,7 @@ class Known:
     image_sd = 0.25
 
     def correct(self, uv, sigma):
-        return SimpleNamespace(uv=uv.copy(), sigma=np.hypot(sigma, 0.04))
+        return SimpleNamespace(uv=uv.copy(), sigma=np.hypot(sigma, 0.04), status=np.zeros(len(uv), dtype=np.uint8))
 
 
 @functools.lru_cache(maxsize=None)

@@ -35,7 +35,7 @@ setup(
     maintainer='fluoro_calib_ros maintainers',
     maintainer_email='maintainers@fluoro-calib.example',
     description='Self-calibration of dual fluoroscopes for ROS 2: robust bundle adjustment and '
-                'nonparametric distortion correction.',
+    'nonparametric distortion correction.',
     license='Apache-2.0',
     entry_points={
         'console_scripts': [

@@ -1,1 +1,3 @@
-"""Measurements: speed (python -m benchmarks) and accuracy against the truth (python -m benchmarks.validation)."""
+"""Measurements: speed (python -m benchmarks) and accuracy against the truth (python -m
+benchmarks.validation).
+"""

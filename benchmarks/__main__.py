@@ -1,7 +1,8 @@
-"""Speed, side by side in one run and on one thread: ours, COLMAP's bundle adjuster and scikit-learn.
+"""Speed, side by side in one run and on one thread: ours, COLMAP's bundle adjuster and
+scikit-learn.
 
-    python -m benchmarks                      all tables, written to docs/performance.md
-    python -m benchmarks scaling adjustment   these only, printed
+python -m benchmarks                      all tables, written to docs/performance.md
+python -m benchmarks scaling adjustment   these only, printed
 """
 
 import argparse
@@ -13,9 +14,9 @@ from pathlib import Path
 
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.network import measured_network
-from fluoro_calib_ros.calibration.self_calibration import Options
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.initial_network import measured_network
+from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 from . import adjustments, profiling, scaling
@@ -33,11 +34,11 @@ def exposures():
 
 
 def models():
-    """Options of the correction models that there are."""
+    """CalibrationOptions of the correction models that there are."""
     for model in MODELS:
         try:
-            yield Options(model)
-        except ValueError:   # not in this version
+            yield CalibrationOptions(model)
+        except ValueError:  # not in this version
             continue
 
 
@@ -57,10 +58,28 @@ def calibration_section():
     rows = []
     for model, job, seconds in ours:
         f = job.fluoroscopes['a']
-        rows.append([model, f'{seconds:.2f} s', str(len(job.history['a'])), str(f.k), f'{f.interior[2]:.1f}',
-                     ', '.join(f'{x:.3f}' for x in f.rmse_after), f'{peer_seconds / seconds:.0f}'])
-    rows.append(['COLMAP and GridSearchCV', f'{peer_seconds:.2f} s', str(peer.rounds), str(peer.k),
-                 f'{peer.interior[2]:.1f}', ', '.join(f'{x:.3f}' for x in peer.rmse), '1'])
+        rows.append(
+            [
+                model,
+                f'{seconds:.2f} s',
+                str(len(job.history['a'])),
+                str(f.k),
+                f'{f.interior[2]:.1f}',
+                ', '.join(f'{x:.3f}' for x in f.rmse_after),
+                f'{peer_seconds / seconds:.0f}',
+            ]
+        )
+    rows.append(
+        [
+            'COLMAP and GridSearchCV',
+            f'{peer_seconds:.2f} s',
+            str(peer.rounds),
+            str(peer.k),
+            f'{peer.interior[2]:.1f}',
+            ', '.join(f'{x:.3f}' for x in peer.rmse),
+            '1',
+        ]
+    )
     count = sum(len(frame.target_id) for frame in frames['a'])
     return section(
         f'Self-calibration of {len(frames["a"])} exposures, {count} image points',
@@ -69,7 +88,17 @@ def calibration_section():
         'GridSearchCV of KNeighborsRegressor (k = 3..49, ten folds of whole exposures). That loop '
         f'{"settled" if peer.converged else "had not settled yet"} after {peer.rounds} rounds; the grid searches took '
         f'{peer.search_seconds:.1f} s, everything else {peer_seconds - peer.search_seconds:.1f} s.',
-        ['model', 'median time', 'rounds', 'k', 'c [px]', 'RMSE of inliers u, v [px]', 'faster by'], rows)
+        [
+            'model',
+            'median time',
+            'rounds',
+            'k',
+            'c [px]',
+            'RMSE of inliers u, v [px]',
+            'faster by',
+        ],
+        rows,
+    )
 
 
 def adjustment_section():
@@ -79,28 +108,43 @@ def adjustment_section():
         'Every target in every exposure, Student-t noise, its scale held, interior orientation estimated, the same '
         'start values. Every tenth object point is held, the others are free: COLMAP knows no surveyed coordinates '
         'with standard deviations. The costs are the negative log-likelihoods of the image points.',
-        adjustments.HEADER, [adjustments.beside_colmap(size) for size in adjustments.SIZES])
+        adjustments.HEADER,
+        [adjustments.beside_colmap(size) for size in adjustments.SIZES],
+    )
 
 
 def scaling_section():
     """Time and memory by the number of exposures."""
-    return section('Many exposures', 'One adjustment with surveyed coordinates and estimated noise, each size in a '
-                   'fresh process.', scaling.HEADER, list(scaling.rows()))
+    return section(
+        'Many exposures',
+        'One adjustment with surveyed coordinates and estimated noise, each size in a '
+        'fresh process.',
+        scaling.HEADER,
+        list(scaling.rows()),
+    )
 
 
 def profile_section():
     """Where the time of the self-calibration goes."""
     rig, frames = exposures()
-    calibrate(frames, rig.phantom)   # what only the first call does is not counted
+    calibrate(frames, rig.phantom)  # what only the first call does is not counted
     rows = list(profiling.rows(lambda: calibrate(frames, rig.phantom)))
     return section(
         'Where the time of a self-calibration goes',
-        f'cProfile of the self-calibration above with the default model ({Options().model}): functions of the program '
-        'with the largest cumulative times. Under the profiler all takes somewhat longer.', profiling.HEADER, rows)
+        f'cProfile of the self-calibration above with the default model ({CalibrationOptions().model}): functions of the program '
+        'with the largest cumulative times. Under the profiler all takes somewhat longer.',
+        profiling.HEADER,
+        rows,
+    )
 
 
-SECTIONS = {'calibration': calibration_section, 'adjustment': adjustment_section, 'scaling': scaling_section,
-            'correction': lookup_section, 'profile': profile_section}
+SECTIONS = {
+    'calibration': calibration_section,
+    'adjustment': adjustment_section,
+    'scaling': scaling_section,
+    'correction': lookup_section,
+    'profile': profile_section,
+}
 
 
 def machine():
@@ -108,25 +152,36 @@ def machine():
     cpu = platform.processor() or platform.machine()
     information = Path('/proc/cpuinfo')
     if information.exists():
-        names = [line.split(':', 1)[1].strip() for line in information.read_text().splitlines()
-                 if line.startswith('model name')]
+        names = [
+            line.split(':', 1)[1].strip()
+            for line in information.read_text().splitlines()
+            if line.startswith('model name')
+        ]
         cpu = names[0] if names else cpu
-    memory = os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2 ** 30
-    packages = ', '.join(f'{name} {version(name)}' for name in ('numpy', 'scipy', 'scikit-learn', 'pycolmap'))
-    return (f'{cpu} ({platform.machine()}), {os.cpu_count()} cores, {memory:.0f} GiB, {platform.system()}; '
-            f'Python {platform.python_version()}, {packages}.')
+    memory = os.sysconf('SC_PHYS_PAGES') * os.sysconf('SC_PAGE_SIZE') / 2**30
+    packages = ', '.join(
+        f'{name} {version(name)}' for name in ('numpy', 'scipy', 'scikit-learn', 'pycolmap')
+    )
+    return (
+        f'{cpu} ({platform.machine()}), {os.cpu_count()} cores, {memory:.0f} GiB, {platform.system()}; '
+        f'Python {platform.python_version()}, {packages}.'
+    )
 
 
 def main(arguments=None):
     """Print the tables; with all of them, write docs/performance.md."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks', description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog='python -m benchmarks', description=__doc__.splitlines()[0]
+    )
     parser.add_argument('section', nargs='*', help=f'{", ".join(SECTIONS)} (default: all)')
     chosen = parser.parse_args(arguments).section or list(SECTIONS)
     for name in chosen:
         if name not in SECTIONS:
             parser.error(f'{name}: there is no such section; there are {", ".join(SECTIONS)}')
-    parts = ['# Performance\n\nWritten by `make bench` (`python -m benchmarks`), everything on one thread.\n'
-             + machine()]
+    parts = [
+        '# Performance\n\nWritten by `make bench` (`python -m benchmarks`), everything on one thread.\n'
+        + machine()
+    ]
     with threadpool_limits(1):
         for name in chosen:
             print(name, file=sys.stderr)

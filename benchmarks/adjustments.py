@@ -1,4 +1,6 @@
-"""One adjustment of many image points, ours beside COLMAP's: the same problem, start values and cost."""
+"""One adjustment of many image points, ours beside COLMAP's: the same problem, start values and
+cost.
+"""
 
 import numpy as np
 
@@ -12,29 +14,50 @@ from .peers import ColmapAdjustment, with_datum
 from .timing import timed
 
 NOISE = Noise('student_t', 0.25, 5.0)
-SIZES = (15, 150)   # exposures
-HELD_EVERY = 10   # object point: the datum that COLMAP can express
+SIZES = (15, 150)  # exposures
+HELD_EVERY = 10  # object point: the datum that COLMAP can express
 # Ceres stops at this relative decrease of its cost, which is then equal to ours in ten digits.
-STOP = {'function_tolerance': 1e-11, 'gradient_tolerance': 0.0, 'parameter_tolerance': 0.0, 'max_num_iterations': 200}
+STOP = {
+    'function_tolerance': 1e-11,
+    'gradient_tolerance': 0.0,
+    'parameter_tolerance': 0.0,
+    'max_num_iterations': 200,
+}
 
 
 def large_network(exposures, seed=0):
-    """Network and disturbed start values: every bead of the virtual rig in every exposure, Student-t noise."""
+    """Network and disturbed start values: every bead of the virtual rig in every exposure,
+    Student-t noise.
+    """
     rng = np.random.default_rng([seed, exposures])
     rig = virtual_rig(1)
-    fluoroscope, beads = rig.fluoroscopes[0], len(rig.true_mm)
+    fluoroscope = rig.fluoroscopes[0]
+    beads = len(rig.true_mm)
     orientations = [fluoroscope.exterior(pose) for pose in phantom_poses(rng, exposures)]
     rotation, position = (np.array(part) for part in zip(*orientations))
-    exposure, point = np.repeat(np.arange(exposures), beads), np.tile(np.arange(beads), exposures)
+    exposure = np.repeat(np.arange(exposures), beads)
+    point = np.tile(np.arange(beads), exposures)
     uv = project(rotation[exposure], position[exposure], rig.true_mm[point], fluoroscope.interior)
     tails = np.sqrt(rng.chisquare(NOISE.nu, len(uv)) / NOISE.nu)
     uv += rng.normal(0, NOISE.scale, uv.shape) / tails[:, None]
-    network = Network(uv, np.ones(len(uv)), exposure, point, np.zeros(exposures, dtype=int), rig.phantom.xyz_mm,
-                      rig.phantom.sd_mm, np.array([True]))
+    network = Network(
+        uv,
+        np.ones(len(uv)),
+        exposure,
+        point,
+        np.zeros(exposures, dtype=int),
+        rig.phantom.xyz_mm,
+        rig.phantom.sd_mm,
+        np.array([True]),
+    )
     # About as far off as resections of bent images are.
     turn = matrix_from_vector(rng.normal(0, 2e-3, position.shape))
-    start = Parameters(fluoroscope.interior[None] + [[5.0, -5.0, 40.0]], turn @ rotation,
-                       position + rng.normal(0, 3.0, position.shape), rig.phantom.xyz_mm.copy())
+    start = Parameters(
+        fluoroscope.interior[None] + [[5.0, -5.0, 40.0]],
+        turn @ rotation,
+        position + rng.normal(0, 3.0, position.shape),
+        rig.phantom.xyz_mm.copy(),
+    )
     return network, start
 
 
@@ -51,11 +74,29 @@ def beside_colmap(exposures, repeats=3):
 
     (peer, summary), with_set_up = timed(colmap, 1 if exposures > 50 else repeats)
     cost = peer.cost(summary)
-    return [f'{exposures} x {len(held)}', f'{len(network.uv)}', f'{seconds:.2f} s', str(ours.steps), f'{ours.cost:.6f}',
-            f'{summary.total_time_in_seconds:.2f} s', f'{with_set_up:.2f} s',
-            str(summary.num_successful_steps + summary.num_unsuccessful_steps), f'{cost:.6f}',
-            f'{summary.total_time_in_seconds / seconds:.1f}']
+    return [
+        f'{exposures} x {len(held)}',
+        f'{len(network.uv)}',
+        f'{seconds:.2f} s',
+        str(ours.steps),
+        f'{ours.cost:.6f}',
+        f'{summary.total_time_in_seconds:.2f} s',
+        f'{with_set_up:.2f} s',
+        str(summary.num_successful_steps + summary.num_unsuccessful_steps),
+        f'{cost:.6f}',
+        f'{summary.total_time_in_seconds / seconds:.1f}',
+    ]
 
 
-HEADER = ['exposures x targets', 'image points', 'ours', 'steps', 'cost', 'COLMAP, solver alone', 'with its set-up',
-          'steps', 'cost', 'ours faster by (solver alone)']
+HEADER = [
+    'exposures x targets',
+    'image points',
+    'ours',
+    'steps',
+    'cost',
+    'COLMAP, solver alone',
+    'with its set-up',
+    'steps',
+    'cost',
+    'ours faster by (solver alone)',
+]

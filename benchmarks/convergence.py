@@ -1,4 +1,6 @@
-"""Convergence: random rigs, bad start values and false matches; no wrong answer may be called converged."""
+"""Convergence: random rigs, bad start values and false matches; no wrong answer may be called
+converged.
+"""
 
 import argparse
 import multiprocessing
@@ -9,36 +11,58 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.precision import QUANTITIES, errors_of
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.self_calibration import Options
-from fluoro_calib_ros.photogrammetry.observations import DataError
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
-# A mean normalised squared error beyond which an answer is wrong. A single coordinate is off by more than 5 standard
-# deviations once in a million; sources and attitudes of one calibration err together, object points hardly.
+# A mean normalised squared error beyond which an answer is wrong. A single coordinate is off by
+# more than 5 standard deviations once in a million; sources and attitudes of one calibration err
+# together, object points hardly.
 LIMITS = {'xp': 25.0, 'yp': 25.0, 'c': 25.0, 'T': 9.0, 'q': 9.0, 'object points': 1.6}
 
 
 def random_case(seed):
-    """Strength of the distortion, number of exposures, share of false matches and start of the principal distance."""
+    """Strength of the distortion, number of exposures, share of false matches and start of the
+    principal distance.
+    """
     rng = np.random.default_rng([seed, 77])
-    return {'strength': rng.uniform(0, 2), 'exposures': int(np.exp(rng.uniform(np.log(5), np.log(61)))),
-            'false_matches': rng.uniform(0, 0.2), 'off': rng.choice([0.8, 1.2])}
+    return {
+        'strength': rng.uniform(0, 2),
+        'exposures': int(np.exp(rng.uniform(np.log(5), np.log(61)))),
+        'false_matches': rng.uniform(0, 0.2),
+        'off': rng.choice([0.8, 1.2]),
+    }
 
 
 def outcome(seed):
-    """One case: its values, 'converged', 'not converged' or 'refused', the normalised errors, and what is wrong."""
+    """One case: its values, 'converged', 'not converged' or 'refused', the normalised errors, and
+    what is wrong.
+    """
     case = random_case(seed)
     rig = virtual_rig(seed, case['strength'])
-    simulated = simulate_exposures(rig, case['exposures'], seed, false_matches=case['false_matches'])
+    simulated = simulate_exposures(
+        rig, case['exposures'], seed, false_matches=case['false_matches']
+    )
     start = case['off'] * rig.fluoroscopes[0].interior[2]
     try:
-        job = calibrate({'a': simulated.frames['a']}, rig.phantom, Options(), principal_distance=start)
+        job = calibrate(
+            {'a': simulated.frames['a']},
+            rig.phantom,
+            CalibrationOptions(),
+            principal_distance=start,
+        )
     except DataError as error:
         return {**case, 'seed': seed, 'end': 'refused', 'wrong': [], 'said': str(error)}
     errors = errors_of(job, rig, simulated)
     wrong = [name for name in QUANTITIES if not errors[name] <= LIMITS[name]]
-    return {**case, 'seed': seed, 'end': 'converged' if job.converged else 'not converged', 'wrong': wrong, **errors}
+    return {
+        **case,
+        'seed': seed,
+        'end': 'converged' if job.converged else 'not converged',
+        'wrong': wrong,
+        **errors,
+    }
 
 
 TEXT = """# Convergence
@@ -60,15 +84,24 @@ def main(arguments=None):
     """Entry point; exit status 1 where a wrong answer was called converged."""
     parser = argparse.ArgumentParser(prog='python -m benchmarks.convergence', description=__doc__)
     parser.add_argument('--count', type=int, default=200, help='number of rigs (default: 200)')
-    parser.add_argument('--first', type=int, default=5000, help='seed of the first rig (default: 5000)')
-    parser.add_argument('--out', type=Path, default=Path('docs/convergence.md'), help='file to write')
+    parser.add_argument(
+        '--first', type=int, default=5000, help='seed of the first rig (default: 5000)'
+    )
+    parser.add_argument(
+        '--out', type=Path, default=Path('docs/convergence.md'), help='file to write'
+    )
     options = parser.parse_args(arguments)
-    began, results = time.monotonic(), []
+    began = time.monotonic()
+    results = []
     with multiprocessing.get_context('spawn').Pool(2) as pool:
-        for result in pool.imap_unordered(outcome, range(options.first, options.first + options.count)):
+        for result in pool.imap_unordered(
+            outcome, range(options.first, options.first + options.count)
+        ):
             results.append(result)
-            print(f'{len(results)} of {options.count}: seed {result["seed"]} {result["end"]} {result["wrong"]}',
-                  file=sys.stderr)
+            print(
+                f'{len(results)} of {options.count}: seed {result["seed"]} {result["end"]} {result["wrong"]}',
+                file=sys.stderr,
+            )
     text = report(sorted(results, key=lambda r: r['seed']))
     options.out.write_text(text)
     print(text)
@@ -87,14 +120,29 @@ def report(results):
     good = [r for r in results if r['end'] == 'converged']
     spread = ['| quantity | median | largest |', '|---|---:|---:|'] + [
         f'| {name} | {np.median([r[name] for r in good]):.2f} | {max(r[name] for r in good):.2f} |'
-        for name in QUANTITIES]
-    odd = [f'- seed {r["seed"]}: {r["end"]}, {r["exposures"]} exposures, strength {r["strength"]:.2f}, '
-           f'{100 * r["false_matches"]:.0f} % false matches'
-           + (f'; wrong: {", ".join(r["wrong"])}' if r['wrong'] else '')
-           + (f'; {r["said"]}' if 'said' in r else '') for r in results if r['end'] != 'converged' or r['wrong']]
-    cases = '\nThe cases that did not converge, were refused or are wrong:\n\n' + '\n'.join(odd) + '\n' if odd else ''
+        for name in QUANTITIES
+    ]
+    odd = [
+        f'- seed {r["seed"]}: {r["end"]}, {r["exposures"]} exposures, strength {r["strength"]:.2f}, '
+        f'{100 * r["false_matches"]:.0f} % false matches'
+        + (f'; wrong: {", ".join(r["wrong"])}' if r['wrong'] else '')
+        + (f'; {r["said"]}' if 'said' in r else '')
+        for r in results
+        if r['end'] != 'converged' or r['wrong']
+    ]
+    cases = (
+        '\nThe cases that did not converge, were refused or are wrong:\n\n' + '\n'.join(odd) + '\n'
+        if odd
+        else ''
+    )
     limits = ', '.join(f'{value:g} ({name})' for name, value in LIMITS.items())
-    return TEXT.format(count=len(results), limits=limits, table='\n'.join(lines), spread='\n'.join(spread), cases=cases)
+    return TEXT.format(
+        count=len(results),
+        limits=limits,
+        table='\n'.join(lines),
+        spread='\n'.join(spread),
+        cases=cases,
+    )
 
 
 if __name__ == '__main__':

@@ -1,8 +1,10 @@
-"""The drift watch, end to end on virtual rigs: false alarms against the stated rate, delays, what is told of a drift.
+"""The drift watch, end to end on virtual rigs: false alarms against the stated rate, delays, what
+is told of a drift.
 
-A rig is calibrated with 15 exposures, its orientation taken from the same; then 30 markers in five rigid clusters move
-through it, are corrected, checked by their epipolar residuals and intersected as in the stream. The motions repeat,
-the noise does not. Frames are handed over block by block, which is the same for the watch and faster than real time.
+A rig is calibrated with 15 exposures, its orientation taken from the same; then 30 markers in five
+rigid clusters move through it, are corrected, checked by their epipolar residuals and intersected
+as in the stream. The motions repeat, the noise does not. Frames are handed over block by block,
+which is the same for the watch and faster than real time.
 """
 
 import argparse
@@ -15,34 +17,48 @@ from dataclasses import dataclass
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.orientation import orientation_of_capture, orientation_of_exposures
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.rig_orientation import (
+    orientation_of_capture,
+    orientation_of_exposures,
+)
 from fluoro_calib_ros.distortion.grid import OUTSIDE
+from fluoro_calib_ros.drift.clusters import Cluster
+from fluoro_calib_ros.drift.watch import ERROR, OK, WARN, DriftOptions, DriftWatch
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.reconstruction.clusters import Cluster
-from fluoro_calib_ros.reconstruction.drift import ERROR, OK, WARN, DriftOptions, DriftWatch
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 from .timing import table
 
-RATE_HZ, NOISE_PX, FALSE_MATCHES, REJECT = 120, 0.25, 0.01, 4.0
-FRAMES = 30   # of a block of 0.25 s
-CLUSTERS, BEADS = 5, 6
-PERIOD_S = 60   # of one motion
+RATE_HZ = 120
+NOISE_PX = 0.25
+FALSE_MATCHES = 0.01
+REJECT = 4.0
+FRAMES = 30  # of a block of 0.25 s
+CLUSTERS = 5
+BEADS = 6
+PERIOD_S = 60  # of one motion
 MOTIONS = 3
 IDS = np.arange(1001, 1001 + CLUSTERS * BEADS)
 SIZE = 1024
-QUARTERS = {'upper left': (0, 0), 'upper right': (1, 0), 'lower left': (0, 1), 'lower right': (1, 1)}
+QUARTERS = {
+    'upper left': (0, 0),
+    'upper right': (1, 0),
+    'lower left': (0, 1),
+    'lower right': (1, 1),
+}
 WHOLE = 'whole image'
-WITHIN_S = 5.0   # in which a drift is to be found
-AFTER_S = 20.0   # after which it is given up
+WITHIN_S = 5.0  # in which a drift is to be found
+AFTER_S = 20.0  # after which it is given up
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A calibrated rig and its markers: observed pixels without noise by fluoroscope (frames, markers, 2)."""
+    """A calibrated rig and its markers: observed pixels without noise by fluoroscope (frames,
+    markers, 2).
+    """
 
     names: tuple
     calibrations: dict
@@ -54,35 +70,55 @@ class Scene:
     @property
     def clusters(self):
         """The Clusters, their distances unknown."""
-        return tuple(Cluster(f'bone {i + 1}', IDS[BEADS * i:BEADS * (i + 1)]) for i in range(CLUSTERS))
+        return tuple(
+            Cluster(f'bone {i + 1}', IDS[BEADS * i : BEADS * (i + 1)]) for i in range(CLUSTERS)
+        )
 
     def watch(self, options=DriftOptions(), clusters=True):
         """A DriftWatch of the scene."""
         o = self.orientation
-        return DriftWatch({n: (SIZE, SIZE) for n in self.names}, options, self.clusters if clusters else (),
-                          (o.interior, o.rotation, o.position_mm))
+        return DriftWatch(
+            dict.fromkeys(self.names, (SIZE, SIZE)),
+            options,
+            self.clusters if clusters else (),
+            (o.interior, o.rotation, o.position_mm),
+        )
 
 
 def markers(rng, beads, seconds):
-    """Positions (frames, 30, 3) [mm] of rigid clusters, beads (5, 6, 3) [mm], on the bones of a joint that bends,
-    straightens and sways."""
-    places = np.array([[-8, 0, 85], [12, 10, 40], [0, -5, 0], [-10, -8, -35], [10, 5, -80]], dtype=float)
+    """Positions (frames, 30, 3) [mm] of rigid clusters, beads (5, 6, 3) [mm], on the bones of a
+    joint that bends, straightens and sways.
+    """
+    places = np.array(
+        [[-8, 0, 85], [12, 10, 40], [0, -5, 0], [-10, -8, -35], [10, 5, -80]], dtype=float
+    )
     t = np.arange(round(seconds * RATE_HZ)) / RATE_HZ
-    speed, phase = rng.uniform(0.7, 1.3, 4), rng.uniform(0, 2 * np.pi, 4)
+    speed = rng.uniform(0.7, 1.3, 4)
+    phase = rng.uniform(0, 2 * np.pi, 4)
     bend = np.deg2rad(25) * np.sin(2 * np.pi * 0.5 * speed[0] * t + phase[0])
     middle = rng.uniform(-10, 10, 3)
-    sway = middle + np.stack([70 * np.sin(2 * np.pi * 0.31 * speed[1] * t + phase[1]),
-                              70 * np.cos(2 * np.pi * 0.23 * speed[2] * t + phase[2]),
-                              42 * np.sin(speed[3] * t + phase[3])], axis=1)
+    sway = middle + np.stack(
+        [
+            70 * np.sin(2 * np.pi * 0.31 * speed[1] * t + phase[1]),
+            70 * np.cos(2 * np.pi * 0.23 * speed[2] * t + phase[2]),
+            42 * np.sin(speed[3] * t + phase[3]),
+        ],
+        axis=1,
+    )
     out = []
     for number, (cluster, place) in enumerate(zip(beads, places)):
-        turn = np.stack([bend * (1, 1, 0.3, -1, -1)[number], 0.3 * np.sin(1.1 * t + number), np.zeros_like(t)], axis=1)
+        turn = np.stack(
+            [bend * (1, 1, 0.3, -1, -1)[number], 0.3 * np.sin(1.1 * t + number), np.zeros_like(t)],
+            axis=1,
+        )
         out.append((cluster + place) @ matrix_from_vector(turn).transpose(0, 2, 1) + sway[:, None])
     return np.concatenate(out, axis=1)
 
 
 def scene(seed, source='exposures'):
-    """The Scene of a rig; source of its orientation: 'exposures' of the calibration, or a 'capture' of the phantom."""
+    """The Scene of a rig; source of its orientation: 'exposures' of the calibration, or a
+    'capture' of the phantom.
+    """
     rig = virtual_rig(seed)
     exposures = simulate_exposures(rig, 15, seed).frames
     calibrations = calibrate(exposures, rig.phantom).calibrations
@@ -94,10 +130,18 @@ def scene(seed, source='exposures'):
     rng = np.random.default_rng([seed, 4])
     beads = rng.uniform(-22, 22, (CLUSTERS, BEADS, 3))
     points = np.concatenate([markers(rng, beads, PERIOD_S) for _ in range(MOTIONS)])
-    pixels = {f.name: f.distortion.distort(f.ideal(points.reshape(-1, 3))).reshape(*points.shape[:2], 2)
-              for f in rig.fluoroscopes}
-    return Scene(tuple(pixels), calibrations, orientation, EpipolarGeometry(orientation, *pixels),
-                 Intersector(orientation, None), pixels)
+    pixels = {
+        f.name: f.distortion.distort(f.ideal(points.reshape(-1, 3))).reshape(*points.shape[:2], 2)
+        for f in rig.fluoroscopes
+    }
+    return Scene(
+        tuple(pixels),
+        calibrations,
+        orientation,
+        EpipolarGeometry(orientation, *pixels),
+        Intersector(orientation, None),
+        pixels,
+    )
 
 
 def false_matches(rng, uv):
@@ -108,24 +152,37 @@ def false_matches(rng, uv):
 
 
 def blocks(scene_, rng, first, count, drift=None):
-    """Blocks of the stream: pixels by fluoroscope (FRAMES, markers, 2), corrected points, their systematic sd, stamps.
+    """Blocks of the stream: pixels by fluoroscope (FRAMES, markers, 2), corrected points, their
+    systematic sd, stamps.
 
-    first: number of the block to begin with; drift(name, uv, t): shift (k, 2) [px] of observed pixels (k, 2) at t [s].
+    first: number of the block to begin with; drift(name, uv, t): shift (k, 2) [px] of observed
+    pixels (k, 2) at t [s].
     """
     total = next(iter(scene_.pixels.values())).shape[0] // FRAMES
     for number in range(first, first + count):
         rows = slice(FRAMES * (number % total), FRAMES * (number % total + 1))
-        seen, corrected, systematic = {}, {}, {}
+        seen = {}
+        corrected = {}
+        systematic = {}
         for name in scene_.names:
             uv = scene_.pixels[name][rows] + rng.normal(0, NOISE_PX, (FRAMES, len(IDS), 2))
             uv = false_matches(rng, uv)
             if drift is not None:
-                uv = uv + drift(name, uv.reshape(-1, 2), number * FRAMES / RATE_HZ).reshape(uv.shape)
+                uv = uv + drift(name, uv.reshape(-1, 2), number * FRAMES / RATE_HZ).reshape(
+                    uv.shape
+                )
             found = scene_.calibrations[name].correct(uv.reshape(-1, 2), np.zeros(uv[..., 0].size))
             # What lies beyond the calibrated area is not looked at, as by watch_views.
             inside = np.where(found.status[:, None] == OUTSIDE, np.nan, found.uv)
-            seen[name], corrected[name], systematic[name] = uv.reshape(-1, 2), inside, found.sigma
-        yield seen, corrected, systematic, (np.arange(FRAMES) + number * FRAMES) * 1_000_000_000 // RATE_HZ
+            seen[name] = uv.reshape(-1, 2)
+            corrected[name] = inside
+            systematic[name] = found.sigma
+        yield (
+            seen,
+            corrected,
+            systematic,
+            (np.arange(FRAMES) + number * FRAMES) * 1_000_000_000 // RATE_HZ,
+        )
 
 
 def feed(scene_, watch, block, clusters=True):
@@ -136,41 +193,73 @@ def feed(scene_, watch, block, clusters=True):
     found = scene_.geometry.residuals(corrected[a], corrected[b], systematic[a], systematic[b])
     sd_noise = np.hypot(found.factor_a * noise[0], found.factor_b * noise[1])
     good = np.abs(found.residual) <= REJECT * np.hypot(sd_noise, found.sd_total)
-    state = watch.add(stamps[0], a, b, np.tile(IDS, FRAMES), seen[a], seen[b], found.residual, sd_noise, found.sd_total,
-                      found.normal_a, found.normal_b, found.factor_a, found.factor_b)
+    state = watch.add(
+        stamps[0],
+        a,
+        b,
+        np.tile(IDS, FRAMES),
+        seen[a],
+        seen[b],
+        found.residual,
+        sd_noise,
+        found.sd_total,
+        found.normal_a,
+        found.normal_b,
+        found.factor_a,
+        found.factor_b,
+    )
     if clusters:
         uv = np.stack([corrected[a], corrected[b]])
         uv[:, ~good] = np.nan
-        points = scene_.intersector.intersect(uv, np.repeat(np.array(noise)[:, None], uv.shape[1], axis=1))
-        where, sd = np.stack([seen[a], seen[b]]), np.stack([systematic[a], systematic[b]])
+        points = scene_.intersector.intersect(
+            uv, np.repeat(np.array(noise)[:, None], uv.shape[1], axis=1)
+        )
+        where = np.stack([seen[a], seen[b]])
+        sd = np.stack([systematic[a], systematic[b]])
         for k, stamp in enumerate(stamps):
             rows = slice(k * len(IDS), (k + 1) * len(IDS))
-            state = watch.add_points(stamp, IDS, points.xyz_mm[rows], points.covariance_noise[rows], where[:, rows],
-                                     sd[:, rows])
+            state = watch.add_points(
+                stamp,
+                IDS,
+                points.xyz_mm[rows],
+                points.covariance_noise[rows],
+                where[:, rows],
+                sd[:, rows],
+            )
     return state
 
 
 def step_of(fluoroscope, quarter, size, direction, begin, ramp_s=0.0):
-    """A drift for `blocks`: size [px] in a direction [deg] over a quarter of an image from begin [s] on, after ramp_s
-    at its full size."""
+    """A drift for `blocks`: size [px] in a direction [deg] over a quarter of an image from begin
+    [s] on, after ramp_s at its full size.
+    """
     vector = size * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
     column, row = QUARTERS.get(quarter, (None, None))
 
     def drift(name, uv, t):
         if name != fluoroscope or t < begin:
             return np.zeros_like(uv)
-        inside = np.ones(len(uv), dtype=bool) if column is None else (
-            ((uv[:, 0] >= SIZE / 2) == column) & ((uv[:, 1] >= SIZE / 2) == row))
+        inside = (
+            np.ones(len(uv), dtype=bool)
+            if column is None
+            else (((uv[:, 0] >= SIZE / 2) == column) & ((uv[:, 1] >= SIZE / 2) == row))
+        )
         return inside[:, None] * vector * (min(1.0, (t - begin) / ramp_s) if ramp_s else 1.0)
+
     return drift
 
 
 def false_alarms(seed, hours=0.5, source='exposures', options=DriftOptions(), clusters=True):
-    """Alarms of a stream without drift: dict of hours, the number of WARNs and ERRORs that began, the largest evidence
-    over the threshold of WARN, and the sentences of the alarms."""
+    """Alarms of a stream without drift: dict of hours, the number of WARNs and ERRORs that began,
+    the largest evidence over the threshold of WARN, and the sentences of the alarms.
+    """
     scene_ = scene(seed, source)
-    watch, rng = scene_.watch(options, clusters), np.random.default_rng([seed, 5])
-    count, level, largest, said = [0, 0, 0], OK, 0.0, []
+    watch = scene_.watch(options, clusters)
+    rng = np.random.default_rng([seed, 5])
+    count = [0, 0, 0]
+    level = OK
+    largest = 0.0
+    said = []
     for block in blocks(scene_, rng, 0, round(hours * 3600 * RATE_HZ / FRAMES)):
         state = feed(scene_, watch, block, clusters)
         largest = max(largest, state.evidence / state.threshold_warn)
@@ -179,8 +268,15 @@ def false_alarms(seed, hours=0.5, source='exposures', options=DriftOptions(), cl
             for passed in range(level + 1, state.level + 1):
                 count[passed] += 1
         level = state.level
-    return {'seed': seed, 'source': source, 'hours': hours, 'warn': count[WARN], 'error': count[ERROR],
-            'largest': largest, 'said': said}
+    return {
+        'seed': seed,
+        'source': source,
+        'hours': hours,
+        'warn': count[WARN],
+        'error': count[ERROR],
+        'largest': largest,
+        'said': said,
+    }
 
 
 def right_place(state, quarter):
@@ -189,17 +285,42 @@ def right_place(state, quarter):
     if quarter == WHOLE:
         return (u1 - u0) * (v1 - v0) >= 0.49
     column, row = QUARTERS[quarter]
-    return bool(abs((u0 + u1) / 2 - 0.25 - 0.5 * column) < 0.2 and abs((v0 + v1) / 2 - 0.25 - 0.5 * row) < 0.2)
+    return bool(
+        abs((u0 + u1) / 2 - 0.25 - 0.5 * column) < 0.2
+        and abs((v0 + v1) / 2 - 0.25 - 0.5 * row) < 0.2
+    )
 
 
-def detection(scene_, watch, first, fluoroscope, quarter, size, direction, rng, clusters=True, ramp_s=0.0,
-              after_s=AFTER_S):
-    """One drift from block first on: delays of WARN and ERROR [s] (inf: not found), and what was told of it."""
+def detection(
+    scene_,
+    watch,
+    first,
+    fluoroscope,
+    quarter,
+    size,
+    direction,
+    rng,
+    clusters=True,
+    ramp_s=0.0,
+    after_s=AFTER_S,
+):
+    """One drift from block first on: delays of WARN and ERROR [s] (inf: not found), and what was
+    told of it.
+    """
     begin = first * FRAMES / RATE_HZ
     drift = step_of(fluoroscope, quarter, size, direction, begin, ramp_s)
-    out = {'fluoroscope': fluoroscope, 'quarter': quarter, 'size': size, 'direction': direction, 'warn': np.inf,
-           'error': np.inf, 'message': ''}
-    for number, block in enumerate(blocks(scene_, rng, first, round(after_s * RATE_HZ / FRAMES), drift)):
+    out = {
+        'fluoroscope': fluoroscope,
+        'quarter': quarter,
+        'size': size,
+        'direction': direction,
+        'warn': np.inf,
+        'error': np.inf,
+        'message': '',
+    }
+    for number, block in enumerate(
+        blocks(scene_, rng, first, round(after_s * RATE_HZ / FRAMES), drift)
+    ):
         state = feed(scene_, watch, block, clusters)
         # A block is judged when the next one begins: that is the time of the alarm.
         delay = number * FRAMES / RATE_HZ
@@ -207,53 +328,117 @@ def detection(scene_, watch, first, fluoroscope, quarter, size, direction, rng, 
             out['warn'] = min(out['warn'], delay)
         if state.level == ERROR:
             out['error'] = min(out['error'], delay)
-            if delay >= min(WITHIN_S, after_s - 1) or ramp_s:   # what is told is judged then, or when it is found later
-                vector = size * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
-                along = float(vector @ state.direction) * (min(1.0, delay / ramp_s) if ramp_s else 1.0)
-                if ' or ' in state.fluoroscope:   # down in one is up in the other
+            if (
+                delay >= min(WITHIN_S, after_s - 1) or ramp_s
+            ):  # what is told is judged then, or when it is found later
+                vector = size * np.array(
+                    [np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))]
+                )
+                along = float(vector @ state.direction) * (
+                    min(1.0, delay / ramp_s) if ramp_s else 1.0
+                )
+                if ' or ' in state.fluoroscope:  # down in one is up in the other
                     along = abs(along)
-                out.update(message=state.message, named=state.fluoroscope, place=right_place(state, quarter),
-                           source=state.source, sd=state.sd, since=state.since_s - delay,
-                           size_error=state.size - along)
+                out.update(
+                    message=state.message,
+                    named=state.fluoroscope,
+                    place=right_place(state, quarter),
+                    source=state.source,
+                    sd=state.sd,
+                    since=state.since_s - delay,
+                    size_error=state.size - along,
+                )
                 break
     return out
 
 
 def started(seed, clusters=True, source='exposures'):
-    """Scene, its watch after the start, the generator and the number of blocks that the start took."""
+    """Scene, its watch after the start, the generator and the number of blocks that the start
+    took.
+    """
     scene_ = scene(seed, source)
-    watch, rng, learned = scene_.watch(clusters=clusters), np.random.default_rng([seed, 6]), 60
+    watch = scene_.watch(clusters=clusters)
+    rng = np.random.default_rng([seed, 6])
+    learned = 60
     for block in blocks(scene_, rng, 0, learned):
         feed(scene_, watch, block, clusters)
     return scene_, watch, rng, learned
 
 
-def detections(seed, size=0.5, clusters=True, source='exposures', quarters=tuple(QUARTERS), directions=8):
-    """Drifts over every quarter of both images in so many directions: a list of dicts of `detection`."""
+def detections(
+    seed, size=0.5, clusters=True, source='exposures', quarters=tuple(QUARTERS), directions=8
+):
+    """Drifts over every quarter of both images in so many directions: a list of dicts of
+    `detection`.
+    """
     scene_, watch, rng, learned = started(seed, clusters, source)
-    out, total = [], PERIOD_S * MOTIONS * RATE_HZ // FRAMES
+    out = []
+    total = PERIOD_S * MOTIONS * RATE_HZ // FRAMES
     for name in scene_.names:
         for quarter in quarters:
             for k in range(directions):
-                first = learned + int(rng.integers(total))   # the motion from anywhere on
-                out.append(detection(scene_, copy.deepcopy(watch), first, name, quarter, size, 360 * k / directions,
-                                     rng, clusters))
+                first = learned + int(rng.integers(total))  # the motion from anywhere on
+                out.append(
+                    detection(
+                        scene_,
+                        copy.deepcopy(watch),
+                        first,
+                        name,
+                        quarter,
+                        size,
+                        360 * k / directions,
+                        rng,
+                        clusters,
+                    )
+                )
     return out
 
 
 def from_the_start(seed, size=0.5, directions=8):
-    """Drifts that are there before the watch starts, so that it can only hold them against the calibration."""
-    scene_, rng = scene(seed), np.random.default_rng([seed, 8])
-    return [detection(scene_, scene_.watch(), int(rng.integers(700)), name, quarter, size, 360 * k / directions, rng)
-            for name in scene_.names for quarter in QUARTERS for k in range(directions)]
+    """Drifts that are there before the watch starts, so that it can only hold them against the
+    calibration.
+    """
+    scene_ = scene(seed)
+    rng = np.random.default_rng([seed, 8])
+    return [
+        detection(
+            scene_,
+            scene_.watch(),
+            int(rng.integers(700)),
+            name,
+            quarter,
+            size,
+            360 * k / directions,
+            rng,
+        )
+        for name in scene_.names
+        for quarter in QUARTERS
+        for k in range(directions)
+    ]
 
 
 def slow(seed, size=0.5, hours=1.0):
-    """A drift that takes hours to its size, in a quarter drawn at random, in one of 8 directions: list of one dict."""
+    """A drift that takes hours to its size, in a quarter drawn at random, in one of 8 directions:
+    list of one dict.
+    """
     scene_, watch, rng, learned = started(seed)
-    place, direction = str(rng.choice(list(QUARTERS))), 45 * int(rng.integers(8))
-    return [detection(scene_, watch, learned, str(rng.choice(scene_.names)), place, size, direction, rng, True,
-                      hours * 3600, 1.1 * hours * 3600)]
+    place = str(rng.choice(list(QUARTERS)))
+    direction = 45 * int(rng.integers(8))
+    return [
+        detection(
+            scene_,
+            watch,
+            learned,
+            str(rng.choice(scene_.names)),
+            place,
+            size,
+            direction,
+            rng,
+            True,
+            hours * 3600,
+            1.1 * hours * 3600,
+        )
+    ]
 
 
 # Title of a row, function, its arguments but the seed.
@@ -266,10 +451,28 @@ CASES = (
     ('3 px, with clusters', detections, {'size': 3.0}),
     ('0.5 px over the whole image', detections, {'quarters': (WHOLE,)}),
     ('0.5 px, there before the start', from_the_start, {}),
-    ('0.5 px in an hour', slow, {}))
-SECTORS = {'across': (90, 270), 'oblique': (45, 135, 225, 315), 'along': (0, 180)}   # to the epipolar lines, in degrees
-HEADER = ['drift', 'direction', 'drifts', 'ERROR in 5 s', 'WARN in 5 s', 'found', 'median delay [s]', '95 % [s]',
-          'size error, RMS [px]', 'over its sd', 'right image', 'either', 'right place']
+    ('0.5 px in an hour', slow, {}),
+)
+SECTORS = {
+    'across': (90, 270),
+    'oblique': (45, 135, 225, 315),
+    'along': (0, 180),
+}  # to the epipolar lines, in degrees
+HEADER = [
+    'drift',
+    'direction',
+    'drifts',
+    'ERROR in 5 s',
+    'WARN in 5 s',
+    'found',
+    'median delay [s]',
+    '95 % [s]',
+    'size error, RMS [px]',
+    'over its sd',
+    'right image',
+    'either',
+    'right place',
+]
 
 
 def row(title, sector, found):
@@ -284,14 +487,22 @@ def row(title, sector, found):
 
     def figure(value):
         return f'{value:.2f}' if np.isfinite(value) else '-'
-    return [title, sector, str(len(found)), part(delay <= WITHIN_S), part([f['warn'] <= WITHIN_S for f in found]),
-            part(np.isfinite(delay)), figure(np.quantile(delay, 0.5, method='higher')),
-            figure(np.quantile(delay, 0.95, method='higher')),
-            figure(np.sqrt(np.mean(error ** 2)) if len(told) else np.nan),
-            figure(np.sqrt(np.mean(normalised ** 2)) if len(told) else np.nan),
-            part([f['named'] == f['fluoroscope'] for f in told]),
-            part([' or ' in f['named'] and f['fluoroscope'] in f['named'] for f in told]),
-            part([f['place'] for f in told])]
+
+    return [
+        title,
+        sector,
+        str(len(found)),
+        part(delay <= WITHIN_S),
+        part([f['warn'] <= WITHIN_S for f in found]),
+        part(np.isfinite(delay)),
+        figure(np.quantile(delay, 0.5, method='higher')),
+        figure(np.quantile(delay, 0.95, method='higher')),
+        figure(np.sqrt(np.mean(error**2)) if len(told) else np.nan),
+        figure(np.sqrt(np.mean(normalised**2)) if len(told) else np.nan),
+        part([f['named'] == f['fluoroscope'] for f in told]),
+        part([' or ' in f['named'] and f['fluoroscope'] in f['named'] for f in told]),
+        part([f['place'] for f in told]),
+    ]
 
 
 def _call(task):
@@ -304,13 +515,23 @@ def _call(task):
 def measure(rigs=3, alarm_rigs=10, hours=0.5, processes=1, chosen=None):
     """All figures: {'alarms': dicts of false_alarms, 'cases': {title: dicts of detection}}.
 
-    rigs: of each case of drifts; alarm_rigs: without drift, hours [h] each, every third with the orientation of a
-    capture; chosen: titles of cases, None: all.
+    rigs: of each case of drifts; alarm_rigs: without drift, hours [h] each, every third with the
+    orientation of a capture; chosen: titles of cases, None: all.
     """
-    tasks = [('alarms', false_alarms, {'seed': s, 'hours': hours, 'source': 'capture' if s % 3 == 2 else 'exposures'})
-             for s in range(alarm_rigs)]
-    tasks += [(title, function, {'seed': 100 + s, **more}) for title, function, more in CASES
-              for s in range(rigs) if chosen is None or title in chosen]
+    tasks = [
+        (
+            'alarms',
+            false_alarms,
+            {'seed': s, 'hours': hours, 'source': 'capture' if s % 3 == 2 else 'exposures'},
+        )
+        for s in range(alarm_rigs)
+    ]
+    tasks += [
+        (title, function, {'seed': 100 + s, **more})
+        for title, function, more in CASES
+        for s in range(rigs)
+        if chosen is None or title in chosen
+    ]
     with multiprocessing.get_context('spawn').Pool(processes) as pool:
         results = []
         for n, result in enumerate(pool.imap(_call, [(f, a) for _, f, a in tasks])):
@@ -329,11 +550,13 @@ def report(figures, options=DriftOptions()):
     hours = sum(a['hours'] for a in alarms)
     lines = []
     if alarms:
-        lines += [f'{hours:g} h of stream without drift on {len(alarms)} rigs, 120 Hz, 30 markers: '
-                  f'{sum(a["error"] for a in alarms)} false ERRORs (stated: {hours / options.error_interval_h:.2g} at '
-                  f'most on average), {sum(a["warn"] for a in alarms)} false WARNs (stated: '
-                  f'{hours / options.warn_interval_h:.2g}); largest evidence '
-                  f'{max(a["largest"] for a in alarms):.2f} of the threshold of WARN.']
+        lines += [
+            f'{hours:g} h of stream without drift on {len(alarms)} rigs, 120 Hz, 30 markers: '
+            f'{sum(a["error"] for a in alarms)} false ERRORs (stated: {hours / options.error_interval_h:.2g} at '
+            f'most on average), {sum(a["warn"] for a in alarms)} false WARNs (stated: '
+            f'{hours / options.warn_interval_h:.2g}); largest evidence '
+            f'{max(a["largest"] for a in alarms):.2f} of the threshold of WARN.'
+        ]
         lines += [text for a in alarms for text in a['said']]
     rows = []
     for title, found in figures['cases'].items():
@@ -345,12 +568,16 @@ def report(figures, options=DriftOptions()):
 
 def main(arguments=None):
     """Print the table."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks.drift', description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog='python -m benchmarks.drift', description=__doc__.splitlines()[0]
+    )
     parser.add_argument('--rigs', type=int, default=3, help='of each case of drifts (3)')
     parser.add_argument('--alarm-rigs', type=int, default=10, help='rigs without drift (10)')
     parser.add_argument('--hours', type=float, default=0.5, help='of stream of each of them (0.5)')
     parser.add_argument('--processes', type=int, default=1)
-    parser.add_argument('--case', action='append', help='only these cases of drifts, by their titles')
+    parser.add_argument(
+        '--case', action='append', help='only these cases of drifts, by their titles'
+    )
     a = parser.parse_args(arguments)
     print(report(measure(a.rigs, a.alarm_rigs, a.hours, a.processes, a.case)))
 

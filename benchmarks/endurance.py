@@ -1,10 +1,12 @@
-"""An hour of the stream, faster than real time: what comes in comes out, and memory stays what it was.
+"""An hour of the stream, faster than real time: what comes in comes out, and memory stays what it
+was.
 
     python -m benchmarks.endurance [--hours 1] [--rate 120]
 
-The frames of 2 x 120 Hz x 30 markers of an hour go through correction and reconstruction (with the drift watch and a
-subscriber of the point cloud) as fast as they are taken: never more than a fraction of a queue ahead of the points that
-come out. Every minute of the stream the resident memory of both nodes is noted.
+The frames of 2 x 120 Hz x 30 markers of an hour go through correction and reconstruction (with the
+drift watch and a subscriber of the point cloud) as fast as they are taken: never more than a
+fraction of a queue ahead of the points that come out. Every minute of the stream the resident
+memory of both nodes is noted.
 """
 
 import argparse
@@ -28,7 +30,7 @@ from .online import NAMES, Reader, _command, rig_of_the_simulator
 
 NODES = ('correction_node', 'reconstruction_node')
 AHEAD = OBSERVATIONS.depth // 4
-PAGE_MB = os.sysconf('SC_PAGE_SIZE') / 2 ** 20
+PAGE_MB = os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
 def resident_mb(process):
@@ -37,23 +39,35 @@ def resident_mb(process):
 
 
 def stream(reader, frames, rate_hz, note):
-    """Publish frames exposures in step with the points that come out; note(number) at every minute of the stream."""
-    outputs = {n: reader.create_publisher(TargetObservations, f'{n}/target_observations', OBSERVATIONS) for n in NAMES}
+    """Publish frames exposures in step with the points that come out; note(number) at every minute
+    of the stream.
+    """
+    outputs = {
+        n: reader.create_publisher(TargetObservations, f'{n}/target_observations', OBSERVATIONS)
+        for n in NAMES
+    }
     tracking = simulate_tracking(virtual_rig(1), 10.0, rate_hz, 1, clusters=5).frames
-    messages = [[(n, message_from_frame(tracking[n][k])) for n in NAMES] for k in range(len(tracking['a']))]
-    reader.wait(lambda: all(o.get_subscription_count() for o in outputs.values()), 30, 'the readers')
+    messages = [
+        [(n, message_from_frame(tracking[n][k])) for n in NAMES] for k in range(len(tracking['a']))
+    ]
+    reader.wait(
+        lambda: all(o.get_subscription_count() for o in outputs.values()), 30, 'the readers'
+    )
     came = reader.came['reconstruction_node', 'ab']
     start_ns = time.time_ns()
     for number, pair in zip(range(1, frames + 1), itertools.cycle(messages)):
         end = time.monotonic() + 60
         while number - len(came) > AHEAD:
             if time.monotonic() > end:
-                raise SystemExit(f'{number} exposures went in, {len(came)} came out, and nothing more for a minute')
+                raise SystemExit(
+                    f'{number} exposures went in, {len(came)} came out, and nothing more for a minute'
+                )
             time.sleep(0.0005)
         for name, message in pair:
             message.frame_number = number
-            seconds, nanoseconds = divmod(start_ns + round(number / rate_hz * 1e9), 10 ** 9)
-            message.header.stamp.sec, message.header.stamp.nanosec = seconds, nanoseconds
+            seconds, nanoseconds = divmod(start_ns + round(number / rate_hz * 1e9), 10**9)
+            message.header.stamp.sec = seconds
+            message.header.stamp.nanosec = nanoseconds
             outputs[name].publish(message)
         if number % round(60 * rate_hz) == 0:
             note(number)
@@ -64,15 +78,22 @@ def run(hours, rate_hz):
     """Figures: exposures, frames in and out, seconds, and memory {node: [MB by minute]}."""
     isolate()
     rclpy.init(args=[])
-    reader, frames = Reader(*rig_of_the_simulator()), round(3600 * hours * rate_hz)
-    processes = {node: subprocess.Popen(_command(node), stderr=subprocess.DEVNULL) for node in NODES}
+    reader = Reader(*rig_of_the_simulator())
+    frames = round(3600 * hours * rate_hz)
+    processes = {
+        node: subprocess.Popen(_command(node), stderr=subprocess.DEVNULL) for node in NODES
+    }
     memory = {node: [] for node in NODES}
 
     def note(number):
         for node, process in processes.items():
             memory[node].append(resident_mb(process))
-        print(f'{number / rate_hz / 60:.0f} min: ' + ', '.join(f'{n} {m[-1]:.1f} MB' for n, m in memory.items()),
-              flush=True)
+        print(
+            f'{number / rate_hz / 60:.0f} min: '
+            + ', '.join(f'{n} {m[-1]:.1f} MB' for n, m in memory.items()),
+            flush=True,
+        )
+
     try:
         reader.listen(NODES)
         reader.ready.clear()
@@ -95,13 +116,21 @@ def run(hours, rate_hz):
 def text_of(figures):
     """Sentences of the figures."""
     frames = figures['exposures']
-    lines = [f'{frames} exposures of 2 x 30 markers in {figures["seconds"]:.0f} s.',
-             f'In: 2 x {frames} frames. Out: ' + ', '.join(
-                 f'{node} {name} {count}' for (node, name), count in figures['out'].items())]
+    lines = [
+        f'{frames} exposures of 2 x 30 markers in {figures["seconds"]:.0f} s.',
+        f'In: 2 x {frames} frames. Out: '
+        + ', '.join(f'{node} {name} {count}' for (node, name), count in figures['out'].items()),
+    ]
     for node, of_one in figures['memory'].items():
-        slope = np.polyfit(np.arange(len(of_one)), of_one, 1)[0] * 60 if len(of_one) > 2 else float('nan')
-        lines.append(f'{node}: {of_one[0]:.1f} MB after a minute of the stream, {of_one[-1]:.1f} MB at the end, '
-                     f'largest {max(of_one):.1f} MB, trend {slope:+.2f} MB an hour')
+        slope = (
+            np.polyfit(np.arange(len(of_one)), of_one, 1)[0] * 60
+            if len(of_one) > 2
+            else float('nan')
+        )
+        lines.append(
+            f'{node}: {of_one[0]:.1f} MB after a minute of the stream, {of_one[-1]:.1f} MB at the end, '
+            f'largest {max(of_one):.1f} MB, trend {slope:+.2f} MB an hour'
+        )
     return '\n'.join(lines)
 
 

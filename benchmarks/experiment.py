@@ -1,8 +1,9 @@
-"""One case of the validation experiment: calibrate on some exposures of a virtual rig, test on others.
+"""One case of the validation experiment: calibrate on some exposures of a virtual rig, test on
+others.
 
-The reference is the truth of the rig: bead coordinates, source positions and distortion field that the
-observations were made from. A Case says what is done, an Outcome what came of it, in numbers only, so that
-cases can be run in processes of their own.
+The reference is the truth of the rig: bead coordinates, source positions and distortion field that
+the observations were made from. A Case says what is done, an Outcome what came of it, in numbers
+only, so that cases can be run in processes of their own.
 """
 
 import functools
@@ -13,36 +14,41 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.job import SEEN_FOR_NOISE, calibrate, held_corrections
-from fluoro_calib_ros.calibration.network import measured_network
-from fluoro_calib_ros.calibration.self_calibration import Options, start_noise
+from fluoro_calib_ros.calibration.calibrate import SEEN_FOR_NOISE, calibrate, held_corrections
+from fluoro_calib_ros.calibration.initial_network import measured_network
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.self_calibration import start_noise
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import points_on_image
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
-from fluoro_calib_ros.photogrammetry.estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.noise import Noise
-from fluoro_calib_ros.photogrammetry.observations import DataError, points_on_image
+from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.report.figures import relative_costs
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 NOISE_PX = 0.25
-BEFORE, HELD, KNOWN = 'before', 'knn, interior held', 'known distortion'
-# In the order of the tables; what this version's Options does not take is left out.
+BEFORE = 'before'
+HELD = 'knn, interior held'
+KNOWN = 'known distortion'
+# In the order of the tables; what this version's CalibrationOptions does not take is left out.
 MODELS = ('knn', 'local_linear', 'parametric', 'hybrid', 'collocation', 'auto')
 RELATIVE = ('none', 'soft', 'hard')
-TEST_TOLERANCE = 1e-4   # decrease of F left by the adjustment of a test: a hundredth of a sigma
-GRID_PX = 16   # spacing of the pixels at which the correction is compared with the truth
+TEST_TOLERANCE = 1e-4  # decrease of F left by the adjustment of a test: a hundredth of a sigma
+GRID_PX = 16  # spacing of the pixels at which the correction is compared with the truth
 
 
 @dataclass(frozen=True)
 class Case:
     """What is calibrated, and from what.
 
-    seed of the rig; variant: BEFORE, HELD, KNOWN or a model (interior orientation estimated); exposures: of the
-    recording, of which every so many (10: every tenth) are for the calibration, the others for the test; training:
-    number of other exposures for the calibration, None: those; joint: one adjustment for all fluoroscopes;
-    relative: relative orientation constraint; survey: factor of the standard deviation that is stated for the survey;
-    rounds: largest number of them; detail: residuals are wanted too.
+    seed of the rig; variant: BEFORE, HELD, KNOWN or a model (interior orientation estimated);
+    exposures: of the recording, of which every so many (10: every tenth) are for the calibration,
+    the others for the test; training: number of other exposures for the calibration, None: those;
+    joint: one adjustment for all fluoroscopes; relative: relative orientation constraint; survey:
+    factor of the standard deviation that is stated for the survey; rounds: largest number of them;
+    detail: residuals are wanted too.
     """
 
     seed: int
@@ -62,15 +68,22 @@ class Case:
     @property
     def scene(self):
         """Key of the rig and its recording."""
-        return self.seed, self.strength, self.false_matches, self.exposures, self.every, self.survey
+        return (
+            self.seed,
+            self.strength,
+            self.false_matches,
+            self.exposures,
+            self.every,
+            self.survey,
+        )
 
 
 @dataclass(frozen=True)
 class Residuals:
     """In-sample residuals of one fluoroscope.
 
-    uv (n, 2) observed pixels, residual (n, 2) [px], sd (n,) its standard deviation from the simulated noise [px],
-    weight (n,) robust weight, inlier (n,).
+    uv (n, 2) observed pixels, residual (n, 2) [px], sd (n,) its standard deviation from the
+    simulated noise [px], weight (n,) robust weight, inlier (n,).
     """
 
     uv: np.ndarray
@@ -89,21 +102,27 @@ class Residuals:
 
     def reweighted(self):
         """RMSE (2,) [px] of all residuals times the square root of their robust weight."""
-        return np.sqrt(np.mean(self.weight[:, None] * self.residual ** 2, axis=0))
+        return np.sqrt(np.mean(self.weight[:, None] * self.residual**2, axis=0))
 
     def together(self, other):
         """The residuals of two fluoroscopes as one set."""
-        return Residuals(*(np.concatenate([getattr(r, f.name) for r in (self, other)]) for f in fields(Residuals)))
+        return Residuals(
+            *(
+                np.concatenate([getattr(r, f.name) for r in (self, other)])
+                for f in fields(Residuals)
+            )
+        )
 
 
 @dataclass(frozen=True)
 class Outcome:
     """What came of a case; failed: the reason where it has no numbers.
 
-    inside and outside (6,): RMSE [mm] in and out of sample of object points X, Y, Z and sources Xo, Yo, Zo;
-    error_map (rows, columns, 2) [px] by fluoroscope: error of the correction over the image, see error_over_image;
-    model: kind and k by fluoroscope; seconds of the calibration; rounds of its loop; residuals by fluoroscope and
-    costs: F and G in percent of the first, for detailed cases.
+    inside and outside (6,): RMSE [mm] in and out of sample of object points X, Y, Z and sources
+    Xo, Yo, Zo; error_map (rows, columns, 2) [px] by fluoroscope: error of the correction over the
+    image, see error_over_image; model: kind and k by fluoroscope; seconds of the calibration;
+    rounds of its loop; residuals by fluoroscope and costs: F and G in percent of the first, for
+    detailed cases.
     """
 
     failed: str = ''
@@ -118,11 +137,13 @@ class Outcome:
     costs: tuple = ()
 
     def image_px(self, name, within=None):
-        """RMSE [px] of a coordinate of the correction over the calibrated area; within: map that covers less."""
+        """RMSE [px] of a coordinate of the correction over the calibrated area; within: map that
+        covers less.
+        """
         errors = self.error_map[name]
         if within is not None:
             errors = errors[np.isfinite(errors) & np.isfinite(within)]
-        return float(np.sqrt(np.nanmean(errors ** 2)))
+        return float(np.sqrt(np.nanmean(errors**2)))
 
     def covered(self, name):
         """Part of the image inside the calibrated area."""
@@ -138,32 +159,39 @@ class Outcome:
 
 
 def available_models():
-    """Correction models that Options takes, in the order of the tables."""
+    """Correction models that CalibrationOptions takes, in the order of the tables."""
     return tuple(name for name in MODELS if _accepted(model=name))
 
 
 def available_relative():
-    """Settings of the relative orientation constraint that Options takes beside 'none'."""
+    """Settings of the relative orientation constraint that CalibrationOptions takes beside 'none'."""
     return tuple(name for name in RELATIVE[1:] if _accepted(relative_orientation=name))
 
 
 def _accepted(**options):
     try:
-        Options(**options)
+        CalibrationOptions(**options)
     except (TypeError, ValueError):
         return False
     return True
 
 
 def options_of(case):
-    """Options of the calibration of a case."""
-    model, interior = {BEFORE: ('none', 'fixed'), HELD: ('knn', 'fixed'),
-                       KNOWN: ('none', 'estimated')}.get(case.variant, (case.variant, 'estimated'))
+    """CalibrationOptions of the calibration of a case."""
+    model, interior = {
+        BEFORE: ('none', 'fixed'),
+        HELD: ('knn', 'fixed'),
+        KNOWN: ('none', 'estimated'),
+    }.get(case.variant, (case.variant, 'estimated'))
     relative = {} if case.relative == 'none' else {'relative_orientation': case.relative}
-    return Options(model=model, interior=interior, max_iterations=case.rounds, **relative)
+    return CalibrationOptions(
+        model=model, interior=interior, max_iterations=case.rounds, **relative
+    )
 
 
-# ---------------------------------------------------------------------------------------------------------- rigs
+# ----------------------------------------------------------------------------------------------------------
+# rigs
+
 
 class Scene:
     """A virtual rig with its exposures for calibration and test."""
@@ -171,35 +199,54 @@ class Scene:
     def __init__(self, seed, strength, false_matches, exposures, every, survey):
         rig = virtual_rig(seed, strength)
         self.rig = replace(rig, phantom=replace(rig.phantom, sd_mm=survey * rig.phantom.sd_mm))
-        self._seed, self._false_matches, self._every = seed, false_matches, every
+        self._seed = seed
+        self._false_matches = false_matches
+        self._every = every
         self.recording = simulate_exposures(self.rig, exposures, seed, NOISE_PX, false_matches)
         self._tested = {}
 
     def training(self, count, known):
-        """Frames by fluoroscope for the calibration: count of their own, None: some of the recording."""
+        """Frames by fluoroscope for the calibration: count of their own, None: some of the
+        recording.
+        """
         if count is None:
-            return self._frames(self.recording, known, lambda i: i % self._every == 0), self.recording
+            return self._frames(
+                self.recording, known, lambda i: i % self._every == 0
+            ), self.recording
         # Exposures of their own, so that the test is the same for every count.
-        own = simulate_exposures(self.rig, count, 1000 * self._seed + count, NOISE_PX, self._false_matches)
+        own = simulate_exposures(
+            self.rig, count, 1000 * self._seed + count, NOISE_PX, self._false_matches
+        )
         return self._frames(own, known), own
 
     def test_network(self, fluoroscopes, known):
-        """Measured network of the exposures for the test; the start values are those of the true calibration."""
+        """Measured network of the exposures for the test; the start values are those of the true
+        calibration.
+        """
         key = fluoroscopes, known
         if key not in self._tested:
             frames = self._frames(self.recording, known, lambda i: i % self._every != 0)
             true = {f.name: f.interior for f in self.rig.fluoroscopes}
             fields = None if known else {f.name: f.distortion for f in self.rig.fluoroscopes}
-            self._tested[key] = measured_network({n: frames[n] for n in fluoroscopes}, self.rig.phantom, interior=true,
-                                                 interior_free=False, corrections=fields, min_exposures=1)
+            self._tested[key] = measured_network(
+                {n: frames[n] for n in fluoroscopes},
+                self.rig.phantom,
+                interior=true,
+                interior_free=False,
+                corrections=fields,
+                min_exposures=1,
+            )
         return self._tested[key]
 
     def _frames(self, simulated, known, chosen=lambda i: True):
         """Frames by fluoroscope; known: with the true distortion taken off."""
         out = {}
         for name, frames in simulated.frames.items():
-            out[name] = [_undistorted(frame, simulated.undistorted[name][i]) if known else frame
-                         for i, frame in enumerate(frames) if chosen(i)]
+            out[name] = [
+                _undistorted(frame, simulated.undistorted[name][i]) if known else frame
+                for i, frame in enumerate(frames)
+                if chosen(i)
+            ]
         return out
 
     def field(self, name):
@@ -207,12 +254,18 @@ class Scene:
         return next(f.distortion for f in self.rig.fluoroscopes if f.name == name)
 
     def errors(self, targets_id, xyz_mm, exposures, simulated):
-        """RMSE (6,) [mm] of object points and of sources; exposures: (fluoroscope, number, position_mm)."""
+        """RMSE (6,) [mm] of object points and of sources; exposures: (fluoroscope, number,
+        position_mm).
+        """
         points = xyz_mm - self.rig.true_mm[targets_id - self.rig.phantom.target_id[0]]
         rigs = {f.name: f for f in self.rig.fluoroscopes}
-        sources = np.array([position - rigs[name].exterior(simulated.poses[number - 1])[1]
-                            for name, number, position in exposures])
-        return np.sqrt(np.concatenate([np.mean(points ** 2, axis=0), np.mean(sources ** 2, axis=0)]))
+        sources = np.array(
+            [
+                position - rigs[name].exterior(simulated.poses[number - 1])[1]
+                for name, number, position in exposures
+            ]
+        )
+        return np.sqrt(np.concatenate([np.mean(points**2, axis=0), np.mean(sources**2, axis=0)]))
 
 
 def _undistorted(frame, uv):
@@ -227,7 +280,9 @@ def scene_of(*key):
     return Scene(*key)
 
 
-# --------------------------------------------------------------------------------------------------------- cases
+# ---------------------------------------------------------------------------------------------------------
+# cases
+
 
 def run_case(case):
     """Outcome of a case."""
@@ -236,55 +291,90 @@ def run_case(case):
     frames, simulated = scene.training(case.training, known)
     began = time.perf_counter()
     try:
-        job = calibrate({n: frames[n] for n in case.fluoroscopes}, scene.rig.phantom, options_of(case), case.joint)
+        job = calibrate(
+            {n: frames[n] for n in case.fluoroscopes},
+            scene.rig.phantom,
+            options_of(case),
+            case.joint,
+        )
         seconds = time.perf_counter() - began
         with threadpool_limits(1):
             outside = errors_of_test(scene, case, job.calibrations)
-    except (DataError, np.linalg.LinAlgError) as error:   # a result too, and to be told as such
+    except (DataError, np.linalg.LinAlgError) as error:  # a result too, and to be told as such
         return Outcome(failed=f'{type(error).__name__}: {error}')
-    exposures = [(name, e.exposure, e.position_mm) for name in case.fluoroscopes
-                 for e in job.fluoroscopes[name].exposures]
+    exposures = [
+        (name, e.exposure, e.position_mm)
+        for name in case.fluoroscopes
+        for e in job.fluoroscopes[name].exposures
+    ]
     inside = scene.errors(job.targets.target_id, job.targets.xyz_mm, exposures, simulated)
     models = {name: job.calibrations[name].model for name in case.fluoroscopes}
-    maps = {} if known else {name: error_over_image(
-        models[name], scene.field(name), np.concatenate([f.uv for f in frames[name]]),
-        job.fluoroscopes[name].image_size) for name in case.fluoroscopes}
+    maps = (
+        {}
+        if known
+        else {
+            name: error_over_image(
+                models[name],
+                scene.field(name),
+                np.concatenate([f.uv for f in frames[name]]),
+                job.fluoroscopes[name].image_size,
+            )
+            for name in case.fluoroscopes
+        }
+    )
     detail = _details(job) if case.detail else {}
     return Outcome(
-        inside=inside, outside=outside, error_map=maps,
-        model={n: (f.model_kind, f.k) for n, f in job.fluoroscopes.items()}, seconds=seconds,
-        rounds=sum(len(r.history) for r in job.runs.values()), converged=job.converged,
-        **detail)
+        inside=inside,
+        outside=outside,
+        error_map=maps,
+        model={n: (f.model_kind, f.k) for n, f in job.fluoroscopes.items()},
+        seconds=seconds,
+        rounds=sum(len(r.history) for r in job.runs.values()),
+        converged=job.converged,
+        **detail,
+    )
 
 
 def errors_of_test(scene, case, calibrations):
     """RMSE (6,) [mm] of the test exposures, adjusted with the calibrations held.
 
-    The same as adjust_with, but for the start values, and without covariances and the adjustment before the
-    correction, which are not needed here: a third of the time.
+    The same as adjust_with, but for the start values, and without covariances and the adjustment
+    before the correction, which are not needed here: a third of the time.
     """
     measured = scene.test_network(case.fluoroscopes, case.variant == KNOWN)
     correction, network = held_corrections(measured, calibrations)
-    start = with_interior(measured, np.array([calibrations[n].interior for n in case.fluoroscopes]))
-    noise = replace(start_noise('student_t'), scale=float(np.median([c.sigma0 for c in calibrations.values()])),
-                    nu=float(np.median([c.nu for c in calibrations.values()])))
+    start = with_interior(
+        measured, np.array([calibrations[n].interior for n in case.fluoroscopes])
+    )
+    noise = replace(
+        start_noise('student_t'),
+        scale=float(np.median([c.sigma0 for c in calibrations.values()])),
+        nu=float(np.median([c.nu for c in calibrations.values()])),
+    )
     if len(network.uv) < SEEN_FOR_NOISE * len(network.survey_mm):
-        after = adjust(network, start, correction, noise, tolerance=TEST_TOLERANCE, noise_held=True)
+        after = adjust(
+            network, start, correction, noise, tolerance=TEST_TOLERANCE, noise_held=True
+        )
     else:
         after = adjust_and_estimate_noise(network, start, correction, noise, TEST_TOLERANCE)
-    exposures = [(frame.fluoroscope, frame.number, after.parameters.position_mm[j])
-                 for j, frame in enumerate(measured.frames)]
+    exposures = [
+        (frame.fluoroscope, frame.number, after.parameters.position_mm[j])
+        for j, frame in enumerate(measured.frames)
+    ]
     return scene.errors(measured.target_id, after.parameters.points_mm, exposures, scene.recording)
 
 
 def with_interior(measured, interior):
-    """Start values of a network for other interior orientations (F, 3), which show nearly the same image.
+    """Start values of a network for other interior orientations (F, 3), which show nearly the same
+    image.
 
-    A shift of the principal point looks like a turn of the sensor, and another principal distance like another
-    distance of the source.
+    A shift of the principal point looks like a turn of the sensor, and another principal distance
+    like another distance of the source.
     """
-    start, network = measured.start, measured.network
-    rotation, position = start.rotation.copy(), start.position_mm.copy()
+    start = measured.start
+    network = measured.network
+    rotation = start.rotation.copy()
+    position = start.position_mm.copy()
     for f, (last, now) in enumerate(zip(start.interior, interior)):
         rows = network.fluoroscope == f
         x, y = (last[:2] - now[:2]) / now[2]
@@ -297,29 +387,41 @@ def with_interior(measured, interior):
 
 def _details(job):
     """Residuals by fluoroscope and relative costs of a calibration."""
-    residuals, costs = {}, ()
+    residuals = {}
+    costs = ()
     for run in job.runs.values():
-        network, after = run.measured.network, run.after
+        network = run.measured.network
+        after = run.after
         weight = after.noise.weight(after.q)
-        # C_r with the simulated noise as C_l: one unit for every variant, so that the costs can be compared.
+        # C_r with the simulated noise as C_l: one unit for every variant, so that the costs can be
+        # compared.
         redundancy = geometric_redundancy(network, after.parameters, Noise('gaussian', NOISE_PX))
         sd = NOISE_PX * network.sigma * np.sqrt(np.maximum(redundancy, 0.05))
         for f, name in enumerate(run.measured.fluoroscopes):
             rows = np.flatnonzero(network.fluoroscope[network.exposure] == f)
-            residuals[name] = Residuals(network.uv[rows], after.residuals[rows], sd[rows], weight[rows],
-                                        after.inliers[rows])
+            residuals[name] = Residuals(
+                network.uv[rows],
+                after.residuals[rows],
+                sd[rows],
+                weight[rows],
+                after.inliers[rows],
+            )
         if len(run.history) > 1:
             costs = relative_costs(run)[:2]
     return {'residuals': residuals, 'costs': costs}
 
 
-# --------------------------------------------------------------------------------------------- correction itself
+# ---------------------------------------------------------------------------------------------
+# correction itself
+
 
 def error_over_image(model, true_field, training_uv, image_size):
-    """Errors (rows, columns, 2) [px] of corrected coordinates on a grid of pixels, NaN outside the calibrated area.
+    """Errors (rows, columns, 2) [px] of corrected coordinates on a grid of pixels, NaN outside the
+    calibrated area.
 
-    After the best projective map between corrected and true coordinates: a shift, scale, rotation and tilt of
-    the image plane belong to the orientation of the fluoroscope, not to its distortion.
+    After the best projective map between corrected and true coordinates: a shift, scale, rotation
+    and tilt of the image plane belong to the orientation of the fluoroscope, not to its
+    distortion.
     """
     u, v = np.meshgrid(*(np.arange(GRID_PX / 2 - 0.5, size, GRID_PX) for size in image_size))
     pixels = np.column_stack([u.ravel(), v.ravel()])
@@ -327,25 +429,47 @@ def error_over_image(model, true_field, training_uv, image_size):
     inside = (pixels @ hull[:, :2].T + hull[:, 2] <= 0).all(axis=1) & ~model.outside(pixels)
     out = np.full(pixels.shape, np.nan)
     observed = pixels[inside]
-    out[inside] = projective_residuals(observed - model.predict(observed), observed - true_field(observed))
+    out[inside] = projective_residuals(
+        observed - model.predict(observed), observed - true_field(observed)
+    )
     return out.reshape(*u.shape, 2).astype(np.float32)
 
 
 def projective_residuals(uv, ideal):
-    """What is left (n, 2) of uv - ideal after the projective map of uv (8 parameters) that fits ideal best."""
-    centre, half = np.mean(ideal, axis=0), np.max(np.ptp(ideal, axis=0)) / 2
+    """What is left (n, 2) of uv - ideal after the projective map of uv (8 parameters) that fits
+    ideal best.
+    """
+    centre = np.mean(ideal, axis=0)
+    half = np.max(np.ptp(ideal, axis=0)) / 2
     x, y = ((uv - centre) / half).T
     goal = (ideal - centre) / half
-    one, zero = np.ones_like(x), np.zeros_like(x)
+    one = np.ones_like(x)
+    zero = np.zeros_like(x)
     h = np.array([1.0, 0, 0, 0, 1, 0, 0, 0])
-    for _ in range(5):   # Gauss-Newton: the linear solution minimises something slightly different
+    for _ in range(5):  # Gauss-Newton: the linear solution minimises something slightly different
         below = h[6] * x + h[7] * y + 1
-        mapped = np.stack([h[0] * x + h[1] * y + h[2], h[3] * x + h[4] * y + h[5]], axis=1) / below[:, None]
-        rows = np.stack([np.stack([x, y, one, zero, zero, zero, -mapped[:, 0] * x, -mapped[:, 0] * y], axis=1),
-                         np.stack([zero, zero, zero, x, y, one, -mapped[:, 1] * x, -mapped[:, 1] * y], axis=1)],
-                        axis=1) / below[:, None, None]
+        mapped = (
+            np.stack([h[0] * x + h[1] * y + h[2], h[3] * x + h[4] * y + h[5]], axis=1)
+            / below[:, None]
+        )
+        rows = (
+            np.stack(
+                [
+                    np.stack(
+                        [x, y, one, zero, zero, zero, -mapped[:, 0] * x, -mapped[:, 0] * y], axis=1
+                    ),
+                    np.stack(
+                        [zero, zero, zero, x, y, one, -mapped[:, 1] * x, -mapped[:, 1] * y], axis=1
+                    ),
+                ],
+                axis=1,
+            )
+            / below[:, None, None]
+        )
         step, *_ = np.linalg.lstsq(rows.reshape(-1, 8), (goal - mapped).ravel(), rcond=None)
         h = h + step
     below = h[6] * x + h[7] * y + 1
-    mapped = np.stack([h[0] * x + h[1] * y + h[2], h[3] * x + h[4] * y + h[5]], axis=1) / below[:, None]
+    mapped = (
+        np.stack([h[0] * x + h[1] * y + h[2], h[3] * x + h[4] * y + h[5]], axis=1) / below[:, None]
+    )
     return half * (mapped - goal)

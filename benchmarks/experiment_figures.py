@@ -15,13 +15,25 @@ from fluoro_calib_ros.simulation.rig import IMAGE_SIZE
 from .experiment import BEFORE, GRID_PX, HELD, KNOWN
 
 # Okabe and Ito: colour-blind people can tell them apart, and the markers differ too.
-LOOK = {'knn': ('#E69F00', 's'), 'local_linear': ('#56B4E9', 'o'), 'parametric': ('#009E73', '^'),
-        'hybrid': ('#CC79A7', 'D'), 'collocation': ('#0072B2', 'v'), 'auto': ('#000000', 'o'),
-        BEFORE: ('#D55E00', 'x'), HELD: ('#D55E00', 'P'), KNOWN: ('#777777', '')}
-PANEL = {BEFORE: 'before', HELD: 'after\n(kNN, interior held)', 'knn': 'after w/ IOP\n(kNN, interior estimated)'}
+LOOK = {
+    'knn': ('#E69F00', 's'),
+    'local_linear': ('#56B4E9', 'o'),
+    'parametric': ('#009E73', '^'),
+    'hybrid': ('#CC79A7', 'D'),
+    'collocation': ('#0072B2', 'v'),
+    'auto': ('#000000', 'o'),
+    BEFORE: ('#D55E00', 'x'),
+    HELD: ('#D55E00', 'P'),
+    KNOWN: ('#777777', ''),
+}
+PANEL = {
+    BEFORE: 'before',
+    HELD: 'after\n(kNN, interior held)',
+    'knn': 'after w/ IOP\n(kNN, interior estimated)',
+}
 STRIPES = 24
-LIMIT = 10.0   # standard deviations shown to either side
-COLOURS = 96   # of a picture: as good to the eye, at a third of the size
+LIMIT = 10.0  # standard deviations shown to either side
+COLOURS = 96  # of a picture: as good to the eye, at a third of the size
 
 
 def title_of(variant):
@@ -30,7 +42,9 @@ def title_of(variant):
 
 
 def write_all(plan, outcomes, folder):
-    """Write all pictures of the experiment; returns their paths by key: 'figure 1' to 'figure 10', 'curves', 'map'."""
+    """Write all pictures of the experiment; returns their paths by key: 'figure 1' to 'figure 10',
+    'curves', 'map'.
+    """
     os.makedirs(folder, exist_ok=True)
     paths = {}
     with style.context(['default', STYLE, {'savefig.dpi': 'figure', 'figure.dpi': 100}]):
@@ -52,7 +66,10 @@ def _small(png, colours):
 def _figures(plan, outcomes):
     """Keys and figures of the experiment."""
     shown = tuple(dict.fromkeys((HELD, 'knn', plan.default)))
-    of = {s: {v: outcomes[c] for v, c in plan.paper_cases(s).items() if not outcomes[c].failed} for s in 'ab'}
+    of = {
+        s: {v: outcomes[c] for v, c in plan.paper_cases(s).items() if not outcomes[c].failed}
+        for s in 'ab'
+    }
     costs = {v: outcomes[c].costs for v, c in plan.cost_cases().items() if len(outcomes[c].costs)}
     if costs:
         yield 'figure 1', cost_figure(costs)
@@ -63,16 +80,28 @@ def _figures(plan, outcomes):
             yield f'figure {number + axis}', histogram_figure(residuals, system, axis)
         for axis in (0, 1):
             yield f'figure {number + 2 + axis}', position_figure(residuals, system, axis)
-    yield 'map', map_figure({v: of['a'][v].error_map['a'] for v in dict.fromkeys(('knn', 'local_linear', plan.default))
-                             if v in of['a']})
+    yield (
+        'map',
+        map_figure(
+            {
+                v: of['a'][v].error_map['a']
+                for v in dict.fromkeys(('knn', 'local_linear', plan.default))
+                if v in of['a']
+            }
+        ),
+    )
     yield 'curves', curve_figure(plan, outcomes)
 
 
-# ------------------------------------------------------------------------------------------------- Figures 1 and 2
+# -------------------------------------------------------------------------------------------------
+# Figures 1 and 2
+
 
 def cost_figure(costs):
     """F and G of every round in percent of the first; a panel for each variant."""
-    figure = new_figure(4.4 * len(costs), 4.6, 'Figure 1: relative cost at every iteration, fluoroscopic system 1')
+    figure = new_figure(
+        4.4 * len(costs), 4.6, 'Figure 1: relative cost at every iteration, fluoroscopic system 1'
+    )
     panels = np.atleast_1d(figure.subplots(1, len(costs), sharey=True))
     for axes, (variant, (f, g)) in zip(panels, costs.items()):
         axes.plot(range(len(f)), f, '-o', color=BLUE, markersize=4, label='F, bundle adjustment')
@@ -90,10 +119,21 @@ def total_cost_figure(costs):
     axes = figure.subplots()
     for variant, (f, g) in costs.items():
         colour, marker = LOOK[variant]
-        axes.plot(range(len(g)), (f[:len(g)] + g) / 2, '-', marker=marker, color=colour, markersize=5,
-                  label=title_of(variant).replace('\n', ' '))
-    axes.set(yscale='log', xlabel='iteration (0: without correction)', ylabel='(F + G) / 2 [% of iteration 0]')
-    _percent(axes, [c for f, g in costs.values() for c in (f[:len(g)] + g) / 2])
+        axes.plot(
+            range(len(g)),
+            (f[: len(g)] + g) / 2,
+            '-',
+            marker=marker,
+            color=colour,
+            markersize=5,
+            label=title_of(variant).replace('\n', ' '),
+        )
+    axes.set(
+        yscale='log',
+        xlabel='iteration (0: without correction)',
+        ylabel='(F + G) / 2 [% of iteration 0]',
+    )
+    _percent(axes, [c for f, g in costs.values() for c in (f[: len(g)] + g) / 2])
     figure.legend(loc='outside lower center', ncol=len(costs))
     return figure
 
@@ -108,42 +148,84 @@ def _percent(axes, values):
     axes.xaxis.get_major_locator().set_params(integer=True)
 
 
-# ------------------------------------------------------------------------------------------------ Figures 3 to 10
+# ------------------------------------------------------------------------------------------------
+# Figures 3 to 10
+
 
 def histogram_figure(residuals, system, axis):
     """Histograms of the normalised residuals of one coordinate, with the unit normal."""
     number = (3 if system == '1' else 7) + axis
-    figure = new_figure(3.5 * len(residuals), 4.4, f'Figure {number}: histogram of the {"xy"[axis]}-image residuals in '
-                                                   f'fluoroscopic system {system}')
-    edges, x, top = np.linspace(-LIMIT, LIMIT, 81), np.linspace(-LIMIT, LIMIT, 500), 0.4
-    for axes, (variant, r) in zip(figure.subplots(1, len(residuals), sharey=True), residuals.items()):
+    figure = new_figure(
+        3.5 * len(residuals),
+        4.4,
+        f'Figure {number}: histogram of the {"xy"[axis]}-image residuals in '
+        f'fluoroscopic system {system}',
+    )
+    edges = np.linspace(-LIMIT, LIMIT, 81)
+    x = np.linspace(-LIMIT, LIMIT, 500)
+    top = 0.4
+    for axes, (variant, r) in zip(
+        figure.subplots(1, len(residuals), sharey=True), residuals.items()
+    ):
         v = (r.residual / r.sd[:, None])[:, axis]
-        bars = axes.hist(v, edges, weights=np.full(len(v), 1 / (len(v) * (edges[1] - edges[0]))),
-                         color=LOOK[BEFORE][0] if variant == BEFORE else BLUE, alpha=0.65)
+        bars = axes.hist(
+            v,
+            edges,
+            weights=np.full(len(v), 1 / (len(v) * (edges[1] - edges[0]))),
+            color=LOOK[BEFORE][0] if variant == BEFORE else BLUE,
+            alpha=0.65,
+        )
         top = max(top, bars[0].max())
-        axes.plot(x, np.exp(-x * x / 2) / np.sqrt(2 * np.pi), color=BLACK, linewidth=1.5, label='unit normal')
+        axes.plot(
+            x,
+            np.exp(-x * x / 2) / np.sqrt(2 * np.pi),
+            color=BLACK,
+            linewidth=1.5,
+            label='unit normal',
+        )
         axes.set(title=title_of(variant), xlim=(-LIMIT, LIMIT), xticks=(-8, -4, 0, 4, 8))
-        axes.text(0.03, 0.97, f'within ±3: {100 * np.mean(np.abs(v) <= 3):.1f} %\nbeyond panel: '
-                  f'{100 * np.mean(np.abs(v) > LIMIT):.1f} %', transform=axes.transAxes, va='top', fontsize=9)
-    figure.axes[0].set(ylabel='probability density [-]', ylim=(0, 1.2 * top))   # room for the text
+        axes.text(
+            0.03,
+            0.97,
+            f'within ±3: {100 * np.mean(np.abs(v) <= 3):.1f} %\nbeyond panel: '
+            f'{100 * np.mean(np.abs(v) > LIMIT):.1f} %',
+            transform=axes.transAxes,
+            va='top',
+            fontsize=9,
+        )
+    figure.axes[0].set(ylabel='probability density [-]', ylim=(0, 1.2 * top))  # room for the text
     figure.axes[0].legend(loc='upper right', fontsize=9, bbox_to_anchor=(1.0, 0.86))
-    figure.supxlabel(f'{"xy"[axis]} residual / its standard deviation from the simulated noise [-]', fontsize=11)
+    figure.supxlabel(
+        f'{"xy"[axis]} residual / its standard deviation from the simulated noise [-]', fontsize=11
+    )
     return figure
 
 
 def position_figure(residuals, system, axis):
     """Residuals of one coordinate over that coordinate; the panel before has a scale of its own."""
     number = (5 if system == '1' else 9) + axis
-    figure = new_figure(3.6 * len(residuals), 4.4, f'Figure {number}: {"xy"[axis]}-image residuals as a function of '
-                        f'their {("column", "row")[axis]} number, fluoroscopic system {system}')
+    figure = new_figure(
+        3.6 * len(residuals),
+        4.4,
+        f'Figure {number}: {"xy"[axis]}-image residuals as a function of '
+        f'their {("column", "row")[axis]} number, fluoroscopic system {system}',
+    )
     panels = figure.subplots(1, len(residuals))
     after = [r.residual[r.inlier, axis] for v, r in residuals.items() if v != BEFORE]
     limit = 1.15 * max([np.quantile(np.abs(r), 0.999) for r in after])
     for axes, (variant, r) in zip(panels, residuals.items()):
-        own = 1.15 * np.quantile(np.abs(r.residual[r.inlier, axis]), 0.999) if variant == BEFORE else limit
+        own = (
+            1.15 * np.quantile(np.abs(r.residual[r.inlier, axis]), 0.999)
+            if variant == BEFORE
+            else limit
+        )
         _scatter(axes, r, axis, own, LOOK[BEFORE][0] if variant == BEFORE else BLUE)
-        axes.set(title=title_of(variant), xlabel=f'{("column u", "row v")[axis]} [px]',
-                 xlim=(-0.5, IMAGE_SIZE[axis] - 0.5), ylim=(-own, own))
+        axes.set(
+            title=title_of(variant),
+            xlabel=f'{("column u", "row v")[axis]} [px]',
+            xlim=(-0.5, IMAGE_SIZE[axis] - 0.5),
+            ylim=(-own, own),
+        )
         axes.set_xticks([0, 256, 512, 768, 1023])
     panels[0].set_ylabel(f'{"xy"[axis]} residual [px]')
     panels[-1].legend(loc='lower center', ncol=3, fontsize=8, handletextpad=0.2, columnspacing=0.8)
@@ -151,61 +233,124 @@ def position_figure(residuals, system, axis):
 
 
 def _scatter(axes, r, axis, limit, colour):
-    """Dots of inliers, crosses of outliers (at the rim if beyond), and what the inliers do by stripes."""
-    position, residual = r.uv[:, axis], r.residual[:, axis]
-    axes.plot(position[r.inlier], residual[r.inlier], '.', color=colour, markersize=2, alpha=0.5, label='inliers')
+    """Dots of inliers, crosses of outliers (at the rim if beyond), and what the inliers do by
+    stripes.
+    """
+    position = r.uv[:, axis]
+    residual = r.residual[:, axis]
+    axes.plot(
+        position[r.inlier],
+        residual[r.inlier],
+        '.',
+        color=colour,
+        markersize=2,
+        alpha=0.5,
+        label='inliers',
+    )
     out = ~r.inlier
-    axes.plot(position[out], np.clip(residual[out], -0.98 * limit, 0.98 * limit), 'x', color=GREY, markersize=4,
-              label='outliers')
+    axes.plot(
+        position[out],
+        np.clip(residual[out], -0.98 * limit, 0.98 * limit),
+        'x',
+        color=GREY,
+        markersize=4,
+        label='outliers',
+    )
     stripe = np.linspace(-0.5, IMAGE_SIZE[axis] - 0.5, STRIPES + 1)
     of = np.digitize(position, stripe) - 1
-    middle = [np.median(residual[r.inlier & (of == s)]) if np.sum(r.inlier & (of == s)) > 4 else np.nan
-              for s in range(STRIPES)]
-    axes.plot((stripe[:-1] + stripe[1:]) / 2, middle, '-', color=BLACK, linewidth=1.5, label='median')
+    middle = [
+        np.median(residual[r.inlier & (of == s)]) if np.sum(r.inlier & (of == s)) > 4 else np.nan
+        for s in range(STRIPES)
+    ]
+    axes.plot(
+        (stripe[:-1] + stripe[1:]) / 2, middle, '-', color=BLACK, linewidth=1.5, label='median'
+    )
 
 
-# ------------------------------------------------------------------------------------------------ beyond the paper
+# ------------------------------------------------------------------------------------------------
+# beyond the paper
+
 
 def map_figure(maps):
-    """Size of the error of the correction over the image, one panel for each variant to one colour scale."""
-    figure = new_figure(4.3 * len(maps) + 1, 4.9, 'What the correction leaves over the image, fluoroscopic system 1',
-                        'compressed')
+    """Size of the error of the correction over the image, one panel for each variant to one colour
+    scale.
+    """
+    figure = new_figure(
+        4.3 * len(maps) + 1,
+        4.9,
+        'What the correction leaves over the image, fluoroscopic system 1',
+        'compressed',
+    )
     panels = np.atleast_1d(figure.subplots(1, len(maps), sharey=True))
     sizes = {v: np.hypot(m[..., 0], m[..., 1]) for v, m in maps.items()}
     top = max(np.nanquantile(size, 0.9) for size in sizes.values())
     for axes, (variant, size) in zip(panels, sizes.items()):
         axes.set_facecolor('#BBBBBB')
         axes.grid(False)
-        mesh = axes.imshow(np.ma.masked_invalid(size), cmap='cividis', vmin=0, vmax=top, interpolation='nearest',
-                           extent=(-0.5, size.shape[1] * GRID_PX - 0.5, size.shape[0] * GRID_PX - 0.5, -0.5))
-        axes.set(title=f'{variant}: RMSE {np.sqrt(np.nanmean(maps[variant] ** 2)):.3f} px', xlabel='column u [px]')
+        mesh = axes.imshow(
+            np.ma.masked_invalid(size),
+            cmap='cividis',
+            vmin=0,
+            vmax=top,
+            interpolation='nearest',
+            extent=(-0.5, size.shape[1] * GRID_PX - 0.5, size.shape[0] * GRID_PX - 0.5, -0.5),
+        )
+        axes.set(
+            title=f'{variant}: RMSE {np.sqrt(np.nanmean(maps[variant] ** 2)):.3f} px',
+            xlabel='column u [px]',
+        )
     panels[0].set_ylabel('row v [px]')
-    figure.colorbar(mesh, ax=list(panels), label='error of the corrected position [px]', extend='max', shrink=0.85)
+    figure.colorbar(
+        mesh,
+        ax=list(panels),
+        label='error of the corrected position [px]',
+        extend='max',
+        shrink=0.85,
+    )
     return figure
 
 
 def curve_figure(plan, outcomes):
-    """Accuracy over the number of training exposures: object points, source, and the correction itself."""
-    figure = new_figure(14, 5.2, f'Accuracy of {plan.exposures - plan.trained} exposures never used, by number of '
-                                 'training exposures')
+    """Accuracy over the number of training exposures: object points, source, and the correction
+    itself.
+    """
+    figure = new_figure(
+        14,
+        5.2,
+        f'Accuracy of {plan.exposures - plan.trained} exposures never used, by number of '
+        'training exposures',
+    )
     panels = figure.subplots(1, 3)
     for variant in (*plan.models, KNOWN):
         colour, marker = LOOK.get(variant, (BLACK, '*'))
-        look = {'color': colour, 'marker': marker, 'markersize': 6, 'label': variant, 'linewidth': 1.4,
-                'linestyle': '--' if variant == KNOWN else '-'}
-        if variant == plan.default:   # may lie on the line of the model that it chose: wider, and below it
+        look = {
+            'color': colour,
+            'marker': marker,
+            'markersize': 6,
+            'label': variant,
+            'linewidth': 1.4,
+            'linestyle': '--' if variant == KNOWN else '-',
+        }
+        if (
+            variant == plan.default
+        ):  # may lie on the line of the model that it chose: wider, and below it
             look |= {'linewidth': 4, 'alpha': 0.4, 'markersize': 11, 'zorder': 1.5}
         for axes, values in zip(panels, curves(plan, outcomes, variant)):
             if np.isfinite(values).any():
                 axes.plot(plan.curve, values, **look)
-    for axes, title, unit in zip(panels, ('Object points', 'Source position', 'Correction over the image'),
-                                 ('3-D RMSE [mm]', '3-D RMSE [mm]', 'RMSE of a coordinate [px]')):
+    for axes, title, unit in zip(
+        panels,
+        ('Object points', 'Source position', 'Correction over the image'),
+        ('3-D RMSE [mm]', '3-D RMSE [mm]', 'RMSE of a coordinate [px]'),
+    ):
         axes.set(title=title, xlabel='training exposures', ylabel=unit, xscale='log', yscale='log')
         axes.set_xticks(plan.curve, [str(c) for c in plan.curve])
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.xaxis.set_tick_params(which='minor', size=0)
         low, high = axes.get_ylim()
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 1.5, 2, 3, 5, 7) if high > 4 * low else np.arange(1, 10, 0.5)))
+        axes.yaxis.set_major_locator(
+            LogLocator(subs=(1, 1.5, 2, 3, 5, 7) if high > 4 * low else np.arange(1, 10, 0.5))
+        )
         axes.yaxis.set_major_formatter('{x:g}')
         axes.yaxis.set_minor_formatter(NullFormatter())
     handles, labels = panels[0].get_legend_handles_labels()
@@ -214,8 +359,11 @@ def curve_figure(plan, outcomes):
 
 
 def curves(plan, outcomes, variant):
-    """Three arrays (counts,) of a variant: object points [mm], source [mm], correction [px]; rms over the rigs."""
-    cases, out = plan.curve_cases(), np.full((3, len(plan.curve)), np.nan)
+    """Three arrays (counts,) of a variant: object points [mm], source [mm], correction [px]; rms
+    over the rigs.
+    """
+    cases = plan.curve_cases()
+    out = np.full((3, len(plan.curve)), np.nan)
     for i, count in enumerate(plan.curve):
         found = [outcomes[cases[variant, count, seed]] for seed in plan.curve_seeds]
         if any(o.failed for o in found):

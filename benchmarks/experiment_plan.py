@@ -8,7 +8,7 @@ from collections import defaultdict
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 
-from fluoro_calib_ros.calibration.self_calibration import Options
+from fluoro_calib_ros.calibration.options import CalibrationOptions
 
 from .experiment import BEFORE, HELD, KNOWN, Case, available_models, available_relative, run_case
 
@@ -29,10 +29,11 @@ class Setting:
 class Plan:
     """Size of the experiment.
 
-    models that are compared and the default among them; relative: settings of the relative orientation constraint;
-    exposures of a recording, of which every so many are for the calibration; curve: counts of training exposures,
-    with curve_seeds; seeds of the rigs of the comparison under settings; joint_seeds of that of joint with separate
-    calibration; rounds: largest number of them in a calibration; paper_survey: factor of the stated standard deviation
+    models that are compared and the default among them; relative: settings of the relative
+    orientation constraint; exposures of a recording, of which every so many are for the
+    calibration; curve: counts of training exposures, with curve_seeds; seeds of the rigs of the
+    comparison under settings; joint_seeds of that of joint with separate calibration; rounds:
+    largest number of them in a calibration; paper_survey: factor of the stated standard deviation
     of the survey in the paper's tables.
     """
 
@@ -57,8 +58,16 @@ class Plan:
     def case(self, seed, variant, fluoroscopes=('a',), training=None, **more):
         """A case of this size."""
         training = None if training == self.trained else training
-        return Case(seed, variant, fluoroscopes, training, exposures=self.exposures, every=self.every,
-                    rounds=self.rounds, **more)
+        return Case(
+            seed,
+            variant,
+            fluoroscopes,
+            training,
+            exposures=self.exposures,
+            every=self.every,
+            rounds=self.rounds,
+            **more,
+        )
 
     def paper_variants(self):
         """Variants of the paper's tables and beyond, in order."""
@@ -67,61 +76,133 @@ class Plan:
     def paper_cases(self, system):
         """Cases by variant of system 'a', 'b' or 'a+b' (joint)."""
         names = tuple(system.split('+'))
-        return {v: self.case(self.seeds[0], v, names, joint=len(names) > 1, survey=self.paper_survey,
-                             detail=True) for v in self.paper_variants()}
+        return {
+            v: self.case(
+                self.seeds[0],
+                v,
+                names,
+                joint=len(names) > 1,
+                survey=self.paper_survey,
+                detail=True,
+            )
+            for v in self.paper_variants()
+        }
 
     def cost_cases(self):
-        """Cases of system 1 whose rounds are shown, by variant. The survey counts fully: where it hardly does, C_r of
-        a bead that is seen once or twice is nearly singular, and G is that of these few beads."""
-        return {v: self.case(self.seeds[0], v, detail=True) for v in dict.fromkeys((HELD, 'knn', self.default))}
+        """Cases of system 1 whose rounds are shown, by variant. The survey counts fully: where it
+        hardly does, C_r of a bead that is seen once or twice is nearly singular, and G is that of
+        these few beads.
+        """
+        return {
+            v: self.case(self.seeds[0], v, detail=True)
+            for v in dict.fromkeys((HELD, 'knn', self.default))
+        }
 
     def curve_cases(self):
         """Cases by variant, count of training exposures and seed."""
-        return {(v, count, seed): self.case(seed, v, training=count)
-                for v in (*self.models, KNOWN) for count in self.curve for seed in self.curve_seeds}
+        return {
+            (v, count, seed): self.case(seed, v, training=count)
+            for v in (*self.models, KNOWN)
+            for count in self.curve
+            for seed in self.curve_seeds
+        }
 
     def setting_cases(self, setting):
         """Cases by variant and seed."""
-        return {(v, seed): self.case(seed, v, training=setting.training, strength=setting.strength,
-                                     false_matches=setting.false_matches)
-                for v in (BEFORE, *self.models, KNOWN) for seed in self.seeds}
+        return {
+            (v, seed): self.case(
+                seed,
+                v,
+                training=setting.training,
+                strength=setting.strength,
+                false_matches=setting.false_matches,
+            )
+            for v in (BEFORE, *self.models, KNOWN)
+            for seed in self.seeds
+        }
 
     def joint_cases(self):
         """Cases of the default model by label and seed."""
         kinds = {'separate': {}, 'joint': {'joint': True}}
-        kinds.update({f'joint, relative orientation {r}': {'joint': True, 'relative': r} for r in self.relative})
-        return {(label, seed): self.case(seed, self.default, ('a', 'b'), **more)
-                for label, more in kinds.items() for seed in self.joint_seeds}
+        kinds.update(
+            {
+                f'joint, relative orientation {r}': {'joint': True, 'relative': r}
+                for r in self.relative
+            }
+        )
+        return {
+            (label, seed): self.case(seed, self.default, ('a', 'b'), **more)
+            for label, more in kinds.items()
+            for seed in self.joint_seeds
+        }
 
     def cases(self):
         """All cases, each once."""
         listed = [c for system in ('a', 'b', 'a+b') for c in self.paper_cases(system).values()]
-        for more in (self.cost_cases(), self.curve_cases(), self.joint_cases(),
-                     *map(self.setting_cases, self.settings)):
+        for more in (
+            self.cost_cases(),
+            self.curve_cases(),
+            self.joint_cases(),
+            *map(self.setting_cases, self.settings),
+        ):
             listed += more.values()
-        return list(dict.fromkeys(listed))   # the first of equals has its details
+        return list(dict.fromkeys(listed))  # the first of equals has its details
 
 
 def full_plan():
     """The experiment of docs/validation.md."""
-    return Plan(available_models(), Options().model, available_relative(), 150, 10, (5, 10, 15, 30, 60), (1, 2, 3),
-                (1, 2, 3, 4, 5), (1, 2, 3, 4, 5),
-                (Setting('15 exposures'), Setting('5 exposures', training=5),
-                 Setting('15 exposures, double distortion, 5 % false matches', strength=2.0, false_matches=0.05)), 60,
-                # The paper fixed its datum by surveyed coordinates with a low weight. A survey that counts fully would
-                # hold the object points before any calibration, and hide most of what it improves.
-                20.0)
+    return Plan(
+        available_models(),
+        CalibrationOptions().model,
+        available_relative(),
+        150,
+        10,
+        (5, 10, 15, 30, 60),
+        (1, 2, 3),
+        (1, 2, 3, 4, 5),
+        (1, 2, 3, 4, 5),
+        (
+            Setting('15 exposures'),
+            Setting('5 exposures', training=5),
+            Setting(
+                '15 exposures, double distortion, 5 % false matches',
+                strength=2.0,
+                false_matches=0.05,
+            ),
+        ),
+        60,
+        # The paper fixed its datum by surveyed coordinates with a low weight. A survey that counts
+        # fully would hold the object points before any calibration, and hide most of what it
+        # improves.
+        20.0,
+    )
 
 
 def quick_plan():
     """The same in small: every section is there, but the figures tell little."""
-    default = Options().model
-    hard = Setting('5 exposures, double distortion, 5 % false matches', strength=2.0, false_matches=0.05)
-    return Plan(tuple(m for m in available_models() if m in ('knn', default)), default, available_relative(), 20, 4,
-                (5, 6), (1,), (1,), (1,), (Setting('5 exposures'), hard), 4, 1.0)
+    default = CalibrationOptions().model
+    hard = Setting(
+        '5 exposures, double distortion, 5 % false matches', strength=2.0, false_matches=0.05
+    )
+    return Plan(
+        tuple(m for m in available_models() if m in ('knn', default)),
+        default,
+        available_relative(),
+        20,
+        4,
+        (5, 6),
+        (1,),
+        (1,),
+        (1,),
+        (Setting('5 exposures'), hard),
+        4,
+        1.0,
+    )
 
 
-# ------------------------------------------------------------------------------------------------------- running
+# -------------------------------------------------------------------------------------------------------
+# running
+
 
 def run(cases, processes=PROCESSES):
     """Outcomes by case. Cases of one recording run in one process, the longest groups first."""
@@ -130,13 +211,17 @@ def run(cases, processes=PROCESSES):
         groups[case.scene, case.fluoroscopes].append(case)
     ordered = sorted(groups.values(), key=lambda group: -sum(map(_effort, group)))
     for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
-        os.environ[name] = '1'   # for the processes that are started below
-    out, began = {}, time.monotonic()
+        os.environ[name] = '1'  # for the processes that are started below
+    out = {}
+    began = time.monotonic()
     with ProcessPoolExecutor(processes, multiprocessing.get_context('spawn')) as pool:
         running = {pool.submit(_run_group, group): group for group in ordered}
         for done in as_completed(running):
             out.update(zip(running[done], done.result()))
-            print(f'{len(out)} of {len(cases)} cases after {time.monotonic() - began:.0f} s', file=sys.stderr)
+            print(
+                f'{len(out)} of {len(cases)} cases after {time.monotonic() - began:.0f} s',
+                file=sys.stderr,
+            )
     return out
 
 
@@ -148,9 +233,11 @@ def _run_group(group):
         outcome = run_case(case)
         outcomes.append(outcome)
         told = outcome.failed or f'{outcome.points_mm():.4f} mm out of sample'
-        print(f'rig {case.seed} {"+".join(case.fluoroscopes)}, {case.training or case.exposures // case.every} '
-              f'exposures, {case.variant}{", joint" * case.joint}: {told}, {time.perf_counter() - began:.1f} s',
-              file=sys.stderr)
+        print(
+            f'rig {case.seed} {"+".join(case.fluoroscopes)}, {case.training or case.exposures // case.every} '
+            f'exposures, {case.variant}{", joint" * case.joint}: {told}, {time.perf_counter() - began:.1f} s',
+            file=sys.stderr,
+        )
     return outcomes
 
 

@@ -1,12 +1,15 @@
-"""Corrected images: how fast one core is, and the node live beside a relay that does nothing with the same images.
+"""Corrected images: how fast one core is, and the node live beside a relay that does nothing with
+the same images.
 
-    python -m benchmarks.images [--seconds 10] [--only NAME]      printed as the tables of docs/images.md
+    python -m benchmarks.images [--seconds 10] [--only NAME]      printed as the tables of
+    docs/images.md
     python -m benchmarks.images --picture docs/images/corrected_image.png
 
-Camera, node and the reader (this process, or one of its own for another transport) share the machine. An image is lost
-when it does not come out; latency is from the stamp of the camera, set just before it publishes, to the time stamp that
-DDS gives the output. A segment of shared memory of Fast DDS is smaller than an image by default: the cases `wide` are
-measured with one of 32 MB, as docs/images.md tells to make it.
+Camera, node and the reader (this process, or one of its own for another transport) share the
+machine. An image is lost when it does not come out; latency is from the stamp of the camera, set
+just before it publishes, to the time stamp that DDS gives the output. A segment of shared memory
+of Fast DDS is smaller than an image by default: the cases `wide` are measured with one of 32 MB,
+as docs/images.md tells to make it.
 """
 
 import argparse
@@ -25,9 +28,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.ndimage import map_coordinates
 
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.images.undistortion import ImageCorrector
-from fluoro_calib_ros.simulation.images import bead_image
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.images.corrector import ImageCorrector
+from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 from .timing import table, timed
@@ -50,11 +53,12 @@ WIDE = """<?xml version="1.0" encoding="UTF-8"?>
   </participant>
 </profiles>
 """
-CASES = {   # name: (encoding, rate, node)
+CASES = {  # name: (encoding, rate, node)
     'mono8 120 Hz': ('mono8', 120, 'image_node'),
     'mono8 120 Hz, relay': ('mono8', 120, 'relay'),
     'mono16 60 Hz': ('mono16', 60, 'image_node'),
-    'mono16 60 Hz, relay': ('mono16', 60, 'relay')}
+    'mono16 60 Hz, relay': ('mono16', 60, 'relay'),
+}
 OUTPUTS = {'image_node': 'a/image_corrected', 'relay': 'a/relayed'}
 
 
@@ -67,9 +71,11 @@ def calibration_of_the_rig():
 
 # ---- one core
 
+
 def on_one_core(calibration, frames, repeats=200):
-    """[{depth, interpolation, ms: median wall time, cpu_ms, rate: images a second of CPU}] of the correction alone, and
-    scipy's map_coordinates with the same map."""
+    """[{depth, interpolation, ms: median wall time, cpu_ms, rate: images a second of CPU}] of the
+    correction alone, and scipy's map_coordinates with the same map.
+    """
     cv2.setNumThreads(1)
     out = []
     for interpolation, order in (('linear', 1), ('cubic', 3)):
@@ -81,13 +87,25 @@ def on_one_core(calibration, frames, repeats=200):
             _, wall = timed(lambda: corrector.correct(image, into), repeats)
             cpu = (time.process_time() - began) / repeats
             source = np.nan_to_num(corrector.source)[::-1]
-            _, of_scipy = timed(lambda: map_coordinates(image, source, order=order, mode='nearest'), 3)
-            out.append({'depth': 8 * image.itemsize, 'interpolation': interpolation, 'ms': 1e3 * wall,
-                        'cpu_ms': 1e3 * cpu, 'rate': 1 / cpu, 'scipy_ms': 1e3 * of_scipy, 'map_s': seconds})
+            _, of_scipy = timed(
+                lambda: map_coordinates(image, source, order=order, mode='nearest'), 3
+            )
+            out.append(
+                {
+                    'depth': 8 * image.itemsize,
+                    'interpolation': interpolation,
+                    'ms': 1e3 * wall,
+                    'cpu_ms': 1e3 * cpu,
+                    'rate': 1 / cpu,
+                    'scipy_ms': 1e3 * of_scipy,
+                    'map_s': seconds,
+                }
+            )
     return out
 
 
 # ---- live
+
 
 class Reader:
     """Publishes the calibration, and takes what the nodes put out."""
@@ -98,10 +116,14 @@ class Reader:
 
         from fluoro_calib_ros.nodes.conversion import message_from_calibration
         from fluoro_calib_ros.nodes.qos import LATCHED
+
         self.node = rclpy.create_node('reader')
-        self._latched = self.node.create_publisher(FluoroscopeCalibration, 'a/calibration', LATCHED)
+        self._latched = self.node.create_publisher(
+            FluoroscopeCalibration, 'a/calibration', LATCHED
+        )
         self._latched.publish(message_from_calibration(calibration))
-        self.came, self.reader = [], None
+        self.came = []
+        self.reader = None
 
     def listen(self, topic):
         """Collect (stamp, latency) [ns] of a topic anew, with the images unread."""
@@ -109,13 +131,15 @@ class Reader:
 
         from fluoro_calib_ros.nodes.qos import IMAGES
         from fluoro_calib_ros.nodes.streams import StreamReader
+
         self.came, fatal = [], self.node.get_logger().fatal
         came = self.came
 
         def take(data, info):
             seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
-            stamp = seconds * 10 ** 9 + nanoseconds
+            stamp = seconds * 10**9 + nanoseconds
             came.append((stamp, info['source_timestamp'] - stamp))
+
         self.reader = StreamReader(self.node, fatal, fatal)
         self.reader.subscribe(Image, topic, take, IMAGES, decode=bytes)
         self.reader.start()
@@ -138,26 +162,50 @@ def _cpu(process):
 
 def _start(*command, log, **parameters):
     arguments = [word for key, value in parameters.items() for word in ('-p', f'{key}:={value}')]
-    return subprocess.Popen([sys.executable, '-m', *command, '--ros-args', '-p', 'fluoroscopes:=[a]', *arguments],
-                            stdout=log, stderr=log)
+    return subprocess.Popen(
+        [sys.executable, '-m', *command, '--ros-args', '-p', 'fluoroscopes:=[a]', *arguments],
+        stdout=log,
+        stderr=log,
+    )
 
 
 def measured(reader, encoding, rate, node, seconds, log):
     """{images, lost, p50, p99, max [ms], cpu_ms an image} of a node at a rate."""
     frames = round(rate * seconds)
-    command = ['fluoro_calib_ros.nodes.image_node'] if node == 'image_node' else ['benchmarks.image_processes', 'relay']
+    command = (
+        ['fluoro_calib_ros.nodes.image_node']
+        if node == 'image_node'
+        else ['benchmarks.image_processes', 'relay']
+    )
     under_test = _start(*command, log=log)
     reader.listen(OUTPUTS[node])
     path = Path(log.name)
     if node == 'image_node':
-        wait(lambda: 'images corrected with calibration' in path.read_text(errors='replace'), 60, 'the calibration')
+        wait(
+            lambda: 'images corrected with calibration' in path.read_text(errors='replace'),
+            60,
+            'the calibration',
+        )
     wait(lambda: reader.node.count_publishers(OUTPUTS[node]), 60, 'the node')
-    camera = _start('benchmarks.image_processes', 'camera', log=log, encoding=encoding, rate=float(rate), frames=frames)
+    camera = _start(
+        'benchmarks.image_processes',
+        'camera',
+        log=log,
+        encoding=encoding,
+        rate=float(rate),
+        frames=frames,
+    )
     try:
         wait(lambda: reader.came, 60, 'the first image')
-        began, first = _cpu(under_test), len(reader.came)
-        wait(lambda: camera.poll() is not None or len(reader.came) >= frames, seconds * 2 + 30, 'the stream')
-        used, counted = _cpu(under_test) - began, len(reader.came) - first
+        began = _cpu(under_test)
+        first = len(reader.came)
+        wait(
+            lambda: camera.poll() is not None or len(reader.came) >= frames,
+            seconds * 2 + 30,
+            'the stream',
+        )
+        used = _cpu(under_test) - began
+        counted = len(reader.came) - first
         wait(lambda: camera.poll() is not None, 30, 'the end of the camera')
     finally:
         for process in (camera, under_test):
@@ -168,19 +216,29 @@ def measured(reader, encoding, rate, node, seconds, log):
     came = np.array(reader.came)
     latency = came[:, 1] * 1e-6
     span = (came[-1, 0] - came[0, 0]) * 1e-9
-    return {'images': frames, 'lost': int(frames - len(np.unique(came[:, 0]))), 'rate': float((len(came) - 1) / span),
-            'p50': float(np.percentile(latency, 50)), 'p99': float(np.percentile(latency, 99)),
-            'max': float(latency.max()), 'cpu_ms': 1e3 * used / max(counted, 1)}
+    return {
+        'images': frames,
+        'lost': int(frames - len(np.unique(came[:, 0]))),
+        'rate': float((len(came) - 1) / span),
+        'p50': float(np.percentile(latency, 50)),
+        'p99': float(np.percentile(latency, 99)),
+        'max': float(latency.max()),
+        'cpu_ms': 1e3 * used / max(counted, 1),
+    }
 
 
 def live(calibration, seconds, only=''):
-    """{case: figures} of those whose name contains only, with the transports of this process's environment."""
+    """{case: figures} of those whose name contains only, with the transports of this process's
+    environment.
+    """
     import rclpy
 
     from fluoro_calib_ros.nodes.graph import isolate
+
     isolate()
     rclpy.init(args=[])
-    reader, out = Reader(calibration), {}
+    reader = Reader(calibration)
+    out = {}
     for case, (encoding, rate, node) in CASES.items():
         if only in case:
             with tempfile.NamedTemporaryFile('wb', suffix='.log') as log:
@@ -196,28 +254,50 @@ def live_wide(seconds, only=''):
         profile.write(WIDE)
         profile.flush()
         done = subprocess.run(
-            [sys.executable, '-m', 'benchmarks.images', '--live', '--seconds', str(seconds), '--only', only],
-            env={**os.environ, 'FASTRTPS_DEFAULT_PROFILES_FILE': profile.name}, stdout=subprocess.PIPE, check=True)
+            [
+                sys.executable,
+                '-m',
+                'benchmarks.images',
+                '--live',
+                '--seconds',
+                str(seconds),
+                '--only',
+                only,
+            ],
+            env={**os.environ, 'FASTRTPS_DEFAULT_PROFILES_FILE': profile.name},
+            stdout=subprocess.PIPE,
+            check=True,
+        )
     return {f'{case}, wide': figures for case, figures in json.loads(done.stdout).items()}
 
 
 def run(seconds=10.0, only=''):
     """(figures of one core, {case: figures} live)."""
     calibration, frames = calibration_of_the_rig()
-    return on_one_core(calibration, frames), live(calibration, seconds, only) | live_wide(seconds, only)
+    return on_one_core(calibration, frames), live(calibration, seconds, only) | live_wide(
+        seconds, only
+    )
 
 
 def draw(path, lines=15):
-    """Draw a square pattern of beads through the fluoroscope of the rig, and corrected, with straight lines."""
-    fluoroscope, calibration = virtual_rig(1).fluoroscopes[0], calibration_of_the_rig()[0]
+    """Draw a square pattern of beads through the fluoroscope of the rig, and corrected, with
+    straight lines.
+    """
+    fluoroscope = virtual_rig(1).fluoroscopes[0]
+    calibration = calibration_of_the_rig()[0]
     at = np.linspace(24, 999, lines)
-    observed = fluoroscope.distortion.distort(np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2))
+    observed = fluoroscope.distortion.distort(
+        np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+    )
     seen = np.all((observed > 4) & (observed < 1019), axis=1)[:, None]
     image = bead_image(observed, bead_px=4.5, contrast=0.8)
     figure = Figure(figsize=(8.4, 4.5), dpi=120, layout='constrained')
-    for axes, name, shown, uv in zip(figure.subplots(1, 2), ('observed', 'corrected'),
-                                     (image, ImageCorrector(calibration).correct(image)),
-                                     (observed, calibration.correct(observed).uv)):
+    for axes, name, shown, uv in zip(
+        figure.subplots(1, 2),
+        ('observed', 'corrected'),
+        (image, ImageCorrector(calibration).correct(image)),
+        (observed, calibration.correct(observed).uv),
+    ):
         axes.imshow(shown, cmap='gray', vmin=0, vmax=255, interpolation='antialiased')
         uv = np.where(seen, uv, np.nan).reshape(lines, lines, 2)
         for line in (uv[1], uv[-2], uv[:, 1], uv[:, -2]):
@@ -228,13 +308,40 @@ def draw(path, lines=15):
 
 def text_of(core, cases):
     """The tables."""
-    rows = [[f'mono{f["depth"]} {f["interpolation"]}', f'{f["ms"]:.1f}', f'{f["cpu_ms"]:.1f}', f'{f["rate"]:.0f}',
-             f'{f["scipy_ms"] / f["ms"]:.0f}'] for f in core]
-    first = table(['1024 x 1024', 'median [ms]', 'CPU [ms]', 'images a second a core', 'as fast as scipy'], rows)
-    rows = [[case, str(f['images']), str(f['lost']), f'{f["p50"]:.1f}', f'{f["p99"]:.1f}', f'{f["max"]:.0f}',
-             f'{f["cpu_ms"]:.1f}'] for case, f in cases.items()]
-    return first + '\n\n' + table(['live', 'images', 'lost', 'p50 [ms]', 'p99 [ms]', 'max [ms]',
-                                    'CPU an image [ms]'], rows)
+    rows = [
+        [
+            f'mono{f["depth"]} {f["interpolation"]}',
+            f'{f["ms"]:.1f}',
+            f'{f["cpu_ms"]:.1f}',
+            f'{f["rate"]:.0f}',
+            f'{f["scipy_ms"] / f["ms"]:.0f}',
+        ]
+        for f in core
+    ]
+    first = table(
+        ['1024 x 1024', 'median [ms]', 'CPU [ms]', 'images a second a core', 'as fast as scipy'],
+        rows,
+    )
+    rows = [
+        [
+            case,
+            str(f['images']),
+            str(f['lost']),
+            f'{f["p50"]:.1f}',
+            f'{f["p99"]:.1f}',
+            f'{f["max"]:.0f}',
+            f'{f["cpu_ms"]:.1f}',
+        ]
+        for case, f in cases.items()
+    ]
+    return (
+        first
+        + '\n\n'
+        + table(
+            ['live', 'images', 'lost', 'p50 [ms]', 'p99 [ms]', 'max [ms]', 'CPU an image [ms]'],
+            rows,
+        )
+    )
 
 
 if __name__ == '__main__':
@@ -242,7 +349,9 @@ if __name__ == '__main__':
     parser.add_argument('--seconds', type=float, default=10.0)
     parser.add_argument('--only', default='', help='live cases whose name contains this')
     parser.add_argument('--live', action='store_true', help='the live cases alone, as JSON')
-    parser.add_argument('--picture', metavar='FILE', help='draw docs/images/corrected_image.png anew, nothing else')
+    parser.add_argument(
+        '--picture', metavar='FILE', help='draw docs/images/corrected_image.png anew, nothing else'
+    )
     options = parser.parse_args()
     if options.picture:
         draw(options.picture)

@@ -1,7 +1,8 @@
-"""The lookup grid of the correction: points a second, frames of 30 points beside scikit-learn, building, accuracy.
+"""The lookup grid of the correction: points a second, frames of 30 points beside scikit-learn,
+building, accuracy.
 
-    python -m benchmarks.lookup             all correction models
-    python -m benchmarks.lookup knn auto    these only
+python -m benchmarks.lookup             all correction models
+python -m benchmarks.lookup knn auto    these only
 """
 
 import argparse
@@ -13,28 +14,38 @@ import numpy as np
 from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.self_calibration import Options
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.distortion.grid import CorrectionGrid
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 from .timing import section, timed
 
 MODELS = ('knn', 'local_linear', 'hybrid', 'parametric', 'collocation')
-POINTS = 2 ** 20   # of a large array
-FRAME = 30   # points of a frame
-ROUNDS = 41   # in each, ours and theirs one after the other
-HEADER = ['model', 'cell [px]', 'largest difference [px]', 'built in', 'points a second', f'{FRAME} points',
-          f'{FRAME} points corrected', 'KNeighborsRegressor.predict', 'faster by']
+POINTS = 2**20  # of a large array
+FRAME = 30  # points of a frame
+ROUNDS = 41  # in each, ours and theirs one after the other
+HEADER = [
+    'model',
+    'cell [px]',
+    'largest difference [px]',
+    'built in',
+    'points a second',
+    f'{FRAME} points',
+    f'{FRAME} points corrected',
+    'KNeighborsRegressor.predict',
+    'faster by',
+]
 
 
 @dataclass(frozen=True)
 class Figures:
     """What was measured of one correction model.
 
-    kind and k; cell_px; error_px: largest difference of a coordinate from the exact model at 20,000 random pixels of
-    the calibrated area, stated_px: what the grid says of itself; build_s; points_per_s of a large array on one core;
-    look_up_s, correct_s and predict_s of a frame, and ratio of predict_s to look_up_s.
+    kind and k; cell_px; error_px: largest difference of a coordinate from the exact model at
+    20,000 random pixels of the calibrated area, stated_px: what the grid says of itself; build_s;
+    points_per_s of a large array on one core; look_up_s, correct_s and predict_s of a frame, and
+    ratio of predict_s to look_up_s.
     """
 
     kind: str
@@ -59,17 +70,26 @@ def mean_time(function, calls):
 
 
 def beside_each_other(ours, correct, theirs):
-    """Median times [s] of calls of three functions, and median ratio of the third to the first, in rounds of all
-    three: what else the machine does hits all of them."""
-    rounds = np.array([[mean_time(ours, 100), mean_time(correct, 100), mean_time(theirs, 5)] for _ in range(ROUNDS)])
+    """Median times [s] of calls of three functions, and median ratio of the third to the first, in
+    rounds of all three: what else the machine does hits all of them.
+    """
+    rounds = np.array(
+        [
+            [mean_time(ours, 100), mean_time(correct, 100), mean_time(theirs, 5)]
+            for _ in range(ROUNDS)
+        ]
+    )
     return *np.median(rounds, axis=0), float(np.median(rounds[:, 2] / rounds[:, 0]))
 
 
 def points_per_second(grid, rng):
-    """Points of a large array that are looked up in a second of a core: du, dv, standard deviation and status of
-    pixels in random order, which is the worst for the cache. Median of 15."""
+    """Points of a large array that are looked up in a second of a core: du, dv, standard deviation
+    and status of pixels in random order, which is the worst for the cache. Median of 15.
+    """
     u, v = rng.uniform(-0.5, np.array(grid.image_size)[:, None] - 0.5, (2, POINTS))
-    values, status, seconds = np.empty((3, POINTS)), np.empty(POINTS, dtype=np.uint8), []
+    values = np.empty((3, POINTS))
+    status = np.empty(POINTS, dtype=np.uint8)
+    seconds = []
     for _ in range(15):
         began = time.thread_time()
         grid.look_up(u, v, values, status)
@@ -78,10 +98,13 @@ def points_per_second(grid, rng):
 
 
 def measure(model):
-    """Figures of a correction model (of Options), of a calibration of the virtual rig with 15 exposures."""
-    rig, rng = virtual_rig(1), np.random.default_rng(0)
+    """Figures of a correction model (of CalibrationOptions), of a calibration of the virtual rig with 15
+    exposures.
+    """
+    rig = virtual_rig(1)
+    rng = np.random.default_rng(0)
     frames = {'a': simulate_exposures(rig, 15, 1, matched=(130, 134)).frames['a']}
-    calibration = calibrate(frames, rig.phantom, Options(model)).calibrations['a']
+    calibration = calibrate(frames, rig.phantom, CalibrationOptions(model)).calibrations['a']
     exact = calibration.model
     grid, build_s = timed(lambda: CorrectionGrid(exact, calibration.image_size), 3)
     uv = rng.uniform(-0.5, np.array(calibration.image_size) - 0.5, (20_000, 2))
@@ -92,18 +115,39 @@ def measure(model):
     frame = rng.uniform(80, 940, (FRAME, 2))
     u, v = np.ascontiguousarray(frame.T)
     # A model without neighbours stands beside the paper's: the regressor with k = 3.
-    peer = KNeighborsRegressor(exact.k or 3, algorithm='kd_tree').fit(exact.train_uv, exact.train_duv)
-    times = beside_each_other(lambda: grid.look_up(u, v), lambda: calibration.correct_arrays(u, v),
-                              lambda: peer.predict(frame))
-    return Figures(exact.kind, exact.k, grid.cell_px, float(error), grid.error_px, build_s,
-                   points_per_second(grid, rng), *times)
+    peer = KNeighborsRegressor(exact.k or 3, algorithm='kd_tree').fit(
+        exact.train_uv, exact.train_duv
+    )
+    times = beside_each_other(
+        lambda: grid.look_up(u, v),
+        lambda: calibration.correct_arrays(u, v),
+        lambda: peer.predict(frame),
+    )
+    return Figures(
+        exact.kind,
+        exact.k,
+        grid.cell_px,
+        float(error),
+        grid.error_px,
+        build_s,
+        points_per_second(grid, rng),
+        *times,
+    )
 
 
 def row(f):
     """The row of the table for Figures."""
-    return [f'{f.kind}, k = {f.k}' if f.k else f.kind, f'{f.cell_px:g}', f'{f.error_px:.4f}', f'{f.build_s:.2f} s',
-            f'{f.points_per_s / 1e6:.0f} million', f'{f.look_up_s * 1e6:.1f} us', f'{f.correct_s * 1e6:.1f} us',
-            f'{f.predict_s * 1e6:.0f} us', f'{f.ratio:.0f}']
+    return [
+        f'{f.kind}, k = {f.k}' if f.k else f.kind,
+        f'{f.cell_px:g}',
+        f'{f.error_px:.4f}',
+        f'{f.build_s:.2f} s',
+        f'{f.points_per_s / 1e6:.0f} million',
+        f'{f.look_up_s * 1e6:.1f} us',
+        f'{f.correct_s * 1e6:.1f} us',
+        f'{f.predict_s * 1e6:.0f} us',
+        f'{f.ratio:.0f}',
+    ]
 
 
 def lookup_section(models=MODELS):
@@ -116,13 +160,19 @@ def lookup_section(models=MODELS):
         'scikit-learn with the same training points and the same k (3 for a model without neighbours) in the same '
         'rounds. The difference from the exact model is that of 20,000 random pixels of the calibrated area; knn is '
         'piecewise constant, and its lookups lie between the values at the corners of a cell.',
-        HEADER, [row(measure(model)) for model in models])
+        HEADER,
+        [row(measure(model)) for model in models],
+    )
 
 
 def main(arguments=None):
     """Print the table."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks.lookup', description=__doc__.splitlines()[0])
-    parser.add_argument('model', nargs='*', help=f'correction models (default: {", ".join(MODELS)})')
+    parser = argparse.ArgumentParser(
+        prog='python -m benchmarks.lookup', description=__doc__.splitlines()[0]
+    )
+    parser.add_argument(
+        'model', nargs='*', help=f'correction models (default: {", ".join(MODELS)})'
+    )
     models = parser.parse_args(arguments).model or MODELS
     with threadpool_limits(1):
         sys.stdout.write(lookup_section(models) + '\n')

@@ -1,12 +1,14 @@
-"""The online path at lab rates: nodes as processes of their own, beside relays that do nothing with the same messages.
+"""The online path at lab rates: nodes as processes of their own, beside relays that do nothing
+with the same messages.
 
     python -m benchmarks.online [--seconds 60] [--only NAME]
 
-The simulator, the nodes under test and the reader (this process) share the machine. A frame is lost when it does not
-come out. Latency is told twice: within the node, from the arrival of the input (of the last view, for points) to the
-publication of the output, as the node's diagnostics have it (the median of its medians, and the largest of its 99 %,
-each of 2,000 frames); and from the stamp of the simulator, set just before it publishes, to the time stamp that DDS
-gives the output when it is published, with the way through DDS in it.
+The simulator, the nodes under test and the reader (this process) share the machine. A frame is
+lost when it does not come out. Latency is told twice: within the node, from the arrival of the
+input (of the last view, for points) to the publication of the output, as the node's diagnostics
+have it (the median of its medians, and the largest of its 99 %, each of 2,000 frames); and from
+the stamp of the simulator, set just before it publishes, to the time stamp that DDS gives the
+output when it is published, with the way through DDS in it.
 """
 
 import argparse
@@ -21,14 +23,19 @@ from pathlib import Path
 import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
-from fluoro_calib_msgs.msg import (CorrectedObservations, FluoroscopeCalibration, ReconstructedPoints, RigOrientation,
-                                   TargetObservations)
+from fluoro_calib_msgs.msg import (
+    CorrectedObservations,
+    FluoroscopeCalibration,
+    ReconstructedPoints,
+    RigOrientation,
+    TargetObservations,
+)
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.orientation import orientation_of_exposures
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.rig_orientation import orientation_of_exposures
 from fluoro_calib_ros.nodes.conversion import message_from_calibration
 from fluoro_calib_ros.nodes.graph import isolate
 from fluoro_calib_ros.nodes.qos import LATCHED, OBSERVATIONS
@@ -39,7 +46,7 @@ from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 from .timing import table
 
 NAMES = ('a', 'b')
-CASES = {   # name: (scene, rate, nodes under test)
+CASES = {  # name: (scene, rate, nodes under test)
     'markers 250 Hz': ('markers', 250, ('correction_node', 'relay_plain')),
     'grid 30 Hz': ('grid', 30, ('correction_node', 'relay_plain')),
     'markers 1000 Hz': ('markers', 1000, ('correction_node',)),
@@ -49,12 +56,18 @@ CASES = {   # name: (scene, rate, nodes under test)
     'whole chain 250 Hz': ('markers', 250, ('correction_node', 'reconstruction_node')),
     'whole chain 700 Hz': ('markers', 700, ('correction_node', 'reconstruction_node')),
     'whole chain 1000 Hz': ('markers', 1000, ('correction_node', 'reconstruction_node')),
-    'whole chain 1000 Hz, deep': ('markers', 1000, ('correction_node', 'reconstruction_node'))}
-DEEP = {f'qos_overrides./{name}/corrected_observations.{end}.depth': 1000 for name in 'ab'
-        for end in ('publisher', 'subscription')}   # queues of a second instead of a tenth
-OUTPUTS = {'correction_node': ('corrected_observations', CorrectedObservations),
-           'relay_plain': ('relayed_plain', TargetObservations),
-           'relay_streams': ('relayed_streams', TargetObservations)}
+    'whole chain 1000 Hz, deep': ('markers', 1000, ('correction_node', 'reconstruction_node')),
+}
+DEEP = {
+    f'qos_overrides./{name}/corrected_observations.{end}.depth': 1000
+    for name in 'ab'
+    for end in ('publisher', 'subscription')
+}  # queues of a second instead of a tenth
+OUTPUTS = {
+    'correction_node': ('corrected_observations', CorrectedObservations),
+    'relay_plain': ('relayed_plain', TargetObservations),
+    'relay_streams': ('relayed_streams', TargetObservations),
+}
 TICK = os.sysconf('SC_CLK_TCK')
 
 
@@ -67,15 +80,22 @@ class Reader(Node):
         self.spinner.add_node(self)
         for name, calibration in calibrations.items():
             self.create_publisher(FluoroscopeCalibration, f'{name}/calibration', LATCHED).publish(
-                message_from_calibration(calibration))
-        self.create_publisher(RigOrientation, 'rig_orientation', LATCHED).publish(message_from_orientation(orientation))
-        self.ready = set()   # fluoroscopes that are corrected
+                message_from_calibration(calibration)
+            )
+        self.create_publisher(RigOrientation, 'rig_orientation', LATCHED).publish(
+            message_from_orientation(orientation)
+        )
+        self.ready = set()  # fluoroscopes that are corrected
         for name in NAMES:
-            self.create_subscription(CameraInfo, f'{name}/camera_info',
-                                     lambda _, name=name: self.ready.add(name), LATCHED)
-        self.within = {}   # node: [(p50, p99), ...] [ms]
+            self.create_subscription(
+                CameraInfo,
+                f'{name}/camera_info',
+                lambda _, name=name: self.ready.add(name),
+                LATCHED,
+            )
+        self.within = {}  # node: [(p50, p99), ...] [ms]
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
-        self.came = {}   # (node, fluoroscope): [(frame number, latency [ns]), ...]
+        self.came = {}  # (node, fluoroscope): [(frame number, latency [ns]), ...]
         self.reader = None
 
     def _on_diagnostics(self, array):
@@ -83,15 +103,19 @@ class Reader(Node):
             values = {v.key: v.value for v in status.values}
             if 'latency p50 [ms]' in values:
                 self.within.setdefault(status.name.partition(':')[0].strip('/'), []).append(
-                    (float(values['latency p50 [ms]']), float(values['latency p99 [ms]'])))
+                    (float(values['latency p50 [ms]']), float(values['latency p99 [ms]']))
+                )
 
     def listen(self, nodes):
         """Count the outputs of nodes anew."""
-        self.came, self.within = {}, {}
+        self.came = {}
+        self.within = {}
         self.reader = StreamReader(self, self.get_logger().fatal, self.get_logger().fatal)
         for node in nodes:
             if node == 'reconstruction_node':
-                self._listen(node, 'ab', 'reconstruction/points_with_covariance', ReconstructedPoints)
+                self._listen(
+                    node, 'ab', 'reconstruction/points_with_covariance', ReconstructedPoints
+                )
                 continue
             topic, kind = OUTPUTS[node]
             for name in NAMES:
@@ -100,8 +124,13 @@ class Reader(Node):
 
     def _listen(self, node, name, topic, kind):
         came = self.came[node, name] = []
-        self.reader.subscribe(kind, topic, lambda data, info: came.append(_number_and_latency(data, info)),
-                              OBSERVATIONS, decode=bytes)
+        self.reader.subscribe(
+            kind,
+            topic,
+            lambda data, info: came.append(_number_and_latency(data, info)),
+            OBSERVATIONS,
+            decode=bytes,
+        )
 
     def wait(self, condition, seconds, what):
         """Spin until condition() is true."""
@@ -113,10 +142,14 @@ class Reader(Node):
 
 
 def _number_and_latency(data, info):
-    """Frame number and latency [ns] of the CDR bytes of a message that begins with header and frame_number."""
+    """Frame number and latency [ns] of the CDR bytes of a message that begins with header and
+    frame_number.
+    """
     seconds, nanoseconds, length = struct.unpack_from('<iII', data, 4)
     at = 4 + (12 + length + 3) // 4 * 4
-    return struct.unpack_from('<I', data, at)[0], info['source_timestamp'] - seconds * 10 ** 9 - nanoseconds
+    return struct.unpack_from('<I', data, at)[0], info[
+        'source_timestamp'
+    ] - seconds * 10**9 - nanoseconds
 
 
 def _cpu(process):
@@ -126,8 +159,11 @@ def _cpu(process):
 
 
 def _command(node, **parameters):
-    module = ['benchmarks.relay', node.removeprefix('relay_')] if node.startswith('relay') else [
-        f'fluoro_calib_ros.nodes.{node}']
+    module = (
+        ['benchmarks.relay', node.removeprefix('relay_')]
+        if node.startswith('relay')
+        else [f'fluoro_calib_ros.nodes.{node}']
+    )
     command = [sys.executable, '-m', *module, '--ros-args']
     for key, value in parameters.items():
         command += ['-p', f'{key}:={value}']
@@ -136,20 +172,38 @@ def _command(node, **parameters):
 
 def measured(reader, scene, rate, nodes, seconds, log, parameters):
     """[{node, lost, p50, p99, max [ms], cpu [us a message]}] of a case."""
-    processes = {node: subprocess.Popen(_command(node, **parameters), stdout=log, stderr=log) for node in nodes}
+    processes = {
+        node: subprocess.Popen(_command(node, **parameters), stdout=log, stderr=log)
+        for node in nodes
+    }
     frames = round(rate * seconds)
     reader.listen(nodes)
     reader.ready.clear()
     if 'correction_node' in nodes:
         reader.wait(lambda: len(reader.ready) == len(NAMES), 60, 'the correction node')
-    simulator = subprocess.Popen(_command('simulator_node', scene=scene, rate=float(rate), clusters=5, frames=frames,
-                                          wait_for_readers=len(nodes) - ('reconstruction_node' in nodes)),
-                                 stdout=log, stderr=log)
+    simulator = subprocess.Popen(
+        _command(
+            'simulator_node',
+            scene=scene,
+            rate=float(rate),
+            clusters=5,
+            frames=frames,
+            wait_for_readers=len(nodes) - ('reconstruction_node' in nodes),
+        ),
+        stdout=log,
+        stderr=log,
+    )
     try:
         reader.wait(lambda: all(reader.came.values()), 60, 'the first frames')
-        began = {node: _cpu(p) for node, p in processes.items()} | {'simulator_node': _cpu(simulator)}
+        began = {node: _cpu(p) for node, p in processes.items()} | {
+            'simulator_node': _cpu(simulator)
+        }
         first = {key: len(of_one) for key, of_one in reader.came.items()}
-        reader.wait(lambda: simulator.poll() is not None or _nearly(reader.came, frames), seconds + 60, 'the stream')
+        reader.wait(
+            lambda: simulator.poll() is not None or _nearly(reader.came, frames),
+            seconds + 60,
+            'the stream',
+        )
         used = {node: _cpu(p) - began[node] for node, p in processes.items()}
         counted = {key: len(of_one) - first[key] for key, of_one in reader.came.items()}
         reader.wait(lambda: simulator.poll() is not None, 60, 'the end of the simulator')
@@ -164,7 +218,9 @@ def measured(reader, scene, rate, nodes, seconds, log, parameters):
 
 
 def _nearly(came, frames):
-    """Whether the stream is over but for its last frames: the CPU of what is ending is not that of the stream."""
+    """Whether the stream is over but for its last frames: the CPU of what is ending is not that of
+    the stream.
+    """
     return all(of_one[-1][0] >= frames - 10 for of_one in came.values())
 
 
@@ -175,10 +231,18 @@ def _figures(reader, node, frames, used, counted):
     twice = sum(len(of_one) - len(np.unique(of_one[:, 0])) for of_one in of_node.values())
     messages = sum(counted[key] for key in of_node) * (2 if node == 'reconstruction_node' else 1)
     within = np.array(reader.within.get(node, [(np.nan, np.nan)]))
-    return {'node': node, 'frames': frames * len(of_node), 'lost': lost, 'twice': twice,
-            'within_p50': np.median(within[:, 0]), 'within_p99': within[:, 1].max(),
-            'p50': np.percentile(latency, 50), 'p99': np.percentile(latency, 99), 'max': latency.max(),
-            'cpu_us': used / messages * 1e6}
+    return {
+        'node': node,
+        'frames': frames * len(of_node),
+        'lost': lost,
+        'twice': twice,
+        'within_p50': np.median(within[:, 0]),
+        'within_p99': within[:, 1].max(),
+        'p50': np.percentile(latency, 50),
+        'p99': np.percentile(latency, 99),
+        'max': latency.max(),
+        'cpu_us': used / messages * 1e6,
+    }
 
 
 def rig_of_the_simulator():
@@ -193,13 +257,26 @@ def run(seconds, only=''):
     """{case: figures of its nodes}."""
     isolate()
     rclpy.init(args=[])
-    reader, out = Reader(*rig_of_the_simulator()), {}
+    reader = Reader(*rig_of_the_simulator())
+    out = {}
     with open(os.environ.get('ONLINE_LOG', os.devnull), 'ab') as log:
         for case, (scene, rate, nodes) in CASES.items():
             if only in case:
-                out[case] = measured(reader, scene, rate, nodes, seconds, log, DEEP if 'deep' in case else {})
-                print(case, *(' '.join(f'{k} {v:.3f}' if isinstance(v, float) else f'{k} {v}' for k, v in f.items())
-                              for f in out[case]), sep='\n   ', flush=True)
+                out[case] = measured(
+                    reader, scene, rate, nodes, seconds, log, DEEP if 'deep' in case else {}
+                )
+                print(
+                    case,
+                    *(
+                        ' '.join(
+                            f'{k} {v:.3f}' if isinstance(v, float) else f'{k} {v}'
+                            for k, v in f.items()
+                        )
+                        for f in out[case]
+                    ),
+                    sep='\n   ',
+                    flush=True,
+                )
     reader.destroy_node()
     rclpy.shutdown()
     return out
@@ -210,11 +287,37 @@ def text_of(results):
     rows = []
     for case, figures in results.items():
         for f in figures:
-            within = ['-', '-'] if np.isnan(f['within_p50']) else [f'{f["within_p50"]:.2f}', f'{f["within_p99"]:.2f}']
-            rows.append([f'{case}: {f["node"]}', str(f['frames']), str(f['lost']), *within, f'{f["p50"]:.2f}',
-                         f'{f["p99"]:.2f}', f'{f["max"]:.1f}', f'{f["cpu_us"]:.0f}'])
-    return table(['case: node', 'frames', 'lost', 'in the node p50 [ms]', 'p99 [ms]', 'from the stamp p50 [ms]',
-                  'p99 [ms]', 'max [ms]', 'CPU a message [us]'], rows)
+            within = (
+                ['-', '-']
+                if np.isnan(f['within_p50'])
+                else [f'{f["within_p50"]:.2f}', f'{f["within_p99"]:.2f}']
+            )
+            rows.append(
+                [
+                    f'{case}: {f["node"]}',
+                    str(f['frames']),
+                    str(f['lost']),
+                    *within,
+                    f'{f["p50"]:.2f}',
+                    f'{f["p99"]:.2f}',
+                    f'{f["max"]:.1f}',
+                    f'{f["cpu_us"]:.0f}',
+                ]
+            )
+    return table(
+        [
+            'case: node',
+            'frames',
+            'lost',
+            'in the node p50 [ms]',
+            'p99 [ms]',
+            'from the stamp p50 [ms]',
+            'p99 [ms]',
+            'max [ms]',
+            'CPU a message [us]',
+        ],
+        rows,
+    )
 
 
 if __name__ == '__main__':

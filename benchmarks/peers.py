@@ -1,8 +1,9 @@
-"""The adjustment and the self-calibration done with other people's programs, to be compared with ours.
+"""The adjustment and the self-calibration done with other people's programs, to be compared with
+ours.
 
 COLMAP's bundle adjuster (pycolmap, Ceres) with a Cauchy loss of scale b = sigma sqrt(nu) minimises
-b^2/2 sum ln(1 + |r|^2 / b^2): the negative log-likelihood of the bivariate Student-t but for its constant and
-the factor (nu + 2) / b^2. Its pixel centres lie at 0.5, ours at integers.
+b^2/2 sum ln(1 + |r|^2 / b^2): the negative log-likelihood of the bivariate Student-t but for its
+constant and the factor (nu + 2) / b^2. Its pixel centres lie at 0.5, ours at integers.
 """
 
 from dataclasses import dataclass, replace
@@ -20,44 +21,70 @@ from fluoro_calib_ros.photogrammetry.noise import INLIER_Q, Noise
 from .timing import timed
 
 PIXEL_CENTRE = 0.5
-HELD_SD_MM, LOOSE_SD_MM = 1e-6, 1e6   # as a constant and as a free point of the same program: held, and not
+# as a constant and as a free point of the same program: held, and not
+HELD_SD_MM = 1e-6
+LOOSE_SD_MM = 1e6
 # Ceres stops at the first that holds: nothing but rounding.
-TIGHT = {'function_tolerance': 0.0, 'gradient_tolerance': 1e-10, 'parameter_tolerance': 1e-14,
-         'max_num_iterations': 500}
+TIGHT = {
+    'function_tolerance': 0.0,
+    'gradient_tolerance': 1e-10,
+    'parameter_tolerance': 1e-14,
+    'max_num_iterations': 500,
+}
 # Within the loop the next round does what is left.
-LOOP = {'function_tolerance': 1e-8, 'gradient_tolerance': 0.0, 'parameter_tolerance': 0.0, 'max_num_iterations': 100}
-CANDIDATES = tuple(range(3, 50))   # values of k of Chow et al.
+LOOP = {
+    'function_tolerance': 1e-8,
+    'gradient_tolerance': 0.0,
+    'parameter_tolerance': 0.0,
+    'max_num_iterations': 100,
+}
+CANDIDATES = tuple(range(3, 50))  # values of k of Chow et al.
 
 
 def with_datum(network, held):
-    """The network with the object points held (n, True or False) fixed to their survey and the others free.
+    """The network with the object points held (n, True or False) fixed to their survey and the
+    others free.
 
-    COLMAP knows constant points and free ones, not surveyed coordinates with their standard deviations.
+    COLMAP knows constant points and free ones, not surveyed coordinates with their standard
+    deviations.
     """
     return replace(network, survey_sd_mm=np.where(held, HELD_SD_MM, LOOSE_SD_MM))
 
 
 def seen_in(network, start, least):
-    """The network and its start values without the object points that fewer than least exposures show."""
+    """The network and its start values without the object points that fewer than least exposures
+    show.
+    """
     kept = np.bincount(network.point, minlength=len(network.survey_mm)) >= least
-    rows, number = kept[network.point], np.cumsum(kept) - 1
-    network = replace(network, uv=network.uv[rows], sigma=network.sigma[rows], exposure=network.exposure[rows],
-                      point=number[network.point[rows]], survey_mm=network.survey_mm[kept],
-                      survey_sd_mm=network.survey_sd_mm[kept])
+    rows = kept[network.point]
+    number = np.cumsum(kept) - 1
+    network = replace(
+        network,
+        uv=network.uv[rows],
+        sigma=network.sigma[rows],
+        exposure=network.exposure[rows],
+        point=number[network.point[rows]],
+        survey_mm=network.survey_mm[kept],
+        survey_sd_mm=network.survey_sd_mm[kept],
+    )
     return network, replace(start, points_mm=start.points_mm[kept])
 
 
 class ColmapAdjustment:
-    """The adjustment of a network of one fluoroscope, a-priori sigma one, by COLMAP's bundle adjuster.
+    """The adjustment of a network of one fluoroscope, a-priori sigma one, by COLMAP's bundle
+    adjuster.
 
-    held (n,) True for object points that stay at their survey; noise: Student-t, held; tolerances: options of
-    the Ceres solver. solve() may be called again after moved observations: it starts where it ended.
+    held (n,) True for object points that stay at their survey; noise: Student-t, held; tolerances:
+    options of the Ceres solver. solve() may be called again after moved observations: it starts
+    where it ended.
     """
 
     def __init__(self, network, start, noise, held, tolerances=None):
         if network.shape[3] != 1 or noise.loss != 'student_t' or not np.all(network.sigma == 1):
             raise ValueError('one fluoroscope, Student-t and the same sigma for all image points')
-        self._network, self._noise, self._held = network, noise, held
+        self._network = network
+        self._noise = noise
+        self._held = held
         self._reconstruction = _reconstruction(network, start, held)
         self._config = pycolmap.BundleAdjustmentConfig()
         for image in self._reconstruction.reg_image_ids():
@@ -83,40 +110,57 @@ class ColmapAdjustment:
     def solve(self):
         """Adjust. Returns the summary of Ceres."""
         self._adjuster = pycolmap.create_default_ceres_bundle_adjuster(
-            self._options, self._config, self._reconstruction)
+            self._options, self._config, self._reconstruction
+        )
         return self._adjuster.solve().ceres_summary
 
     def cost(self, summary):
-        """F of the image points at the solution, as ours counts it: with the constant of the distribution."""
+        """F of the image points at the solution, as ours counts it: with the constant of the
+        distribution.
+        """
         noise = self._noise
-        factor = (noise.nu + 2) / (noise.nu * noise.scale ** 2)
-        return factor * summary.final_cost + len(self._network.uv) * np.log(2 * np.pi * noise.scale ** 2)
+        factor = (noise.nu + 2) / (noise.nu * noise.scale**2)
+        return factor * summary.final_cost + len(self._network.uv) * np.log(
+            2 * np.pi * noise.scale**2
+        )
 
     def parameters(self):
         """Parameters at the present state."""
         f, cx, cy = self._reconstruction.camera(1).params
-        poses = [self._reconstruction.image(i).cam_from_world() for i in range(1, len(self._network.fluoroscope) + 1)]
+        poses = [
+            self._reconstruction.image(i).cam_from_world()
+            for i in range(1, len(self._network.fluoroscope) + 1)
+        ]
         rotation = np.array([pose.rotation.matrix() for pose in poses])
         position = -np.array([r.T @ pose.translation for r, pose in zip(rotation, poses)])
-        points = np.array([self._reconstruction.point3D(i + 1).xyz for i in range(len(self._network.survey_mm))])
-        return Parameters(np.array([[cx - PIXEL_CENTRE, cy - PIXEL_CENTRE, f]]), rotation, position, points)
+        points = np.array(
+            [self._reconstruction.point3D(i + 1).xyz for i in range(len(self._network.survey_mm))]
+        )
+        return Parameters(
+            np.array([[cx - PIXEL_CENTRE, cy - PIXEL_CENTRE, f]]), rotation, position, points
+        )
 
     def interior_covariance(self):
-        """Covariance (3, 3) [px^2] of xp, yp, c: inverse of the weighted normal matrix, after solve()."""
+        """Covariance (3, 3) [px^2] of xp, yp, c: inverse of the weighted normal matrix, after
+        solve().
+        """
         options = pycolmap.BACovarianceOptions()
         options.params = pycolmap.BACovarianceOptionsParams.ALL
         options.damping = 0.0
         found = pycolmap.estimate_ba_covariance(options, self._reconstruction, self._adjuster)
-        order = [1, 2, 0]   # of f, cx, cy
-        covariance = found.get_other_params_cov(self._reconstruction.camera(1).params)[np.ix_(order, order)]
+        order = [1, 2, 0]  # of f, cx, cy
+        covariance = found.get_other_params_cov(self._reconstruction.camera(1).params)[
+            np.ix_(order, order)
+        ]
         # Ceres weights with 1/(1 + |r|^2/b^2), the likelihood with (nu + 2)/b^2 times that.
-        return covariance * self._noise.nu * self._noise.scale ** 2 / (self._noise.nu + 2)
+        return covariance * self._noise.nu * self._noise.scale**2 / (self._noise.nu + 2)
 
 
 def _options(noise, tolerances):
-    """Options of COLMAP's bundle adjuster: everything refined, one thread."""
+    """CalibrationOptions of COLMAP's bundle adjuster: everything refined, one thread."""
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_principal_point, options.print_summary = True, False
+    options.refine_principal_point = True
+    options.print_summary = False
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.loss_function_scale = noise.scale * np.sqrt(noise.nu)
     options.ceres.solver_options.num_threads = 1
@@ -126,35 +170,53 @@ def _options(noise, tolerances):
 
 
 def _reconstruction(network, start, held):
-    """COLMAP's reconstruction with camera 1, images from 1 and points from 1 in the order of the network."""
+    """COLMAP's reconstruction with camera 1, images from 1 and points from 1 in the order of the
+    network.
+    """
     xp, yp, c = start.interior[0]
     size = np.ceil(network.uv.max(axis=0)).astype(int) + 1
     out = pycolmap.Reconstruction()
-    out.add_camera_with_trivial_rig(pycolmap.Camera(
-        model='SIMPLE_PINHOLE', width=int(size[0]), height=int(size[1]),
-        params=[c, xp + PIXEL_CENTRE, yp + PIXEL_CENTRE], camera_id=1))
+    out.add_camera_with_trivial_rig(
+        pycolmap.Camera(
+            model='SIMPLE_PINHOLE',
+            width=int(size[0]),
+            height=int(size[1]),
+            params=[c, xp + PIXEL_CENTRE, yp + PIXEL_CENTRE],
+            camera_id=1,
+        )
+    )
     for e, (rotation, position) in enumerate(zip(start.rotation, start.position_mm)):
-        image = pycolmap.Image(name=str(e), keypoints=network.uv[network.exposure == e] + PIXEL_CENTRE, camera_id=1,
-                               image_id=e + 1)
+        image = pycolmap.Image(
+            name=str(e),
+            keypoints=network.uv[network.exposure == e] + PIXEL_CENTRE,
+            camera_id=1,
+            image_id=e + 1,
+        )
         out.add_image_with_trivial_frame(
-            image, pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ position])))
+            image, pycolmap.Rigid3d(np.column_stack([rotation, -rotation @ position]))
+        )
     first = np.searchsorted(network.exposure, np.arange(len(start.rotation)))
-    number = np.arange(len(network.uv)) - first[network.exposure]   # of the point in its image
+    number = np.arange(len(network.uv)) - first[network.exposure]  # of the point in its image
     xyz = np.where(held[:, None], network.survey_mm, start.points_mm)
     order = np.argsort(network.point, kind='stable')
     starts = np.searchsorted(network.point[order], np.arange(len(xyz) + 1))
     for p in range(len(xyz)):
-        rows = order[starts[p]:starts[p + 1]]
-        track = pycolmap.Track([pycolmap.TrackElement(int(e) + 1, int(i))
-                                for e, i in zip(network.exposure[rows], number[rows])])
+        rows = order[starts[p] : starts[p + 1]]
+        track = pycolmap.Track(
+            [
+                pycolmap.TrackElement(int(e) + 1, int(i))
+                for e, i in zip(network.exposure[rows], number[rows])
+            ]
+        )
         assert out.add_point3D(xyz[p], track) == p + 1
     return out
 
 
 @dataclass(frozen=True)
 class PeerCalibration:
-    """Result of the loop: interior (3,) [px], k, rounds, converged, RMSE (2,) [px] of the residuals of the inliers,
-    and the part of the time that the grid searches took [s]."""
+    """Result of the loop: interior (3,) [px], k, rounds, converged, RMSE (2,) [px] of the
+    residuals of the inliers, and the part of the time that the grid searches took [s].
+    """
 
     interior: np.ndarray
     k: int
@@ -165,42 +227,68 @@ class PeerCalibration:
 
 
 def self_calibrate_with_peers(network, start, folds=10, rounds=30, settled_px=2e-3):
-    """The loop of Chow et al. of COLMAP's bundle adjustment and scikit-learn's grid search of k nearest neighbours.
+    """The loop of Chow et al. of COLMAP's bundle adjustment and scikit-learn's grid search of k
+    nearest neighbours.
 
-    What does not change is built once: the reconstruction, which every adjustment starts from as the last one
-    left it, and the folds. Object points that less than three exposures show, and every tenth, are the datum.
-    It ends as ours does, when the next round would change the correction by less than settled_px, or after rounds.
+    What does not change is built once: the reconstruction, which every adjustment starts from as
+    the last one left it, and the folds. Object points that less than three exposures show, and
+    every tenth, are the datum. It ends as ours does, when the next round would change the
+    correction by less than settled_px, or after rounds.
     """
     network, start = seen_in(network, start, 2)
     held = (np.arange(len(network.survey_mm)) % 10 == 0) | (np.bincount(network.point) < 3)
     fold = network.exposure % min(folds, len(network.fluoroscope))
-    noise, correction, converged = Noise('student_t', 1.0, 5.0), np.zeros_like(network.uv), False
-    colmap, search_seconds = ColmapAdjustment(network, start, noise, held, LOOP), 0.0
+    noise = Noise('student_t', 1.0, 5.0)
+    correction = np.zeros_like(network.uv)
+    converged = False
+    colmap = ColmapAdjustment(network, start, noise, held, LOOP)
+    search_seconds = 0.0
     for number in range(1, rounds + 1):
         colmap.observe(network.uv - correction)
         colmap.set_noise(noise)
         colmap.solve()
         parameters = colmap.parameters()
         residuals = network.uv - correction - project(*parameters.per_image_point(network))
-        squared = np.sum(residuals ** 2, axis=1)
-        noise = replace(noise, scale=float(np.sqrt(np.median(squared) / (2 * np.log(2)))))   # median of chi-square
-        inliers = squared <= INLIER_Q * noise.scale ** 2
-        search = GridSearchCV(KNeighborsRegressor(), {'n_neighbors': CANDIDATES}, scoring='neg_mean_squared_error',
-                              cv=PredefinedSplit(fold[inliers]), n_jobs=1)
-        _, seconds = timed(lambda: search.fit(network.uv[inliers], (residuals + correction)[inliers]))
+        squared = np.sum(residuals**2, axis=1)
+        noise = replace(
+            noise, scale=float(np.sqrt(np.median(squared) / (2 * np.log(2))))
+        )  # median of chi-square
+        inliers = squared <= INLIER_Q * noise.scale**2
+        search = GridSearchCV(
+            KNeighborsRegressor(),
+            {'n_neighbors': CANDIDATES},
+            scoring='neg_mean_squared_error',
+            cv=PredefinedSplit(fold[inliers]),
+            n_jobs=1,
+        )
+        _, seconds = timed(
+            lambda: search.fit(network.uv[inliers], (residuals + correction)[inliers])
+        )
         search_seconds += seconds
-        fitted = _without_gauge(network.uv, search.predict(network.uv), inliers, parameters.interior[0])
+        fitted = _without_gauge(
+            network.uv, search.predict(network.uv), inliers, parameters.interior[0]
+        )
         change = np.sqrt(np.mean((fitted - correction)[inliers] ** 2))
         if change <= settled_px:
             converged = True
             break
         correction = fitted
-    return PeerCalibration(parameters.interior[0], search.best_params_['n_neighbors'], number, converged,
-                           np.sqrt(np.mean(residuals[inliers] ** 2, axis=0)), search_seconds)
+    return PeerCalibration(
+        parameters.interior[0],
+        search.best_params_['n_neighbors'],
+        number,
+        converged,
+        np.sqrt(np.mean(residuals[inliers] ** 2, axis=0)),
+        search_seconds,
+    )
 
 
 def _without_gauge(uv, fitted, inliers, interior):
-    """The fitted correction (N, 2) less its part that a change of the orientation makes: else c drifts away."""
+    """The fitted correction (N, 2) less its part that a change of the orientation makes: else c
+    drifts away.
+    """
     basis = gauge_basis(uv, interior)
-    part, *_ = np.linalg.lstsq(basis[inliers].reshape(-1, basis.shape[2]), fitted[inliers].ravel(), rcond=None)
+    part, *_ = np.linalg.lstsq(
+        basis[inliers].reshape(-1, basis.shape[2]), fitted[inliers].ravel(), rcond=None
+    )
     return fitted - basis @ part

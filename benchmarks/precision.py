@@ -1,8 +1,10 @@
-"""Honest precision: errors of many simulated calibrations over the standard deviations that are claimed for them.
+"""Honest precision: errors of many simulated calibrations over the standard deviations that are
+claimed for them.
 
-Every calibration is of a rig of its own. An error is taken against the truth in the gauge of the calibration: a shift,
-scale or turn of the whole image belongs to the orientation as well as to the distortion, so the true distortion is
-turned, shifted and scaled by the projective map that makes it as orthogonal to the gauge as the estimated one is.
+Every calibration is of a rig of its own. An error is taken against the truth in the gauge of the
+calibration: a shift, scale or turn of the whole image belongs to the orientation as well as to the
+distortion, so the true distortion is turned, shifted and scaled by the projective map that makes
+it as orthogonal to the gauge as the estimated one is.
 """
 
 import argparse
@@ -15,21 +17,24 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.self_calibration import Options
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.distortion.gauge import gauge_coefficients
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion, matrix_from_vector
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 QUANTITIES = ('xp', 'yp', 'c', 'T', 'q', 'object points')
-MARGIN_PX = 8.0   # of the grid from the edge of the image
+MARGIN_PX = 8.0  # of the grid from the edge of the image
 
 
 def truth_in_gauge(fluoroscope, uv, interior):
-    """Interior orientation (3,), turn (3, 3) of the sensor and correction of the truth in the gauge of a calibration.
+    """Interior orientation (3,), turn (3, 3) of the sensor and correction of the truth in the
+    gauge of a calibration.
 
-    uv (n, 2) image points over which its correction is orthogonal to the gauge about interior (3,).
+    uv (n, 2) image points over which its correction is orthogonal to the gauge about interior
+    (3,).
     """
+
     def camera(k):
         return np.array([[k[2], 0, k[0]], [0, k[2], k[1]], [0, 0, 1.0]])
 
@@ -40,38 +45,63 @@ def truth_in_gauge(fluoroscope, uv, interior):
         turned = ideal @ (camera(x[:3]) @ matrix_from_vector(x[3:]) @ back).T
         return pixels - turned[:, :2] / turned[:, 2:]
 
-    found = least_squares(lambda x: gauge_coefficients(uv, correction(x, uv), interior),
-                          np.concatenate([interior, np.zeros(3)]), x_scale=[1, 1, 1, 1e-3, 1e-3, 1e-3], xtol=1e-14)
+    found = least_squares(
+        lambda x: gauge_coefficients(uv, correction(x, uv), interior),
+        np.concatenate([interior, np.zeros(3)]),
+        x_scale=[1, 1, 1, 1e-3, 1e-3, 1e-3],
+        xtol=1e-14,
+    )
     return found.x[:3], matrix_from_vector(found.x[3:]), lambda pixels: correction(found.x, pixels)
 
 
 def normalised(seed, exposures=15, model='auto'):
-    """One calibration: mean normalised squared error by quantity, share of the correction within its 95 % interval."""
+    """One calibration: mean normalised squared error by quantity, share of the correction within
+    its 95 % interval.
+    """
     rig = virtual_rig(seed)
     simulated = simulate_exposures(rig, exposures, seed, matched=(125, 139))
-    return errors_of(calibrate({'a': simulated.frames['a']}, rig.phantom, Options(model)), rig, simulated)
+    return errors_of(
+        calibrate({'a': simulated.frames['a']}, rig.phantom, CalibrationOptions(model)),
+        rig,
+        simulated,
+    )
 
 
 def errors_of(job, rig, simulated):
-    """Mean normalised squared errors of a calibration of fluoroscope a, and its correction against the truth."""
-    run, figures, fluoroscope = job.runs['a'], job.fluoroscopes['a'], rig.fluoroscopes[0]
-    interior, turn, true = truth_in_gauge(fluoroscope, run.measured.network.uv, run.after.parameters.interior[0])
+    """Mean normalised squared errors of a calibration of fluoroscope a, and its correction against
+    the truth.
+    """
+    run = job.runs['a']
+    figures = job.fluoroscopes['a']
+    fluoroscope = rig.fluoroscopes[0]
+    interior, turn, true = truth_in_gauge(
+        fluoroscope, run.measured.network.uv, run.after.parameters.interior[0]
+    )
     out = dict(zip(QUANTITIES, ((figures.interior - interior) / figures.interior_sd) ** 2))
     squares = {'T': [], 'q': []}
     for e in figures.exposures:
         rotation, position = fluoroscope.exterior(simulated.poses[e.exposure - 1])
         squares['T'].append(((e.position_mm - position) / e.sd_mm) ** 2)
-        error = Rotation.from_matrix(matrix_from_quaternion(e.quaternion_wxyz) @ (turn @ rotation).T).as_rotvec()
+        error = Rotation.from_matrix(
+            matrix_from_quaternion(e.quaternion_wxyz) @ (turn @ rotation).T
+        ).as_rotvec()
         squares['q'].append((error / e.sd_rad) ** 2)
     out.update({name: float(np.mean(value)) for name, value in squares.items()})
     points = job.targets.xyz_mm - rig.true_mm[job.targets.target_id - 1]
-    out['object points'] = float(np.mean(points ** 2 / np.diagonal(job.targets.covariance, axis1=1, axis2=2)))
-    grid = np.stack(np.meshgrid(*[np.linspace(MARGIN_PX, 1023 - MARGIN_PX, 41)] * 2), axis=-1).reshape(-1, 2)
+    out['object points'] = float(
+        np.mean(points**2 / np.diagonal(job.targets.covariance, axis1=1, axis2=2))
+    )
+    grid = np.stack(
+        np.meshgrid(*[np.linspace(MARGIN_PX, 1023 - MARGIN_PX, 41)] * 2), axis=-1
+    ).reshape(-1, 2)
     found = job.calibrations['a'].model.evaluate(grid)
     inside = ~found.outside
-    out['interval'] = float(np.mean(np.abs(found.duv - true(grid))[inside] <= 1.96 * found.sd[inside, None]))
+    out['interval'] = float(
+        np.mean(np.abs(found.duv - true(grid))[inside] <= 1.96 * found.sd[inside, None])
+    )
     out['correction'] = float(np.sqrt(np.mean((found.duv - true(grid))[inside] ** 2)))
-    out['converged'], out['sigma0'] = job.converged, run.after.noise.scale
+    out['converged'] = job.converged
+    out['sigma0'] = run.after.noise.scale
     return out
 
 
@@ -93,28 +123,47 @@ area); its RMSE is {correction:.4f} px. The mean of the estimated noise is {sigm
 def main(arguments=None):
     """Entry point."""
     parser = argparse.ArgumentParser(prog='python -m benchmarks.precision', description=__doc__)
-    parser.add_argument('--count', type=int, default=200, help='number of calibrations (default: 200)')
-    parser.add_argument('--first', type=int, default=1000, help='seed of the first rig (default: 1000)')
-    parser.add_argument('--exposures', type=int, default=15, help='exposures of each (default: 15)')
+    parser.add_argument(
+        '--count', type=int, default=200, help='number of calibrations (default: 200)'
+    )
+    parser.add_argument(
+        '--first', type=int, default=1000, help='seed of the first rig (default: 1000)'
+    )
+    parser.add_argument(
+        '--exposures', type=int, default=15, help='exposures of each (default: 15)'
+    )
     parser.add_argument('--model', default='auto', help='correction model (default: auto)')
-    parser.add_argument('--out', type=Path, default=Path('docs/precision.md'), help='file to write')
+    parser.add_argument(
+        '--out', type=Path, default=Path('docs/precision.md'), help='file to write'
+    )
     options = parser.parse_args(arguments)
-    start, results = time.monotonic(), []
+    start = time.monotonic()
+    results = []
     with multiprocessing.get_context('spawn').Pool(2) as pool:
         seeds = range(options.first, options.first + options.count)
         jobs = [(seed, options.exposures, options.model) for seed in seeds]
         for result in pool.imap_unordered(_one, jobs):
             results.append(result)
             print(f'{len(results)} of {options.count}', file=sys.stderr, end='\r')
-    lines = ['| quantity | mean normalised squared error | standard error of it |', '|---|---:|---:|']
+    lines = [
+        '| quantity | mean normalised squared error | standard error of it |',
+        '|---|---:|---:|',
+    ]
     for name in QUANTITIES:
         values = np.array([r[name] for r in results])
-        lines.append(f'| {name} | {values.mean():.3f} | {values.std() / np.sqrt(len(values)):.3f} |')
+        lines.append(
+            f'| {name} | {values.mean():.3f} | {values.std() / np.sqrt(len(values)):.3f} |'
+        )
     text = TEXT.format(
-        count=len(results), exposures=options.exposures, model=options.model, table='\n'.join(lines),
-        interval=100 * np.mean([r['interval'] for r in results]), converged=sum(r['converged'] for r in results),
+        count=len(results),
+        exposures=options.exposures,
+        model=options.model,
+        table='\n'.join(lines),
+        interval=100 * np.mean([r['interval'] for r in results]),
+        converged=sum(r['converged'] for r in results),
         correction=np.sqrt(np.mean([r['correction'] ** 2 for r in results])),
-        sigma0=np.mean([r['sigma0'] for r in results]))
+        sigma0=np.mean([r['sigma0'] for r in results]),
+    )
     options.out.write_text(text)
     print(text)
     print(f'{time.monotonic() - start:.0f} s', file=sys.stderr)

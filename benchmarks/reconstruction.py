@@ -1,9 +1,10 @@
 """Accuracy of points in space: `python -m benchmarks.reconstruction`.
 
-Virtual rigs with image noise of 0.25 px. Each is calibrated with 15 exposures; then the phantom stands in the rig frame
-for the orientation, and markers in four rigid clusters move. Aims: RMSE of the markers within 5 % of that with
-perfectly known distortion; distances in the rigid clusters as constant as their predicted standard deviations;
-normalised squared errors of the points with a mean of 0.9 to 1.1.
+Virtual rigs with image noise of 0.25 px. Each is calibrated with 15 exposures; then the phantom
+stands in the rig frame for the orientation, and markers in four rigid clusters move. Aims: RMSE of
+the markers within 5 % of that with perfectly known distortion; distances in the rigid clusters as
+constant as their predicted standard deviations; normalised squared errors of the points with a
+mean of 0.9 to 1.1.
 """
 
 import argparse
@@ -13,28 +14,46 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.orientation import orientation_of_capture, orientation_of_exposures
-from fluoro_calib_ros.calibration.self_calibration import Options
-from fluoro_calib_ros.photogrammetry.observations import Frame
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.rig_orientation import (
+    orientation_of_capture,
+    orientation_of_exposures,
+)
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.reconstruction.intersection import Intersector
-from fluoro_calib_ros.reconstruction.recording import reconstruct_recording
-from fluoro_calib_ros.simulation.rig import seen_beads, simulate_exposures, simulate_tracking, virtual_rig
+from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
+from fluoro_calib_ros.simulation.rig import (
+    seen_beads,
+    simulate_exposures,
+    simulate_tracking,
+    virtual_rig,
+)
 
-EXPOSURES, NOISE_PX, CAPTURED = 15, 0.25, 1
-CLUSTERS = np.arange(24).reshape(4, 6)   # rows of the markers of each rigid cluster
-MARGIN_PX = 100   # round images without distortion: at the edge a point leaves the image when its distortion is off
-WAYS = {'uncorrected': 'none', 'knn': 'knn', 'auto': 'auto', 'known distortion': 'none'}   # correction model of each
+EXPOSURES = 15
+NOISE_PX = 0.25
+CAPTURED = 1
+CLUSTERS = np.arange(24).reshape(4, 6)  # rows of the markers of each rigid cluster
+# round images without distortion: at the edge a point leaves the image when its distortion is off
+MARGIN_PX = 100
+WAYS = {
+    'uncorrected': 'none',
+    'knn': 'knn',
+    'auto': 'auto',
+    'known distortion': 'none',
+}  # correction model of each
 FROM_EXPOSURES = ', orientation from the calibration'
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Figures of one way on one rig: rmse_mm (3-D) of the markers; normalised: mean normalised squared error, NaN for
-    a rig frame that is not the true one; epipolar: mean squared standardised epipolar distance; lost: share of
-    the points without coordinates; constancy (4,): standard deviation over time of the distances in each cluster, over
-    the predicted one; distance_mm: RMSE of these distances; sd_orientation_mm (3-D) of the points by the rig's
-    orientation, NaN as normalised."""
+    """Figures of one way on one rig: rmse_mm (3-D) of the markers; normalised: mean normalised
+    squared error, NaN for a rig frame that is not the true one; epipolar: mean squared
+    standardised epipolar distance; lost: share of the points without coordinates; constancy (4,):
+    standard deviation over time of the distances in each cluster, over the predicted one;
+    distance_mm: RMSE of these distances; sd_orientation_mm (3-D) of the points by the rig's
+    orientation, NaN as normalised.
+    """
 
     rmse_mm: float
     normalised: float
@@ -48,32 +67,60 @@ class Outcome:
 def capture(rig, seed, count=CAPTURED):
     """{fluoroscope: [Frame, ...]} of the phantom standing in the rig frame, count frames of each."""
     rng = np.random.default_rng([seed, 4])
-    return {f.name: [Frame(f.name, k + 1, *seen_beads(rng, f, rig.true_mm, rig.phantom.target_id, NOISE_PX, 0.01,
-                                                      (130, 160)), f.image_size) for k in range(count)]
-            for f in rig.fluoroscopes}
+    return {
+        f.name: [
+            Frame(
+                f.name,
+                k + 1,
+                *seen_beads(
+                    rng, f, rig.true_mm, rig.phantom.target_id, NOISE_PX, 0.01, (130, 160)
+                ),
+                f.image_size,
+            )
+            for k in range(count)
+        ]
+        for f in rig.fluoroscopes
+    }
 
 
 def undistorted(rig, frames):
     """The frames with their true distortion taken off, in images with a margin."""
     field = {f.name: f.distortion for f in rig.fluoroscopes}
-    return {name: [replace(frame, uv=frame.uv - field[name](frame.uv) + MARGIN_PX,
-                           image_size=tuple(size + 2 * MARGIN_PX for size in frame.image_size)) for frame in of_one]
-            for name, of_one in frames.items()}
+    return {
+        name: [
+            replace(
+                frame,
+                uv=frame.uv - field[name](frame.uv) + MARGIN_PX,
+                image_size=tuple(size + 2 * MARGIN_PX for size in frame.image_size),
+            )
+            for frame in of_one
+        ]
+        for name, of_one in frames.items()
+    }
 
 
 def measure(seed, ways=tuple(WAYS), seconds=4.0, rate_hz=60.0, captured=CAPTURED):
-    """{way: Outcome} of one virtual rig, each way also with the orientation from the exposures of the calibration."""
-    rig, out = virtual_rig(seed), {}
+    """{way: Outcome} of one virtual rig, each way also with the orientation from the exposures of
+    the calibration.
+    """
+    rig = virtual_rig(seed)
+    out = {}
     exposures = simulate_exposures(rig, EXPOSURES, seed, NOISE_PX).frames
-    standing, tracking = capture(rig, seed, captured), simulate_tracking(rig, seconds, rate_hz, seed, NOISE_PX)
+    standing = capture(rig, seed, captured)
+    tracking = simulate_tracking(rig, seconds, rate_hz, seed, NOISE_PX)
     for way in ways:
-        training, still, moving = exposures, standing, tracking.frames
+        training = exposures
+        still = standing
+        moving = tracking.frames
         if way == 'known distortion':
-            training, still, moving = (undistorted(rig, frames) for frames in (training, still, moving))
-        calibrations = calibrate(training, rig.phantom, Options(WAYS[way])).calibrations
+            training, still, moving = (
+                undistorted(rig, frames) for frames in (training, still, moving)
+            )
+        calibrations = calibrate(training, rig.phantom, CalibrationOptions(WAYS[way])).calibrations
         for label, orientation in (
-                (way, orientation_of_capture(still, rig.phantom, calibrations)),
-                (way + FROM_EXPOSURES, orientation_of_exposures(training, rig.phantom, calibrations))):
+            (way, orientation_of_capture(still, rig.phantom, calibrations)),
+            (way + FROM_EXPOSURES, orientation_of_exposures(training, rig.phantom, calibrations)),
+        ):
             found, _ = reconstruct_recording(moving, calibrations, Intersector(orientation))
             out[label] = _outcome(found, tracking.points_mm, orientation.source == 'capture')
     return out
@@ -81,35 +128,57 @@ def measure(seed, ways=tuple(WAYS), seconds=4.0, rate_hz=60.0, captured=CAPTURED
 
 def _outcome(found, truth, in_rig_frame):
     """Outcome of ReconstructedFrames against the true points (frames, n, 3) [mm]."""
-    xyz, covariance, noise, standardised = (np.array([getattr(frame.points, name) for frame in found]) for name in (
-        'xyz_mm', 'covariance', 'covariance_noise', 'standardised'))
+    xyz, covariance, noise, standardised = (
+        np.array([getattr(frame.points, name) for frame in found])
+        for name in ('xyz_mm', 'covariance', 'covariance_noise', 'standardised')
+    )
     good = np.isfinite(xyz).all(axis=2)
     normalised = of_rig = np.nan
     if in_rig_frame:
         error = xyz - truth
-        normalised = float(np.mean(np.einsum('ni,nij,nj->n', error[good], np.linalg.inv(covariance[good]),
-                                             error[good])) / 3)
-        of_rig = float(np.sqrt(np.mean(np.trace(covariance[good] - noise[good], axis1=1, axis2=2))))
+        normalised = float(
+            np.mean(
+                np.einsum(
+                    'ni,nij,nj->n', error[good], np.linalg.inv(covariance[good]), error[good]
+                )
+            )
+            / 3
+        )
+        of_rig = float(
+            np.sqrt(np.mean(np.trace(covariance[good] - noise[good], axis1=1, axis2=2)))
+        )
     else:
         error = np.full(xyz.shape, np.nan)
         error[good] = _fitted(xyz[good], truth[good]) - truth[good]
-    constancy, off = zip(*(_distances(xyz[:, rows], truth[:, rows], noise[:, rows]) for rows in CLUSTERS))
-    return Outcome(float(np.sqrt(np.mean(np.sum(error[good] ** 2, axis=1)))), normalised,
-                   float(np.mean(standardised[good] ** 2)), float(np.mean(~good)), np.array(constancy),
-                   float(np.sqrt(np.mean(np.square(off)))), of_rig)
+    constancy, off = zip(
+        *(_distances(xyz[:, rows], truth[:, rows], noise[:, rows]) for rows in CLUSTERS)
+    )
+    return Outcome(
+        float(np.sqrt(np.mean(np.sum(error[good] ** 2, axis=1)))),
+        normalised,
+        float(np.mean(standardised[good] ** 2)),
+        float(np.mean(~good)),
+        np.array(constancy),
+        float(np.sqrt(np.mean(np.square(off)))),
+        of_rig,
+    )
 
 
 def _fitted(points, truth):
-    """Points (n, 3) moved as a rigid body onto the truth (Kabsch 1976): a rig frame that is not the true one."""
-    a, b = points.mean(axis=0), truth.mean(axis=0)
+    """Points (n, 3) moved as a rigid body onto the truth (Kabsch 1976): a rig frame that is not
+    the true one.
+    """
+    a = points.mean(axis=0)
+    b = truth.mean(axis=0)
     left, _, right = np.linalg.svd((points - a).T @ (truth - b))
     turn = left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right
     return (points - a) @ turn + b
 
 
 def _distances(xyz, truth, noise):
-    """Of the distances in a rigid cluster (frames, k, 3): standard deviation over time over the predicted one, and
-    RMSE [mm]."""
+    """Of the distances in a rigid cluster (frames, k, 3): standard deviation over time over the
+    predicted one, and RMSE [mm].
+    """
     one, other = np.triu_indices(xyz.shape[1], 1)
     apart = xyz[:, one] - xyz[:, other]
     length = np.linalg.norm(apart, axis=2)
@@ -117,35 +186,59 @@ def _distances(xyz, truth, noise):
     variance = np.einsum('tpi,tpij,tpj->tp', along, noise[:, one] + noise[:, other], along)
     observed = np.nanvar(length, axis=0, ddof=1)
     off = length - np.linalg.norm(truth[:, one] - truth[:, other], axis=2)
-    return (float(np.sqrt(np.mean(observed) / np.nanmean(variance))), float(np.sqrt(np.nanmean(off ** 2))))
+    return (
+        float(np.sqrt(np.mean(observed) / np.nanmean(variance))),
+        float(np.sqrt(np.nanmean(off**2))),
+    )
 
 
 def table(outcomes):
-    """Markdown table of {way: [Outcome of every rig]}: squares averaged over the rigs; +-: standard error."""
-    known = {suffix: _rms([o.rmse_mm for o in outcomes['known distortion' + suffix]])
-             for suffix in ('', FROM_EXPOSURES)}
-    lines = ['| way | RMSE, 3-D [mm] | of known distortion | normalised squared error | squared standardised epipolar '
-             'distance | lost points [%] | RMSE of distances in clusters [mm] |', '| --- ' + '| ---: ' * 6 + '|']
+    """Markdown table of {way: [Outcome of every rig]}: squares averaged over the rigs; +-:
+    standard error.
+    """
+    known = {
+        suffix: _rms([o.rmse_mm for o in outcomes['known distortion' + suffix]])
+        for suffix in ('', FROM_EXPOSURES)
+    }
+    lines = [
+        '| way | RMSE, 3-D [mm] | of known distortion | normalised squared error | squared standardised epipolar '
+        'distance | lost points [%] | RMSE of distances in clusters [mm] |',
+        '| --- ' + '| ---: ' * 6 + '|',
+    ]
     for way, of_rigs in outcomes.items():
         rmse = _rms([o.rmse_mm for o in of_rigs])
         normalised = np.array([o.normalised for o in of_rigs])
-        said = '-' if np.isnan(normalised).all() else (
-            f'{normalised.mean():.3f} +- {normalised.std() / np.sqrt(len(normalised)):.3f}')
+        said = (
+            '-'
+            if np.isnan(normalised).all()
+            else (f'{normalised.mean():.3f} +- {normalised.std() / np.sqrt(len(normalised)):.3f}')
+        )
         ratio = rmse / known[FROM_EXPOSURES if way.endswith(FROM_EXPOSURES) else '']
-        lines.append(f'| {way} | {rmse:.4f} | {ratio:.3f} | {said} | {np.mean([o.epipolar for o in of_rigs]):.3f} | '
-                     f'{100 * np.mean([o.lost for o in of_rigs]):.2f} | '
-                     f'{_rms([o.distance_mm for o in of_rigs]):.4f} |')
+        lines.append(
+            f'| {way} | {rmse:.4f} | {ratio:.3f} | {said} | {np.mean([o.epipolar for o in of_rigs]):.3f} | '
+            f'{100 * np.mean([o.lost for o in of_rigs]):.2f} | '
+            f'{_rms([o.distance_mm for o in of_rigs]):.4f} |'
+        )
     return '\n'.join(lines)
 
 
 def cluster_table(outcomes):
-    """Markdown table of the constancy of the distances: observed over predicted standard deviation by cluster."""
-    lines = ['| way | ' + ' | '.join(f'cluster {k + 1}' for k in range(len(CLUSTERS))) + ' | all | largest of a rig |',
-             '| --- ' + '| ---: ' * (len(CLUSTERS) + 2) + '|']
+    """Markdown table of the constancy of the distances: observed over predicted standard deviation
+    by cluster.
+    """
+    lines = [
+        '| way | '
+        + ' | '.join(f'cluster {k + 1}' for k in range(len(CLUSTERS)))
+        + ' | all | largest of a rig |',
+        '| --- ' + '| ---: ' * (len(CLUSTERS) + 2) + '|',
+    ]
     for way, of_rigs in outcomes.items():
         values = np.array([o.constancy for o in of_rigs])
-        lines.append(f'| {way} | ' + ' | '.join(f'{_rms(column):.3f}' for column in values.T)
-                     + f' | {_rms(values):.3f} | {values.max():.3f} |')
+        lines.append(
+            f'| {way} | '
+            + ' | '.join(f'{_rms(column):.3f}' for column in values.T)
+            + f' | {_rms(values):.3f} | {values.max():.3f} |'
+        )
     return '\n'.join(lines)
 
 
@@ -154,36 +247,57 @@ def _rms(values):
 
 
 def speed(points=30, repeats=2000):
-    """Time [s] of one intersection of points in two views with covariance, the smallest of ten means."""
+    """Time [s] of one intersection of points in two views with covariance, the smallest of ten
+    means.
+    """
     rig = virtual_rig(1)
-    calibrations = calibrate(simulate_exposures(rig, 5, 1).frames, rig.phantom, Options('parametric')).calibrations
+    calibrations = calibrate(
+        simulate_exposures(rig, 5, 1).frames, rig.phantom, CalibrationOptions('parametric')
+    ).calibrations
     intersector = Intersector(orientation_of_capture(capture(rig, 1), rig.phantom, calibrations))
     rng = np.random.default_rng(1)
     xyz = rng.uniform(-80, 80, (points, 3))
-    uv = np.array([f.ideal(xyz) for f in rig.fluoroscopes]) + rng.normal(0, NOISE_PX, (2, points, 2))
+    uv = np.array([f.ideal(xyz) for f in rig.fluoroscopes]) + rng.normal(
+        0, NOISE_PX, (2, points, 2)
+    )
     sigma = np.full((2, points), NOISE_PX)
     number = repeats // 10
-    return min(timeit.repeat(lambda: intersector.intersect(uv, sigma), number=number, repeat=10)) / number
+    return (
+        min(timeit.repeat(lambda: intersector.intersect(uv, sigma), number=number, repeat=10))
+        / number
+    )
 
 
 def main(arguments=None):
     """Entry point: the tables on standard output."""
-    parser = argparse.ArgumentParser(prog='python -m benchmarks.reconstruction', description=__doc__)
+    parser = argparse.ArgumentParser(
+        prog='python -m benchmarks.reconstruction', description=__doc__
+    )
     parser.add_argument('--count', type=int, default=5, help='number of virtual rigs (default: 5)')
     parser.add_argument('--first', type=int, default=1, help='seed of the first rig (default: 1)')
-    parser.add_argument('--captured', type=int, default=CAPTURED,
-                        help=f'frames of the standing phantom for the orientation (default: {CAPTURED})')
+    parser.add_argument(
+        '--captured',
+        type=int,
+        default=CAPTURED,
+        help=f'frames of the standing phantom for the orientation (default: {CAPTURED})',
+    )
     options = parser.parse_args(arguments)
     outcomes = {}
     for seed in range(options.first, options.first + options.count):
         for way, outcome in measure(seed, captured=options.captured).items():
             outcomes.setdefault(way, []).append(outcome)
         print(f'rig {seed}', file=sys.stderr, flush=True)
-    print(f'{options.count} virtual rigs, {EXPOSURES} exposures, noise {NOISE_PX} px, orientation from '
-          f'{options.captured} frame(s) of the standing phantom\n\n{table(outcomes)}\n')
-    print('Standard deviation over time of the distances in rigid clusters, observed over predicted\n')
+    print(
+        f'{options.count} virtual rigs, {EXPOSURES} exposures, noise {NOISE_PX} px, orientation from '
+        f'{options.captured} frame(s) of the standing phantom\n\n{table(outcomes)}\n'
+    )
+    print(
+        'Standard deviation over time of the distances in rigid clusters, observed over predicted\n'
+    )
     print(f'{cluster_table(outcomes)}\n')
-    print(f'Intersection of 30 points in two views with covariance: {1e6 * speed():.0f} microseconds')
+    print(
+        f'Intersection of 30 points in two views with covariance: {1e6 * speed():.0f} microseconds'
+    )
 
 
 if __name__ == '__main__':

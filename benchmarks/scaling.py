@@ -1,6 +1,6 @@
 """Time and memory of an adjustment by its number of exposures, each in a process of its own.
 
-    python -m benchmarks.scaling 300      one size: prints a line of JSON
+python -m benchmarks.scaling 300      one size: prints a line of JSON
 """
 
 import json
@@ -15,16 +15,28 @@ from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from .adjustments import NOISE, large_network
 from .timing import timed
 
-SIZES = (30, 100, 300, 1000, 3000)   # exposures
-HEADER = ['exposures x targets', 'image points', 'unknowns', 'steps', 'adjustment', 'a step',
-          'a step and image point', 'peak memory', 'of which before the adjustment']
+SIZES = (30, 100, 300, 1000, 3000)  # exposures
+HEADER = [
+    'exposures x targets',
+    'image points',
+    'unknowns',
+    'steps',
+    'adjustment',
+    'a step',
+    'a step and image point',
+    'peak memory',
+    'of which before the adjustment',
+]
 
 
 def peak_gib():
     """Largest resident size of this process so far [GiB]."""
-    # The ru_maxrss of getrusage starts with that of the parent, which is larger than the small sizes here.
-    status = dict(line.split(':', 1) for line in Path('/proc/self/status').read_text().splitlines())
-    return int(status['VmHWM'].split()[0]) / 2 ** 20
+    # The ru_maxrss of getrusage starts with that of the parent, which is larger than the small
+    # sizes here.
+    status = dict(
+        line.split(':', 1) for line in Path('/proc/self/status').read_text().splitlines()
+    )
+    return int(status['VmHWM'].split()[0]) / 2**20
 
 
 def measure(exposures):
@@ -33,15 +45,27 @@ def measure(exposures):
     before = peak_gib()
     with threadpool_limits(1):
         result, seconds = timed(lambda: adjust(network, start, None, NOISE))
-    return {'exposures': exposures, 'targets': len(network.survey_mm), 'image_points': len(network.uv),
-            'unknowns': network.unknowns, 'steps': result.steps, 'converged': bool(result.converged),
-            'seconds': seconds, 'before_gib': before, 'peak_gib': peak_gib()}
+    return {
+        'exposures': exposures,
+        'targets': len(network.survey_mm),
+        'image_points': len(network.uv),
+        'unknowns': network.unknowns,
+        'steps': result.steps,
+        'converged': bool(result.converged),
+        'seconds': seconds,
+        'before_gib': before,
+        'peak_gib': peak_gib(),
+    }
 
 
 def measure_afresh(exposures):
     """The same in a fresh process, whose memory is that of this adjustment alone."""
-    done = subprocess.run([sys.executable, '-m', 'benchmarks.scaling', str(exposures)], stdout=subprocess.PIPE,
-                          text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, '-m', 'benchmarks.scaling', str(exposures)],
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
     return json.loads(done.stdout)
 
 
@@ -50,9 +74,17 @@ def rows(sizes=SIZES):
     for size in sizes:
         f = measure_afresh(size)
         step = f['seconds'] / f['steps']
-        yield [f'{size} x {f["targets"]}', f'{f["image_points"]:,}', f'{f["unknowns"]:,}',
-               f'{f["steps"]}{"" if f["converged"] else " (not converged)"}', f'{f["seconds"]:.2f} s', f'{step:.3f} s',
-               f'{step / f["image_points"] * 1e6:.2f} us', f'{f["peak_gib"]:.2f} GiB', f'{f["before_gib"]:.2f} GiB']
+        yield [
+            f'{size} x {f["targets"]}',
+            f'{f["image_points"]:,}',
+            f'{f["unknowns"]:,}',
+            f'{f["steps"]}{"" if f["converged"] else " (not converged)"}',
+            f'{f["seconds"]:.2f} s',
+            f'{step:.3f} s',
+            f'{step / f["image_points"] * 1e6:.2f} us',
+            f'{f["peak_gib"]:.2f} GiB',
+            f'{f["before_gib"]:.2f} GiB',
+        ]
 
 
 if __name__ == '__main__':

@@ -8,7 +8,8 @@ import numpy as np
 
 def timed(function, repeats=1):
     """Result of the last of repeated calls, and the median of their wall times [s]."""
-    times, result = [], None
+    times = []
+    result = None
     for _ in range(repeats):
         began = time.perf_counter()
         result = function()

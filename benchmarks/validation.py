@@ -1,6 +1,7 @@
 """The experiment of Chow et al. on the virtual rig, and what goes beyond it: `make validation`.
 
-Writes docs/validation.md and its pictures. What is done is in experiment_plan, what is written in experiment_text.
+Writes docs/validation.md and its pictures. What is done is in experiment_plan, what is written in
+experiment_text.
 """
 
 import argparse
@@ -19,16 +20,24 @@ def make(plan, document):
     outcomes = run(plan.cases())
     paths = write_all(plan, outcomes, document.parent / 'images')
     document.write_text(document_text(plan, outcomes, paths, document))
-    print(f'{document} and {len(paths)} pictures, {time.monotonic() - began:.0f} s', file=sys.stderr)
+    print(
+        f'{document} and {len(paths)} pictures, {time.monotonic() - began:.0f} s', file=sys.stderr
+    )
     return outcomes
 
 
 def main(arguments=None):
     """Entry point: exit status 1 where a calibration failed."""
     parser = argparse.ArgumentParser(prog='python -m benchmarks.validation', description=__doc__)
-    parser.add_argument('--quick', action='store_true', help='all sections, but of a small experiment')
-    parser.add_argument('--out', type=Path, default=Path('docs/validation.md'),
-                        help='file to write, pictures go into images/ beside it (default: docs/validation.md)')
+    parser.add_argument(
+        '--quick', action='store_true', help='all sections, but of a small experiment'
+    )
+    parser.add_argument(
+        '--out',
+        type=Path,
+        default=Path('docs/validation.md'),
+        help='file to write, pictures go into images/ beside it (default: docs/validation.md)',
+    )
     options = parser.parse_args(arguments)
     outcomes = make(quick_plan() if options.quick else full_plan(), options.out)
     return 1 if any(o.failed for o in outcomes.values()) else 0

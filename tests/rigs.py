@@ -4,36 +4,54 @@ import functools
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.self_calibration import Options
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.photogrammetry.adjustment import Network, Parameters
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.rig import looking_at_origin, phantom_poses, simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    looking_at_origin,
+    phantom_poses,
+    simulate_exposures,
+    virtual_rig,
+)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def rig():
     """The virtual rig of the tests."""
     return virtual_rig(1)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def exposures(count=15, seed=1):
     """{fluoroscope: [Frame, ...]} of the rig, to be left as they are."""
     return simulate_exposures(rig(), count, seed).frames
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def calibrated(name='a', count=15, **options):
     """JobResult of fluoroscope name of the rig with the first exposures of 15."""
-    return calibrate({name: exposures()[name][:count]}, rig().phantom, Options(**options))
+    return calibrate(
+        {name: exposures()[name][:count]}, rig().phantom, CalibrationOptions(**options)
+    )
 
 
-def small_network(exposures=4, targets=30, fluoroscopes=1, noise_px=0.3, nu=np.inf, seed=0, survey_sd_mm=0.1,
-                  free=True, seen=0.8):
-    """A Network and its true Parameters: targets in a box of 200 mm, of which a part is seen in each exposure."""
+def small_network(
+    exposures=4,
+    targets=30,
+    fluoroscopes=1,
+    noise_px=0.3,
+    nu=np.inf,
+    seed=0,
+    survey_sd_mm=0.1,
+    free=True,
+    seen=0.8,
+):
+    """A Network and its true Parameters: targets in a box of 200 mm, of which a part is seen in
+    each exposure.
+    """
     rng = np.random.default_rng(seed)
     true_mm = rng.uniform(-100, 100, (targets, 3))
     survey = true_mm + rng.normal(0, survey_sd_mm, true_mm.shape)
@@ -51,8 +69,16 @@ def small_network(exposures=4, targets=30, fluoroscopes=1, noise_px=0.3, nu=np.i
     noise = rng.normal(0, noise_px, (len(point), 2))
     if np.isfinite(nu):
         noise /= np.sqrt(rng.chisquare(nu, len(point)) / nu)[:, None]
-    network = Network(np.zeros((len(point), 2)), sigma, exposure, point, of_exposure, survey,
-                      np.full(targets, survey_sd_mm), np.full(fluoroscopes, free))
+    network = Network(
+        np.zeros((len(point), 2)),
+        sigma,
+        exposure,
+        point,
+        of_exposure,
+        survey,
+        np.full(targets, survey_sd_mm),
+        np.full(fluoroscopes, free),
+    )
     uv = project(*truth.per_image_point(network)) + sigma[:, None] * noise
     object.__setattr__(network, 'uv', uv)
     return network, truth
@@ -63,19 +89,29 @@ def disturbed(parameters, seed=0, degrees=0.5, mm=5.0):
     rng = np.random.default_rng(seed)
     turn = matrix_from_vector(rng.normal(0, np.deg2rad(degrees), parameters.position_mm.shape))
     interior = parameters.interior + rng.normal(0, 5.0, parameters.interior.shape)
-    return Parameters(interior, turn @ parameters.rotation,
-                      parameters.position_mm + rng.normal(0, mm, parameters.position_mm.shape),
-                      parameters.points_mm + rng.normal(0, 0.3, parameters.points_mm.shape))
+    return Parameters(
+        interior,
+        turn @ parameters.rotation,
+        parameters.position_mm + rng.normal(0, mm, parameters.position_mm.shape),
+        parameters.points_mm + rng.normal(0, 0.3, parameters.points_mm.shape),
+    )
 
 
 def moved(network, parameters, x):
-    """Parameters moved by a flat vector of all unknowns: T and w of the exposures, points, free interiors."""
+    """Parameters moved by a flat vector of all unknowns: T and w of the exposures, points, free
+    interiors.
+    """
     _, m, n, _ = network.shape
-    exterior, points = x[:6 * m].reshape(m, 6), x[6 * m:6 * m + 3 * n].reshape(n, 3)
+    exterior = x[: 6 * m].reshape(m, 6)
+    points = x[6 * m : 6 * m + 3 * n].reshape(n, 3)
     interior = parameters.interior.copy()
-    interior[network.interior_free] += x[6 * m + 3 * n:].reshape(-1, 3)
-    return Parameters(interior, matrix_from_vector(exterior[:, 3:]) @ parameters.rotation,
-                      parameters.position_mm + exterior[:, :3], parameters.points_mm + points)
+    interior[network.interior_free] += x[6 * m + 3 * n :].reshape(-1, 3)
+    return Parameters(
+        interior,
+        matrix_from_vector(exterior[:, 3:]) @ parameters.rotation,
+        parameters.position_mm + exterior[:, :3],
+        parameters.points_mm + points,
+    )
 
 
 def design_matrix(network, parameters):
@@ -85,22 +121,26 @@ def design_matrix(network, parameters):
     out = np.zeros((count, 2, network.unknowns))
     column = 6 * m + 3 * n + 3 * (np.cumsum(network.interior_free) - 1)
     for row, (e, p) in enumerate(zip(network.exposure, network.point)):
-        out[row, :, 6 * e:6 * e + 6] = d_e[row]
-        out[row, :, 6 * m + 3 * p:6 * m + 3 * p + 3] = d_p[row]
+        out[row, :, 6 * e : 6 * e + 6] = d_e[row]
+        out[row, :, 6 * m + 3 * p : 6 * m + 3 * p + 3] = d_p[row]
         f = network.fluoroscope[e]
         if network.interior_free[f]:
-            out[row, :, column[f]:column[f] + 3] = d_i[row]
+            out[row, :, column[f] : column[f] + 3] = d_i[row]
     return out.reshape(2 * count, -1)
 
 
 def dense_normal_matrix(network, adjustment, factor=1.0):
     """Dense normal matrix (u, u) of an adjustment, its image weights times factor."""
     a = design_matrix(network, adjustment.parameters)
-    weight = factor * adjustment.noise.weight(adjustment.q) / (adjustment.noise.scale * network.sigma) ** 2
+    weight = (
+        factor
+        * adjustment.noise.weight(adjustment.q)
+        / (adjustment.noise.scale * network.sigma) ** 2
+    )
     normal = a.T @ (np.repeat(weight, 2)[:, None] * a)
     m, n = network.shape[1:3]
     points = np.arange(6 * m, 6 * m + 3 * n)
-    normal[points, points] += np.repeat(1 / network.survey_sd_mm ** 2, 3)
+    normal[points, points] += np.repeat(1 / network.survey_sd_mm**2, 3)
     return normal
 
 

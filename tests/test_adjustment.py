@@ -4,23 +4,28 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rigs
 from scipy import optimize
 from threadpoolctl import threadpool_limits
 
-import rigs
 from fluoro_calib_ros.calibration.self_calibration import adjusted_with_precision
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
-from fluoro_calib_ros.photogrammetry import normal as normal_module
+from fluoro_calib_ros.photogrammetry import normal_equations as normal_module
 from fluoro_calib_ros.photogrammetry import precision as precision_module
-from fluoro_calib_ros.photogrammetry.adjustment import adjust, eliminates_points, residuals_and_q, total_cost
+from fluoro_calib_ros.photogrammetry.adjustment import (
+    adjust,
+    eliminates_points,
+    residuals_and_q,
+    total_cost,
+)
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
-from fluoro_calib_ros.photogrammetry.observations import DataError
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy, precision
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 
-MANY_TARGETS = dict(exposures=4, targets=30)   # the points are eliminated
-MANY_EXPOSURES = dict(exposures=14, targets=20)   # the exposures are eliminated
+MANY_TARGETS = dict(exposures=4, targets=30)  # the points are eliminated
+MANY_EXPOSURES = dict(exposures=14, targets=20)  # the exposures are eliminated
 
 
 @pytest.fixture(autouse=True)
@@ -43,24 +48,39 @@ def standard_deviations(network, result):
 
 
 def assert_same_solution(one, other, position_mm=1e-5, angle=1e-8, points_mm=1e-6, interior=1e-4):
-    np.testing.assert_allclose(one.parameters.position_mm, other.parameters.position_mm, rtol=0, atol=position_mm)
-    assert np.max(rotation_angle(one.parameters.rotation @ other.parameters.rotation.transpose(0, 2, 1))) < angle
-    np.testing.assert_allclose(one.parameters.points_mm, other.parameters.points_mm, rtol=0, atol=points_mm)
-    np.testing.assert_allclose(one.parameters.interior, other.parameters.interior, rtol=0, atol=interior)
+    np.testing.assert_allclose(
+        one.parameters.position_mm, other.parameters.position_mm, rtol=0, atol=position_mm
+    )
+    assert (
+        np.max(
+            rotation_angle(one.parameters.rotation @ other.parameters.rotation.transpose(0, 2, 1))
+        )
+        < angle
+    )
+    np.testing.assert_allclose(
+        one.parameters.points_mm, other.parameters.points_mm, rtol=0, atol=points_mm
+    )
+    np.testing.assert_allclose(
+        one.parameters.interior, other.parameters.interior, rtol=0, atol=interior
+    )
 
 
 @pytest.mark.parametrize('shape', [MANY_TARGETS, MANY_EXPOSURES])
 @pytest.mark.parametrize('loss', LOSSES)
 def test_gradient_of_the_cost_is_zero_at_the_solution(loss, shape):
-    """Central differences of F in as many directions as there are unknowns, each of one standard deviation."""
+    """Central differences of F in as many directions as there are unknowns, each of one standard
+    deviation.
+    """
     network, truth = rigs.small_network(**shape, nu=4.0)
     result = adjust(network, rigs.disturbed(truth), noise=Noise(loss))
     assert result.converged
     directions = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, result))).T
     step = 1e-3
-    slope = [(cost_at(network, result, step * d) - cost_at(network, result, -step * d)) / (2 * step)
-             for d in directions]
-    assert np.linalg.norm(slope) < 2e-4   # a decrease of less than 2e-8 is left
+    slope = [
+        (cost_at(network, result, step * d) - cost_at(network, result, -step * d)) / (2 * step)
+        for d in directions
+    ]
+    assert np.linalg.norm(slope) < 2e-4  # a decrease of less than 2e-8 is left
     assert result.cost == pytest.approx(cost_at(network, result), rel=1e-12)
 
 
@@ -72,13 +92,21 @@ def test_gaussian_adjustment_equals_scipy_least_squares():
     def residuals(x):
         parameters = rigs.moved(network, truth, x)
         image = (network.uv - project(*parameters.per_image_point(network))) / (
-            result.noise.scale * network.sigma)[:, None]
+            result.noise.scale * network.sigma
+        )[:, None]
         survey = (parameters.points_mm - network.survey_mm) / network.survey_sd_mm[:, None]
         return np.concatenate([image.ravel(), survey.ravel()])
 
     sd = standard_deviations(network, result)
-    theirs = optimize.least_squares(residuals, np.zeros(network.unknowns), x_scale=sd, xtol=1e-13, ftol=1e-15,
-                                    gtol=1e-12, jac='3-point')
+    theirs = optimize.least_squares(
+        residuals,
+        np.zeros(network.unknowns),
+        x_scale=sd,
+        xtol=1e-13,
+        ftol=1e-15,
+        gtol=1e-12,
+        jac='3-point',
+    )
     parameters = rigs.moved(network, truth, theirs.x)
     assert_same_solution(result, replace(result, parameters=parameters), 2e-3, 1e-6, 1e-5, 5e-3)
     constant = np.sum(np.log(2 * np.pi * (result.noise.scale * network.sigma) ** 2))
@@ -88,20 +116,31 @@ def test_gaussian_adjustment_equals_scipy_least_squares():
 @pytest.mark.long
 @pytest.mark.parametrize('loss', ['student_t', 'huber'])
 def test_no_better_solution_is_found_by_direct_minimisation(loss):
-    """With the noise model held, scipy gains nothing from our solution, and from elsewhere comes back to it."""
+    """With the noise model held, scipy gains nothing from our solution, and from elsewhere comes
+    back to it.
+    """
     network, truth = rigs.small_network(exposures=3, targets=14, nu=4.0)
     result = adjust(network, rigs.disturbed(truth), noise=Noise(loss), tolerance=1e-12)
     root = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, result)))
     ours = cost_at(network, result)
-    for start in (np.zeros(network.unknowns), np.random.default_rng(1).normal(0, 0.5, network.unknowns)):
-        theirs = optimize.minimize(lambda z: cost_at(network, result, root @ z), start, method='BFGS',
-                                   options={'gtol': 1e-5})
+    for start in (
+        np.zeros(network.unknowns),
+        np.random.default_rng(1).normal(0, 0.5, network.unknowns),
+    ):
+        theirs = optimize.minimize(
+            lambda z: cost_at(network, result, root @ z),
+            start,
+            method='BFGS',
+            options={'gtol': 1e-5},
+        )
         assert ours - theirs.fun < 1e-5
-        assert np.max(np.abs(theirs.x)) < 0.02   # in standard deviations
+        assert np.max(np.abs(theirs.x)) < 0.02  # in standard deviations
 
 
 @pytest.mark.parametrize('loss', LOSSES)
-@pytest.mark.parametrize('shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)])
+@pytest.mark.parametrize(
+    'shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)]
+)
 def test_both_eliminations_give_the_same_solution_and_covariances(monkeypatch, shape, loss):
     network, truth = rigs.small_network(**shape, nu=5.0)
     assert eliminates_points(network) == (shape is not MANY_EXPOSURES)
@@ -116,20 +155,27 @@ def test_both_eliminations_give_the_same_solution_and_covariances(monkeypatch, s
     assert one.cost == pytest.approx(other.cost, rel=1e-10)
     assert_same_solution(one, other)
     for name in ('interior', 'exterior', 'points', 'residual', 'redundancy', 'survey_redundancy'):
-        a, b = getattr(one_precise, name), getattr(other_precise, name)
+        a = getattr(one_precise, name)
+        b = getattr(other_precise, name)
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-7 * np.max(np.abs(b)), err_msg=name)
 
 
 @pytest.mark.parametrize('free', [True, False])
 @pytest.mark.parametrize('loss', LOSSES)
-@pytest.mark.parametrize('shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)])
+@pytest.mark.parametrize(
+    'shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)]
+)
 def test_covariances_equal_the_dense_inverse(shape, loss, free):
-    """Those of the unknowns under the Fisher information, those of the residuals under the weighted problem."""
+    """Those of the unknowns under the Fisher information, those of the residuals under the
+    weighted problem.
+    """
     network, truth = rigs.small_network(**shape, nu=5.0, free=free)
     result = adjust(network, truth, noise=Noise(loss))
     precise = precision(network, result)
     _, m, n, _ = network.shape
-    honest = np.linalg.inv(rigs.dense_normal_matrix(network, result, result.noise.information_factor(result.q)))
+    honest = np.linalg.inv(
+        rigs.dense_normal_matrix(network, result, result.noise.information_factor(result.q))
+    )
     for j in range(m):
         part = slice(6 * j, 6 * j + 6)
         np.testing.assert_allclose(precise.exterior[j], honest[part, part], rtol=1e-5, atol=1e-9)
@@ -138,21 +184,31 @@ def test_covariances_equal_the_dense_inverse(shape, loss, free):
         np.testing.assert_allclose(precise.points[i], honest[part, part], rtol=1e-5, atol=1e-9)
     for f, own in enumerate(precise.interior):
         part = slice(6 * m + 3 * n + 3 * f, 6 * m + 3 * n + 3 * f + 3)
-        np.testing.assert_allclose(own, honest[part, part] if free else np.zeros((3, 3)), rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(
+            own, honest[part, part] if free else np.zeros((3, 3)), rtol=1e-5, atol=1e-6
+        )
 
     a = rigs.design_matrix(network, result.parameters)
     weighted = a @ np.linalg.inv(rigs.dense_normal_matrix(network, result)) @ a.T
-    variance = np.repeat((result.noise.scale * network.sigma) ** 2 / result.noise.weight(result.q), 2)
+    variance = np.repeat(
+        (result.noise.scale * network.sigma) ** 2 / result.noise.weight(result.q), 2
+    )
     residual = np.diag(variance) - weighted
     for row, own in enumerate(precise.residual):
         part = slice(2 * row, 2 * row + 2)
-        np.testing.assert_allclose(own, residual[part, part], rtol=0, atol=1e-6 * variance[2 * row])
-    np.testing.assert_allclose(precise.redundancy.ravel(), 1 - np.diagonal(weighted) / variance, atol=1e-6)
+        np.testing.assert_allclose(
+            own, residual[part, part], rtol=0, atol=1e-6 * variance[2 * row]
+        )
+    np.testing.assert_allclose(
+        precise.redundancy.ravel(), 1 - np.diagonal(weighted) / variance, atol=1e-6
+    )
 
 
 @pytest.mark.parametrize('free', [True, False])
 @pytest.mark.parametrize('loss', LOSSES)
-@pytest.mark.parametrize('shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)])
+@pytest.mark.parametrize(
+    'shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)]
+)
 def test_redundancy_numbers_sum_to_observations_less_unknowns(shape, loss, free):
     network, truth = rigs.small_network(**shape, nu=4.0, free=free)
     m, n, fluoroscopes = network.shape[1:]
@@ -166,24 +222,34 @@ def test_redundancy_numbers_sum_to_observations_less_unknowns(shape, loss, free)
 
 
 def test_geometric_redundancy_is_that_of_equal_weights():
-    """It does not follow the residuals: the same as the redundancy numbers of a Gaussian adjustment."""
+    """It does not follow the residuals: the same as the redundancy numbers of a Gaussian
+    adjustment.
+    """
     network, truth = rigs.small_network(**MANY_TARGETS)
     result = adjust(network, truth, noise=Noise('gaussian'))
     numbers = precision(network, result).redundancy.mean(axis=1)
     noise = Noise('student_t', result.noise.scale, 3.0)
-    np.testing.assert_allclose(geometric_redundancy(network, result.parameters, noise), numbers, atol=1e-9)
+    np.testing.assert_allclose(
+        geometric_redundancy(network, result.parameters, noise), numbers, atol=1e-9
+    )
 
 
 def normalised_errors(count, loss, **network):
-    """Squared errors in units of their covariances, of `count` simulated adjustments: {unknowns: (n,)}, scales."""
-    out, scales = {'interior': [], 'exterior': [], 'points': []}, []
+    """Squared errors in units of their covariances, of `count` simulated adjustments: {unknowns:
+    (n,)}, scales.
+    """
+    out = {'interior': [], 'exterior': [], 'points': []}
+    scales = []
     for seed in range(count):
         net, truth = rigs.small_network(seed=seed, **network)
         result, precise = adjusted_with_precision(net, truth, np.zeros_like(net.uv), Noise(loss))
         found = result.parameters
         turn = small_vectors(found.rotation @ truth.rotation.transpose(0, 2, 1))
-        errors = {'interior': found.interior - truth.interior, 'points': found.points_mm - truth.points_mm,
-                  'exterior': np.concatenate([found.position_mm - truth.position_mm, turn], axis=1)}
+        errors = {
+            'interior': found.interior - truth.interior,
+            'points': found.points_mm - truth.points_mm,
+            'exterior': np.concatenate([found.position_mm - truth.position_mm, turn], axis=1),
+        }
         for name, error in errors.items():
             out[name].append(normalised(error, getattr(precise, name)))
         scales.append(result.noise.scale)
@@ -201,8 +267,12 @@ def test_standard_deviations_of_gaussian_noise_against_monte_carlo():
 
 
 def test_standard_deviations_of_heavy_tailed_noise_against_monte_carlo():
-    """The same under a true t of four degrees of freedom; without (nu+4)/(nu+2) the squares would be 1.4."""
-    errors, scales = normalised_errors(40, 'student_t', exposures=5, targets=80, nu=4.0, survey_sd_mm=0.02)
+    """The same under a true t of four degrees of freedom; without (nu+4)/(nu+2) the squares would
+    be 1.4.
+    """
+    errors, scales = normalised_errors(
+        40, 'student_t', exposures=5, targets=80, nu=4.0, survey_sd_mm=0.02
+    )
     assert np.mean(scales) == pytest.approx(0.3, rel=0.05)
     assert np.mean(errors['exterior']) == pytest.approx(1, abs=0.2)
     assert np.mean(errors['interior']) == pytest.approx(1, abs=0.3)
@@ -215,26 +285,44 @@ def normalised(error, covariance):
 
 def small_vectors(turn):
     """Rotation vectors of small turns."""
-    return np.stack([turn[:, 2, 1] - turn[:, 1, 2], turn[:, 0, 2] - turn[:, 2, 0], turn[:, 1, 0] - turn[:, 0, 1]],
-                    axis=1) / 2
+    return (
+        np.stack(
+            [
+                turn[:, 2, 1] - turn[:, 1, 2],
+                turn[:, 0, 2] - turn[:, 2, 0],
+                turn[:, 1, 0] - turn[:, 0, 1],
+            ],
+            axis=1,
+        )
+        / 2
+    )
 
 
 def test_false_matches_do_not_move_the_solution():
-    """With 5 % of them the Student-t solution is that of the others within a part of its standard deviation."""
+    """With 5 % of them the Student-t solution is that of the others within a part of its standard
+    deviation.
+    """
     network, truth = rigs.small_network(exposures=6, targets=40)
-    false = np.random.default_rng(1).permutation(len(network.uv))[:len(network.uv) // 20]
+    false = np.random.default_rng(1).permutation(len(network.uv))[: len(network.uv) // 20]
     uv = network.uv.copy()
     uv[false] += np.random.default_rng(2).choice([-60, 60], (len(false), 2))
     keep = np.setdiff1d(np.arange(len(uv)), false)
-    clean = replace(network, uv=uv[keep], sigma=network.sigma[keep], exposure=network.exposure[keep],
-                    point=network.point[keep])
+    clean = replace(
+        network,
+        uv=uv[keep],
+        sigma=network.sigma[keep],
+        exposure=network.exposure[keep],
+        point=network.point[keep],
+    )
     wanted = adjust(clean, truth)
     sd = np.sqrt(np.diagonal(precision(clean, wanted).exterior, axis1=1, axis2=2)[:, :3])
 
     def shift(loss):
         found = adjust(replace(network, uv=uv), rigs.disturbed(truth), noise=Noise(loss))
         assert found.converged
-        return np.max(np.abs(found.parameters.position_mm - wanted.parameters.position_mm) / sd), found
+        return np.max(
+            np.abs(found.parameters.position_mm - wanted.parameters.position_mm) / sd
+        ), found
 
     moved, found = shift('student_t')
     assert moved < 0.6 and not found.inliers[false].any() and found.inliers[keep].mean() > 0.98
@@ -245,8 +333,11 @@ def test_the_order_of_image_points_does_not_matter():
     network, truth = rigs.small_network(exposures=5, targets=30, nu=4.0)
     order = np.lexsort((np.random.default_rng(1).random(len(network.uv)), network.exposure))
     assert (order != np.arange(len(order))).any()
-    shuffled = replace(network, uv=network.uv[order], sigma=network.sigma[order], point=network.point[order])
-    one, other = adjust(network, rigs.disturbed(truth)), adjust(shuffled, rigs.disturbed(truth))
+    shuffled = replace(
+        network, uv=network.uv[order], sigma=network.sigma[order], point=network.point[order]
+    )
+    one = adjust(network, rigs.disturbed(truth))
+    other = adjust(shuffled, rigs.disturbed(truth))
     assert_same_solution(one, other)
     np.testing.assert_allclose(one.residuals[order], other.residuals, atol=1e-6)
 
@@ -255,23 +346,44 @@ def test_sigma_has_a_unit_of_its_own():
     """Ten times the sigma gives a tenth of the scale, and nothing else changes."""
     network, truth = rigs.small_network(**MANY_TARGETS)
     one = adjust(network, rigs.disturbed(truth))
-    other = adjust(replace(network, sigma=10 * network.sigma), rigs.disturbed(truth), noise=Noise(scale=0.1))
+    other = adjust(
+        replace(network, sigma=10 * network.sigma), rigs.disturbed(truth), noise=Noise(scale=0.1)
+    )
     assert other.noise.scale == pytest.approx(one.noise.scale / 10, rel=1e-6)
     assert_same_solution(one, other)
 
 
 def test_image_points_of_small_sigma_decide():
-    """Where two exposures contradict each other on a point, it goes where the more precise one sees it."""
-    network, truth = rigs.small_network(exposures=6, targets=40, noise_px=0.3, survey_sd_mm=50.0, seen=1.0)
+    """Where two exposures contradict each other on a point, it goes where the more precise one
+    sees it.
+    """
+    network, truth = rigs.small_network(
+        exposures=6, targets=40, noise_px=0.3, survey_sd_mm=50.0, seen=1.0
+    )
     rough = network.exposure % 2 == 1
     sigma = np.where(rough, 50.0, 1.0)
     uv = project(*truth.per_image_point(network))
     uv += np.where(rough[:, None], 5.0, 0.0) * np.random.default_rng(1).normal(size=uv.shape)
     uv += 0.01 * np.random.default_rng(2).normal(size=uv.shape)
-    interior_held = replace(network, uv=uv, survey_mm=truth.points_mm, survey_sd_mm=np.full(40, 0.5),
-                            interior_free=np.array([False]))
-    error = [np.sqrt(np.mean((adjust(replace(interior_held, sigma=s), truth).parameters.points_mm
-                              - truth.points_mm) ** 2)) for s in (sigma, np.ones(len(uv)))]
+    interior_held = replace(
+        network,
+        uv=uv,
+        survey_mm=truth.points_mm,
+        survey_sd_mm=np.full(40, 0.5),
+        interior_free=np.array([False]),
+    )
+    error = [
+        np.sqrt(
+            np.mean(
+                (
+                    adjust(replace(interior_held, sigma=s), truth).parameters.points_mm
+                    - truth.points_mm
+                )
+                ** 2
+            )
+        )
+        for s in (sigma, np.ones(len(uv)))
+    ]
     assert error[0] < 0.2 * error[1]
 
 
@@ -289,7 +401,9 @@ def test_a_held_interior_orientation_stays_to_the_last_bit():
 
 
 def test_a_correction_is_taken_off_the_observed_points():
-    """undistorted = observed - correction: adjusting distorted points with their correction is as before."""
+    """Undistorted = observed - correction: adjusting distorted points with their correction is as
+    before.
+    """
     network, truth = rigs.small_network(**MANY_TARGETS)
     correction = np.random.default_rng(1).normal(0, 5, network.uv.shape)
     one = adjust(network, rigs.disturbed(truth))
@@ -297,17 +411,24 @@ def test_a_correction_is_taken_off_the_observed_points():
     other = adjust(distorted, rigs.disturbed(truth), correction)
     assert_same_solution(one, other)
     np.testing.assert_allclose(one.residuals, other.residuals, atol=1e-6)
-    np.testing.assert_allclose(precision(distorted, other, correction).residual, precision(network, one).residual,
-                               rtol=1e-4, atol=1e-7)
+    np.testing.assert_allclose(
+        precision(distorted, other, correction).residual,
+        precision(network, one).residual,
+        rtol=1e-4,
+        atol=1e-7,
+    )
 
 
 def test_a_far_start_ends_in_the_same_place():
     network, truth = rigs.small_network(exposures=6, targets=40, nu=5.0)
-    near, far = adjust(network, truth), adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0))
+    near = adjust(network, truth)
+    far = adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0))
     assert near.converged and far.converged
     assert near.cost == pytest.approx(far.cost, abs=1e-3)
     sd = standard_deviations(network, near)[:3]
-    assert np.max(np.abs(near.parameters.position_mm[0] - far.parameters.position_mm[0]) / sd) < 1e-2
+    assert (
+        np.max(np.abs(near.parameters.position_mm[0] - far.parameters.position_mm[0]) / sd) < 1e-2
+    )
 
 
 def test_steps_that_run_out_are_told():
@@ -326,7 +447,7 @@ def test_check_stops_an_adjustment_before_its_next_step():
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0), check=check)
+        adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0), raise_if_cancelled=check)
     assert len(calls) == 3
 
 
@@ -334,8 +455,13 @@ def test_a_network_that_leaves_unknowns_open_is_refused():
     """Two targets do not give an exposure's orientation."""
     network, truth = rigs.small_network(**MANY_TARGETS, seen=1.0)
     keep = (network.exposure != 1) | (network.point < 2)
-    open_one = replace(network, uv=network.uv[keep], sigma=network.sigma[keep], exposure=network.exposure[keep],
-                       point=network.point[keep])
+    open_one = replace(
+        network,
+        uv=network.uv[keep],
+        sigma=network.sigma[keep],
+        exposure=network.exposure[keep],
+        point=network.point[keep],
+    )
     with pytest.raises(DataError, match='do not determine the unknowns'):
         adjusted_with_precision(open_one, truth, np.zeros_like(open_one.uv), Noise())
 
@@ -343,10 +469,18 @@ def test_a_network_that_leaves_unknowns_open_is_refused():
 def test_a_held_noise_model_stays():
     """Scale and degrees of freedom as given; the solution is that of the cost under them."""
     network, truth = rigs.small_network(**MANY_TARGETS)
-    held = adjust(network, rigs.disturbed(truth), noise=Noise(scale=0.7, nu=9.0), noise_held=True, tolerance=1e-12)
+    held = adjust(
+        network,
+        rigs.disturbed(truth),
+        noise=Noise(scale=0.7, nu=9.0),
+        noise_held=True,
+        tolerance=1e-12,
+    )
     assert (held.noise.scale, held.noise.nu) == (0.7, 9.0) and held.converged
     directions = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, held))).T
-    slope = [cost_at(network, held, 1e-3 * d) - cost_at(network, held, -1e-3 * d) for d in directions]
+    slope = [
+        cost_at(network, held, 1e-3 * d) - cost_at(network, held, -1e-3 * d) for d in directions
+    ]
     assert np.linalg.norm(slope) / 2e-3 < 1e-5
     assert adjust(network, truth).noise.scale == pytest.approx(0.3, rel=0.3)
 
@@ -356,5 +490,7 @@ def test_exact_observations_give_the_exact_solution():
     network, truth = rigs.small_network(**MANY_TARGETS, noise_px=0.0, survey_sd_mm=1e-9)
     network = replace(network, survey_sd_mm=np.full(30, 0.1))
     result = adjust(network, rigs.disturbed(truth))
-    assert result.converged and result.noise.scale * np.median(network.sigma) == pytest.approx(0.01)
+    assert result.converged and result.noise.scale * np.median(network.sigma) == pytest.approx(
+        0.01
+    )
     assert_same_solution(result, replace(result, parameters=truth), 1e-2, 1e-5, 1e-4, 1e-2)

@@ -1,4 +1,6 @@
-"""Bags: as rosbag2 writes them, the same bytes each time, readable by others, and every fault told."""
+"""Bags: as rosbag2 writes them, the same bytes each time, readable by others, and every fault
+told.
+"""
 
 import io
 import os
@@ -16,10 +18,24 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
 from rosbags.typesys import Stores, get_typestore
 
-from fluoro_calib_ros.bags.definitions import TARGET_OBSERVATIONS, from_cdr, full_text, to_cdr, type_hash, typestore
-from fluoro_calib_ros.bags.reader import frame_from_message, iterate_messages, read_frames, storage_files, topics_of
+from fluoro_calib_ros.bags.definitions import (
+    TARGET_OBSERVATIONS,
+    from_cdr,
+    full_text,
+    to_cdr,
+    type_hash,
+    typestore,
+)
+from fluoro_calib_ros.bags.reader import (
+    frame_from_message,
+    iterate_messages,
+    read_frames,
+    storage_files,
+    topics_of,
+)
 from fluoro_calib_ros.bags.writer import BagWriter, message_from_frame, observations_topic
-from fluoro_calib_ros.photogrammetry.observations import DataError, Frame
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import Frame
 
 SIZE = (1024, 960)
 START = 1_700_000_000_000_000_000
@@ -28,10 +44,16 @@ TOPIC = '/a/target_observations'
 
 def frame(fluoroscope='a', number=0, targets=30, sigma=True, **changes):
     rng = np.random.default_rng(number)
-    values = dict(fluoroscope=fluoroscope, number=number, target_id=rng.permutation(503)[:targets],
-                  uv=rng.uniform(0, 900, (targets, 2)), image_size=SIZE,
-                  sigma=rng.uniform(0.1, 1, targets) if sigma else None,
-                  stamp_ns=START + number * 100_000_000, frame_id=f'{fluoroscope}_optical')
+    values = dict(
+        fluoroscope=fluoroscope,
+        number=number,
+        target_id=rng.permutation(503)[:targets],
+        uv=rng.uniform(0, 900, (targets, 2)),
+        image_size=SIZE,
+        sigma=rng.uniform(0.1, 1, targets) if sigma else None,
+        stamp_ns=START + number * 100_000_000,
+        frame_id=f'{fluoroscope}_optical',
+    )
     return Frame(**{**values, **changes})
 
 
@@ -55,10 +77,13 @@ def message_of(function, *arguments):
 
 
 def same(one, two):
-    return ((one.fluoroscope, one.number, one.image_size, one.stamp_ns, one.frame_id)
-            == (two.fluoroscope, two.number, two.image_size, two.stamp_ns, two.frame_id)
-            and np.array_equal(one.target_id, two.target_id) and np.array_equal(one.uv, two.uv)
-            and ((one.sigma is None and two.sigma is None) or np.array_equal(one.sigma, two.sigma)))
+    return (
+        (one.fluoroscope, one.number, one.image_size, one.stamp_ns, one.frame_id)
+        == (two.fluoroscope, two.number, two.image_size, two.stamp_ns, two.frame_id)
+        and np.array_equal(one.target_id, two.target_id)
+        and np.array_equal(one.uv, two.uv)
+        and ((one.sigma is None and two.sigma is None) or np.array_equal(one.sigma, two.sigma))
+    )
 
 
 def assert_holds(source, frames):
@@ -70,9 +95,20 @@ def assert_holds(source, frames):
     assert sum(map(len, read.values())) == len(frames)
 
 
-def mcap_file(path, messages, schema=None, compression=CompressionType.NONE, schema_name=TARGET_OBSERVATIONS,
-              encoding='ros2msg', metadata=None, message_encoding='cdr', **options):
-    """An .mcap file with messages [(topic, log time, bytes)], written by the library of the format's authors."""
+def mcap_file(
+    path,
+    messages,
+    schema=None,
+    compression=CompressionType.NONE,
+    schema_name=TARGET_OBSERVATIONS,
+    encoding='ros2msg',
+    metadata=None,
+    message_encoding='cdr',
+    **options,
+):
+    """An .mcap file with messages [(topic, log time, bytes)], written by the library of the
+    format's authors.
+    """
     with open(path, 'wb') as file:
         writer = Writer(file, compression=compression, enable_crcs=False, **options)
         writer.start('ros2', 'someone else')
@@ -81,7 +117,9 @@ def mcap_file(path, messages, schema=None, compression=CompressionType.NONE, sch
         channels = {}
         for topic, time, data in messages:
             if topic not in channels:
-                channels[topic] = writer.register_channel(topic, message_encoding, schema_id, metadata or {})
+                channels[topic] = writer.register_channel(
+                    topic, message_encoding, schema_id, metadata or {}
+                )
             writer.add_message(channels[topic], time, data, time)
         writer.finish()
     return str(path)
@@ -96,7 +134,10 @@ def cdr(one=None, **changes):
 
 # ---------------------------------------------------------------- round trips
 
-@pytest.mark.parametrize('options', [{}, {'live': True}, {'split_bytes': 2000}], ids=['usual', 'live', 'split'])
+
+@pytest.mark.parametrize(
+    'options', [{}, {'live': True}, {'split_bytes': 2000}], ids=['usual', 'live', 'split']
+)
 def test_frames_are_the_same_to_the_last_bit(tmp_path, options):
     frames = some_frames(40)
     path = write_bag(tmp_path / 'run', frames, **options)
@@ -117,14 +158,26 @@ def test_namespaces_topics_and_their_quality_of_service(tmp_path):
         writer.write('/text', 'std_msgs/msg/String', hello, START, START - 5, qos='latched')
         writer.add_topic('/silent', 'std_msgs/msg/Empty')
     topics = topics_of(tmp_path / 'run')
-    assert list(topics) == ['/other/b/target_observations', '/rig/a/target_observations', '/silent', '/text']
+    assert list(topics) == [
+        '/other/b/target_observations',
+        '/rig/a/target_observations',
+        '/silent',
+        '/text',
+    ]
     assert [info.count for info in topics.values()] == [1, 1, 0, 1]
     latched = topics['/text'].offered_qos[0]
     assert (latched['durability'], latched['depth']) == ('transient_local', 1)
-    assert topics['/silent'].offered_qos[0] == {**topics['/silent'].offered_qos[0], 'history': 'keep_last',
-                                                'reliability': 'reliable', 'durability': 'volatile'}
+    assert topics['/silent'].offered_qos[0] == {
+        **topics['/silent'].offered_qos[0],
+        'history': 'keep_last',
+        'reliability': 'reliable',
+        'durability': 'volatile',
+    }
     contents = read_frames(tmp_path / 'run')
-    assert contents.topics == {'a': '/rig/a/target_observations', 'b': '/other/b/target_observations'}
+    assert contents.topics == {
+        'a': '/rig/a/target_observations',
+        'b': '/other/b/target_observations',
+    }
     assert observations_topic('a') == TOPIC and observations_topic('a', 'x/y') == '/x/y' + TOPIC
 
 
@@ -139,12 +192,24 @@ def test_messages_come_in_time_order_whatever_their_order_in_the_file(tmp_path):
     assert same(frame_from_message(from_cdr(only[3].data, only[3].type), 'a', ''), frames[6])
 
 
-@pytest.mark.parametrize('options', [
-    {}, {'use_chunking': False}, {'compression': CompressionType.LZ4}, {'use_statistics': False},
-    {'repeat_channels': False, 'repeat_schemas': False},
-    {'use_chunking': False, 'use_statistics': False, 'repeat_channels': False, 'repeat_schemas': False,
-     'use_summary_offsets': False},
-], ids=['plain', 'unchunked', 'lz4', 'no statistics', 'no repeats', 'no summary'])
+@pytest.mark.parametrize(
+    'options',
+    [
+        {},
+        {'use_chunking': False},
+        {'compression': CompressionType.LZ4},
+        {'use_statistics': False},
+        {'repeat_channels': False, 'repeat_schemas': False},
+        {
+            'use_chunking': False,
+            'use_statistics': False,
+            'repeat_channels': False,
+            'repeat_schemas': False,
+            'use_summary_offsets': False,
+        },
+    ],
+    ids=['plain', 'unchunked', 'lz4', 'no statistics', 'no repeats', 'no summary'],
+)
 def test_other_forms_of_mcap_are_read(tmp_path, options):
     frames = [frame(number=i) for i in (3, 1, 2)]
     messages = [(TOPIC, one.stamp_ns, cdr(one)) for one in frames]
@@ -157,19 +222,35 @@ def test_many_split_files_without_metadata_come_in_the_order_of_their_numbers(tm
     for number in (0, 2, 10, 1):
         mcap_file(tmp_path / f'run_{number}.mcap', [(TOPIC, 5, cdr(frame(number=number)))])
     assert [os.path.basename(path) for path in storage_files(tmp_path)] == [
-        'run_0.mcap', 'run_1.mcap', 'run_2.mcap', 'run_10.mcap']
+        'run_0.mcap',
+        'run_1.mcap',
+        'run_2.mcap',
+        'run_10.mcap',
+    ]
     assert [one.number for one in read_frames(tmp_path).frames['a']] == [0, 1, 2, 10]
 
 
 def test_messages_of_rclpy_convert_as_well():
     header = SimpleNamespace(stamp=SimpleNamespace(sec=3, nanosec=7), frame_id='x')
-    message = SimpleNamespace(header=header, frame_number=5, image_width=8, image_height=9, target_id=[1, 2],
-                              u=[1.0, 2.0], v=[3.0, 4.0], sigma=[])
+    message = SimpleNamespace(
+        header=header,
+        frame_number=5,
+        image_width=8,
+        image_height=9,
+        target_id=[1, 2],
+        u=[1.0, 2.0],
+        v=[3.0, 4.0],
+        sigma=[],
+    )
     one = frame_from_message(message, 'a', 'here')
-    assert one.stamp_ns == 3_000_000_007 and one.uv.tolist() == [[1, 3], [2, 4]] and one.sigma is None
+    assert (
+        one.stamp_ns == 3_000_000_007 and one.uv.tolist() == [[1, 3], [2, 4]] and one.sigma is None
+    )
 
 
-# ---------------------------------------------------------------- the same bytes, as rosbag2 writes them
+# ---------------------------------------------------------------- the same bytes, as rosbag2
+# writes them
+
 
 def test_the_same_messages_give_the_same_bytes(tmp_path):
     for folder in ('1', '2'):
@@ -180,15 +261,31 @@ def test_the_same_messages_give_the_same_bytes(tmp_path):
 
 def test_metadata_is_version_9_of_rosbag2(tmp_path):
     write_bag(tmp_path / 'run', split_bytes=4000)
-    information = yaml.safe_load((tmp_path / 'run/metadata.yaml').read_text())['rosbag2_bagfile_information']
+    information = yaml.safe_load((tmp_path / 'run/metadata.yaml').read_text())[
+        'rosbag2_bagfile_information'
+    ]
     assert list(information) == [
-        'version', 'storage_identifier', 'duration', 'starting_time', 'message_count', 'topics_with_message_count',
-        'compression_format', 'compression_mode', 'relative_file_paths', 'files', 'custom_data', 'ros_distro']
+        'version',
+        'storage_identifier',
+        'duration',
+        'starting_time',
+        'message_count',
+        'topics_with_message_count',
+        'compression_format',
+        'compression_mode',
+        'relative_file_paths',
+        'files',
+        'custom_data',
+        'ros_distro',
+    ]
     assert (information['version'], information['storage_identifier']) == (9, 'mcap')
     assert information['ros_distro'] == 'jazzy' and information['custom_data'] is None
     assert information['compression_format'] == information['compression_mode'] == ''
     assert information['starting_time'] == {'nanoseconds_since_epoch': START}
-    assert information['duration'] == {'nanoseconds': 500_000_000} and information['message_count'] == 12
+    assert (
+        information['duration'] == {'nanoseconds': 500_000_000}
+        and information['message_count'] == 12
+    )
     assert information['relative_file_paths'] == [file['path'] for file in information['files']]
     assert information['relative_file_paths'][:2] == ['run_0.mcap', 'run_1.mcap']
     assert sum(file['message_count'] for file in information['files']) == 12
@@ -196,10 +293,19 @@ def test_metadata_is_version_9_of_rosbag2(tmp_path):
     assert topic['message_count'] == 6
     assert topic['topic_metadata']['type_description_hash'] == type_hash(TARGET_OBSERVATIONS)
     infinite = {'sec': 9223372036, 'nsec': 854775807}
-    assert topic['topic_metadata']['offered_qos_profiles'] == [{
-        'history': 'keep_last', 'depth': 10, 'reliability': 'reliable', 'durability': 'volatile', 'deadline': infinite,
-        'lifespan': infinite, 'liveliness': 'automatic', 'liveliness_lease_duration': infinite,
-        'avoid_ros_namespace_conventions': False}]
+    assert topic['topic_metadata']['offered_qos_profiles'] == [
+        {
+            'history': 'keep_last',
+            'depth': 10,
+            'reliability': 'reliable',
+            'durability': 'volatile',
+            'deadline': infinite,
+            'lifespan': infinite,
+            'liveliness': 'automatic',
+            'liveliness_lease_duration': infinite,
+            'avoid_ros_namespace_conventions': False,
+        }
+    ]
 
 
 def test_the_file_has_what_rosbag2_puts_into_it(tmp_path):
@@ -209,35 +315,58 @@ def test_the_file_has_what_rosbag2_puts_into_it(tmp_path):
         assert reader.get_header().profile == 'ros2'
         summary = reader.get_summary()
         assert {chunk.compression for chunk in summary.chunk_indexes} == {'zstd'}
-        metadata = [record.metadata['serialized_metadata'] for record in reader.iter_metadata()
-                    if record.name == 'rosbag2']
-    outside = yaml.safe_load((tmp_path / 'run/metadata.yaml').read_text())['rosbag2_bagfile_information']
+        metadata = [
+            record.metadata['serialized_metadata']
+            for record in reader.iter_metadata()
+            if record.name == 'rosbag2'
+        ]
+    outside = yaml.safe_load((tmp_path / 'run/metadata.yaml').read_text())[
+        'rosbag2_bagfile_information'
+    ]
     assert yaml.safe_load(metadata[-1]) == outside
-    schema, = summary.schemas.values()
+    (schema,) = summary.schemas.values()
     assert (schema.name, schema.encoding) == (TARGET_OBSERVATIONS, 'ros2msg')
     parts = schema.data.decode().split('=' * 80 + '\n')
-    assert [part.splitlines()[0] for part in parts[1:]] == ['MSG: std_msgs/Header', 'MSG: builtin_interfaces/Time']
+    assert [part.splitlines()[0] for part in parts[1:]] == [
+        'MSG: std_msgs/Header',
+        'MSG: builtin_interfaces/Time',
+    ]
     for channel in summary.channels.values():
         assert channel.message_encoding == 'cdr'
         assert set(channel.metadata) == {'offered_qos_profiles', 'topic_type_hash'}
-        assert yaml.safe_load(channel.metadata['offered_qos_profiles'])[0]['reliability'] == 'reliable'
+        assert (
+            yaml.safe_load(channel.metadata['offered_qos_profiles'])[0]['reliability']
+            == 'reliable'
+        )
 
 
 def test_type_hashes_are_those_of_ros():
     # From /opt/ros/jazzy/share/std_msgs/msg/*.json, and of ours as rosidl generates it.
-    assert type_hash('std_msgs/msg/Header') == 'RIHS01_f49fb3ae2cf070f793645ff749683ac6b06203e41c891e17701b1cb597ce6a01'
-    assert type_hash(TARGET_OBSERVATIONS) == 'RIHS01_28e36f830a53c4f32ca4ec7fb79fbcf47a7f54f67fd2cee70de93e9b793e9cff'
+    assert (
+        type_hash('std_msgs/msg/Header')
+        == 'RIHS01_f49fb3ae2cf070f793645ff749683ac6b06203e41c891e17701b1cb597ce6a01'
+    )
+    assert (
+        type_hash(TARGET_OBSERVATIONS)
+        == 'RIHS01_28e36f830a53c4f32ca4ec7fb79fbcf47a7f54f67fd2cee70de93e9b793e9cff'
+    )
 
 
 # ---------------------------------------------------------------- independent readers
+
 
 def test_the_mcap_library_reads_our_bags_and_all_checksums_agree(tmp_path):
     write_bag(tmp_path / 'run', some_frames(60))
     content = (tmp_path / 'run/run_0.mcap').read_bytes()
     records = list(StreamReader(io.BytesIO(content), validate_crcs=True, emit_chunks=True).records)
     assert any(getattr(record, 'data_section_crc', 0) for record in records)
-    assert all(record.uncompressed_crc for record in records if hasattr(record, 'uncompressed_crc'))
-    for reader in (make_reader(io.BytesIO(content), validate_crcs=True), NonSeekingReader(io.BytesIO(content), True)):
+    assert all(
+        record.uncompressed_crc for record in records if hasattr(record, 'uncompressed_crc')
+    )
+    for reader in (
+        make_reader(io.BytesIO(content), validate_crcs=True),
+        NonSeekingReader(io.BytesIO(content), True),
+    ):
         assert sum(1 for _ in reader.iter_messages()) == 120
 
 
@@ -248,16 +377,25 @@ def test_rosbags_reads_our_bags(tmp_path):
         assert (reader.message_count, reader.ros_distro, reader.start_time) == (40, 'jazzy', START)
         assert reader.duration == 19 * 100_000_000 + 1
     with AnyReader([Path(path)], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
-        messages = [reader.deserialize(data, connection.msgtype) for connection, _, data in reader.messages()]
+        messages = [
+            reader.deserialize(data, connection.msgtype)
+            for connection, _, data in reader.messages()
+        ]
     assert [m.frame_number for m in messages] == [f.number for f in frames]
-    assert np.array_equal(messages[7].u, frames[7].uv[:, 0]) and messages[7].header.frame_id == 'b_optical'
+    assert (
+        np.array_equal(messages[7].u, frames[7].uv[:, 0])
+        and messages[7].header.frame_id == 'b_optical'
+    )
 
 
 def test_a_bag_of_rosbags_is_read(tmp_path):
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as RosbagsWriter
+
     frames = [frame(number=i) for i in range(5)]
-    with RosbagsWriter(tmp_path / 'theirs', version=8, storage_plugin=StoragePlugin.MCAP) as writer:
+    with RosbagsWriter(
+        tmp_path / 'theirs', version=8, storage_plugin=StoragePlugin.MCAP
+    ) as writer:
         connection = writer.add_connection(TOPIC, TARGET_OBSERVATIONS, typestore=typestore())
         for one in frames:
             writer.write(connection, one.stamp_ns, cdr(one))
@@ -265,6 +403,7 @@ def test_a_bag_of_rosbags_is_read(tmp_path):
 
 
 # ---------------------------------------------------------------- crash safety
+
 
 def test_an_exception_leaves_nothing(tmp_path):
     with pytest.raises(RuntimeError), BagWriter(tmp_path / 'run') as writer:
@@ -310,7 +449,11 @@ def test_only_a_bag_is_overwritten_and_only_on_request(tmp_path):
 def test_a_disk_that_is_full_is_told_and_leaves_nothing(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, 'No space left on device')
-    with pytest.raises(DataError, match='no space left on device'), BagWriter(tmp_path / 'run') as writer:
+
+    with (
+        pytest.raises(DataError, match='no space left on device'),
+        BagWriter(tmp_path / 'run') as writer,
+    ):
         writer.write_frame(frame())
         monkeypatch.setattr(os, 'fsync', full)
     assert os.listdir(tmp_path) == []
@@ -319,14 +462,17 @@ def test_a_disk_that_is_full_is_told_and_leaves_nothing(tmp_path, monkeypatch):
         write_bag(tmp_path / 'file' / 'run')
 
 
-@pytest.mark.parametrize('arguments, sentence', [
-    (('a/b', TARGET_OBSERVATIONS, b'', 0), "'a/b' cannot be the name of a ROS topic"),
-    (('/c-arm/x', TARGET_OBSERVATIONS, b'', 0), "'/c-arm/x' cannot be the name"),
-    (('/x', 'some_msgs/msg/Thing', b'', 0), "'some_msgs/msg/Thing' is not known"),
-    (('/x', 'std_msgs/msg/Empty', b'', -1), 'the time -1 ns cannot stand in a bag'),
-    (('/x', 'std_msgs/msg/String', 'hello', 0), 'not a message of type std_msgs/msg/String'),
-    ((TOPIC, 'std_msgs/msg/Empty', b'', 0), 'does not belong to this topic of type'),
-])
+@pytest.mark.parametrize(
+    'arguments, sentence',
+    [
+        (('a/b', TARGET_OBSERVATIONS, b'', 0), "'a/b' cannot be the name of a ROS topic"),
+        (('/c-arm/x', TARGET_OBSERVATIONS, b'', 0), "'/c-arm/x' cannot be the name"),
+        (('/x', 'some_msgs/msg/Thing', b'', 0), "'some_msgs/msg/Thing' is not known"),
+        (('/x', 'std_msgs/msg/Empty', b'', -1), 'the time -1 ns cannot stand in a bag'),
+        (('/x', 'std_msgs/msg/String', 'hello', 0), 'not a message of type std_msgs/msg/String'),
+        ((TOPIC, 'std_msgs/msg/Empty', b'', 0), 'does not belong to this topic of type'),
+    ],
+)
 def test_what_cannot_be_written_is_told(tmp_path, arguments, sentence):
     with BagWriter(tmp_path / 'run') as writer:
         writer.write_frame(frame())
@@ -336,11 +482,13 @@ def test_what_cannot_be_written_is_told(tmp_path, arguments, sentence):
 
 # ---------------------------------------------------------------- faults of a bag
 
+
 def test_sources_that_are_no_bag(tmp_path):
     def said(path):
         text = message_of(read_frames, path)
         assert text.startswith(str(path)) and text == message_of(topics_of, path)
         return text
+
     assert 'there is no such bag' in said(tmp_path / 'missing')
     assert 'this folder is no bag' in said(tmp_path)
     (tmp_path / 'x.mcap').write_bytes(b'')
@@ -351,14 +499,20 @@ def test_sources_that_are_no_bag(tmp_path):
     assert 'not the metadata of a bag' in message_of(read_frames, tmp_path)
 
 
-@pytest.mark.parametrize('change, sentence', [
-    ({'relative_file_paths': ['run_0.mcap', 'run_1.mcap']}, 'it names run_1.mcap, but there is no such file'),
-    ({'storage_identifier': 'sqlite3'}, 'stored as sqlite3, only mcap is read'),
-    ({'compression_mode': 'FILE'}, 'compressed as a whole'),
-    ({'relative_file_paths': []}, 'has no files'),
-    ({'relative_file_paths': 5}, 'not the metadata of a bag'),
-    ({'storage_identifier': None}, 'stored as None'),
-])
+@pytest.mark.parametrize(
+    'change, sentence',
+    [
+        (
+            {'relative_file_paths': ['run_0.mcap', 'run_1.mcap']},
+            'it names run_1.mcap, but there is no such file',
+        ),
+        ({'storage_identifier': 'sqlite3'}, 'stored as sqlite3, only mcap is read'),
+        ({'compression_mode': 'FILE'}, 'compressed as a whole'),
+        ({'relative_file_paths': []}, 'has no files'),
+        ({'relative_file_paths': 5}, 'not the metadata of a bag'),
+        ({'storage_identifier': None}, 'stored as None'),
+    ],
+)
 def test_metadata_that_does_not_fit_is_told(tmp_path, change, sentence):
     write_bag(tmp_path / 'run')
     path = tmp_path / 'run/metadata.yaml'
@@ -383,7 +537,16 @@ def test_a_bag_that_is_cut_off_is_told(tmp_path):
     write_bag(tmp_path / 'run')
     path = tmp_path / 'run/run_0.mcap'
     content = path.read_bytes()
-    for length in (7, 8, 30, 500, len(content) // 2, len(content) - 40, len(content) - 8, len(content) - 1):
+    for length in (
+        7,
+        8,
+        30,
+        500,
+        len(content) // 2,
+        len(content) - 40,
+        len(content) - 8,
+        len(content) - 1,
+    ):
         path.write_bytes(content[:length])
         for read in (read_frames, topics_of, lambda source: list(iterate_messages(source))):
             assert str(path) in message_of(read, str(path))
@@ -394,7 +557,8 @@ def test_a_changed_byte_is_told_or_has_no_meaning(tmp_path):
     frames = some_frames(20)
     write_bag(tmp_path / 'run', frames)
     path = tmp_path / 'run/run_0.mcap'
-    content, told = path.read_bytes(), 0
+    content = path.read_bytes()
+    told = 0
     for place in np.linspace(0, len(content) - 1, 300).astype(int):
         damaged = bytearray(content)
         damaged[place] ^= 0x55
@@ -408,11 +572,13 @@ def test_a_changed_byte_is_told_or_has_no_meaning(tmp_path):
 
 
 def test_a_damaged_bag_without_checksums_raises_nothing_else(tmp_path):
-    path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, i, cdr(frame(number=i, targets=5))) for i in range(5)])
+    path = mcap_file(
+        tmp_path / 'x.mcap', [(TOPIC, i, cdr(frame(number=i, targets=5))) for i in range(5)]
+    )
     content = (tmp_path / 'x.mcap').read_bytes()
     for place in range(0, len(content), 7):
         damaged = bytearray(content)
-        damaged[place] ^= 0xff
+        damaged[place] ^= 0xFF
         (tmp_path / 'x.mcap').write_bytes(damaged)
         for read in (read_frames, topics_of, lambda source: list(iterate_messages(source))):
             try:
@@ -425,7 +591,7 @@ def test_the_footer_and_lengths_of_a_record_may_be_nonsense(tmp_path):
     write_bag(tmp_path / 'run')
     path = tmp_path / 'run/run_0.mcap'
     content = path.read_bytes()
-    for summary in (1, len(content) - 30, 2 ** 63, 2 ** 64 - 1):
+    for summary in (1, len(content) - 30, 2**63, 2**64 - 1):
         footer = struct.pack('<BQQQI', 2, 20, summary, 0, 0)
         path.write_bytes(content[:-37] + footer + content[-8:])
         assert str(path) in message_of(read_frames, str(path))
@@ -440,7 +606,10 @@ WRONG = [
     (dict(sigma=np.zeros(30)), 'is not a positive number'),
     (dict(target_id=np.full(30, 7, dtype=np.uint32)), 'target 7 is there 30 times'),
     (dict(image_width=0), 'the image size is 0 x 960 px'),
-    (dict(target_id=np.zeros(0, np.uint32), u=np.zeros(0), v=np.zeros(0), sigma=np.zeros(0)), 'the frame is empty'),
+    (
+        dict(target_id=np.zeros(0, np.uint32), u=np.zeros(0), v=np.zeros(0), sigma=np.zeros(0)),
+        'the frame is empty',
+    ),
 ]
 
 
@@ -449,7 +618,11 @@ def test_a_wrong_frame_is_named_by_bag_topic_and_message(tmp_path, changes, sent
     messages = [(TOPIC, 1, cdr(frame(number=4))), (TOPIC, 2, cdr(frame(number=8), **changes))]
     path = mcap_file(tmp_path / 'x.mcap', messages)
     said = message_of(read_frames, path)
-    assert said.startswith(f'{path}, topic {TOPIC}, message 2') and 'frame 8' in said and sentence in said
+    assert (
+        said.startswith(f'{path}, topic {TOPIC}, message 2')
+        and 'frame 8' in said
+        and sentence in said
+    )
 
 
 def test_frames_need_not_be_checked(tmp_path):
@@ -458,10 +631,20 @@ def test_frames_need_not_be_checked(tmp_path):
 
 
 def test_a_message_that_is_none_is_named(tmp_path):
-    for data in (b'', b'\0\1\0\0', b'garbage' * 20, cdr()[:100], cdr() + b'more bytes', b'\0\1\0\0' + b'\xff' * 99):
+    for data in (
+        b'',
+        b'\0\1\0\0',
+        b'garbage' * 20,
+        cdr()[:100],
+        cdr() + b'more bytes',
+        b'\0\1\0\0' + b'\xff' * 99,
+    ):
         path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, data)])
         said = message_of(read_frames, path)
-        assert said.startswith(f'{path}, topic {TOPIC}, message 1') and 'not a fluoro_calib_msgs' in said
+        assert (
+            said.startswith(f'{path}, topic {TOPIC}, message 1')
+            and 'not a fluoro_calib_msgs' in said
+        )
 
 
 def test_a_frame_that_is_there_twice_is_named(tmp_path):
@@ -479,14 +662,23 @@ def test_two_topics_of_one_fluoroscope_are_named(tmp_path):
 
 def test_another_definition_of_the_message_is_told(tmp_path):
     text = full_text(TARGET_OBSERVATIONS)
-    for schema in (text.replace('float64[] u ', 'float32[] u '), text.replace('float64[] sigma', 'float64[] weight'),
-                   text.replace('string frame_id', 'uint32 seq\nstring frame_id'), 'uint32 x\n'):
+    for schema in (
+        text.replace('float64[] u ', 'float32[] u '),
+        text.replace('float64[] sigma', 'float64[] weight'),
+        text.replace('string frame_id', 'uint32 seq\nstring frame_id'),
+        'uint32 x\n',
+    ):
         path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], schema=schema)
         assert f'{path}, topic {TOPIC}: the bag defines' in message_of(read_frames, path)
     for schema in ('float64[[ u', 'some_msgs/Thing x\n'):
         path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], schema=schema)
         assert f'{path}, topic {TOPIC}: ' in message_of(read_frames, path)
-    path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], schema='', metadata={'topic_type_hash': 'RIHS01_0'})
+    path = mcap_file(
+        tmp_path / 'x.mcap',
+        [(TOPIC, 1, cdr())],
+        schema='',
+        metadata={'topic_type_hash': 'RIHS01_0'},
+    )
     assert 'differently' in message_of(read_frames, path)
     path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], message_encoding='json')
     assert 'only cdr is read' in message_of(read_frames, path)
@@ -502,8 +694,19 @@ def test_comments_and_blanks_of_a_definition_do_not_matter(tmp_path):
 
 def test_an_old_bag_with_numbered_policies_tells_them_by_name(tmp_path):
     old = '- history: 3\n  depth: 0\n  reliability: 1\n  durability: 2\n  liveliness: 1\n'
-    path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], metadata={'offered_qos_profiles': old})
-    assert topics_of(path)[TOPIC].offered_qos == [{'history': 'unknown', 'depth': 0, 'reliability': 'reliable',
-                                                   'durability': 'volatile', 'liveliness': 'automatic'}]
-    path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], metadata={'offered_qos_profiles': ': ['})
+    path = mcap_file(
+        tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], metadata={'offered_qos_profiles': old}
+    )
+    assert topics_of(path)[TOPIC].offered_qos == [
+        {
+            'history': 'unknown',
+            'depth': 0,
+            'reliability': 'reliable',
+            'durability': 'volatile',
+            'liveliness': 'automatic',
+        }
+    ]
+    path = mcap_file(
+        tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], metadata={'offered_qos_profiles': ': ['}
+    )
     assert topics_of(path)[TOPIC].offered_qos == []

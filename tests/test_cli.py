@@ -1,4 +1,6 @@
-"""The command fluoro-calib: what it writes, what it prints, and what it says when something is wrong."""
+"""The command fluoro-calib: what it writes, what it prints, and what it says when something is
+wrong.
+"""
 
 import csv
 import filecmp
@@ -13,10 +15,10 @@ import numpy as np
 import pytest
 from rigs import run
 
-from fluoro_calib_ros.bags.dataset import write_bag
 from fluoro_calib_ros.calibration.result import OUTSIDE
 from fluoro_calib_ros.cli import EXAMPLES, main
 from fluoro_calib_ros.files.calibration import load_calibration
+from fluoro_calib_ros.jobs.dataset import write_bag
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 IMAGE = ('--image-size', '1024x1024')
@@ -24,13 +26,23 @@ IMAGE = ('--image-size', '1024x1024')
 
 def command(*arguments, **options):
     """The command as a process of its own."""
-    return subprocess.run([sys.executable, '-m', 'fluoro_calib_ros.cli', *map(str, arguments)], cwd=ROOT,
-                          capture_output=True, text=True, timeout=120, **options)
+    return subprocess.run(
+        [sys.executable, '-m', 'fluoro_calib_ros.cli', *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        **options,
+    )
 
 
 def files_of(folder):
     """{path: content} of all files below a folder."""
-    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(pathlib.Path(folder).rglob('*')) if p.is_file()}
+    return {
+        str(p.relative_to(folder)): p.read_bytes()
+        for p in sorted(pathlib.Path(folder).rglob('*'))
+        if p.is_file()
+    }
 
 
 @pytest.fixture(scope='module')
@@ -45,8 +57,19 @@ def rig(tmp_path_factory):
 def result(rig, tmp_path_factory):
     """The folder that a short calibration of both fluoroscopes has written."""
     folder = tmp_path_factory.mktemp('calibrated') / 'result'
-    assert run('calibrate', rig / 'calibration', '--phantom', rig / 'phantom.csv', '--out', folder,
-               '--max-iterations', 2) == 0
+    assert (
+        run(
+            'calibrate',
+            rig / 'calibration',
+            '--phantom',
+            rig / 'phantom.csv',
+            '--out',
+            folder,
+            '--max-iterations',
+            2,
+        )
+        == 0
+    )
     return folder
 
 
@@ -55,28 +78,60 @@ def calibrate(rig, out, *more, source='calibration', phantom='phantom.csv'):
 
 
 def said(capsys, arguments, status=1):
-    """The one sentence on standard error with which a command fails; nothing is on standard output."""
+    """The one sentence on standard error with which a command fails; nothing is on standard
+    output.
+    """
     assert run(*arguments) == status
     out, err = capsys.readouterr()
     assert out == '' and 'Traceback' not in err
     if status == 1:
-        assert err.startswith(f'fluoro-calib {arguments[0]}: ') and err.count('\n') == 1 and err.endswith('\n')
+        assert (
+            err.startswith(f'fluoro-calib {arguments[0]}: ')
+            and err.count('\n') == 1
+            and err.endswith('\n')
+        )
     return err
 
 
 # ---- simulate
 
+
 def test_simulate_writes_the_same_bytes_again(tmp_path):
     """Of every file; another seed gives others."""
     for name, seed in (('one', 5), ('other', 5), ('third', 6)):
-        assert run('simulate', '--out', tmp_path / name, '--seed', seed, '--exposures', 3, '--test-exposures', 2,
-                   '--seconds', 0.1) == 0
+        assert (
+            run(
+                'simulate',
+                '--out',
+                tmp_path / name,
+                '--seed',
+                seed,
+                '--exposures',
+                3,
+                '--test-exposures',
+                2,
+                '--seconds',
+                0.1,
+            )
+            == 0
+        )
     one, other, third = (files_of(tmp_path / name) for name in ('one', 'other', 'third'))
     assert one == other and one.keys() == third.keys()
     assert all(one[name] != third[name] for name in one if not name.endswith('metadata.yaml'))
-    assert {'phantom.csv', 'calibration.csv', 'test.csv', 'calibration/metadata.yaml', 'calibration/calibration_0.mcap',
-            'test/test_0.mcap', 'tracking/tracking_0.mcap', 'truth/phantom.csv', 'truth/rig.json', 'truth/markers.csv',
-            'truth/calibration_exposures.csv', 'truth/calibration_undistorted.csv'} <= one.keys()
+    assert {
+        'phantom.csv',
+        'calibration.csv',
+        'test.csv',
+        'calibration/metadata.yaml',
+        'calibration/calibration_0.mcap',
+        'test/test_0.mcap',
+        'tracking/tracking_0.mcap',
+        'truth/phantom.csv',
+        'truth/rig.json',
+        'truth/markers.csv',
+        'truth/calibration_exposures.csv',
+        'truth/calibration_undistorted.csv',
+    } <= one.keys()
 
 
 def test_the_recorded_bags_are_made_by_the_documented_command(tmp_path):
@@ -98,7 +153,13 @@ def test_more_of_one_part_does_not_change_another(tmp_path, rig):
 
 # ---- calibrate
 
-NUMBERS = {'fluoroscopes': dict, 'targets': list, 'history': list, 'converged': bool, 'seconds': float}
+NUMBERS = {
+    'fluoroscopes': dict,
+    'targets': list,
+    'history': list,
+    'converged': bool,
+    'seconds': float,
+}
 
 
 def check_result(document, names, exposures):
@@ -107,19 +168,34 @@ def check_result(document, names, exposures):
     assert all(isinstance(document[key], kind) for key, kind in NUMBERS.items())
     assert list(document['fluoroscopes']) == names
     for figures in document['fluoroscopes'].values():
-        assert {'interior', 'image_size', 'model', 'rmse_px', 'inliers', 'observations', 'exposures'} <= figures.keys()
-        assert {'xp', 'yp', 'c', 'sd'} == figures['interior'].keys() and len(figures['interior']['sd']) == 3
+        assert {
+            'interior',
+            'image_size',
+            'model',
+            'rmse_px',
+            'inliers',
+            'observations',
+            'exposures',
+        } <= figures.keys()
+        assert {'xp', 'yp', 'c', 'sd'} == figures['interior'].keys() and len(
+            figures['interior']['sd']
+        ) == 3
         assert figures['image_size'] == [1024, 1024] and {'kind', 'k'} == figures['model'].keys()
         assert len(figures['rmse_px']['before']) == len(figures['rmse_px']['after']) == 2
         assert 0 < figures['inliers'] <= figures['observations']
         assert [e['exposure'] for e in figures['exposures']] == exposures
         for exposure in figures['exposures']:
-            assert [len(exposure[key]) for key in ('position_mm', 'quaternion_wxyz', 'sd_mm', 'sd_rad')] == [3, 4, 3, 3]
+            assert [
+                len(exposure[key]) for key in ('position_mm', 'quaternion_wxyz', 'sd_mm', 'sd_rad')
+            ] == [3, 4, 3, 3]
             assert np.linalg.norm(exposure['quaternion_wxyz']) == pytest.approx(1)
             assert min(exposure['sd_mm'] + exposure['sd_rad']) > 0
     ids = [target['target_id'] for target in document['targets']]
     assert ids == sorted(set(ids)) and len(ids) > 300
-    assert all(len(t['xyz_mm']) == len(t['sd_mm']) == 3 and min(t['sd_mm']) > 0 for t in document['targets'])
+    assert all(
+        len(t['xyz_mm']) == len(t['sd_mm']) == 3 and min(t['sd_mm']) > 0
+        for t in document['targets']
+    )
     for this in document['history']:
         assert {'F', 'G', 'k'} <= this.keys() and set(this['k']) <= set(names)
 
@@ -131,11 +207,19 @@ def test_calibrate_writes_result_and_calibrations(result):
     for name, figures in document['fluoroscopes'].items():
         assert max(figures['rmse_px']['after']) < 0.3 < 1 < min(figures['rmse_px']['before'])
         with np.load(result / f'{name}.calibration.npz', allow_pickle=False) as arrays:
-            np.testing.assert_array_equal(arrays['interior'], [figures['interior'][key] for key in ('xp', 'yp', 'c')])
+            np.testing.assert_array_equal(
+                arrays['interior'], [figures['interior'][key] for key in ('xp', 'yp', 'c')]
+            )
             assert int(arrays['model_k']) == figures['model']['k']
     assert sorted(p.name for p in result.iterdir()) == [
-        'a.calibration.npz', 'b.calibration.npz', 'observations.csv', 'options.json', 'phantom.csv', 'result.json',
-        'rig_orientation.npz']
+        'a.calibration.npz',
+        'b.calibration.npz',
+        'observations.csv',
+        'options.json',
+        'phantom.csv',
+        'result.json',
+        'rig_orientation.npz',
+    ]
 
 
 @pytest.mark.long
@@ -144,37 +228,76 @@ def test_a_bag_and_its_csv_give_the_same_numbers(rig, tmp_path):
     more = ('--max-iterations', 1, '--fluoroscopes', 'a')
     assert run(*calibrate(rig, tmp_path / 'bag', *more)) == 0
     assert run(*calibrate(rig, tmp_path / 'csv', *more, *IMAGE, source='calibration.csv')) == 0
-    done = command(*calibrate(rig, tmp_path / 'file', *more, source='calibration/calibration_0.mcap'),
-                   env={**os.environ, 'OPENBLAS_NUM_THREADS': '2'})
+    done = command(
+        *calibrate(rig, tmp_path / 'file', *more, source='calibration/calibration_0.mcap'),
+        env={**os.environ, 'OPENBLAS_NUM_THREADS': '2'},
+    )
     assert done.returncode == 0 and done.stderr == '', done.stderr
-    bag, table, file = ({**json.loads((tmp_path / name / 'result.json').read_text()), 'seconds': 0.0}
-                        for name in ('bag', 'csv', 'file'))
+    bag, table, file = (
+        {**json.loads((tmp_path / name / 'result.json').read_text()), 'seconds': 0.0}
+        for name in ('bag', 'csv', 'file')
+    )
     assert bag == table == file
     check_result(bag, ['a'], list(range(1, 16)))
 
 
 def test_json_is_all_there_is_on_standard_output(rig, tmp_path):
     """What result.json says; nothing on standard error."""
-    done = command(*calibrate(rig, tmp_path, '--json', '--max-iterations', 1, '--fluoroscopes', 'b', '--model', 'none'))
+    done = command(
+        *calibrate(
+            rig,
+            tmp_path,
+            '--json',
+            '--max-iterations',
+            1,
+            '--fluoroscopes',
+            'b',
+            '--model',
+            'none',
+        )
+    )
     assert (done.returncode, done.stderr) == (0, '')
     assert json.loads(done.stdout) == json.loads((tmp_path / 'result.json').read_text())
 
 
 def test_without_json_a_summary_for_people_is_printed(rig, tmp_path, capsys):
-    assert run(*calibrate(rig, tmp_path, '--max-iterations', 1, '--fluoroscopes', 'b', '--model', 'none')) == 0
+    assert (
+        run(
+            *calibrate(
+                rig, tmp_path, '--max-iterations', 1, '--fluoroscopes', 'b', '--model', 'none'
+            )
+        )
+        == 0
+    )
     out, err = capsys.readouterr()
     assert err == '' and out.count('\n') >= 2 and 'NaN' not in out and not out.startswith('{')
 
 
-@pytest.mark.parametrize('options, check', [
-    (('--interior', 'fixed', '--principal-distance', 4000), lambda f: f['interior'] == {
-        'xp': 511.5, 'yp': 511.5, 'c': 4000, 'sd': [0, 0, 0]}),
-    (('--model', 'knn', '--k', 9), lambda f: f['model'] == {'kind': 'knn', 'k': 9}),
-    (('--loss', 'gaussian', '--model', 'none'), lambda f: f['inliers'] > 0.9 * f['observations']),
-    (('--joint', '--model', 'none'), lambda f: f['model']['kind'] == 'none')])
+@pytest.mark.parametrize(
+    'options, check',
+    [
+        (
+            ('--interior', 'fixed', '--principal-distance', 4000),
+            lambda f: f['interior'] == {'xp': 511.5, 'yp': 511.5, 'c': 4000, 'sd': [0, 0, 0]},
+        ),
+        (('--model', 'knn', '--k', 9), lambda f: f['model'] == {'kind': 'knn', 'k': 9}),
+        (
+            ('--loss', 'gaussian', '--model', 'none'),
+            lambda f: f['inliers'] > 0.9 * f['observations'],
+        ),
+        (('--joint', '--model', 'none'), lambda f: f['model']['kind'] == 'none'),
+    ],
+)
 def test_options_of_calibrate_reach_the_result(rig, tmp_path, options, check):
     names = ['a', 'b'] if '--joint' in options else ['a']
-    assert run(*calibrate(rig, tmp_path, '--max-iterations', 1, '--fluoroscopes', ','.join(names), *options)) == 0
+    assert (
+        run(
+            *calibrate(
+                rig, tmp_path, '--max-iterations', 1, '--fluoroscopes', ','.join(names), *options
+            )
+        )
+        == 0
+    )
     document = json.loads((tmp_path / 'result.json').read_text())
     assert list(document['fluoroscopes']) == names and check(document['fluoroscopes']['a'])
     assert [this['fluoroscopes'] for this in document['history']] == [names]
@@ -182,22 +305,42 @@ def test_options_of_calibrate_reach_the_result(rig, tmp_path, options, check):
 
 # ---- adjust
 
+
 def test_adjust_holds_the_calibration(rig, result, tmp_path):
-    """Residuals of exposures it has not seen come down; the calibrations beside the result are the same bytes."""
-    assert run('adjust', rig / 'test', '--phantom', rig / 'phantom.csv', '--calibration', result,
-               '--out', tmp_path) == 0
+    """Residuals of exposures it has not seen come down; the calibrations beside the result are the
+    same bytes.
+    """
+    assert (
+        run(
+            'adjust',
+            rig / 'test',
+            '--phantom',
+            rig / 'phantom.csv',
+            '--calibration',
+            result,
+            '--out',
+            tmp_path,
+        )
+        == 0
+    )
     document = json.loads((tmp_path / 'result.json').read_text())
     check_result(document, ['a', 'b'], list(range(16, 21)))
     assert document['history'] == [] and document['converged']
     before = json.loads((result / 'result.json').read_text())
     for name, figures in document['fluoroscopes'].items():
-        assert {**figures['interior'], 'sd': 0} == {**before['fluoroscopes'][name]['interior'], 'sd': 0}
+        assert {**figures['interior'], 'sd': 0} == {
+            **before['fluoroscopes'][name]['interior'],
+            'sd': 0,
+        }
         assert figures['interior']['sd'] == [0, 0, 0]
         assert max(figures['rmse_px']['after']) < 0.35 < 1 < min(figures['rmse_px']['before'])
-        assert (tmp_path / f'{name}.calibration.npz').read_bytes() == (result / f'{name}.calibration.npz').read_bytes()
+        assert (tmp_path / f'{name}.calibration.npz').read_bytes() == (
+            result / f'{name}.calibration.npz'
+        ).read_bytes()
 
 
 # ---- correct
+
 
 def test_correct_takes_the_distortion_off(rig, result, tmp_path, capsys):
     """u_corrected = u - du at the observed pixel, row by row, with all other columns as they were."""
@@ -216,7 +359,9 @@ def test_correct_takes_the_distortion_off(rig, result, tmp_path, capsys):
         mine = [(g, r) for g, r in zip(given, rows) if r['fluoroscope'] == name]
         uv = np.array([[float(g['u']), float(g['v'])] for g, _ in mine])
         corrected = np.array([[float(r['u_corrected']), float(r['v_corrected'])] for _, r in mine])
-        np.testing.assert_allclose(corrected, uv - calibration.model.predict(uv), atol=0.01)   # the lookup grid's
+        np.testing.assert_allclose(
+            corrected, uv - calibration.model.predict(uv), atol=0.01
+        )  # the lookup grid's
         assert all(g == {key: r[key] for key in g} for g, r in mine)
         wanted = calibration.correct(uv)
         assert np.array_equal(corrected, wanted.uv)
@@ -225,18 +370,29 @@ def test_correct_takes_the_distortion_off(rig, result, tmp_path, capsys):
 
 # ---- what users get wrong
 
-@pytest.mark.parametrize('arguments', [
-    (), ('calibrat',), ('simulate',), ('simulate', '--out', 'x', '--exposures', '0'),
-    ('simulate', '--out', 'x', '--noise', 'nan'), ('simulate', '--out', 'x', '--seed', '1.5'),
-    ('calibrate', 'bags', '--out', 'x'), ('calibrate', 'bags', '--phantom', 'p.csv'),
-    ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--model', 'spline'),
-    ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--loss', 'cauchy'),
-    ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--image-size', '1024'),
-    ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--image-size', '0x9'),
-    ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--k', '0'),
-    ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--joint', '--separate'),
-    ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--principal-distance', '-5'),
-    ('adjust', 'bags', '--phantom', 'p.csv', '--out', 'x'), ('correct', 'p.csv', '--out', 'x')])
+
+@pytest.mark.parametrize(
+    'arguments',
+    [
+        (),
+        ('calibrat',),
+        ('simulate',),
+        ('simulate', '--out', 'x', '--exposures', '0'),
+        ('simulate', '--out', 'x', '--noise', 'nan'),
+        ('simulate', '--out', 'x', '--seed', '1.5'),
+        ('calibrate', 'bags', '--out', 'x'),
+        ('calibrate', 'bags', '--phantom', 'p.csv'),
+        ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--model', 'spline'),
+        ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--loss', 'cauchy'),
+        ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--image-size', '1024'),
+        ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--image-size', '0x9'),
+        ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--k', '0'),
+        ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--joint', '--separate'),
+        ('calibrate', 'bags', '--phantom', 'p.csv', '--out', 'x', '--principal-distance', '-5'),
+        ('adjust', 'bags', '--phantom', 'p.csv', '--out', 'x'),
+        ('correct', 'p.csv', '--out', 'x'),
+    ],
+)
 def test_wrong_usage_ends_with_status_2_and_the_usage(arguments, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert 'usage: fluoro-calib' in said(capsys, arguments, status=2)
@@ -246,6 +402,7 @@ def test_wrong_usage_ends_with_status_2_and_the_usage(arguments, capsys, tmp_pat
 @pytest.mark.parametrize('name', sorted(EXAMPLES))
 def test_every_command_has_help_with_an_example_that_parses(name, capsys):
     from fluoro_calib_ros.cli import make_parser
+
     assert run(name, '--help') == 0
     text = ' '.join(capsys.readouterr().out.split())
     assert f'example: {EXAMPLES[name]}' in text
@@ -254,11 +411,22 @@ def test_every_command_has_help_with_an_example_that_parses(name, capsys):
 
 def test_missing_files_are_named(rig, tmp_path, capsys):
     nowhere = tmp_path / 'nowhere'
-    for arguments in (calibrate(rig, tmp_path / 'x', source=nowhere), calibrate(rig, tmp_path / 'x', phantom=nowhere),
-                      calibrate(rig, tmp_path / 'x', *IMAGE, source=nowhere.with_suffix('.csv')),
-                      ('adjust', rig / 'test', '--phantom', rig / 'phantom.csv', '--calibration', nowhere,
-                       '--out', tmp_path / 'x'),
-                      ('correct', nowhere, '--calibration', nowhere, '--out', tmp_path / 'x')):
+    for arguments in (
+        calibrate(rig, tmp_path / 'x', source=nowhere),
+        calibrate(rig, tmp_path / 'x', phantom=nowhere),
+        calibrate(rig, tmp_path / 'x', *IMAGE, source=nowhere.with_suffix('.csv')),
+        (
+            'adjust',
+            rig / 'test',
+            '--phantom',
+            rig / 'phantom.csv',
+            '--calibration',
+            nowhere,
+            '--out',
+            tmp_path / 'x',
+        ),
+        ('correct', nowhere, '--calibration', nowhere, '--out', tmp_path / 'x'),
+    ):
         assert str(nowhere) in said(capsys, arguments)
     assert list(tmp_path.iterdir()) == []
 
@@ -277,14 +445,25 @@ def test_a_bag_without_observations_is_refused(rig, tmp_path, capsys):
     assert str(tmp_path / 'empty') in sentence and 'observations' in sentence.lower()
     (tmp_path / 'folder').mkdir()
     assert 'folder' in said(capsys, calibrate(rig, tmp_path / 'x', source=tmp_path / 'folder'))
-    (tmp_path / 'torn.mcap').write_bytes((rig / 'calibration' / 'calibration_0.mcap').read_bytes()[:4])
-    assert 'torn.mcap' in said(capsys, calibrate(rig, tmp_path / 'x', source=tmp_path / 'torn.mcap'))
+    (tmp_path / 'torn.mcap').write_bytes(
+        (rig / 'calibration' / 'calibration_0.mcap').read_bytes()[:4]
+    )
+    assert 'torn.mcap' in said(
+        capsys, calibrate(rig, tmp_path / 'x', source=tmp_path / 'torn.mcap')
+    )
 
 
-@pytest.mark.parametrize('bad, cause', [
-    ('7,1,2,x,0.1', "row 9: z is 'x', not a number"), ('7,1,2,nan,0.1', 'row 9: z'), ('7,1,2,3,0', 'row 9: sd'),
-    ('7,1,2,3', 'row 9: 4 columns'), ('1,1,2,3,0.1', 'row 9: target 1 is there already, in row 2'),
-    ('-7,1,2,3,0.1', 'row 9: target_id')])
+@pytest.mark.parametrize(
+    'bad, cause',
+    [
+        ('7,1,2,x,0.1', "row 9: z is 'x', not a number"),
+        ('7,1,2,nan,0.1', 'row 9: z'),
+        ('7,1,2,3,0', 'row 9: sd'),
+        ('7,1,2,3', 'row 9: 4 columns'),
+        ('1,1,2,3,0.1', 'row 9: target 1 is there already, in row 2'),
+        ('-7,1,2,3,0.1', 'row 9: target_id'),
+    ],
+)
 def test_a_bad_row_of_the_phantom_is_named(rig, tmp_path, capsys, bad, cause):
     lines = (rig / 'phantom.csv').read_text().splitlines()
     lines[8] = bad
@@ -299,7 +478,9 @@ def test_a_csv_needs_the_size_of_the_image(rig, tmp_path, capsys):
 
 
 def test_points_off_the_stated_image_are_refused_with_their_row(rig, tmp_path, capsys):
-    sentence = said(capsys, calibrate(rig, tmp_path / 'x', '--image-size', '512x512', source='calibration.csv'))
+    sentence = said(
+        capsys, calibrate(rig, tmp_path / 'x', '--image-size', '512x512', source='calibration.csv')
+    )
     assert re.search(r'calibration.csv, row \d+: the point .* is off the image', sentence)
 
 
@@ -320,7 +501,9 @@ def test_too_few_exposures_are_told(rig, tmp_path, capsys):
 def test_a_k_that_the_observations_do_not_allow_is_told(rig, tmp_path, capsys):
     more = ('--fluoroscopes', 'a', '--max-iterations', 1, '--model', 'local_linear', '--k')
     assert 'fluoroscope a: ' in said(capsys, calibrate(rig, tmp_path / 'x', *more, 100000))
-    assert 'fluoroscope a: local_linear with k = 3' in said(capsys, calibrate(rig, tmp_path / 'x', *more, 3))
+    assert 'fluoroscope a: local_linear with k = 3' in said(
+        capsys, calibrate(rig, tmp_path / 'x', *more, 3)
+    )
 
 
 def test_a_k_for_a_model_without_neighbours_is_wrong_usage(rig, tmp_path, capsys):
@@ -330,13 +513,17 @@ def test_a_k_for_a_model_without_neighbours_is_wrong_usage(rig, tmp_path, capsys
 
 
 def test_an_empty_or_damaged_calibration_folder_is_told(rig, result, tmp_path, capsys):
-    empty, damaged = tmp_path / 'empty', tmp_path / 'damaged'
+    empty = tmp_path / 'empty'
+    damaged = tmp_path / 'damaged'
     empty.mkdir()
     damaged.mkdir()
     content = (result / 'a.calibration.npz').read_bytes()
     (damaged / 'a.calibration.npz').write_bytes(content[:-100])
     for folder, cause in ((empty, 'there is no calibration'), (damaged, 'damaged')):
-        for arguments in (('adjust', rig / 'test', '--phantom', rig / 'phantom.csv'), ('correct', rig / 'test.csv')):
+        for arguments in (
+            ('adjust', rig / 'test', '--phantom', rig / 'phantom.csv'),
+            ('correct', rig / 'test.csv'),
+        ):
             sentence = said(capsys, (*arguments, '--calibration', folder, '--out', tmp_path / 'x'))
             assert str(folder) in sentence and cause in sentence
     assert not (tmp_path / 'x').exists()
@@ -344,21 +531,41 @@ def test_an_empty_or_damaged_calibration_folder_is_told(rig, result, tmp_path, c
 
 def test_a_fluoroscope_without_calibration_is_told(rig, result, tmp_path, capsys):
     (tmp_path / 'only').mkdir()
-    (tmp_path / 'only' / 'b.calibration.npz').write_bytes((result / 'b.calibration.npz').read_bytes())
+    (tmp_path / 'only' / 'b.calibration.npz').write_bytes(
+        (result / 'b.calibration.npz').read_bytes()
+    )
     more = ('--calibration', tmp_path / 'only', '--out', tmp_path / 'x')
     assert 'no calibration of fluoroscope a, only of b' in said(
-        capsys, ('adjust', rig / 'test', '--phantom', rig / 'phantom.csv', *more))
-    assert "row 2: there is no calibration of fluoroscope 'a'" in said(capsys, ('correct', rig / 'test.csv', *more))
+        capsys, ('adjust', rig / 'test', '--phantom', rig / 'phantom.csv', *more)
+    )
+    assert "row 2: there is no calibration of fluoroscope 'a'" in said(
+        capsys, ('correct', rig / 'test.csv', *more)
+    )
 
 
 def test_frames_of_another_image_size_are_not_adjusted(rig, result, tmp_path, capsys):
-    sentence = said(capsys, ('adjust', rig / 'test.csv', '--image-size', '2048x2048', '--phantom', rig / 'phantom.csv',
-                             '--calibration', result, '--out', tmp_path / 'x'))
+    sentence = said(
+        capsys,
+        (
+            'adjust',
+            rig / 'test.csv',
+            '--image-size',
+            '2048x2048',
+            '--phantom',
+            rig / 'phantom.csv',
+            '--calibration',
+            result,
+            '--out',
+            tmp_path / 'x',
+        ),
+    )
     assert 'the image is 2048 x 2048 px, but the calibration is for 1024 x 1024 px' in sentence
 
 
 def test_a_failing_command_leaves_earlier_results_untouched(rig, result, tmp_path, capsys):
-    """Byte for byte: a calibration that fails at its second fluoroscope, an adjustment, a correction."""
+    """Byte for byte: a calibration that fails at its second fluoroscope, an adjustment, a
+    correction.
+    """
     before = files_of(result)
     lines = (rig / 'calibration.csv').read_text().splitlines()
     few = [line for line in lines if line[0] != 'b' or line.split(',')[1] in ('1', '2')]
@@ -366,19 +573,37 @@ def test_a_failing_command_leaves_earlier_results_untouched(rig, result, tmp_pat
     (tmp_path / 'bad.csv').write_text('fluoroscope,u,v\na,1,2\na,1,x\n')
     corrected = tmp_path / 'corrected.csv'
     corrected.write_text('earlier')
-    said(capsys, calibrate(rig, result, *IMAGE, '--max-iterations', 1, source=tmp_path / 'few.csv'))
-    said(capsys, ('adjust', tmp_path / 'bad.csv', '--phantom', rig / 'phantom.csv', *IMAGE, '--calibration', result,
-                  '--out', result))
-    assert "row 3: v is 'x'" in said(capsys, ('correct', tmp_path / 'bad.csv', '--calibration', result,
-                                              '--out', corrected))
+    said(
+        capsys, calibrate(rig, result, *IMAGE, '--max-iterations', 1, source=tmp_path / 'few.csv')
+    )
+    said(
+        capsys,
+        (
+            'adjust',
+            tmp_path / 'bad.csv',
+            '--phantom',
+            rig / 'phantom.csv',
+            *IMAGE,
+            '--calibration',
+            result,
+            '--out',
+            result,
+        ),
+    )
+    assert "row 3: v is 'x'" in said(
+        capsys, ('correct', tmp_path / 'bad.csv', '--calibration', result, '--out', corrected)
+    )
     assert files_of(result) == before and corrected.read_text() == 'earlier'
 
 
 def test_what_cannot_be_written_is_told(rig, tmp_path, capsys):
     (tmp_path / 'file').write_text('')
-    for arguments in (('simulate', '--out', tmp_path / 'file', '--exposures', 1, '--seconds', 0),
-                      calibrate(rig, tmp_path / 'file', '--max-iterations', 1, '--fluoroscopes', 'a', '--model',
-                                'none')):
+    for arguments in (
+        ('simulate', '--out', tmp_path / 'file', '--exposures', 1, '--seconds', 0),
+        calibrate(
+            rig, tmp_path / 'file', '--max-iterations', 1, '--fluoroscopes', 'a', '--model', 'none'
+        ),
+    ):
         assert str(tmp_path / 'file') in said(capsys, arguments)
 
 
@@ -386,12 +611,28 @@ def test_exposures_that_are_left_out_are_told(rig, tmp_path, capsys):
     """On standard error and in the result; the calibration goes on."""
     lines = (rig / 'calibration.csv').read_text().splitlines()
     third = [n for n, line in enumerate(lines) if line.startswith('a,3,')]
-    kept = [line for n, line in enumerate(lines) if n not in third[10:] and not line.startswith('b')]
+    kept = [
+        line for n, line in enumerate(lines) if n not in third[10:] and not line.startswith('b')
+    ]
     (tmp_path / 'less.csv').write_text('\n'.join(kept) + '\n')
-    assert run(*calibrate(rig, tmp_path / 'x', *IMAGE, '--max-iterations', 1, '--json', '--model', 'none',
-                          source=tmp_path / 'less.csv')) == 0
+    assert (
+        run(
+            *calibrate(
+                rig,
+                tmp_path / 'x',
+                *IMAGE,
+                '--max-iterations',
+                1,
+                '--json',
+                '--model',
+                'none',
+                source=tmp_path / 'less.csv',
+            )
+        )
+        == 0
+    )
     out, err = capsys.readouterr()
     assert err == 'not used: fluoroscope a, exposure 3: 10 targets are too few, 12 are needed\n'
     document = json.loads(out)
-    assert document['left_out'] == [err[len('not used: '):-1]]
+    assert document['left_out'] == [err[len('not used: ') : -1]]
     check_result(document, ['a'], [n for n in range(1, 16) if n != 3])

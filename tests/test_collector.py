@@ -5,10 +5,16 @@ import itertools
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.calibration.collector import (
-    ExposureCollector, FramePairer, StillOptions, collect_recorded, displacement)
-from fluoro_calib_ros.calibration.coverage import Coverage
-from fluoro_calib_ros.photogrammetry.observations import DataError, Frame
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.collector import (
+    ExposureCollector,
+    StillOptions,
+    collect_recorded,
+    displacement,
+)
+from fluoro_calib_ros.exposures.coverage import Coverage
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.pairing import FramePairer
 
 SIZE = (1000, 800)
 MS = 1_000_000
@@ -22,11 +28,14 @@ def frame(name='a', number=1, stamp_ms=0.0, shift=0.0, ids=range(20)):
 
 
 def pair(number=1, stamp_ms=0.0, shift=0.0, shift_b=None):
-    return {'a': frame('a', number, stamp_ms, shift),
-            'b': frame('b', number, stamp_ms, shift if shift_b is None else shift_b)}
+    return {
+        'a': frame('a', number, stamp_ms, shift),
+        'b': frame('b', number, stamp_ms, shift if shift_b is None else shift_b),
+    }
 
 
 # ---- pairing
+
 
 def test_frames_pair_by_number_in_any_order():
     pairer = FramePairer('ab')
@@ -95,9 +104,11 @@ def test_pairing_of_another_kind_is_refused():
 
 # ---- still exposures
 
+
 def test_displacement_is_the_median_of_common_targets():
     """Some false matches do not count; with too few targets in common two frames are different."""
-    one, other = frame(), frame(shift=3.0)
+    one = frame()
+    other = frame(shift=3.0)
     other.uv[:5] += 400
     assert displacement(one, other) == pytest.approx(3)
     assert displacement(frame(ids=range(8)), frame(shift=2.0)) == pytest.approx(2)
@@ -108,14 +119,22 @@ def test_displacement_is_the_median_of_common_targets():
 
 def test_the_phantom_is_taken_where_it_stands_still_in_a_new_pose():
     """A stream of 50 frames a second: standing, moving, standing elsewhere, and back again."""
-    collector, taken = ExposureCollector('ab'), []
-    shifts = [0] * 20 + list(np.linspace(0, 100, 20)) + [100] * 20 + list(np.linspace(100, 0, 20)) + [0] * 20
+    collector = ExposureCollector('ab')
+    taken = []
+    shifts = (
+        [0] * 20
+        + list(np.linspace(0, 100, 20))
+        + [100] * 20
+        + list(np.linspace(100, 0, 20))
+        + [0] * 20
+    )
     said = []
     for number, shift in enumerate(shifts, 1):
         said.append(collector.offer(pair(number, 20.0 * number, shift)))
         if not said[-1]:
             taken.append(number)
-    # Frame 40 is the first at rest: taken 100 ms after it, and never again in a pose that is there already.
+    # Frame 40 is the first at rest: taken 100 ms after it, and never again in a pose that is there
+    # already.
     assert taken == [1, 45], said
     assert [e['a'].number for e in collector.exposures] == taken
     assert said[10] == 'the phantom stands in a pose that is collected already'
@@ -132,22 +151,32 @@ def test_a_movement_that_only_one_fluoroscope_sees_counts():
 
 
 def test_single_shots_count_each_in_a_new_pose():
-    """Frames further apart than the still time have nothing to be compared with but the collected poses."""
+    """Frames further apart than the still time have nothing to be compared with but the collected
+    poses.
+    """
     collector = ExposureCollector('ab', StillOptions(still_time_s=0.1, new_px=10))
     assert collector.offer(pair(1, 0, 0)) == ''
-    assert collector.offer(pair(2, 500, 9.9)) == 'the phantom stands in a pose that is collected already'
+    assert (
+        collector.offer(pair(2, 500, 9.9))
+        == 'the phantom stands in a pose that is collected already'
+    )
     assert collector.offer(pair(3, 1000, 10.1)) == ''
 
 
 def test_after_a_gap_in_a_stream_the_phantom_is_not_taken_on_its_way():
     """A busy machine loses frames of a stream; what comes behind the gap is no single shot."""
-    collector, taken = ExposureCollector('ab'), []
-    times = [20.0 * n for n in range(80) if not 25 <= n < 35 and not 36 <= n < 42]   # gaps of 0.2 and 0.14 s
+    collector = ExposureCollector('ab')
+    taken = []
+    times = [
+        20.0 * n for n in range(80) if not 25 <= n < 35 and not 36 <= n < 42
+    ]  # gaps of 0.2 and 0.14 s
     for number, time in enumerate(times, 1):
-        if not collector.offer(pair(number, time, np.clip(time - 400, 0, 800) / 4)):   # moves from 400 ms to 1200 ms
+        if not collector.offer(
+            pair(number, time, np.clip(time - 400, 0, 800) / 4)
+        ):  # moves from 400 ms to 1200 ms
             taken.append(time)
     assert taken == [0.0, 1300.0]
-    assert collector.offer(pair(90, 3000.0, 50)) == ''   # the stream is over
+    assert collector.offer(pair(90, 3000.0, 50)) == ''  # the stream is over
 
 
 def test_take_asks_for_nothing_but_a_new_number():
@@ -162,7 +191,11 @@ def test_reset_forgets_everything():
     collector.offer(pair(1, 0, 0))
     collector.offer(pair(2, 10, 50))
     collector.reset()
-    assert collector.exposures == [] and collector.coverage == {} and collector.frames() == {'a': [], 'b': []}
+    assert (
+        collector.exposures == []
+        and collector.coverage == {}
+        and collector.frames() == {'a': [], 'b': []}
+    )
     assert collector.offer(pair(1, 20, 100)) == ''
 
 
@@ -170,7 +203,10 @@ def test_frames_are_handed_out_by_fluoroscope():
     collector = ExposureCollector('ab')
     collector.take(pair(1))
     collector.take(pair(2))
-    assert {n: [f.number for f in fs] for n, fs in collector.frames().items()} == {'a': [1, 2], 'b': [1, 2]}
+    assert {n: [f.number for f in fs] for n, fs in collector.frames().items()} == {
+        'a': [1, 2],
+        'b': [1, 2],
+    }
     assert list(collector.frames(['b'])) == ['b']
     with pytest.raises(DataError, match='fluoroscope c is unknown, there are a, b'):
         collector.frames(['c'])
@@ -178,8 +214,12 @@ def test_frames_are_handed_out_by_fluoroscope():
 
 # ---- recordings
 
+
 def recording(shifts, interval_ms):
-    return {name: [frame(name, n, interval_ms * n, shift) for n, shift in enumerate(shifts, 1)] for name in 'ab'}
+    return {
+        name: [frame(name, n, interval_ms * n, shift) for n, shift in enumerate(shifts, 1)]
+        for name in 'ab'
+    }
 
 
 def test_single_shots_of_a_recording_are_all_taken():
@@ -212,29 +252,42 @@ def test_a_recording_of_nothing_is_nothing():
 
 # ---- coverage
 
+
 def test_coverage_grows_from_nothing_to_the_whole_image():
-    coverage, rng, seen = Coverage(SIZE), np.random.default_rng(1), []
+    coverage = Coverage(SIZE)
+    rng = np.random.default_rng(1)
+    seen = []
     assert coverage.fraction == 0
     for _ in range(40):
         coverage.add(rng.uniform(-0.5, np.array(SIZE) - 0.5, (60, 2)))
         seen.append(coverage.fraction)
-    assert all(a <= b for a, b in itertools.pairwise(seen)) and 0.2 < seen[0] < 0.5 and seen[-1] == 1
+    assert (
+        all(a <= b for a, b in itertools.pairwise(seen)) and 0.2 < seen[0] < 0.5 and seen[-1] == 1
+    )
     coverage.add(np.zeros((0, 2)))
     assert coverage.fraction == 1
 
 
 def test_an_image_point_covers_its_surroundings_within_the_image():
     """Its cell of 32 x 32 and the eight around it: in a corner there are three."""
-    middle, corner, far_corner = Coverage(SIZE), Coverage(SIZE), Coverage(SIZE)
+    middle = Coverage(SIZE)
+    corner = Coverage(SIZE)
+    far_corner = Coverage(SIZE)
     middle.add([[500.0, 400.0]])
     corner.add([[-0.5, -0.5]])
     far_corner.add([[999.5, 799.5]])
-    assert (middle.fraction, corner.fraction, far_corner.fraction) == (9 / 1024, 4 / 1024, 4 / 1024)
+    assert (middle.fraction, corner.fraction, far_corner.fraction) == (
+        9 / 1024,
+        4 / 1024,
+        4 / 1024,
+    )
     far_corner.add([[-0.5, -0.5]])
     assert far_corner.fraction == 8 / 1024
     half = Coverage(SIZE)
-    half.add(np.stack(np.meshgrid(np.arange(0, 480.0), np.arange(0, 800.0)), axis=2).reshape(-1, 2))
-    assert half.fraction == pytest.approx(17 / 32)   # the left half and the column beside it
+    half.add(
+        np.stack(np.meshgrid(np.arange(0, 480.0), np.arange(0, 800.0)), axis=2).reshape(-1, 2)
+    )
+    assert half.fraction == pytest.approx(17 / 32)  # the left half and the column beside it
 
 
 def test_coverage_is_kept_for_each_fluoroscope():

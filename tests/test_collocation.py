@@ -1,4 +1,6 @@
-"""Models that are adjusted with the network: series, signal and trend, additional parameters, stepwise terms, auto."""
+"""Models that are adjusted with the network: series, signal and trend, additional parameters,
+stepwise terms, auto.
+"""
 
 import sys
 from dataclasses import replace
@@ -6,35 +8,62 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rigs
 from scipy.spatial.distance import cdist
 from scipy.special import gamma, kv
 from threadpoolctl import threadpool_limits
 
-import rigs
-from fluoro_calib_ros.calibration.automatic import better_kind
-from fluoro_calib_ros.calibration.job import adjust_with, calibrate
-from fluoro_calib_ros.calibration.network import measured_network
-from fluoro_calib_ros.calibration.self_calibration import (Options, _adjust_as_a_whole, adjusted_with_precision,
-                                                           start_noise)
+from fluoro_calib_ros.calibration.calibrate import adjust_with, calibrate
+from fluoro_calib_ros.calibration.initial_network import measured_network
+from fluoro_calib_ros.calibration.model_choice import better_kind
+from fluoro_calib_ros.calibration.self_calibration import (
+    CalibrationOptions,
+    _adjust_as_a_whole,
+    adjusted_with_precision,
+    start_noise,
+)
 from fluoro_calib_ros.distortion.models import CorrectionModel
-from fluoro_calib_ros.distortion.series import (SD_GRID, Functions, Series, packed, sd_grid_pixels, sd_over_image,
-                                                unpacked)
-from fluoro_calib_ros.distortion.signal import (Prior, gauge_precision, most_likely_prior, spectral_density,
-                                                starting_prior)
-from fluoro_calib_ros.distortion.terms import GAUGE, HIGHEST, _polynomial, expert_terms, trend_transformation
+from fluoro_calib_ros.distortion.priors import (
+    Prior,
+    gauge_precision,
+    most_likely_prior,
+    spectral_density,
+    starting_prior,
+)
+from fluoro_calib_ros.distortion.series import (
+    SD_GRID,
+    Functions,
+    Series,
+    packed,
+    sd_grid_pixels,
+    sd_over_image,
+    unpacked,
+)
+from fluoro_calib_ros.distortion.terms import (
+    GAUGE,
+    HIGHEST,
+    _polynomial,
+    expert_terms,
+    trend_transformation,
+)
 from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
-from fluoro_calib_ros.photogrammetry import normal as normal_module
+from fluoro_calib_ros.photogrammetry import normal_equations as normal_module
 from fluoro_calib_ros.photogrammetry import precision as precision_module
-from fluoro_calib_ros.photogrammetry.additional import Additional
+from fluoro_calib_ros.photogrammetry.additional_parameters import Additional
 from fluoro_calib_ros.photogrammetry.adjustment import adjust, residuals_and_q, total_cost
 from fluoro_calib_ros.photogrammetry.noise import Noise
-from fluoro_calib_ros.photogrammetry.normal import normal_equations
-from fluoro_calib_ros.photogrammetry.precision import (covariance_blocks, covariance_of_projection,
-                                                       information_of_additional, precision, solved)
+from fluoro_calib_ros.photogrammetry.normal_equations import normal_equations
+from fluoro_calib_ros.photogrammetry.precision import (
+    covariance_blocks,
+    covariance_of_projection,
+    information_of_additional,
+    precision,
+    solved,
+)
 from fluoro_calib_ros.simulation.distortion import DistortionField
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
-sys.path.append(str(Path(__file__).resolve().parent.parent))   # benchmarks are not installed
+sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed
 
 SIZE = (1024, 768)
 
@@ -52,16 +81,25 @@ def pixels(count=400, seed=0, size=SIZE):
 
 # ---- series
 
+
 def test_functions_are_those_of_the_document():
     """Written out one by one, as docs/calibration_file.md has them."""
-    functions, uv = Functions(SIZE, 2, 3), pixels(20)
+    functions = Functions(SIZE, 2, 3)
+    uv = pixels(20)
     w, h = SIZE
-    x, y = (uv[:, 0] - (w - 1) / 2) / 512, (uv[:, 1] - (h - 1) / 2) / 512
-    columns = [x ** i * y ** j for i in range(3) for j in range(3 - i)]
-    a, b = 0.65 * w, 0.65 * h
-    columns += [np.sin(np.pi * i * (512 * x + a) / (2 * a)) * np.sin(np.pi * j * (512 * y + b) / (2 * b))
-                / np.sqrt(a * b)
-                for i in range(1, 4) for j in range(1, 4) if np.hypot(i, j * w / h) <= 3.5]
+    x = (uv[:, 0] - (w - 1) / 2) / 512
+    y = (uv[:, 1] - (h - 1) / 2) / 512
+    columns = [x**i * y**j for i in range(3) for j in range(3 - i)]
+    a = 0.65 * w
+    b = 0.65 * h
+    columns += [
+        np.sin(np.pi * i * (512 * x + a) / (2 * a))
+        * np.sin(np.pi * j * (512 * y + b) / (2 * b))
+        / np.sqrt(a * b)
+        for i in range(1, 4)
+        for j in range(1, 4)
+        if np.hypot(i, j * w / h) <= 3.5
+    ]
     np.testing.assert_allclose(functions(uv), np.stack(columns, axis=1), atol=1e-12)
     assert len(functions) == len(columns)
 
@@ -69,16 +107,26 @@ def test_functions_are_those_of_the_document():
 def test_a_series_is_packed_and_unpacked_to_the_last_bit():
     functions = Functions(SIZE, 3, 5)
     rng = np.random.default_rng(1)
-    series = Series(functions, rng.normal(size=(2, len(functions))), rng.uniform(0, 1, (SD_GRID, SD_GRID)))
+    series = Series(
+        functions, rng.normal(size=(2, len(functions))), rng.uniform(0, 1, (SD_GRID, SD_GRID))
+    )
     again = unpacked(SIZE, *packed(series))
     assert again.predict(pixels()).tobytes() == series.predict(pixels()).tobytes()
     assert again.sd_at(pixels()).tobytes() == series.sd_at(pixels()).tobytes()
     assert unpacked(SIZE, *packed(None)) is None
 
 
-@pytest.mark.parametrize('changes, said', [
-    ({0: 2}, 'has 2 x'), ({1: 4}, 'has 2 x'), ({0: 99}, 'is unknown'), ({1: 10 ** 9}, 'is unknown'),
-    ({2: np.full((2, 10), np.nan)}, 'not a number'), ({3: np.zeros((33, 32))}, 'standard deviations, not')])
+@pytest.mark.parametrize(
+    'changes, said',
+    [
+        ({0: 2}, 'has 2 x'),
+        ({1: 4}, 'has 2 x'),
+        ({0: 99}, 'is unknown'),
+        ({1: 10**9}, 'is unknown'),
+        ({2: np.full((2, 10), np.nan)}, 'not a number'),
+        ({3: np.zeros((33, 32))}, 'standard deviations, not'),
+    ],
+)
 def test_a_damaged_series_is_refused(changes, said):
     parts = [3, 0, np.zeros((2, 10)), np.zeros((SD_GRID, SD_GRID))]
     for at, value in changes.items():
@@ -93,7 +141,7 @@ def test_standard_deviation_over_the_image_is_that_of_the_coefficients():
     sd = sd_over_image(functions, root @ root.T)
     nodes = sd_grid_pixels(SIZE)
     drawn = np.stack([functions(nodes) @ part for part in np.split(root, 2)])
-    np.testing.assert_allclose(sd.ravel(), np.sqrt(np.sum(drawn ** 2, axis=(0, 2)) / 2), rtol=1e-9)
+    np.testing.assert_allclose(sd.ravel(), np.sqrt(np.sum(drawn**2, axis=(0, 2)) / 2), rtol=1e-9)
     series = Series(functions, np.zeros((2, len(functions))), sd)
     np.testing.assert_allclose(series.sd_at(nodes), sd.ravel(), rtol=1e-9)
 
@@ -101,8 +149,13 @@ def test_standard_deviation_over_the_image_is_that_of_the_coefficients():
 def test_a_model_with_a_series_knows_what_lies_outside():
     functions = Functions(SIZE, 3)
     uv = pixels(size=(500, 500))
-    model = CorrectionModel('collocation', 0, uv, np.zeros_like(uv), series=Series(
-        functions, np.ones((2, 10)), np.full((SD_GRID, SD_GRID), 0.1)))
+    model = CorrectionModel(
+        'collocation',
+        0,
+        uv,
+        np.zeros_like(uv),
+        series=Series(functions, np.ones((2, 10)), np.full((SD_GRID, SD_GRID), 0.1)),
+    )
     found = model.evaluate(np.array([[250.0, 250.0], [900.0, 700.0]]))
     assert list(found.outside) == [False, True] and found.sd == pytest.approx(0.1)
     for kind, series in (('collocation', None), ('local_linear', model.series)):
@@ -112,38 +165,56 @@ def test_a_model_with_a_series_knows_what_lies_outside():
 
 # ---- signal and trend
 
+
 @pytest.mark.parametrize('sd, reach', [(0.5, 180.0), (1.2, 100.0)])
 def test_the_sines_have_the_covariance_function_of_matern(sd, reach):
-    """Against the closed form with a Bessel function (Rasmussen and Williams 2006, Eq. 4.14), away from the rim, where
-    the sines come to an end."""
-    functions, uv = Functions((1024, 1024), -1, 40), pixels(40, size=(500, 500)) + 262
+    """Against the closed form with a Bessel function (Rasmussen and Williams 2006, Eq. 4.14), away
+    from the rim, where the sines come to an end.
+    """
+    functions = Functions((1024, 1024), -1, 40)
+    uv = pixels(40, size=(500, 500)) + 262
     values = functions(uv)
     ours = (values * spectral_density(functions.frequency, sd, reach)) @ values.T
     scaled = np.sqrt(5) * np.maximum(cdist(uv, uv), 1e-9) / reach
-    theirs = sd ** 2 * 2 ** -1.5 / gamma(2.5) * scaled ** 2.5 * kv(2.5, scaled)
-    np.testing.assert_allclose(ours, theirs, atol=0.02 * sd ** 2)
+    theirs = sd**2 * 2**-1.5 / gamma(2.5) * scaled**2.5 * kv(2.5, scaled)
+    np.testing.assert_allclose(ours, theirs, atol=0.02 * sd**2)
 
 
 def drawn_field(functions, prior, seed, uv, noise):
-    """Coefficients drawn from a Prior and noisy values of the field at pixels, as information and right side."""
+    """Coefficients drawn from a Prior and noisy values of the field at pixels, as information and
+    right side.
+    """
     rng = np.random.default_rng(seed)
-    m, t = len(functions), len(functions.powers)
+    m = len(functions)
+    t = len(functions.powers)
     back = np.linalg.inv(trend_transformation(functions.degree)[0])
     terms = np.zeros(2 * t)
-    terms[:len(prior.trend)] = rng.normal(0, np.sqrt(prior.trend))
-    coefficients = np.concatenate([np.zeros((2, t)), rng.normal(
-        0, np.sqrt(spectral_density(functions.frequency, prior.sd, prior.reach)), (2, m - t))], axis=1)
+    terms[: len(prior.trend)] = rng.normal(0, np.sqrt(prior.trend))
+    coefficients = np.concatenate(
+        [
+            np.zeros((2, t)),
+            rng.normal(
+                0,
+                np.sqrt(spectral_density(functions.frequency, prior.sd, prior.reach)),
+                (2, m - t),
+            ),
+        ],
+        axis=1,
+    )
     coefficients[:, :t] = (back @ terms).reshape(2, t)
     values = functions(uv)
     observed = values @ coefficients.T + rng.normal(0, noise, (len(uv), 2))
-    gram = values.T @ values / noise ** 2
+    gram = values.T @ values / noise**2
     information = np.kron(np.eye(2), gram)
-    return information, (values.T @ observed / noise ** 2).T.ravel()
+    return information, (values.T @ observed / noise**2).T.ravel()
 
 
 def test_the_prior_of_a_signal_is_found_from_the_observations():
-    """Standard deviation and reach within a fifth, mean of some fields; terms that are not there get no variance."""
-    functions, uv = Functions((1024, 1024), 3, 18), pixels(2500, 3, (1024, 1024))
+    """Standard deviation and reach within a fifth, mean of some fields; terms that are not there
+    get no variance.
+    """
+    functions = Functions((1024, 1024), 3, 18)
+    uv = pixels(2500, 3, (1024, 1024))
     there = np.zeros(14)
     there[[0, 4, 9]] = 25.0
     found = []
@@ -171,10 +242,15 @@ def test_expert_terms_and_gauge_are_independent():
 
 # ---- additional parameters in the adjustment
 
+
 def network_with_additional(scalar, seed=0, **shape):
-    """A small network of two fluoroscopes with additional parameters in both, and its true parameters."""
+    """A small network of two fluoroscopes with additional parameters in both, and its true
+    parameters.
+    """
     network, truth = rigs.small_network(fluoroscopes=2, seed=seed, **shape)
-    rng, additional, coefficients = np.random.default_rng(seed), [], []
+    rng = np.random.default_rng(seed)
+    additional = []
+    coefficients = []
     for f in range(2):
         uv = network.uv[network.rows(f)]
         values = Functions((1024, 1024), 2, 2)(uv)[:, 3:]
@@ -190,7 +266,9 @@ def network_with_additional(scalar, seed=0, **shape):
 
 
 def dense_normal(network, result):
-    """Dense normal matrix of all unknowns, additional parameters last, by central differences of the residuals."""
+    """Dense normal matrix of all unknowns, additional parameters last, by central differences of
+    the residuals.
+    """
     m, n = network.shape[1:3]
     count = len(network.global_free) - 3 * network.shape[3]
     u = 6 * m + 3 * n + 3 * int(network.interior_free.sum())
@@ -198,18 +276,31 @@ def dense_normal(network, result):
     def moved(x):
         plain = rigs.moved(network, result.parameters, x[:u])
         parts = np.split(x[u:], [network.additional[0].count])
-        return replace(plain, additional=tuple(a + p for a, p in zip(result.parameters.additional, parts)))
+        return replace(
+            plain, additional=tuple(a + p for a, p in zip(result.parameters.additional, parts))
+        )
 
-    step = np.concatenate([np.tile([1e-2] * 3 + [1e-6] * 3, m), np.full(3 * n, 1e-3), np.full(u - 6 * m - 3 * n, 1e-2),
-                           np.full(count, 1e-3)])
-    columns = [(residuals_and_q(network, moved(h * e), 0.0, result.noise)[0]
-                - residuals_and_q(network, moved(-h * e), 0.0, result.noise)[0]).ravel() / (2 * h)
-               for h, e in zip(step, np.eye(u + count))]
+    step = np.concatenate(
+        [
+            np.tile([1e-2] * 3 + [1e-6] * 3, m),
+            np.full(3 * n, 1e-3),
+            np.full(u - 6 * m - 3 * n, 1e-2),
+            np.full(count, 1e-3),
+        ]
+    )
+    columns = [
+        (
+            residuals_and_q(network, moved(h * e), 0.0, result.noise)[0]
+            - residuals_and_q(network, moved(-h * e), 0.0, result.noise)[0]
+        ).ravel()
+        / (2 * h)
+        for h, e in zip(step, np.eye(u + count))
+    ]
     a = np.stack(columns, axis=1)
     weight = result.noise.weight(result.q) / (result.noise.scale * network.sigma) ** 2
     normal = a.T @ (np.repeat(weight, 2)[:, None] * a)
     points = np.arange(6 * m, 6 * m + 3 * n)
-    normal[points, points] += np.repeat(1 / network.survey_sd_mm ** 2, 3)
+    normal[points, points] += np.repeat(1 / network.survey_sd_mm**2, 3)
     at = u
     for additional in network.additional:
         part = slice(at, at + additional.count)
@@ -221,12 +312,26 @@ def dense_normal(network, result):
 @pytest.mark.parametrize('scalar', [True, False])
 @pytest.mark.parametrize('shape', [dict(exposures=3, targets=30), dict(exposures=7, targets=20)])
 def test_covariances_with_additional_parameters_equal_the_dense_inverse(scalar, shape):
-    """Of all unknowns and of the projection, and the information of the additional parameters of each fluoroscope."""
+    """Of all unknowns and of the projection, and the information of the additional parameters of
+    each fluoroscope.
+    """
     network, truth = network_with_additional(scalar, **shape)
-    result = adjust(network, rigs.disturbed(truth).__class__(**{**vars(rigs.disturbed(truth)), 'additional': tuple(
-        np.zeros_like(a) for a in truth.additional)}), noise=Noise('student_t', 0.3, 8.0), noise_held=True)
+    result = adjust(
+        network,
+        rigs.disturbed(truth).__class__(
+            **{
+                **vars(rigs.disturbed(truth)),
+                'additional': tuple(np.zeros_like(a) for a in truth.additional),
+            }
+        ),
+        noise=Noise('student_t', 0.3, 8.0),
+        noise_held=True,
+    )
     assert result.converged
-    matrix = solved(network, normal_equations(network, result.parameters, np.zeros_like(network.uv), result.noise))
+    matrix = solved(
+        network,
+        normal_equations(network, result.parameters, np.zeros_like(network.uv), result.noise),
+    )
     blocks = covariance_blocks(network, matrix)
     normal, u, a = dense_normal(network, result)
     inverse = np.linalg.inv(normal)
@@ -234,12 +339,21 @@ def test_covariances_with_additional_parameters_equal_the_dense_inverse(scalar, 
     np.testing.assert_allclose(blocks.gg[6:, 6:], inverse[u:, u:], rtol=2e-4, atol=1e-6)
     for f in range(2):
         own = slice(u + f * count, u + (f + 1) * count)
-        np.testing.assert_allclose(np.linalg.inv(information_of_additional(network, matrix, f)), inverse[own, own],
-                                   rtol=2e-4, atol=1e-6)
-    projected = (a @ inverse @ a.T).reshape(len(network.uv), 2, -1, 2)[np.arange(len(network.uv)), :,
-                                                                       np.arange(len(network.uv))]
-    np.testing.assert_allclose(covariance_of_projection(network, result.parameters, blocks), projected, rtol=2e-3,
-                               atol=1e-6)
+        np.testing.assert_allclose(
+            np.linalg.inv(information_of_additional(network, matrix, f)),
+            inverse[own, own],
+            rtol=2e-4,
+            atol=1e-6,
+        )
+    projected = (a @ inverse @ a.T).reshape(len(network.uv), 2, -1, 2)[
+        np.arange(len(network.uv)), :, np.arange(len(network.uv))
+    ]
+    np.testing.assert_allclose(
+        covariance_of_projection(network, result.parameters, blocks),
+        projected,
+        rtol=2e-3,
+        atol=1e-6,
+    )
     precise = precision(network, result)
     assert [len(c) for c in precise.additional] == [count, count]
 
@@ -247,10 +361,14 @@ def test_covariances_with_additional_parameters_equal_the_dense_inverse(scalar, 
 @pytest.mark.parametrize('points', [True, False])
 def test_both_eliminations_agree_with_additional_parameters(monkeypatch, points):
     network, truth = network_with_additional(True, exposures=4, targets=25)
-    expected = adjust(network, truth, noise=Noise('student_t', 0.3, 8.0), noise_held=True, tolerance=1e-12)
+    expected = adjust(
+        network, truth, noise=Noise('student_t', 0.3, 8.0), noise_held=True, tolerance=1e-12
+    )
     for module in (adjustment_module, normal_module, precision_module):
         monkeypatch.setattr(module, 'eliminates_points', lambda network: points)
-    found = adjust(network, truth, noise=Noise('student_t', 0.3, 8.0), noise_held=True, tolerance=1e-12)
+    found = adjust(
+        network, truth, noise=Noise('student_t', 0.3, 8.0), noise_held=True, tolerance=1e-12
+    )
     assert found.cost == pytest.approx(expected.cost, abs=1e-7)
     for one, other in zip(found.parameters.additional, expected.parameters.additional):
         np.testing.assert_allclose(one, other, atol=1e-4)
@@ -258,7 +376,9 @@ def test_both_eliminations_agree_with_additional_parameters(monkeypatch, points)
 
 def test_gradient_is_zero_at_the_solution_with_additional_parameters():
     network, truth = network_with_additional(True, exposures=4, targets=25)
-    result = adjust(network, truth, noise=Noise('student_t', 0.3, 8.0), noise_held=True, tolerance=1e-12)
+    result = adjust(
+        network, truth, noise=Noise('student_t', 0.3, 8.0), noise_held=True, tolerance=1e-12
+    )
 
     def cost(f, move):
         moved = list(result.parameters.additional)
@@ -275,6 +395,7 @@ def test_gradient_is_zero_at_the_solution_with_additional_parameters():
 
 # ---- models of whole calibrations
 
+
 def rig_with(field, seed=1):
     """The virtual rig with another distortion in fluoroscope a."""
     rig = virtual_rig(seed)
@@ -284,28 +405,41 @@ def rig_with(field, seed=1):
 
 def whole(rig, model, count=10, seed=1):
     """SelfCalibration as a whole of fluoroscope a and the state of its model."""
-    measured = measured_network({'a': simulate_exposures(rig, count, seed).frames['a']}, rig.phantom)
-    before, _ = adjusted_with_precision(measured.network, measured.start, np.zeros_like(measured.network.uv),
-                                        start_noise('student_t'))
-    return _adjust_as_a_whole(measured, before, Options(model), None, None)
+    measured = measured_network(
+        {'a': simulate_exposures(rig, count, seed).frames['a']}, rig.phantom
+    )
+    before, _ = adjusted_with_precision(
+        measured.network,
+        measured.start,
+        np.zeros_like(measured.network.uv),
+        start_noise('student_t'),
+    )
+    return _adjust_as_a_whole(measured, before, CalibrationOptions(model), None, None)
 
 
 @pytest.mark.long
 def test_stepwise_takes_the_terms_that_are_there():
-    """Pincushion and spiral alone: radial and spiral are found, and next to nothing else; nothing where nothing is."""
+    """Pincushion and spiral alone: radial and spiral are found, and next to nothing else; nothing
+    where nothing is.
+    """
+
     def smooth(field):
         return DistortionField(np.array([511.5, 511.5]), 9.5, np.zeros(2), 2.0, np.zeros((0, 5)))
 
     _, state = whole(rig_with(smooth), 'parametric')
     names = {name for name, there in zip(state.names, state.chosen[0]) if there}
     assert {'radial 1', 'spiral 1'} <= names and len(names) <= 4
-    _, state = whole(rig_with(lambda field: replace(smooth(field), pincushion=0.0, spiral=0.0)), 'parametric')
+    _, state = whole(
+        rig_with(lambda field: replace(smooth(field), pincushion=0.0, spiral=0.0)), 'parametric'
+    )
     assert state.chosen[0].sum() <= 1
 
 
 @pytest.mark.long
 def test_auto_takes_collocation_unless_held_out_exposures_speak_against_it():
-    """Steps of the distortion in small squares are no smooth signal: their neighbours tell them better."""
+    """Steps of the distortion in small squares are no smooth signal: their neighbours tell them
+    better.
+    """
     run, state = whole(virtual_rig(1), 'collocation', 15)
     assert better_kind(run, state) is None
     squares = np.floor(run.measured.network.uv / 80).sum(axis=1) % 2
@@ -317,31 +451,48 @@ def test_auto_takes_collocation_unless_held_out_exposures_speak_against_it():
 @pytest.mark.long
 @pytest.mark.parametrize('model, most', [('auto', 1.1), ('hybrid', 1.15), ('parametric', 1.8)])
 def test_out_of_sample_error_is_near_that_of_known_distortion(model, most):
-    """40 exposures that the calibration has not seen; 3-D error of the object points over that of known distortion."""
+    """40 exposures that the calibration has not seen; 3-D error of the object points over that of
+    known distortion.
+    """
     rig = rigs.rig()
-    test = simulate_exposures(rig, 40, 10 ** 6, first_number=1001)
+    test = simulate_exposures(rig, 40, 10**6, first_number=1001)
     train = simulate_exposures(rig, 15, 1)
 
     def error(frames, tested, options):
-        job = adjust_with({'a': tested}, rig.phantom, calibrate({'a': frames}, rig.phantom, options).calibrations)
-        return np.sqrt(np.mean(np.sum((job.targets.xyz_mm - rig.true_mm[job.targets.target_id - 1]) ** 2, axis=1)))
+        job = adjust_with(
+            {'a': tested}, rig.phantom, calibrate({'a': frames}, rig.phantom, options).calibrations
+        )
+        return np.sqrt(
+            np.mean(
+                np.sum((job.targets.xyz_mm - rig.true_mm[job.targets.target_id - 1]) ** 2, axis=1)
+            )
+        )
 
     def undistorted(exposures):
-        return [replace(f, uv=uv) for f, uv in zip(exposures.frames['a'], exposures.undistorted['a'])]
+        return [
+            replace(f, uv=uv) for f, uv in zip(exposures.frames['a'], exposures.undistorted['a'])
+        ]
 
-    known = error(undistorted(train), undistorted(test), Options('none'))
-    assert error(train.frames['a'], test.frames['a'], Options(model)) < most * known
+    known = error(undistorted(train), undistorted(test), CalibrationOptions('none'))
+    assert error(train.frames['a'], test.frames['a'], CalibrationOptions(model)) < most * known
 
 
 # ---- smaller versions of the long runs
 
+
 @pytest.mark.long
 def test_precision_is_honest():
-    """Some calibrations of `make precision`: object points 0.9 to 1.1, intervals of the correction near 95 %."""
+    """Some calibrations of `make precision`: object points 0.9 to 1.1, intervals of the correction
+    near 95 %.
+    """
     from benchmarks.precision import normalised
+
     results = [normalised(seed, exposures=10) for seed in range(4)]
     assert 0.9 < np.mean([r['object points'] for r in results]) < 1.1
-    assert 0.3 < np.mean([r['T'] for r in results]) < 2.5 and 0.3 < np.mean([r['q'] for r in results]) < 2.5
+    assert (
+        0.3 < np.mean([r['T'] for r in results]) < 2.5
+        and 0.3 < np.mean([r['q'] for r in results]) < 2.5
+    )
     assert 0.9 < np.mean([r['interval'] for r in results]) < 0.99
     assert np.mean([r['sigma0'] for r in results]) == pytest.approx(0.25, rel=0.05)
 
@@ -351,5 +502,6 @@ def test_precision_is_honest():
 def test_random_rigs_converge_to_the_right_answer(seed):
     """Some cases of `make convergence`."""
     from benchmarks.convergence import outcome
+
     result = outcome(seed)
     assert result['end'] == 'converged' and not result['wrong']

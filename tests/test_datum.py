@@ -4,22 +4,25 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rigs
+from test_relative import disturbed, rigid_network
 from threadpoolctl import threadpool_limits
 
-import rigs
 from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
-from fluoro_calib_ros.photogrammetry import normal as normal_module
+from fluoro_calib_ros.photogrammetry import normal_equations as normal_module
 from fluoro_calib_ros.photogrammetry import precision as precision_module
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.datum import directions
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
 from fluoro_calib_ros.photogrammetry.precision import precision
-from fluoro_calib_ros.photogrammetry.relative import Relative
+from fluoro_calib_ros.photogrammetry.relative_orientation import Relative
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
-from test_relative import disturbed, rigid_network
 
-SHAPES = [dict(exposures=5, targets=30), dict(exposures=14, targets=20)]   # points, exposures eliminated
+SHAPES = [
+    dict(exposures=5, targets=30),
+    dict(exposures=14, targets=20),
+]  # points, exposures eliminated
 
 
 @pytest.fixture(autouse=True)
@@ -40,17 +43,21 @@ def dense_free(network, result, factor=1.0):
     weight = factor * result.noise.weight(result.q) / (result.noise.scale * network.sigma) ** 2
     _, m, n, _ = network.shape
     b = np.zeros((7, a.shape[1]))
-    b[:, 6 * m:6 * m + 3 * n] = directions(network.survey_mm, network.survey_mm.mean(axis=0)).reshape(-1, 7).T
+    b[:, 6 * m : 6 * m + 3 * n] = (
+        directions(network.survey_mm, network.survey_mm.mean(axis=0)).reshape(-1, 7).T
+    )
     return a.T @ (np.repeat(weight, 2)[:, None] * a), b
 
 
 def bordered_inverse(normal, b):
-    """Inverse of the bordered matrix [N B; B^T 0], whose first block is the covariance (Granshaw 1980)."""
+    """Inverse of the bordered matrix [N B; B^T 0], whose first block is the covariance (Granshaw
+    1980).
+    """
     scale = np.sqrt(np.diagonal(normal))
     b = b / scale
     b = b / np.linalg.norm(b, axis=1, keepdims=True)
     matrix = np.block([[normal / np.outer(scale, scale), b.T], [b, np.zeros((7, 7))]])
-    return np.linalg.inv(matrix)[:len(normal), :len(normal)] / np.outer(scale, scale)
+    return np.linalg.inv(matrix)[: len(normal), : len(normal)] / np.outer(scale, scale)
 
 
 @pytest.mark.parametrize('free', [True, False])
@@ -71,14 +78,18 @@ def test_solution_and_covariances_equal_those_of_a_bordered_dense_one(shape, los
     assert np.max(np.abs(step) / sd) < 1e-4, 'a bordered Newton step moves the solution'
     _, m, n, _ = network.shape
     off = (result.parameters.points_mm - network.survey_mm).ravel()
-    assert np.max(np.abs(b[:, 6 * m:6 * m + 3 * n] @ off)) < 1e-6   # sums of mm and of mm^2
+    assert np.max(np.abs(b[:, 6 * m : 6 * m + 3 * n] @ off)) < 1e-6  # sums of mm and of mm^2
 
     precise = precision(network, result)
     honest = covariance / result.noise.information_factor(result.q)
     for j in range(m):
         part = slice(6 * j, 6 * j + 6)
-        np.testing.assert_allclose(precise.exterior[j], honest[part, part], rtol=1e-5,
-                                   atol=1e-6 * np.max(np.abs(honest[part, part])))
+        np.testing.assert_allclose(
+            precise.exterior[j],
+            honest[part, part],
+            rtol=1e-5,
+            atol=1e-6 * np.max(np.abs(honest[part, part])),
+        )
     for i in range(n):
         part = slice(6 * m + 3 * i, 6 * m + 3 * i + 3)
         np.testing.assert_allclose(precise.points[i], honest[part, part], rtol=1e-5, atol=1e-9)
@@ -88,19 +99,24 @@ def test_solution_and_covariances_equal_those_of_a_bordered_dense_one(shape, los
     for row, own in enumerate(precise.residual):
         part = slice(2 * row, 2 * row + 2)
         np.testing.assert_allclose(own, residual[part, part], rtol=0, atol=1e-6 / weight[row])
-    assert precise.redundancy.sum() == pytest.approx(network.observations - network.unknowns, rel=1e-7)
+    assert precise.redundancy.sum() == pytest.approx(
+        network.observations - network.unknowns, rel=1e-7
+    )
 
 
 @pytest.mark.parametrize('shape', SHAPES)
 def test_residuals_and_interior_orientation_are_those_of_a_minimal_datum(shape):
-    """Two points and a coordinate of a third held by a survey of vanishing sd, the others free: seven numbers."""
+    """Two points and a coordinate of a third held by a survey of vanishing sd, the others free:
+    seven numbers.
+    """
     network, truth = free_network(**shape)
     noise = Noise('gaussian', 0.3)
     inner = adjust(network, rigs.disturbed(truth), noise=noise, noise_held=True, tolerance=1e-12)
-    dense_b, m = np.zeros((7, replace(network, datum='survey').unknowns)), network.shape[1]
-    for row, column in enumerate([0, 1, 2, 3, 4, 5]):   # the first exposure
+    dense_b = np.zeros((7, replace(network, datum='survey').unknowns))
+    m = network.shape[1]
+    for row, column in enumerate([0, 1, 2, 3, 4, 5]):  # the first exposure
         dense_b[row, column] = 1
-    dense_b[6, 6] = 1   # and a coordinate of the second source: the scale
+    dense_b[6, 6] = 1  # and a coordinate of the second source: the scale
     parameters = replace(truth)
     plain = replace(network, datum='survey')
     for _ in range(30):
@@ -114,7 +130,9 @@ def test_residuals_and_interior_orientation_are_those_of_a_minimal_datum(shape):
             break
     np.testing.assert_allclose(inner.residuals, r, atol=1e-5)
     np.testing.assert_allclose(inner.parameters.interior, parameters.interior, atol=1e-3)
-    np.testing.assert_allclose(precision(network, inner).interior[0], covariance[-3:, -3:], rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(
+        precision(network, inner).interior[0], covariance[-3:, -3:], rtol=1e-4, atol=1e-5
+    )
     assert m == network.shape[1]
 
 
@@ -123,12 +141,21 @@ def test_a_turned_shifted_and_scaled_start_does_not_matter():
     here = adjust(network, rigs.disturbed(truth))
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     turn *= np.sign(np.linalg.det(turn))
-    there = replace(truth, rotation=truth.rotation @ turn.T, position_mm=1.3 * truth.position_mm @ turn.T + 50,
-                    points_mm=1.3 * truth.points_mm @ turn.T + 50)
+    there = replace(
+        truth,
+        rotation=truth.rotation @ turn.T,
+        position_mm=1.3 * truth.position_mm @ turn.T + 50,
+        points_mm=1.3 * truth.points_mm @ turn.T + 50,
+    )
     other = adjust(network, there)
     np.testing.assert_allclose(here.parameters.points_mm, other.parameters.points_mm, atol=1e-4)
     np.testing.assert_allclose(here.residuals, other.residuals, atol=1e-4)
-    assert np.max(rotation_angle(here.parameters.rotation @ other.parameters.rotation.transpose(0, 2, 1))) < 1e-6
+    assert (
+        np.max(
+            rotation_angle(here.parameters.rotation @ other.parameters.rotation.transpose(0, 2, 1))
+        )
+        < 1e-6
+    )
 
 
 @pytest.mark.parametrize('shape', SHAPES)
@@ -151,8 +178,17 @@ def test_both_eliminations_give_the_same(monkeypatch, shape, constrained):
         found.append((result, precise))
     (one, one_precise), (other, other_precise) = found
     np.testing.assert_allclose(one.parameters.points_mm, other.parameters.points_mm, atol=1e-5)
-    for name in ('interior', 'exterior', 'points', 'residual', 'redundancy', 'all_global', 'exterior_global'):
-        a, b = getattr(one_precise, name), getattr(other_precise, name)
+    for name in (
+        'interior',
+        'exterior',
+        'points',
+        'residual',
+        'redundancy',
+        'all_global',
+        'exterior_global',
+    ):
+        a = getattr(one_precise, name)
+        b = getattr(other_precise, name)
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.max(np.abs(b)), err_msg=name)
 
 
@@ -160,28 +196,46 @@ def test_a_wrong_survey_leaves_the_shape_of_a_free_network_alone():
     network, truth = free_network(**SHAPES[0])
     survey = network.survey_mm.copy()
     survey[3] += [2.0, 0.0, 0.0]
-    right, wrong = adjust(network, truth), adjust(replace(network, survey_mm=survey), truth)
+    right = adjust(network, truth)
+    wrong = adjust(replace(network, survey_mm=survey), truth)
     np.testing.assert_allclose(right.residuals, wrong.residuals, atol=1e-4)
-    assert right.parameters.interior[0, 2] == pytest.approx(wrong.parameters.interior[0, 2], abs=1e-3)
+    assert right.parameters.interior[0, 2] == pytest.approx(
+        wrong.parameters.interior[0, 2], abs=1e-3
+    )
 
 
 @pytest.mark.parametrize('shape', SHAPES)
 def test_a_weighted_interior_orientation_is_a_pseudo_observation(shape):
     """Solution and covariances are those of the dense normal matrix with its weights added."""
     network, truth = rigs.small_network(**shape)
-    mean, sd = truth.interior + [[3.0, -2.0, 30.0]], np.array([[1.0, 2.0, 15.0]])
+    mean = truth.interior + [[3.0, -2.0, 30.0]]
+    sd = np.array([[1.0, 2.0, 15.0]])
     weighted = replace(network, interior_mean=mean, interior_sd=sd)
-    result = adjust(weighted, rigs.disturbed(truth), noise=Noise('gaussian', 0.3), noise_held=True, tolerance=1e-12)
+    result = adjust(
+        weighted,
+        rigs.disturbed(truth),
+        noise=Noise('gaussian', 0.3),
+        noise_held=True,
+        tolerance=1e-12,
+    )
     normal = rigs.dense_normal_matrix(network, result)
     normal[-3:, -3:] += np.diag(sd[0] ** -2.0)
-    np.testing.assert_allclose(precision(weighted, result).interior[0], np.linalg.inv(normal)[-3:, -3:], rtol=1e-6)
+    np.testing.assert_allclose(
+        precision(weighted, result).interior[0], np.linalg.inv(normal)[-3:, -3:], rtol=1e-6
+    )
     a = rigs.design_matrix(network, result.parameters)
     gradient = a.T @ (np.repeat((0.3 * network.sigma) ** -2.0, 2) * result.residuals.ravel())
     _, m, n, _ = network.shape
-    gradient[6 * m:6 * m + 3 * n] += ((network.survey_mm - result.parameters.points_mm)
-                                      / network.survey_sd_mm[:, None] ** 2).ravel()
-    gradient[-3:] += ((mean - result.parameters.interior) / sd ** 2)[0]
-    assert np.max(np.abs(np.linalg.solve(normal, gradient)) / np.sqrt(np.diagonal(np.linalg.inv(normal)))) < 1e-5
+    gradient[6 * m : 6 * m + 3 * n] += (
+        (network.survey_mm - result.parameters.points_mm) / network.survey_sd_mm[:, None] ** 2
+    ).ravel()
+    gradient[-3:] += ((mean - result.parameters.interior) / sd**2)[0]
+    assert (
+        np.max(
+            np.abs(np.linalg.solve(normal, gradient)) / np.sqrt(np.diagonal(np.linalg.inv(normal)))
+        )
+        < 1e-5
+    )
 
 
 def test_weights_of_the_interior_orientation_lie_between_held_and_estimated():

@@ -4,22 +4,30 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rigs
+from test_relative import dense, disturbed, rigid_network
 from threadpoolctl import threadpool_limits
 
-import rigs
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.network import measured_network
-from fluoro_calib_ros.calibration.self_calibration import Options, self_calibrate
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.initial_network import measured_network
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.self_calibration import self_calibrate
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.collinearity import project
-from fluoro_calib_ros.photogrammetry.diagnosis import (high_correlations, open_directions, reduced_normal_matrix,
-                                                       sentence_of, undetermined)
+from fluoro_calib_ros.photogrammetry.diagnosis import (
+    high_correlations,
+    open_directions,
+    reduced_normal_matrix,
+    sentence_of,
+    undetermined,
+)
 from fluoro_calib_ros.photogrammetry.noise import Noise
-from fluoro_calib_ros.photogrammetry.observations import DataError, Frame, Phantom
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.rig import looking_at_origin, simulate_exposures, virtual_rig
-from test_relative import dense, disturbed, rigid_network
 
 SOURCE = np.array([0.0, -1500.0, 0.0])
 INTERIOR = np.array([511.5, 511.5, 4000.0])
@@ -32,11 +40,20 @@ def one_thread():
 
 
 def frames_of_poses(poses, points, noise_px=0.25, seed=0):
-    """Frames and the Phantom of points (n, 3) [mm] in poses (rotation, shift), the axis of the image along y."""
-    rng, look, frames = np.random.default_rng(seed), looking_at_origin(SOURCE), []
+    """Frames and the Phantom of points (n, 3) [mm] in poses (rotation, shift), the axis of the
+    image along y.
+    """
+    rng = np.random.default_rng(seed)
+    look = looking_at_origin(SOURCE)
+    frames = []
     for j, (rotation, shift) in enumerate(poses):
         n = len(points)
-        uv = project(np.tile(look, (n, 1, 1)), np.tile(SOURCE, (n, 1)), points @ rotation.T + shift, INTERIOR)
+        uv = project(
+            np.tile(look, (n, 1, 1)),
+            np.tile(SOURCE, (n, 1)),
+            points @ rotation.T + shift,
+            INTERIOR,
+        )
         uv = uv + rng.normal(0, noise_px, uv.shape)
         keep = ((uv > 0) & (uv < 1023)).all(axis=1)
         frames.append(Frame('a', j + 1, np.flatnonzero(keep) + 1, uv[keep], (1024, 1024)))
@@ -50,14 +67,18 @@ def beads(depth_mm, count=120, seed=1):
 
 def moved_across(count=6):
     """Poses that are turned about the axis of the image and shifted across it, never tilted."""
-    return [(matrix_from_vector([0, 0.9 * j, 0]), np.array([20.0 * (j % 3 - 1), 0, 15.0 * (j % 2)]))
-            for j in range(count)]
+    return [
+        (matrix_from_vector([0, 0.9 * j, 0]), np.array([20.0 * (j % 3 - 1), 0, 15.0 * (j % 2)]))
+        for j in range(count)
+    ]
 
 
 def tilted(count=6):
     """Poses that are tilted by half a radian as well."""
-    return [(matrix_from_vector([0.5 * np.cos(1.1 * j), 0, 0.5 * np.sin(1.1 * j)]) @ rotation, shift)
-            for j, (rotation, shift) in enumerate(moved_across(count))]
+    return [
+        (matrix_from_vector([0.5 * np.cos(1.1 * j), 0, 0.5 * np.sin(1.1 * j)]) @ rotation, shift)
+        for j, (rotation, shift) in enumerate(moved_across(count))
+    ]
 
 
 @pytest.mark.parametrize('seed', [1, 2, 3])
@@ -66,42 +87,67 @@ def test_no_false_alarm_on_the_virtual_rig(count, seed):
     rig = virtual_rig(seed)
     for name, frames in simulate_exposures(rig, count, seed).frames.items():
         measured = measured_network({name: frames}, rig.phantom)
-        self_calibrate(measured, Options(model='none'))
+        self_calibrate(measured, CalibrationOptions(model='none'))
 
 
 def test_poses_parallel_to_the_image_do_not_separate_c_and_the_distance():
     frames, phantom = frames_of_poses(moved_across(), beads(8.0))
-    with pytest.raises(DataError, match='fluoroscope a: principal distance and distance to the phantom cannot be sep.*'
-                                        'nearly in one plane.*tilted'):
-        calibrate({'a': frames}, phantom, Options(model='none'), principal_distance=4000.0)
+    with pytest.raises(
+        DataError,
+        match='fluoroscope a: principal distance and distance to the phantom cannot be sep.*'
+        'nearly in one plane.*tilted',
+    ):
+        calibrate(
+            {'a': frames}, phantom, CalibrationOptions(model='none'), principal_distance=4000.0
+        )
 
 
 def test_the_same_phantom_tilted_does():
     frames, phantom = frames_of_poses(tilted(), beads(8.0))
-    job = calibrate({'a': frames}, phantom, Options(model='none'), principal_distance=4000.0)
-    assert job.fluoroscopes['a'].interior[2] == pytest.approx(4000, abs=5 * job.fluoroscopes['a'].interior_sd[2])
+    job = calibrate(
+        {'a': frames}, phantom, CalibrationOptions(model='none'), principal_distance=4000.0
+    )
+    assert job.fluoroscopes['a'].interior[2] == pytest.approx(
+        4000, abs=5 * job.fluoroscopes['a'].interior_sd[2]
+    )
 
 
 def test_a_held_interior_orientation_needs_no_tilt():
     frames, phantom = frames_of_poses(moved_across(), beads(8.0))
-    calibrate({'a': frames}, phantom, Options(model='none', interior='fixed'), principal_distance=4000.0)
+    calibrate(
+        {'a': frames},
+        phantom,
+        CalibrationOptions(model='none', interior='fixed'),
+        principal_distance=4000.0,
+    )
 
 
 def test_beads_in_a_plane_are_named():
     frames, phantom = frames_of_poses(tilted(), beads(0.01))
     with pytest.raises(DataError, match='one plane'):
-        calibrate({'a': frames}, phantom, Options(model='none'), principal_distance=4000.0)
+        calibrate(
+            {'a': frames}, phantom, CalibrationOptions(model='none'), principal_distance=4000.0
+        )
 
 
 def test_an_exposure_of_two_targets_is_named():
     network, truth = rigs.small_network(exposures=4, targets=30, seen=1.0)
     keep = (network.exposure != 1) | (network.point < 2)
-    network = replace(network, uv=network.uv[keep], sigma=network.sigma[keep], exposure=network.exposure[keep],
-                      point=network.point[keep])
+    network = replace(
+        network,
+        uv=network.uv[keep],
+        sigma=network.sigma[keep],
+        exposure=network.exposure[keep],
+        point=network.point[keep],
+    )
     found = open_directions(network, truth, ('a',), [11, 12, 13, 14])
-    assert len(found) == 2 and all(name.startswith('exposure 12 of a') for names in found for name in names)
+    assert len(found) == 2 and all(
+        name.startswith('exposure 12 of a') for names in found for name in names
+    )
     assert sentence_of(found) == 'the orientation of exposure 12 of a is left open'
-    assert not open_directions(rigs.small_network()[0], rigs.small_network()[1], ('a',), [1, 2, 3, 4])
+    assert not open_directions(
+        rigs.small_network()[0], rigs.small_network()[1], ('a',), [1, 2, 3, 4]
+    )
 
 
 def test_the_datum_of_a_free_network_is_not_called_open():
@@ -111,25 +157,37 @@ def test_the_datum_of_a_free_network_is_not_called_open():
 
 def test_the_reduced_normal_matrix_is_the_schur_complement_of_the_dense_one():
     network, truth = rigid_network(4, 30)
-    result = adjust(network, disturbed(truth), noise=Noise('gaussian', 1 / np.median(network.sigma)), noise_held=True)
+    result = adjust(
+        network,
+        disturbed(truth),
+        noise=Noise('gaussian', 1 / np.median(network.sigma)),
+        noise_held=True,
+    )
     full = dense(network, result)[0]
     _, m, n, _ = network.shape
-    points, rest = np.arange(6 * m, 6 * m + 3 * n), np.r_[0:6 * m, 6 * m + 3 * n:len(full)]
+    points = np.arange(6 * m, 6 * m + 3 * n)
+    rest = np.r_[0 : 6 * m, 6 * m + 3 * n : len(full)]
     schur = full[np.ix_(rest, rest)] - full[np.ix_(rest, points)] @ np.linalg.solve(
-        full[np.ix_(points, points)], full[np.ix_(points, rest)])
+        full[np.ix_(points, points)], full[np.ix_(points, rest)]
+    )
     turn = np.eye(len(rest))
     for j, rotation in enumerate(result.parameters.rotation):
-        turn[6 * j:6 * j + 3, 6 * j:6 * j + 3] = rotation
+        turn[6 * j : 6 * j + 3, 6 * j : 6 * j + 3] = rotation
     scale = np.sqrt(np.diagonal(schur))
-    np.testing.assert_allclose(reduced_normal_matrix(network, result.parameters) / np.outer(scale, scale),
-                               turn @ schur @ turn.T / np.outer(scale, scale), atol=1e-5)
+    np.testing.assert_allclose(
+        reduced_normal_matrix(network, result.parameters) / np.outer(scale, scale),
+        turn @ schur @ turn.T / np.outer(scale, scale),
+        atol=1e-5,
+    )
 
 
 def test_correlations_are_those_of_the_dense_inverse():
     network, truth = rigid_network(5, 40)
     result = adjust(network, disturbed(truth), noise=Noise('gaussian'))
     numbers = [1, 2, 3, 4, 5] * 2
-    found = high_correlations(network, result.parameters, precision(network, result), ('a', 'b'), numbers)
+    found = high_correlations(
+        network, result.parameters, precision(network, result), ('a', 'b'), numbers
+    )
     assert found and len(found) <= 20
     assert all(abs(v) > 0.95 for _, _, v in found)
     assert list(found) == sorted(found, key=lambda c: -abs(c[2]))
@@ -137,26 +195,44 @@ def test_correlations_are_those_of_the_dense_inverse():
     _, m, n, _ = network.shape
     turn = np.eye(len(covariance))
     for j, rotation in enumerate(result.parameters.rotation):
-        turn[6 * j:6 * j + 3, 6 * j:6 * j + 3] = rotation
+        turn[6 * j : 6 * j + 3, 6 * j : 6 * j + 3] = rotation
     covariance = turn @ covariance @ turn.T
-    column = {f'{f}: {part}': 6 * m + 3 * n + 3 * i + k for i, f in enumerate('ab') for k, part in
-              enumerate(('xp', 'yp', 'c'))}
+    column = {
+        f'{f}: {part}': 6 * m + 3 * n + 3 * i + k
+        for i, f in enumerate('ab')
+        for k, part in enumerate(('xp', 'yp', 'c'))
+    }
     parts = ('X', 'Y', 'Z', 'rotation about x', 'rotation about y', 'rotation about z')
-    column |= {f'relative orientation of a and b: {part}': len(covariance) - 6 + k for k, part in enumerate(parts)}
-    column |= {f'exposure {numbers[j]} of {"ab"[network.fluoroscope[j]]}: {part}': 6 * j + k
-               for j in range(m) for k, part in enumerate(parts)}
+    column |= {
+        f'relative orientation of a and b: {part}': len(covariance) - 6 + k
+        for k, part in enumerate(parts)
+    }
+    column |= {
+        f'exposure {numbers[j]} of {"ab"[network.fluoroscope[j]]}: {part}': 6 * j + k
+        for j in range(m)
+        for k, part in enumerate(parts)
+    }
     for one, other, value in found:
-        i, j = column[one], column[other]
-        assert value == pytest.approx(covariance[i, j] / np.sqrt(covariance[i, i] * covariance[j, j]), abs=1e-5)
+        i = column[one]
+        j = column[other]
+        assert value == pytest.approx(
+            covariance[i, j] / np.sqrt(covariance[i, i] * covariance[j, j]), abs=1e-5
+        )
 
 
 def test_a_principal_point_that_is_left_open_is_named():
-    """Judged by the precision alone, at a noise of a pixel at most: what a bent image adds does not count."""
+    """Judged by the precision alone, at a noise of a pixel at most: what a bent image adds does
+    not count.
+    """
     network, truth = rigs.small_network()
     precise = precision(network, adjust(network, truth))
     assert not undetermined(network, truth, precise, ('a',), 0.3)
-    worse = replace(precise, interior=precise.interior + np.diag([300.0 ** 2, 0, 0]))
-    sentence, = undetermined(network, truth, worse, ('a',), 0.3)
-    assert sentence.startswith('fluoroscope a: the principal point cannot be separated from the position of the source')
+    worse = replace(precise, interior=precise.interior + np.diag([300.0**2, 0, 0]))
+    (sentence,) = undetermined(network, truth, worse, ('a',), 0.3)
+    assert sentence.startswith(
+        'fluoroscope a: the principal point cannot be separated from the position of the source'
+    )
     assert not undetermined(network, truth, worse, ('a',), 5.0)
-    assert not undetermined(replace(network, interior_free=np.array([False])), truth, worse, ('a',), 0.3)
+    assert not undetermined(
+        replace(network, interior_free=np.array([False])), truth, worse, ('a',), 0.3
+    )

@@ -4,15 +4,20 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rigs
 from scipy.spatial import ConvexHull, Delaunay
 from sklearn.model_selection import GridSearchCV, GroupKFold, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
-import rigs
+from fluoro_calib_ros.distortion.cross_validation import (
+    CrossValidation,
+    NearestTable,
+    candidate_k,
+    exposure_folds,
+)
 from fluoro_calib_ros.distortion.gauge import gauge_basis, gauge_coefficients
 from fluoro_calib_ros.distortion.models import CorrectionModel, no_correction
 from fluoro_calib_ros.distortion.regressor import Regressor
-from fluoro_calib_ros.distortion.selection import CrossValidation, NearestTable, candidate_k, exposure_folds
 from fluoro_calib_ros.distortion.smoothers import Neighbourhoods
 from fluoro_calib_ros.distortion.trend import DEGREE, Trend, least_squares_map
 from fluoro_calib_ros.photogrammetry.collinearity import project
@@ -30,13 +35,17 @@ def training(n=600, seed=0, noise=0.2):
 
 
 def pixels(n=2000, seed=1):
-    """Pixels of the image: anywhere, its four corners, its rim, and borders of cells of every size."""
+    """Pixels of the image: anywhere, its four corners, its rim, and borders of cells of every
+    size.
+    """
     rng = np.random.default_rng(seed)
     uv = rng.uniform(-0.5, np.array(SIZE) - 0.5, (n, 2))
-    uv[:n // 4] = np.clip(np.round(uv[:n // 4] / 8) * 8 - 0.5, -0.5, np.array(SIZE) - 0.5)
-    uv[n // 4:n // 3, 0] = -0.5
-    uv[n // 3:n // 2, 1] = SIZE[1] - 0.5
-    corners = np.array([[-0.5, -0.5], [SIZE[0] - 0.5, -0.5], [-0.5, SIZE[1] - 0.5], np.array(SIZE) - 0.5])
+    uv[: n // 4] = np.clip(np.round(uv[: n // 4] / 8) * 8 - 0.5, -0.5, np.array(SIZE) - 0.5)
+    uv[n // 4 : n // 3, 0] = -0.5
+    uv[n // 3 : n // 2, 1] = SIZE[1] - 0.5
+    corners = np.array(
+        [[-0.5, -0.5], [SIZE[0] - 0.5, -0.5], [-0.5, SIZE[1] - 0.5], np.array(SIZE) - 0.5]
+    )
     return np.concatenate([uv, corners])
 
 
@@ -48,12 +57,15 @@ def random_information(rng, n):
 
 # ---- models
 
+
 @pytest.mark.parametrize('k', [1, 2, 7, 40])
 def test_knn_equals_scikit_learn(k):
     uv, duv = training()
     query = pixels()
     theirs = KNeighborsRegressor(k).fit(uv, duv).predict(query)
-    np.testing.assert_allclose(CorrectionModel('knn', k, uv, duv).predict(query), theirs, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(
+        CorrectionModel('knn', k, uv, duv).predict(query), theirs, rtol=0, atol=1e-12
+    )
 
 
 @pytest.mark.parametrize('k', [6, 20, 150])
@@ -78,10 +90,10 @@ def test_local_linear_equals_a_weighted_least_squares_plane_for_each_pixel(k):
         a = np.column_stack([np.ones(k), (uv[near] - q) / distance[near[-1]]])
         at_query = np.linalg.pinv(weight[:, None] * a)[0] * weight
         expected[row] += at_query @ left[near]
-        norms2[row] = np.sum(at_query ** 2)
+        norms2[row] = np.sum(at_query**2)
     model = CorrectionModel('local_linear', k, uv, duv, noise_px=2.0)
     # The ridge that keeps collinear neighbours harmless is a millionth of the weights.
-    wide = k > 6   # five points determine a plane, and sometimes badly
+    wide = k > 6  # five points determine a plane, and sometimes badly
     error = np.abs(model.predict(query) - expected).max(axis=1)
     assert (np.max(error) if wide else np.quantile(error, 0.9)) < 1e-3
     if wide:
@@ -90,7 +102,9 @@ def test_local_linear_equals_a_weighted_least_squares_plane_for_each_pixel(k):
 
 @pytest.mark.parametrize('k', [6, 30, 200])
 def test_local_planes_reproduce_planes_also_beyond_the_rim(k):
-    """Without the trend: the smoother's own weights sum to one and have no first moment about the pixel."""
+    """Without the trend: the smoother's own weights sum to one and have no first moment about the
+    pixel.
+    """
     uv, _ = training()
     query = np.concatenate([pixels(100), [[-40.0, -40.0], [700.0, 500.0]]])
     order = np.argsort(np.linalg.norm(uv[None] - query[:, None], axis=2), axis=1)[:, :k]
@@ -111,7 +125,9 @@ def test_local_linear_reproduces_cubic_polynomials():
 
     def field(at):
         x, y = (at.T - 200) / 300
-        return np.stack([x ** i * y ** j for i in range(4) for j in range(4 - i)], axis=1) @ coefficients
+        return (
+            np.stack([x**i * y**j for i in range(4) for j in range(4 - i)], axis=1) @ coefficients
+        )
 
     query = np.concatenate([pixels(300), [[-60.0, -60.0], [760.0, 520.0]]])
     for k in (6, 25, 300):
@@ -130,8 +146,12 @@ def test_local_linear_beats_the_mean_at_the_rim():
     """Without noise: the mean of neighbours that lie to one side is off, the plane is not."""
     uv, duv = training(noise=0)
     corner = np.array([[0.0, 0.0], [639.0, 479.0], [0.0, 479.0], [639.0, 0.0]])
-    error = {kind: np.abs(CorrectionModel(kind, 20, uv, duv).predict(corner) - 5 * np.sin(corner / 90)).mean()
-             for kind in ('knn', 'local_linear')}
+    error = {
+        kind: np.abs(
+            CorrectionModel(kind, 20, uv, duv).predict(corner) - 5 * np.sin(corner / 90)
+        ).mean()
+        for kind in ('knn', 'local_linear')
+    }
     assert error['local_linear'] < 0.25 * error['knn']
 
 
@@ -140,16 +160,31 @@ def test_no_correction_corrects_nothing_and_knows_no_outside():
     assert not found.duv.any() and not found.sd.any() and not found.outside.any()
 
 
-@pytest.mark.parametrize('arguments, said', [
-    (('spline', 5, np.zeros((9, 2)), np.zeros((9, 2))),
-     "one of none, knn, local_linear, parametric, hybrid, collocation, not 'spline'"),
-    (('knn', 10, np.zeros((9, 2)), np.zeros((9, 2))), 'knn with k = 10 cannot be had from 9 training points'),
-    (('knn', 0, np.zeros((9, 2)), np.zeros((9, 2))), 'knn with k = 0 cannot be had'),
-    (('local_linear', 5, np.zeros((9, 2)), np.zeros((9, 2))), 'local_linear with k = 5 cannot be had'),
-    (('knn', 1, np.zeros((0, 2)), np.zeros((0, 2))), 'k = 1 cannot be had from 0 training points'),
-    (('knn', 2, np.zeros((9, 2)), np.zeros((8, 2))), '9 training points, but 8 corrections'),
-    (('knn', 2, np.full((9, 2), np.nan), np.zeros((9, 2))), 'is not a number'),
-    (('knn', 2, np.zeros((9, 2)), np.full((9, 2), np.inf)), 'is not a number')])
+@pytest.mark.parametrize(
+    'arguments, said',
+    [
+        (
+            ('spline', 5, np.zeros((9, 2)), np.zeros((9, 2))),
+            "one of none, knn, local_linear, parametric, hybrid, collocation, not 'spline'",
+        ),
+        (
+            ('knn', 10, np.zeros((9, 2)), np.zeros((9, 2))),
+            'knn with k = 10 cannot be had from 9 training points',
+        ),
+        (('knn', 0, np.zeros((9, 2)), np.zeros((9, 2))), 'knn with k = 0 cannot be had'),
+        (
+            ('local_linear', 5, np.zeros((9, 2)), np.zeros((9, 2))),
+            'local_linear with k = 5 cannot be had',
+        ),
+        (
+            ('knn', 1, np.zeros((0, 2)), np.zeros((0, 2))),
+            'k = 1 cannot be had from 0 training points',
+        ),
+        (('knn', 2, np.zeros((9, 2)), np.zeros((8, 2))), '9 training points, but 8 corrections'),
+        (('knn', 2, np.full((9, 2), np.nan), np.zeros((9, 2))), 'is not a number'),
+        (('knn', 2, np.zeros((9, 2)), np.full((9, 2), np.inf)), 'is not a number'),
+    ],
+)
 def test_a_model_that_cannot_be_had_is_refused(arguments, said):
     with pytest.raises(ValueError, match=said):
         CorrectionModel(*arguments)
@@ -177,12 +212,18 @@ def test_training_points_on_a_line_enclose_nothing():
 
 @pytest.mark.parametrize('kind, k', [('knn', 9), ('local_linear', 40)])
 def test_standard_deviations_against_monte_carlo(kind, k):
-    """600 times new noise in the training values: predictions scatter as sd says; bias_px comes on top."""
+    """600 times new noise in the training values: predictions scatter as sd says; bias_px comes on
+    top.
+    """
     uv, duv = training(noise=0)
     query = np.random.default_rng(5).uniform([60, 60], [580, 420], (40, 2))
     rng = np.random.default_rng(6)
-    found = np.array([CorrectionModel(kind, k, uv, duv + rng.normal(0, 0.3, duv.shape)).predict(query)
-                      for _ in range(300)])
+    found = np.array(
+        [
+            CorrectionModel(kind, k, uv, duv + rng.normal(0, 0.3, duv.shape)).predict(query)
+            for _ in range(300)
+        ]
+    )
     scatter = np.sqrt(found.var(axis=0).mean(axis=1))
     sd = CorrectionModel(kind, k, uv, duv, noise_px=0.3).evaluate(query).sd
     assert np.mean(scatter / sd) == pytest.approx(1, abs=0.03)
@@ -193,6 +234,7 @@ def test_standard_deviations_against_monte_carlo(kind, k):
 
 # ---- choice of k
 
+
 @pytest.mark.parametrize('weighted', [False, True])
 def test_scores_of_knn_equal_a_loop_with_scikit_learn(weighted):
     """G for every k with folds of whole exposures, errors weighted by C_r^-1."""
@@ -200,13 +242,16 @@ def test_scores_of_knn_equal_a_loop_with_scikit_learn(weighted):
     rng = np.random.default_rng(9)
     information = random_information(rng, 300) if weighted else np.tile(np.eye(2), (300, 1, 1))
     exposure = np.sort(rng.integers(0, 12, 300))
-    fold, candidates = exposure_folds(exposure, 5), np.arange(1, 30)
+    fold = exposure_folds(exposure, 5)
+    candidates = np.arange(1, 30)
     scores = CrossValidation('knn', uv, fold, candidates).scores(duv, information)
     for k, score in zip(candidates, scores):
         total = 0.0
         for f in range(5):
             out = fold == f
-            error = duv[out] - KNeighborsRegressor(int(k)).fit(uv[~out], duv[~out]).predict(uv[out])
+            error = duv[out] - KNeighborsRegressor(int(k)).fit(uv[~out], duv[~out]).predict(
+                uv[out]
+            )
             total += np.einsum('na,nab,nb', error, information[out], error)
         assert score == pytest.approx(total, rel=1e-10)
 
@@ -223,9 +268,16 @@ def test_k_of_knn_is_that_of_grid_search():
     def scorer(estimator, x, y):
         return -np.sum((y - estimator.predict(x)) ** 2)
 
-    search = GridSearchCV(KNeighborsRegressor(), {'n_neighbors': candidates}, cv=PredefinedSplit(fold), scoring=scorer)
+    search = GridSearchCV(
+        KNeighborsRegressor(),
+        {'n_neighbors': candidates},
+        cv=PredefinedSplit(fold),
+        scoring=scorer,
+    )
     search.fit(uv, duv)
-    scores = CrossValidation('knn', uv, fold, candidates).scores(duv, np.tile(np.eye(2), (300, 1, 1)))
+    scores = CrossValidation('knn', uv, fold, candidates).scores(
+        duv, np.tile(np.eye(2), (300, 1, 1))
+    )
     np.testing.assert_allclose(scores / 6, -search.cv_results_['mean_test_score'], rtol=1e-10)
     best = candidates[np.argmin(scores)]
     assert best == search.best_params_['n_neighbors'] and 1 < best < 40
@@ -235,19 +287,25 @@ def test_scores_of_local_linear_equal_a_loop_with_models():
     """The trend is that of the other folds too: nothing of a held-out exposure is used."""
     uv, duv = training(300)
     rng = np.random.default_rng(11)
-    information, fold = random_information(rng, 300), exposure_folds(np.repeat(np.arange(15), 20), 5)
+    information = random_information(rng, 300)
+    fold = exposure_folds(np.repeat(np.arange(15), 20), 5)
     candidates = [10, 24, 60]
     validation = CrossValidation('local_linear', uv, fold, candidates)
     held_out = np.empty((3, 300, 2))
     for f in range(5):
         out = fold == f
         for number, k in enumerate(candidates):
-            held_out[number, out] = CorrectionModel('local_linear', k, uv[~out], duv[~out]).predict(uv[out])
+            held_out[number, out] = CorrectionModel(
+                'local_linear', k, uv[~out], duv[~out]
+            ).predict(uv[out])
     np.testing.assert_allclose(validation.predictions(duv), held_out, rtol=0, atol=1e-8)
     np.testing.assert_allclose(validation.predictions_for(24, duv), held_out[1], rtol=0, atol=1e-8)
     error = duv - held_out
-    np.testing.assert_allclose(validation.scores(duv, information),
-                               np.einsum('kna,nab,knb->k', error, information, error), rtol=1e-8)
+    np.testing.assert_allclose(
+        validation.scores(duv, information),
+        np.einsum('kna,nab,knb->k', error, information, error),
+        rtol=1e-8,
+    )
 
 
 def test_folds_hold_whole_exposures():
@@ -269,39 +327,61 @@ def test_candidates_stay_within_what_the_training_points_allow():
     assert candidate_k('local_linear', 20).tolist() == [8]
     # A fold may leave fewer points than a candidate asks for: that one is not tried.
     uv, _ = training(30)
-    assert CrossValidation('knn', uv, np.arange(30) % 2, [5, 15, 16]).candidates.tolist() == [5, 15]
+    assert CrossValidation('knn', uv, np.arange(30) % 2, [5, 15, 16]).candidates.tolist() == [
+        5,
+        15,
+    ]
     with pytest.raises(ValueError, match='too few for a cross-validation'):
         CrossValidation('knn', uv, np.arange(30) % 2, [16])
 
 
 # ---- gauge
 
+
 def test_the_gauge_is_what_a_change_of_orientation_does_to_the_image():
-    """Changes of xp, yp, c and turns of the sensor that are common to all exposures, to first order."""
+    """Changes of xp, yp, c and turns of the sensor that are common to all exposures, to first
+    order.
+    """
     network, truth = rigs.small_network(exposures=5, targets=40)
     rotation, position, points, interior = truth.per_image_point(network)
     uv = project(rotation, position, points, interior)
     basis = gauge_basis(uv, truth.interior[0])
     assert np.linalg.matrix_rank(basis.reshape(-1, 6)) == 6
     x, y = (uv - truth.interior[0, :2]).T
-    changes = [project(rotation, position, points, interior + d) - uv for d in np.diag([0.1, 0.1, 0.5])]
-    changes += [project(matrix_from_vector(w) @ rotation, position, points, interior) - uv for w in np.eye(3) * 1e-6]
+    changes = [
+        project(rotation, position, points, interior + d) - uv for d in np.diag([0.1, 0.1, 0.5])
+    ]
+    changes += [
+        project(matrix_from_vector(w) @ rotation, position, points, interior) - uv
+        for w in np.eye(3) * 1e-6
+    ]
     for number, change in enumerate(changes):
         coefficients = gauge_coefficients(uv, change, truth.interior[0])
         left = change - basis @ coefficients
         assert np.max(np.abs(left)) < 1e-5 * np.max(np.abs(change)), number
     # And each change has its own part of it, as the docstring says.
-    wanted = [np.column_stack([np.ones_like(x), 0 * x]), np.column_stack([0 * x, np.ones_like(x)]),
-              np.column_stack([x, y]), np.column_stack([x * y, y * y]), np.column_stack([x * x, x * y]),
-              np.column_stack([-y, x])]
-    shifts = {3: 1, 4: 0}   # a turn about the rows moves the image down, one about the columns to the right
+    wanted = [
+        np.column_stack([np.ones_like(x), 0 * x]),
+        np.column_stack([0 * x, np.ones_like(x)]),
+        np.column_stack([x, y]),
+        np.column_stack([x * y, y * y]),
+        np.column_stack([x * x, x * y]),
+        np.column_stack([-y, x]),
+    ]
+    shifts = {
+        3: 1,
+        4: 0,
+    }  # a turn about the rows moves the image down, one about the columns to the right
     for number, (change, want) in enumerate(zip(changes, wanted)):
-        a = np.column_stack([want.ravel()] + ([wanted[shifts[number]].ravel()] if number in shifts else []))
+        a = np.column_stack(
+            [want.ravel()] + ([wanted[shifts[number]].ravel()] if number in shifts else [])
+        )
         left = change.ravel() - a @ np.linalg.lstsq(a, change.ravel(), rcond=None)[0]
         assert np.max(np.abs(left)) < 1e-5 * np.max(np.abs(change)), number
 
 
 # ---- the regression step
+
 
 def regressor_and_values(kind='local_linear', interior_held=False, k=None, n=600):
     uv, duv = training(n)
@@ -326,16 +406,24 @@ def test_the_regressor_smooths_as_its_model_predicts(kind):
     inside = regressor.inliers
     np.testing.assert_array_equal(inside, np.arange(600) % 30 != 0)
     plain = CorrectionModel(kind, regressor.k, regressor.uv[inside], values[inside])
-    np.testing.assert_allclose(regressor.smooth(values), plain.predict(regressor.uv), rtol=0, atol=1e-9)
-    np.testing.assert_allclose(regressor.model(values).predict(regressor.uv), plain.predict(regressor.uv), atol=1e-9)
+    np.testing.assert_allclose(
+        regressor.smooth(values), plain.predict(regressor.uv), rtol=0, atol=1e-9
+    )
+    np.testing.assert_allclose(
+        regressor.model(values).predict(regressor.uv), plain.predict(regressor.uv), atol=1e-9
+    )
     assert np.abs(regressor.smooth(values)).max() < 10
 
 
 def test_the_chosen_k_has_the_smallest_score():
     regressor, values = chosen('knn')
     inside = regressor.inliers
-    validation = CrossValidation('knn', regressor.uv[inside], exposure_folds(regressor.exposure[inside]),
-                                 candidate_k('knn', int(inside.sum())))
+    validation = CrossValidation(
+        'knn',
+        regressor.uv[inside],
+        exposure_folds(regressor.exposure[inside]),
+        candidate_k('knn', int(inside.sum())),
+    )
     scores = validation.scores(values[inside], np.tile(np.eye(2), (int(inside.sum()), 1, 1)))
     assert regressor.k == validation.candidates[np.argmin(scores)] and regressor.changed
     assert regressor.score == pytest.approx(scores.min(), rel=1e-12)
@@ -353,43 +441,62 @@ def test_a_change_is_told_and_inliers_do_not_flicker():
     q = np.where(np.arange(600) % 30 == 0, 2 * INLIER_Q, 1.0)
     regressor.choose(values, q, information)
     assert not regressor.changed
-    q[0], q[30] = 0.8 * INLIER_Q, 0.4 * INLIER_Q   # in doubt, and well inside
+    # in doubt, and well inside
+    q[0] = 0.8 * INLIER_Q
+    q[30] = 0.4 * INLIER_Q
     values[[0, 30]] -= 500
     regressor.choose(values, q, information)
     assert regressor.changed and not regressor.inliers[0] and regressor.inliers[30]
-    with pytest.raises(ValueError, match='^10 inliers are too few for the correction model, 60 are needed'):
+    with pytest.raises(
+        ValueError, match='^10 inliers are too few for the correction model, 60 are needed'
+    ):
         regressor.choose(values, np.where(np.arange(600) < 11, q, 2 * INLIER_Q), information)
 
 
 @pytest.mark.parametrize('interior_held', [False, True])
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])
 def test_the_fitted_correction_is_made_orthogonal_to_the_gauge(kind, interior_held):
-    """To shift, scale and turns of the sensor; to the turns alone where the interior orientation is held."""
+    """To shift, scale and turns of the sensor; to the turns alone where the interior orientation
+    is held.
+    """
     interior = np.array([320.0, 240.0, 2000.0])
     regressor, values = chosen(kind, interior_held)
     inside = regressor.inliers
-    size = [np.abs(gauge_coefficients(regressor.uv[inside], regressor.smooth(v)[inside], interior,
-                                      interior_held)).max()
-            for v in (values, regressor.without_gauge(values, interior))]
+    size = [
+        np.abs(
+            gauge_coefficients(
+                regressor.uv[inside], regressor.smooth(v)[inside], interior, interior_held
+            )
+        ).max()
+        for v in (values, regressor.without_gauge(values, interior))
+    ]
     assert size[0] > 0.3 and size[1] < (1e-9 if kind == 'local_linear' else 2e-2) * size[0]
 
 
 def test_a_held_interior_orientation_leaves_the_scale_to_the_correction():
-    """An error of the principal distance is learned by the model; estimated, it is not its business."""
+    """An error of the principal distance is learned by the model; estimated, it is not its
+    business.
+    """
     interior = np.array([320.0, 240.0, 2000.0])
     for held, part in ((True, 1.0), (False, 0.0)):
         regressor, _ = chosen(interior_held=held)
         scale = 0.01 * (regressor.uv - interior[:2])
         kept = regressor.smooth(regressor.without_gauge(scale, interior))
-        np.testing.assert_allclose(kept - kept.mean(axis=0), part * (scale - scale.mean(axis=0)), atol=0.05)
+        np.testing.assert_allclose(
+            kept - kept.mean(axis=0), part * (scale - scale.mean(axis=0)), atol=0.05
+        )
 
 
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])
 def test_noise_and_bias_of_a_model_are_estimated(kind):
-    """Pure noise of 0.3 px on a plane field: that noise, hardly a bias. A fast wave: a bias that is seen."""
+    """Pure noise of 0.3 px on a plane field: that noise, hardly a bias. A fast wave: a bias that
+    is seen.
+    """
     rng = np.random.default_rng(13)
     uv = rng.uniform(-0.5, np.array(SIZE) - 0.5, (1500, 2))
-    exposure, information, q = np.repeat(np.arange(15), 100), np.tile(np.eye(2), (1500, 1, 1)), np.zeros(1500)
+    exposure = np.repeat(np.arange(15), 100)
+    information = np.tile(np.eye(2), (1500, 1, 1))
+    q = np.zeros(1500)
     regressor = Regressor(kind, uv, exposure, False, 40)
     flat = rng.normal(0, 0.3, uv.shape)
     regressor.choose(flat, q, information)
@@ -410,22 +517,29 @@ def test_a_model_equals_its_copy_with_other_quality_figures():
 
 
 def test_neighbours_among_changing_points_are_those_of_a_search():
-    """NearestTable: the nearest allowed, in order, also where most are not allowed, and after a restriction."""
+    """NearestTable: the nearest allowed, in order, also where most are not allowed, and after a
+    restriction.
+    """
     uv, _ = training(400)
     rng = np.random.default_rng(14)
     table = NearestTable(uv, 12)
     for share in (1.0, 0.8, 0.1):
         allowed = rng.random(400) < share
         rows = rng.permutation(400)[:90]
-        near = np.argsort(np.where(allowed, np.linalg.norm(uv[rows, None] - uv[None], axis=2), np.inf), axis=1)[:, :12]
+        near = np.argsort(
+            np.where(allowed, np.linalg.norm(uv[rows, None] - uv[None], axis=2), np.inf), axis=1
+        )[:, :12]
         np.testing.assert_array_equal(table.nearest(rows, allowed, 12), near)
     kept = rng.random(400) < 0.7
-    smaller, all_of_it = table.restricted(kept), np.ones(int(kept.sum()), dtype=bool)
+    smaller = table.restricted(kept)
+    all_of_it = np.ones(int(kept.sum()), dtype=bool)
     near = np.argsort(np.linalg.norm(uv[kept][:, None] - uv[kept][None], axis=2), axis=1)[:, :30]
     np.testing.assert_array_equal(smaller.nearest(np.arange(kept.sum()), all_of_it, 30), near)
 
 
 def test_a_wanted_k_that_cannot_be_had_is_refused():
     for kind, k in (('local_linear', 5), ('knn', 581)):
-        with pytest.raises(ValueError, match=f'{kind} with k = {k} cannot be had from 580 inliers'):
+        with pytest.raises(
+            ValueError, match=f'{kind} with k = {k} cannot be had from 580 inliers'
+        ):
             chosen(kind, k=k)

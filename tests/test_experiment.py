@@ -10,19 +10,35 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fluoro_calib_ros.calibration.job import adjust_with, calibrate
+from fluoro_calib_ros.calibration.calibrate import adjust_with, calibrate
 from fluoro_calib_ros.distortion.models import no_correction
 from fluoro_calib_ros.simulation.distortion import random_field
 
-sys.path.append(str(Path(__file__).resolve().parent.parent))   # benchmarks are not installed
-from benchmarks import validation  # noqa: E402
-from benchmarks.experiment import (BEFORE, HELD, KNOWN, Case, Outcome, Residuals, error_over_image,  # noqa: E402
-                                   errors_of_test, options_of, projective_residuals, run_case, scene_of)
-from benchmarks.experiment_figures import curves  # noqa: E402
-from benchmarks.experiment_plan import full_plan, quick_plan  # noqa: E402
-from benchmarks.experiment_tables import (PAPER_INSIDE, PAPER_OUTSIDE, PAPER_REPROJECTION,  # noqa: E402
-                                          Comparison)
-from benchmarks.experiment_text import document_text, shortcomings  # noqa: E402
+sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed
+from benchmarks import validation
+from benchmarks.experiment import (
+    BEFORE,
+    HELD,
+    KNOWN,
+    Case,
+    Outcome,
+    Residuals,
+    error_over_image,
+    errors_of_test,
+    options_of,
+    projective_residuals,
+    run_case,
+    scene_of,
+)
+from benchmarks.experiment_figures import curves
+from benchmarks.experiment_plan import full_plan, quick_plan
+from benchmarks.experiment_tables import (
+    PAPER_INSIDE,
+    PAPER_OUTSIDE,
+    PAPER_REPROJECTION,
+    Comparison,
+)
+from benchmarks.experiment_text import document_text, shortcomings
 
 pytestmark = pytest.mark.long
 
@@ -38,23 +54,38 @@ def experiment(tmp_path_factory):
 
 
 def test_document_has_every_table_and_picture(experiment):
-    """Tables 1-9 with the paper's figures and ours, Figures 1-10, every other section; links lead to pictures."""
+    """Tables 1-9 with the paper's figures and ours, Figures 1-10, every other section; links lead
+    to pictures.
+    """
     plan, _, document = experiment
     text = document.read_text()
     for number in range(1, 10):
         assert text.count(f'**Table {number}: ') == 1
     for first, system in ((1, 'a'), (4, 'b'), (7, 'a+b')):
-        for number, paper in zip(range(first, first + 3), (PAPER_REPROJECTION, PAPER_INSIDE, PAPER_OUTSIDE)):
+        for number, paper in zip(
+            range(first, first + 3), (PAPER_REPROJECTION, PAPER_INSIDE, PAPER_OUTSIDE)
+        ):
             table = text.split(f'**Table {number}: ')[1].split('\n\n')[1].splitlines()
             assert [row.split('|')[1].strip() for row in table[2:5]] == [
-                'paper: before', 'paper: after', 'paper: after w/ IOP']
+                'paper: before',
+                'paper: after',
+                'paper: after w/ IOP',
+            ]
             assert len(table) == 2 + 3 + len(plan.paper_variants())
             printed = [float(cell) for cell in table[2].split('|')[3:5]]
             assert printed == pytest.approx(paper[system][0][1:3], abs=5e-4)
     links = re.findall(r'!\[[^]]+\]\(([^)]+)\)', text)
     assert len(links) == len(set(links)) == 12
     assert all((document.parent / link).is_file() for link in links)
-    for heading in ('## In short', '## 1. ', '## 2. ', '## 3. ', '## 4. ', '## 5. What falls short', '## 6. '):
+    for heading in (
+        '## In short',
+        '## 1. ',
+        '## 2. ',
+        '## 3. ',
+        '## 4. ',
+        '## 5. What falls short',
+        '## 6. ',
+    ):
         assert text.count(heading) == 1
 
 
@@ -62,8 +93,10 @@ def test_pictures_are_whole_and_small(experiment):
     """Every picture can be read, is no empty sheet, and all together stay small."""
     folder = experiment[2].parent / 'images'
     names = sorted(os.listdir(folder))
-    assert names == sorted([f'validation_figure_{n}.png' for n in range(1, 11)]
-                           + ['validation_curves.png', 'validation_map.png'])
+    assert names == sorted(
+        [f'validation_figure_{n}.png' for n in range(1, 11)]
+        + ['validation_curves.png', 'validation_map.png']
+    )
     for name in names:
         with Image.open(folder / name) as picture:
             assert picture.format == 'PNG' and all(300 <= side <= 1800 for side in picture.size)
@@ -83,7 +116,11 @@ def test_order_of_the_variants(experiment):
         assert of['knn'].source_mm() < 0.3 * min(of[BEFORE].source_mm(), of[HELD].source_mm())
         assert of[plan.default].points_mm() < of['knn'].points_mm()
         for name in system.split('+'):
-            assert of[plan.default].image_px(name) < of['knn'].image_px(name) < of[BEFORE].image_px(name)
+            assert (
+                of[plan.default].image_px(name)
+                < of['knn'].image_px(name)
+                < of[BEFORE].image_px(name)
+            )
             assert of['knn'].residuals[name].cost() < 0.2 * of[BEFORE].residuals[name].cost()
 
 
@@ -94,19 +131,29 @@ def test_comparison_counts_from_known_distortion(experiment):
     assert comparison.ratios(KNOWN) == pytest.approx(1)
     seed = plan.seeds[0]
     assert comparison.ratios('knn')[0] == pytest.approx(
-        comparison['knn', seed].points_mm() / comparison[KNOWN, seed].points_mm())
+        comparison['knn', seed].points_mm() / comparison[KNOWN, seed].points_mm()
+    )
     assert comparison.image_px('knn', 'knn') == comparison.image_px('knn')
     values = curves(plan, outcomes, 'knn')
     at = outcomes[plan.curve_cases()['knn', plan.curve[0], seed]]
-    np.testing.assert_allclose(values[:, 0], [at.points_mm(), at.source_mm(), at.image_px('a')], rtol=1e-6)
+    np.testing.assert_allclose(
+        values[:, 0], [at.points_mm(), at.source_mm(), at.image_px('a')], rtol=1e-6
+    )
     assert np.isnan(curves(plan, outcomes, KNOWN)[2]).all()
 
 
 def test_failed_case_is_told(experiment, tmp_path):
-    """A calibration that failed leaves a dash in the tables, and its reason under what falls short."""
+    """A calibration that failed leaves a dash in the tables, and its reason under what falls
+    short.
+    """
     plan, outcomes, _ = experiment
     broken = dict(outcomes)
-    for cases in (plan.paper_cases('a'), plan.curve_cases(), plan.setting_cases(plan.settings[0]), plan.joint_cases()):
+    for cases in (
+        plan.paper_cases('a'),
+        plan.curve_cases(),
+        plan.setting_cases(plan.settings[0]),
+        plan.joint_cases(),
+    ):
         for case in cases.values():
             if case.variant == plan.default:
                 broken[case] = Outcome(failed='DataError: no such luck')
@@ -124,9 +171,12 @@ def test_tested_is_adjust_with():
     job = calibrate({'a': frames['a']}, scene.rig.phantom, options_of(case))
     held_back = [f for i, f in enumerate(scene.recording.frames['a']) if i % case.every]
     user = adjust_with({'a': held_back}, scene.rig.phantom, job.calibrations)
-    expected = scene.errors(user.targets.target_id, user.targets.xyz_mm,
-                            [('a', e.exposure, e.position_mm) for e in user.fluoroscopes['a'].exposures],
-                            scene.recording)
+    expected = scene.errors(
+        user.targets.target_id,
+        user.targets.xyz_mm,
+        [('a', e.exposure, e.position_mm) for e in user.fluoroscopes['a'].exposures],
+        scene.recording,
+    )
     np.testing.assert_allclose(errors_of_test(scene, case, job.calibrations), expected, rtol=5e-3)
 
 
@@ -161,25 +211,35 @@ def test_projective_map_is_taken_out():
     seen = mapped[:, :2] / mapped[:, 2:]
     assert np.abs(projective_residuals(seen, ideal)).max() < 1e-8
     noise = rng.normal(0, 0.3, seen.shape)
-    assert np.sqrt(np.mean(projective_residuals(seen + noise, ideal) ** 2)) == pytest.approx(0.3, rel=0.05)
+    assert np.sqrt(np.mean(projective_residuals(seen + noise, ideal) ** 2)) == pytest.approx(
+        0.3, rel=0.05
+    )
 
 
 def test_error_over_image_stays_in_the_calibrated_area():
-    """Without a correction the error is the distortion, and nothing is said beyond the image points."""
+    """Without a correction the error is the distortion, and nothing is said beyond the image
+    points.
+    """
     field = random_field(np.random.default_rng(3))
     training = np.array([[200, 200], [800, 200], [800, 800], [200, 800.0]])
     errors = error_over_image(no_correction(), field, training, (1024, 1024))
     inside = np.isfinite(errors[..., 0])
     assert 0.3 < inside.mean() < 0.36 and not inside[0].any() and not inside[:, -1].any()
-    assert 0.3 < np.sqrt(np.nanmean(errors ** 2)) < 3
+    assert 0.3 < np.sqrt(np.nanmean(errors**2)) < 3
     half = error_over_image(no_correction(), lambda uv: field(uv) / 2, training, (1024, 1024))
-    assert np.nanmean(half ** 2) < 0.3 * np.nanmean(errors ** 2)
+    assert np.nanmean(half**2) < 0.3 * np.nanmean(errors**2)
 
 
 def test_residual_figures():
     """Raw RMSE is of inliers, the reweighted one and the cost of all with their weights."""
     residual = np.array([[1.0, 0], [-1, 2], [10, 10]])
-    one = Residuals(np.zeros((3, 2)), residual, np.full(3, 0.5), np.array([1, 1, 0.01]), np.array([True, True, False]))
+    one = Residuals(
+        np.zeros((3, 2)),
+        residual,
+        np.full(3, 0.5),
+        np.array([1, 1, 0.01]),
+        np.array([True, True, False]),
+    )
     np.testing.assert_allclose(one.raw(), [1, np.sqrt(2)])
     np.testing.assert_allclose(one.reweighted(), np.sqrt([1, 5 / 3]))
     assert one.cost() == pytest.approx(4 * (1 + 5 + 2))
@@ -191,7 +251,11 @@ def test_full_plan_is_the_papers():
     """150 exposures of two fluoroscopes, every tenth for the calibration; no case is run twice."""
     plan = full_plan()
     cases = plan.cases()
-    assert (plan.exposures, plan.trained, plan.default) == (150, 15, options_of(cases[0]).__class__().model)
+    assert (plan.exposures, plan.trained, plan.default) == (
+        150,
+        15,
+        options_of(cases[0]).__class__().model,
+    )
     assert len(cases) == len(set(cases)) and {'knn', plan.default} <= set(plan.models)
     assert all(c.training is None for c in plan.paper_cases('a+b').values())
     assert {c.training for c in plan.curve_cases().values()} == {5, 10, None, 30, 60}

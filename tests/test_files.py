@@ -10,13 +10,20 @@ import pytest
 
 from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
 from fluoro_calib_ros.distortion.models import CorrectionModel, no_correction
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.atomic import atomic_file, write_bytes, write_text
-from fluoro_calib_ros.files.calibration import FIELDS, load_calibration, load_calibrations, save_calibration
+from fluoro_calib_ros.files.calibration import (
+    FIELDS,
+    load_calibration,
+    load_calibrations,
+    save_calibration,
+)
+from fluoro_calib_ros.files.image_points import correct_points, read_points, write_points
+from fluoro_calib_ros.files.json_file import read_result, write_result
 from fluoro_calib_ros.files.observations import read_observations_csv, write_observations_csv
 from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
-from fluoro_calib_ros.files.points import correct_points, read_points, write_points
-from fluoro_calib_ros.files.results import read_result, write_result
-from fluoro_calib_ros.photogrammetry.observations import DataError, Frame, Phantom
 
 SIZE = (1024, 960)
 OBSERVATIONS = 'fluoroscope,exposure,target_id,u,v,sigma\n'
@@ -44,27 +51,60 @@ def some_phantom(n=12):
 
 def some_frames(exposures=5, targets=9):
     rng = np.random.default_rng(4)
-    return {name: [Frame(name, number, rng.permutation(503)[:targets], rng.uniform(0, 900, (targets, 2)), SIZE,
-                         rng.uniform(0.1, 1, targets) if number % 2 else None) for number in range(exposures)]
-            for name in 'ab'}
+    return {
+        name: [
+            Frame(
+                name,
+                number,
+                rng.permutation(503)[:targets],
+                rng.uniform(0, 900, (targets, 2)),
+                SIZE,
+                rng.uniform(0.1, 1, targets) if number % 2 else None,
+            )
+            for number in range(exposures)
+        ]
+        for name in 'ab'
+    }
 
 
 def some_calibration(name='a', n=400, **changes):
     rng = np.random.default_rng(5)
     uv = rng.uniform(50, 900, (n, 2))
-    model = CorrectionModel('local_linear', 20, uv, np.sin(uv / 200) * 5, 0.08, 0.01) if n else no_correction()
+    model = (
+        CorrectionModel('local_linear', 20, uv, np.sin(uv / 200) * 5, 0.08, 0.01)
+        if n
+        else no_correction()
+    )
     values = dict(
-        fluoroscope=name, image_size=SIZE, interior=np.array([510.1, 480.2, 2000.3]),
-        interior_covariance=np.diag([1.0, 2.0, 3.0]), interior_estimated=True, model=model,
-        train_exposure=rng.integers(0, 15, n), image_sd=0.27, sigma0=0.25, nu=4.5, exposures=15,
-        observations=n + 9, inliers=n,
-        rmse_before=np.array([5.0, 6.0]), rmse_after=np.array([0.25, 0.26]), cost_adjustment=-12.5,
-        cost_regression=99.0, iterations=7, converged=True, stamp_ns=1_700_000_000_123_456_789,
-        frame_id=f'{name}_optical', source_digest='0f' * 32, seconds=3.25)
+        fluoroscope=name,
+        image_size=SIZE,
+        interior=np.array([510.1, 480.2, 2000.3]),
+        interior_covariance=np.diag([1.0, 2.0, 3.0]),
+        interior_estimated=True,
+        model=model,
+        train_exposure=rng.integers(0, 15, n),
+        image_sd=0.27,
+        sigma0=0.25,
+        nu=4.5,
+        exposures=15,
+        observations=n + 9,
+        inliers=n,
+        rmse_before=np.array([5.0, 6.0]),
+        rmse_after=np.array([0.25, 0.26]),
+        cost_adjustment=-12.5,
+        cost_regression=99.0,
+        iterations=7,
+        converged=True,
+        stamp_ns=1_700_000_000_123_456_789,
+        frame_id=f'{name}_optical',
+        source_digest='0f' * 32,
+        seconds=3.25,
+    )
     return FluoroscopeCalibration(**{**values, **changes})
 
 
-# ---------------------------------------------------------------- every reader and files that are none
+# ---------------------------------------------------------------- every reader and files that are
+# none
 
 READERS = {
     'phantom': read_phantom,
@@ -80,8 +120,17 @@ def test_a_file_that_is_none_is_named(read, tmp_path):
     assert 'no such file' in message_of(read, str(tmp_path / 'missing'))
     assert 'folder' in message_of(read, str(tmp_path))
     assert 'empty' in message_of(read, text_file(tmp_path, 'empty', ''))
-    for content in (b'\x89PNG\r\n\x1a\n\x00\x00', b'\xff\xfeu\x00,\x00v\x00', b'\x00' * 100, b'PK\x03\x04' + b'x' * 50,
-                    b'hello\n', b'\n\n\n', b'"', b'a,b\n"c,d\n', b'[1]'):
+    for content in (
+        b'\x89PNG\r\n\x1a\n\x00\x00',
+        b'\xff\xfeu\x00,\x00v\x00',
+        b'\x00' * 100,
+        b'PK\x03\x04' + b'x' * 50,
+        b'hello\n',
+        b'\n\n\n',
+        b'"',
+        b'a,b\n"c,d\n',
+        b'[1]',
+    ):
         path = text_file(tmp_path, 'damaged', content)
         assert path in message_of(read, path)
 
@@ -89,12 +138,18 @@ def test_a_file_that_is_none_is_named(read, tmp_path):
 @pytest.mark.parametrize('read', READERS.values(), ids=READERS)
 def test_a_file_without_permission_is_named(read, tmp_path, monkeypatch):
     def refuse(*_, **__):
-        raise PermissionError(13, 'Permission denied')   # root, as in containers, may read everything
+        raise PermissionError(
+            13, 'Permission denied'
+        )  # root, as in containers, may read everything
+
     monkeypatch.setattr('builtins.open', refuse)
-    assert 'secret: cannot be read (permission denied)' in message_of(read, str(tmp_path / 'secret'))
+    assert 'secret: cannot be read (permission denied)' in message_of(
+        read, str(tmp_path / 'secret')
+    )
 
 
 # ---------------------------------------------------------------- atomic writing
+
 
 def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path):
     path = tmp_path / 'result.json'
@@ -125,6 +180,7 @@ def test_a_link_stays_a_link_and_permissions_follow_the_umask(tmp_path):
 
 # ---------------------------------------------------------------- phantom
 
+
 def test_phantom_round_trip(tmp_path):
     phantom = some_phantom()
     write_phantom(tmp_path / 'phantom.csv', phantom)
@@ -135,43 +191,52 @@ def test_phantom_round_trip(tmp_path):
 
 
 def test_phantom_as_a_spreadsheet_gives_it(tmp_path):
-    text = ('\ufeff# surveyed 2020\r\n\r\nz, sd ,target_id,x,y,remark\r\n' +
-            ''.join(f'3.5,0.1,{i}, 1e1 ,-2,"bead, no. {i}"\r\n# comment\r\n' for i in (4, 2, 9, 7)))
+    text = '\ufeff# surveyed 2020\r\n\r\nz, sd ,target_id,x,y,remark\r\n' + ''.join(
+        f'3.5,0.1,{i}, 1e1 ,-2,"bead, no. {i}"\r\n# comment\r\n' for i in (4, 2, 9, 7)
+    )
     phantom = read_phantom(text_file(tmp_path, 'phantom.csv', text))
     assert phantom.target_id.tolist() == [2, 4, 7, 9]
     assert phantom.xyz_mm.tolist() == [[10, -2, 3.5]] * 4
 
 
-@pytest.mark.parametrize('row, sentence', [
-    ('5,1,abc,3,0.1', "row 6: y is 'abc', not a number"),
-    ('5,1,,3,0.1', "row 6: y is '', not a number"),
-    ('5,1,nan,3,0.1', "row 6: y is 'nan', not a finite number"),
-    ('5,1,2,inf,0.1', "row 6: z is 'inf', not a finite number"),
-    ('5,1,1_0,3,0.1', "row 6: y is '1_0', not a number"),
-    ('5.0,1,2,3,0.1', "row 6: target_id is '5.0', not a whole number"),
-    ('-5,1,2,3,0.1', "row 6: target_id is '-5', not between 0 and 4294967295"),
-    ('99999999999999999999,1,2,3,0.1', 'not between 0 and 4294967295'),
-    ('5,1,2,3,0', "row 6: sd is '0', not above 0"),
-    ('3,1,2,3,0.1', 'row 6: target 3 is there already, in row 5'),
-    ('5,1,2,3', 'row 6: 4 columns, but the header has 5'),
-    ('5,1,2,3,0.1,7', 'row 6: 6 columns, but the header has 5'),
-    ('5,1,"2,3,0.1', 'row 6: this is not CSV'),
-    ('5,1,2,3,\x00', "row 6: "),
-])
+@pytest.mark.parametrize(
+    'row, sentence',
+    [
+        ('5,1,abc,3,0.1', "row 6: y is 'abc', not a number"),
+        ('5,1,,3,0.1', "row 6: y is '', not a number"),
+        ('5,1,nan,3,0.1', "row 6: y is 'nan', not a finite number"),
+        ('5,1,2,inf,0.1', "row 6: z is 'inf', not a finite number"),
+        ('5,1,1_0,3,0.1', "row 6: y is '1_0', not a number"),
+        ('5.0,1,2,3,0.1', "row 6: target_id is '5.0', not a whole number"),
+        ('-5,1,2,3,0.1', "row 6: target_id is '-5', not between 0 and 4294967295"),
+        ('99999999999999999999,1,2,3,0.1', 'not between 0 and 4294967295'),
+        ('5,1,2,3,0', "row 6: sd is '0', not above 0"),
+        ('3,1,2,3,0.1', 'row 6: target 3 is there already, in row 5'),
+        ('5,1,2,3', 'row 6: 4 columns, but the header has 5'),
+        ('5,1,2,3,0.1,7', 'row 6: 6 columns, but the header has 5'),
+        ('5,1,"2,3,0.1', 'row 6: this is not CSV'),
+        ('5,1,2,3,\x00', 'row 6: '),
+    ],
+)
 def test_phantom_names_row_and_cause(tmp_path, row, sentence):
     good = ''.join(f'{i},1,2,3,0.1\n' for i in range(4))
     path = text_file(tmp_path, 'phantom.csv', f'target_id,x,y,z,sd\n{good}{row}\n')
-    assert message_of(read_phantom, path).startswith(path) and sentence in message_of(read_phantom, path)
+    assert message_of(read_phantom, path).startswith(path) and sentence in message_of(
+        read_phantom, path
+    )
 
 
 def test_phantom_header_encoding_and_number_of_targets(tmp_path):
     def said(text):
         return message_of(read_phantom, text_file(tmp_path, 'phantom.csv', text))
+
     assert 'row 1: the header has no column sd' in said('target_id,x,y,z\n1,2,3,4\n')
     assert 'the column x twice' in said('target_id,x,y,z,sd,x\n1,2,3,4,5,6\n')
     assert 'no rows' in said('target_id,x,y,z,sd\n')
     assert 'at least 4' in said('target_id,x,y,z,sd\n1,2,3,4,5\n')
-    assert 'row 3: this is not UTF-8 text (byte 0xe4)' in said(b'target_id,x,y,z,sd\n1,2,3,4,5\n\xe4')
+    assert 'row 3: this is not UTF-8 text (byte 0xe4)' in said(
+        b'target_id,x,y,z,sd\n1,2,3,4,5\n\xe4'
+    )
 
 
 def test_row_numbers_count_cells_with_line_ends_in_them(tmp_path):
@@ -180,6 +245,7 @@ def test_row_numbers_count_cells_with_line_ends_in_them(tmp_path):
 
 
 # ---------------------------------------------------------------- observations
+
 
 def test_observations_round_trip(tmp_path):
     frames = some_frames()
@@ -190,18 +256,28 @@ def test_observations_round_trip(tmp_path):
         for one, two in zip(frames[name], again[name], strict=True):
             assert (one.number, one.image_size) == (two.number, two.image_size)
             assert np.array_equal(one.target_id, two.target_id) and np.array_equal(one.uv, two.uv)
-            assert (one.sigma is None and two.sigma is None) or np.array_equal(one.sigma, two.sigma)
+            assert (one.sigma is None and two.sigma is None) or np.array_equal(
+                one.sigma, two.sigma
+            )
     write_observations_csv(tmp_path / 'again.csv', again)
     assert (tmp_path / 'again.csv').read_bytes() == (tmp_path / 'o.csv').read_bytes()
 
 
 def test_observations_in_any_order_of_rows_and_columns(tmp_path):
-    path = text_file(tmp_path, 'o.csv', 'v,u,extra,exposure,fluoroscope,target_id\n'
-                                        '1,10,x,7,b,3\n2,20,x,7,a,3\n3,30,x,2,b,5\n4,40,x,7,b,1\n')
+    path = text_file(
+        tmp_path,
+        'o.csv',
+        'v,u,extra,exposure,fluoroscope,target_id\n'
+        '1,10,x,7,b,3\n2,20,x,7,a,3\n3,30,x,2,b,5\n4,40,x,7,b,1\n',
+    )
     frames = read_observations_csv(path, SIZE)
     assert list(frames) == ['a', 'b'] and [f.number for f in frames['b']] == [2, 7]
     last = frames['b'][1]
-    assert last.target_id.tolist() == [3, 1] and last.uv.tolist() == [[10, 1], [40, 4]] and last.sigma is None
+    assert (
+        last.target_id.tolist() == [3, 1]
+        and last.uv.tolist() == [[10, 1], [40, 4]]
+        and last.sigma is None
+    )
 
 
 def test_observations_need_the_image_size(tmp_path):
@@ -209,19 +285,22 @@ def test_observations_need_the_image_size(tmp_path):
     assert '--image-size' in message_of(read_observations_csv, path)
 
 
-@pytest.mark.parametrize('row, sentence', [
-    ('a,0,3,abc,2,', "row 4: u is 'abc', not a number"),
-    ('a,0,3,nan,2,', "row 4: u is 'nan', not a finite number"),
-    ('a,0,3,1,-inf,', "row 4: v is '-inf', not a finite number"),
-    ('a,x,3,1,2,', "row 4: exposure is 'x', not a whole number"),
-    ('a,0,3,1024,2,', 'row 4: the point (1024, 2) is off the image of 1024 x 960 px'),
-    ('a,0,1,1,2,', 'row 4: target 1 of fluoroscope a, exposure 0 is there already, in row 2'),
-    ('a,0,3,1,2,0.5', 'sigma of target 1 of fluoroscope a, exposure 0 is empty'),
-    ('a,1,3,1,2,0', "row 4: sigma is '0', not a finite number above 0"),
-    ('a,1,3,1,2,nan', "row 4: sigma is 'nan', not a finite number above 0"),
-    ('../a,0,3,1,2,', "row 4: the fluoroscope is called '../a'"),
-    (',0,3,1,2,', "row 4: the fluoroscope is called ''"),
-])
+@pytest.mark.parametrize(
+    'row, sentence',
+    [
+        ('a,0,3,abc,2,', "row 4: u is 'abc', not a number"),
+        ('a,0,3,nan,2,', "row 4: u is 'nan', not a finite number"),
+        ('a,0,3,1,-inf,', "row 4: v is '-inf', not a finite number"),
+        ('a,x,3,1,2,', "row 4: exposure is 'x', not a whole number"),
+        ('a,0,3,1024,2,', 'row 4: the point (1024, 2) is off the image of 1024 x 960 px'),
+        ('a,0,1,1,2,', 'row 4: target 1 of fluoroscope a, exposure 0 is there already, in row 2'),
+        ('a,0,3,1,2,0.5', 'sigma of target 1 of fluoroscope a, exposure 0 is empty'),
+        ('a,1,3,1,2,0', "row 4: sigma is '0', not a finite number above 0"),
+        ('a,1,3,1,2,nan', "row 4: sigma is 'nan', not a finite number above 0"),
+        ('../a,0,3,1,2,', "row 4: the fluoroscope is called '../a'"),
+        (',0,3,1,2,', "row 4: the fluoroscope is called ''"),
+    ],
+)
 def test_observations_name_row_and_cause(tmp_path, row, sentence):
     path = text_file(tmp_path, 'o.csv', OBSERVATIONS + f'a,0,1,1,2,\nb,0,2,1,2,\n{row}\n')
     said = message_of(read_observations_csv, path, SIZE)
@@ -231,7 +310,9 @@ def test_observations_name_row_and_cause(tmp_path, row, sentence):
 def test_the_row_is_exact_far_down_a_large_file(tmp_path):
     rows = [f'a,{i // 100},{i % 100},{i % 900}.5,1,\n' for i in range(60_000)]
     rows[54_320] = 'a,1,1,1.5.2,1,\n'
-    said = message_of(read_observations_csv, text_file(tmp_path, 'o.csv', OBSERVATIONS + ''.join(rows)), SIZE)
+    said = message_of(
+        read_observations_csv, text_file(tmp_path, 'o.csv', OBSERVATIONS + ''.join(rows)), SIZE
+    )
     assert "row 54322: u is '1.5.2'" in said
 
 
@@ -244,20 +325,31 @@ def test_a_campaign_is_read_in_a_second(tmp_path):
 
 # ---------------------------------------------------------------- calibration
 
-@pytest.mark.parametrize('calibration', [
-    some_calibration(), some_calibration(nu=np.inf), some_calibration('b-2_c', n=0, rmse_after=[np.nan, np.nan]),
-    some_calibration(frame_id='', interior_covariance=np.zeros((3, 3)), interior_estimated=False),
-], ids=['usual', 'gaussian', 'no model', 'held'])
+
+@pytest.mark.parametrize(
+    'calibration',
+    [
+        some_calibration(),
+        some_calibration(nu=np.inf),
+        some_calibration('b-2_c', n=0, rmse_after=[np.nan, np.nan]),
+        some_calibration(
+            frame_id='', interior_covariance=np.zeros((3, 3)), interior_estimated=False
+        ),
+    ],
+    ids=['usual', 'gaussian', 'no model', 'held'],
+)
 def test_a_calibration_is_the_same_to_the_last_bit(tmp_path, calibration):
     path = save_calibration(tmp_path / 'new' / 'folder', calibration)
     again = load_calibration(path)
     assert path == str(tmp_path / 'new' / 'folder' / f'{calibration.fluoroscope}.calibration.npz')
     assert again.calibration_id == calibration.calibration_id and np.isnan(again.seconds)
     for name in set(FluoroscopeCalibration.__dataclass_fields__) - {'model', 'seconds'}:
-        one, two = getattr(calibration, name), getattr(again, name)
+        one = getattr(calibration, name)
+        two = getattr(again, name)
         assert np.array_equal(one, two, equal_nan=isinstance(one, (list, np.ndarray))), name
     pixels = np.random.default_rng(1).uniform(-20, 1000, (2000, 2))
-    one, two = calibration.correct(pixels), again.correct(pixels)
+    one = calibration.correct(pixels)
+    two = again.correct(pixels)
     for name in ('uv', 'sigma', 'status'):
         assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
 
@@ -267,7 +359,10 @@ def test_the_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
     monkeypatch.setattr(time, 'time', lambda: 2_000_000_000.0)
     monkeypatch.setattr(time, 'localtime', lambda *_: time.gmtime(2_000_000_000))
     second = open(save_calibration(tmp_path / '2', some_calibration(seconds=99.0)), 'rb').read()
-    third = open(save_calibration(tmp_path / '3', load_calibration(tmp_path / '1' / 'a.calibration.npz')), 'rb').read()
+    third = open(
+        save_calibration(tmp_path / '3', load_calibration(tmp_path / '1' / 'a.calibration.npz')),
+        'rb',
+    ).read()
     assert first == second == third
 
 
@@ -275,14 +370,18 @@ def test_numpy_reads_it_without_pickle_and_the_document_names_every_array(tmp_pa
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
         assert file.files == ['format_version', *FIELDS]
         assert file['format_version'] == 2
-        document = open(os.path.join(os.path.dirname(__file__), '..', 'docs', 'calibration_file.md')).read()
+        document = open(
+            os.path.join(os.path.dirname(__file__), '..', 'docs', 'calibration_file.md')
+        ).read()
         for name in file.files:
             dtype = 'text' if file[name].dtype.kind == 'U' else file[name].dtype.name
             assert f'| `{name}` | {dtype} |' in document
 
 
 def changed(tmp_path, **arrays):
-    """Path of a calibration file in which some arrays are replaced, or left out where they are None."""
+    """Path of a calibration file in which some arrays are replaced, or left out where they are
+    None.
+    """
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
         arrays = {**{name: file[name] for name in file.files}, **arrays}
     path = str(tmp_path / 'a.calibration.npz')
@@ -295,27 +394,33 @@ class Bomb:
         return os.mkdir, ('/tmp/this_must_never_be_made',)
 
 
-@pytest.mark.parametrize('arrays, sentence', [
-    ({'format_version': np.array(7)}, 'layout version 7, this program knows versions 1 to 2'),
-    ({'format_version': np.array('1')}, 'format_version is not a whole number'),
-    ({'format_version': None}, 'it has no array format_version'),
-    ({'interior': None}, 'has no array interior'),
-    ({'interior': np.zeros(4)}, 'the array interior has shape (4,), not (3)'),
-    ({'interior': np.zeros(3, dtype=np.float32)}, 'has dtype float32, not float64'),
-    ({'interior': np.array([1, np.nan, 3])}, 'the array interior holds nan'),
-    ({'train_uv': np.zeros((400, 3))}, 'the array train_uv has shape (400, 3), not (N, 2)'),
-    ({'train_uv': np.zeros((399, 2))}, 'the training arrays differ in length'),
-    ({'train_duv': np.full((400, 2), np.inf)}, 'the array train_duv holds inf'),
-    ({'nu': np.array(np.nan)}, 'the array nu holds nan'),
-    ({'sigma0': np.array(-1.0)}, 'the array sigma0 holds -1.0, which is below 0'),
-    ({'model_kind': np.array('magic')}, "not 'magic'"),
-    ({'model_k': np.array(401)}, 'k = 401'),
-    ({'fluoroscope': np.array('../../etc')}, "called '../../etc'"),
-    ({'fluoroscope': np.array('b')}, 'does not belong to its calibration_id'),
-    ({'interior': np.array([1.0, 2.0, 3.0])}, 'does not belong to its calibration_id'),
-    ({'interior': np.array([Bomb()] * 3, dtype=object)}, 'the array interior is not one of plain numbers'),
-    ({'format_version': np.array(Bomb(), dtype=object)}, 'not one of plain numbers'),
-])
+@pytest.mark.parametrize(
+    'arrays, sentence',
+    [
+        ({'format_version': np.array(7)}, 'layout version 7, this program knows versions 1 to 2'),
+        ({'format_version': np.array('1')}, 'format_version is not a whole number'),
+        ({'format_version': None}, 'it has no array format_version'),
+        ({'interior': None}, 'has no array interior'),
+        ({'interior': np.zeros(4)}, 'the array interior has shape (4,), not (3)'),
+        ({'interior': np.zeros(3, dtype=np.float32)}, 'has dtype float32, not float64'),
+        ({'interior': np.array([1, np.nan, 3])}, 'the array interior holds nan'),
+        ({'train_uv': np.zeros((400, 3))}, 'the array train_uv has shape (400, 3), not (N, 2)'),
+        ({'train_uv': np.zeros((399, 2))}, 'the training arrays differ in length'),
+        ({'train_duv': np.full((400, 2), np.inf)}, 'the array train_duv holds inf'),
+        ({'nu': np.array(np.nan)}, 'the array nu holds nan'),
+        ({'sigma0': np.array(-1.0)}, 'the array sigma0 holds -1.0, which is below 0'),
+        ({'model_kind': np.array('magic')}, "not 'magic'"),
+        ({'model_k': np.array(401)}, 'k = 401'),
+        ({'fluoroscope': np.array('../../etc')}, "called '../../etc'"),
+        ({'fluoroscope': np.array('b')}, 'does not belong to its calibration_id'),
+        ({'interior': np.array([1.0, 2.0, 3.0])}, 'does not belong to its calibration_id'),
+        (
+            {'interior': np.array([Bomb()] * 3, dtype=object)},
+            'the array interior is not one of plain numbers',
+        ),
+        ({'format_version': np.array(Bomb(), dtype=object)}, 'not one of plain numbers'),
+    ],
+)
 def test_a_wrong_calibration_is_refused(tmp_path, arrays, sentence):
     path = changed(tmp_path, **arrays)
     said = message_of(load_calibration, path)
@@ -325,23 +430,32 @@ def test_a_wrong_calibration_is_refused(tmp_path, arrays, sentence):
 
 def test_a_calibration_that_is_cut_off_or_changed_by_a_byte_is_refused(tmp_path):
     path = save_calibration(tmp_path, some_calibration())
-    content, good = open(path, 'rb').read(), load_calibration(path)
+    content = open(path, 'rb').read()
+    good = load_calibration(path)
     for length in (1, 10, 200, len(content) // 2, len(content) - 100, len(content) - 1):
-        assert path in message_of(load_calibration, text_file(tmp_path, 'a.calibration.npz', content[:length]))
-    directory = bytearray(content)   # is said to lie further behind than it does: its members before the file
+        assert path in message_of(
+            load_calibration, text_file(tmp_path, 'a.calibration.npz', content[:length])
+        )
+    directory = bytearray(
+        content
+    )  # is said to lie further behind than it does: its members before the file
     directory[-6:-2] = (int.from_bytes(content[-6:-2], 'little') + 999).to_bytes(4, 'little')
-    assert 'or it is damaged' in message_of(load_calibration, text_file(tmp_path, 'a.calibration.npz',
-                                                                        bytes(directory)))
+    assert 'or it is damaged' in message_of(
+        load_calibration, text_file(tmp_path, 'a.calibration.npz', bytes(directory))
+    )
     for place in np.linspace(0, len(content) - 1, 300).astype(int):
         damaged = bytearray(content)
         damaged[place] ^= 0x55
         text_file(tmp_path, 'a.calibration.npz', bytes(damaged))
         try:
-            again = load_calibration(path)   # a byte without a meaning, such as a date
+            again = load_calibration(path)  # a byte without a meaning, such as a date
         except DataError:
             continue
         assert again.calibration_id == good.calibration_id
-        assert np.array_equal(again.train_exposure, good.train_exposure) and again.stamp_ns == good.stamp_ns
+        assert (
+            np.array_equal(again.train_exposure, good.train_exposure)
+            and again.stamp_ns == good.stamp_ns
+        )
 
 
 def test_other_archives_are_no_calibration(tmp_path):
@@ -354,8 +468,12 @@ def test_other_archives_are_no_calibration(tmp_path):
 def test_what_could_not_be_read_again_is_not_written(tmp_path):
     save_calibration(tmp_path, some_calibration())
     before = (tmp_path / 'a.calibration.npz').read_bytes()
-    assert 'interior' in message_of(save_calibration, tmp_path, some_calibration(interior=np.array([1, 2, np.nan])))
-    assert 'differ in length' in message_of(save_calibration, tmp_path, some_calibration(train_exposure=np.arange(3)))
+    assert 'interior' in message_of(
+        save_calibration, tmp_path, some_calibration(interior=np.array([1, 2, np.nan]))
+    )
+    assert 'differ in length' in message_of(
+        save_calibration, tmp_path, some_calibration(train_exposure=np.arange(3))
+    )
     assert "'../a'" in message_of(save_calibration, tmp_path, some_calibration('../a'))
     assert os.listdir(tmp_path) == ['a.calibration.npz']
     assert (tmp_path / 'a.calibration.npz').read_bytes() == before
@@ -375,6 +493,7 @@ def test_all_calibrations_of_a_folder(tmp_path):
 
 # ---------------------------------------------------------------- image points
 
+
 def corrected_rows(tmp_path, text, calibrations):
     points = read_points(text_file(tmp_path, 'p.csv', text))
     write_points(tmp_path / 'out.csv', points, correct_points(points, calibrations))
@@ -384,33 +503,49 @@ def corrected_rows(tmp_path, text, calibrations):
 def test_points_are_corrected_and_all_else_is_kept(tmp_path):
     calibration = some_calibration()
     header, good, empty, off, outside = corrected_rows(
-        tmp_path, 'note,v,u\n kept ,500.25,400\n1,,3\n2,5,nan\n3,1,1\n', {'a': calibration})
+        tmp_path, 'note,v,u\n kept ,500.25,400\n1,,3\n2,5,nan\n3,1,1\n', {'a': calibration}
+    )
     assert header == ['note', 'v', 'u', 'u_corrected', 'v_corrected', 'sigma', 'status']
     wanted = calibration.correct([[400, 500.25]])
     assert good[:3] == [' kept ', '500.25', '400'] and good[6] == 'OK'
     assert list(map(float, good[3:6])) == [*wanted.uv[0], wanted.sigma[0]]
-    assert empty == ['1', '', '3', '', '', '', 'INVALID'] and off == ['2', '5', 'nan', '', '', '', 'INVALID']
+    assert empty == ['1', '', '3', '', '', '', 'INVALID'] and off == [
+        '2',
+        '5',
+        'nan',
+        '',
+        '',
+        '',
+        'INVALID',
+    ]
     assert outside[6] == 'OUTSIDE' and float(outside[3])
 
 
 def test_points_of_two_fluoroscopes_with_their_own_sigma(tmp_path):
     calibrations = {'a': some_calibration('a'), 'b': some_calibration('b', n=0)}
     header, one, two, three = corrected_rows(
-        tmp_path, 'fluoroscope,u,v,sigma\nb,10,20,0.5\na,300,400,\nb,10,5000,1\n', calibrations)
+        tmp_path, 'fluoroscope,u,v,sigma\nb,10,20,0.5\na,300,400,\nb,10,5000,1\n', calibrations
+    )
     assert header[4:] == ['u_corrected', 'v_corrected', 'sigma_corrected', 'status']
     assert one == ['b', '10', '20', '0.5', '10.0', '20.0', '0.5', 'OK']
     assert float(two[6]) == calibrations['a'].correct([[300, 400]]).sigma[0]
     assert three[-1] == 'INVALID'
 
 
-@pytest.mark.parametrize('text, sentence', [
-    ('u,v\n1,2\nx,2\n', "row 3: u is 'x', not a number"),
-    ('u,v,sigma\n1,2,-1\n', "row 2: sigma is '-1', not a finite number above 0"),
-    ('fluoroscope,u,v\na,1,2\nc,1,2\n', "row 3: there is no calibration of fluoroscope 'c', only of a, b"),
-    ('u,v\n1,2\n', 'no column fluoroscope, and there are calibrations of a, b'),
-    ('fluoroscope,u,v,status\na,1,2,3\n', 'has a column status already'),
-    ('u\n1\n', 'no column v'),
-])
+@pytest.mark.parametrize(
+    'text, sentence',
+    [
+        ('u,v\n1,2\nx,2\n', "row 3: u is 'x', not a number"),
+        ('u,v,sigma\n1,2,-1\n', "row 2: sigma is '-1', not a finite number above 0"),
+        (
+            'fluoroscope,u,v\na,1,2\nc,1,2\n',
+            "row 3: there is no calibration of fluoroscope 'c', only of a, b",
+        ),
+        ('u,v\n1,2\n', 'no column fluoroscope, and there are calibrations of a, b'),
+        ('fluoroscope,u,v,status\na,1,2,3\n', 'has a column status already'),
+        ('u\n1\n', 'no column v'),
+    ],
+)
 def test_points_name_row_and_cause(tmp_path, text, sentence):
     calibrations = {name: some_calibration(name) for name in 'ab'}
     assert sentence in message_of(corrected_rows, tmp_path, text, calibrations)
@@ -418,18 +553,37 @@ def test_points_name_row_and_cause(tmp_path, text, sentence):
 
 # ---------------------------------------------------------------- results
 
+
 def test_results_round_trip_and_have_no_nan(tmp_path):
-    result = {'a': np.float64(1) / 3, 'n': np.int64(5), 'nan': float('nan'), 'inf': [np.inf], 'xyz': np.eye(2),
-              'yes': np.bool_(True), 'none': None, 'text': 'Größe'}
+    result = {
+        'a': np.float64(1) / 3,
+        'n': np.int64(5),
+        'nan': float('nan'),
+        'inf': [np.inf],
+        'xyz': np.eye(2),
+        'yes': np.bool_(True),
+        'none': None,
+        'text': 'Größe',
+    }
     write_result(tmp_path / 'result.json', result)
     again = read_result(str(tmp_path / 'result.json'))
-    assert again == {'a': 1 / 3, 'n': 5, 'nan': None, 'inf': [None], 'xyz': [[1, 0], [0, 1]], 'yes': True,
-                     'none': None, 'text': 'Größe'}
+    assert again == {
+        'a': 1 / 3,
+        'n': 5,
+        'nan': None,
+        'inf': [None],
+        'xyz': [[1, 0], [0, 1]],
+        'yes': True,
+        'none': None,
+        'text': 'Größe',
+    }
     assert list(again) == list(result)
     json.loads((tmp_path / 'result.json').read_text(), parse_constant=pytest.fail)
 
 
 def test_a_damaged_result_names_its_row(tmp_path):
-    assert 'row 2: this is not JSON' in message_of(read_result, text_file(tmp_path, 'r.json', '{"a": 1,\n b}'))
+    assert 'row 2: this is not JSON' in message_of(
+        read_result, text_file(tmp_path, 'r.json', '{"a": 1,\n b}')
+    )
     assert 'no object' in message_of(read_result, text_file(tmp_path, 'r.json', '[1]'))
     assert 'nested' in message_of(read_result, text_file(tmp_path, 'r.json', '[' * 100_000))

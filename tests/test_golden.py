@@ -1,4 +1,6 @@
-"""The same problems solved by other people's programs: COLMAP's bundle adjuster and scikit-learn's grid search."""
+"""The same problems solved by other people's programs: COLMAP's bundle adjuster and scikit-learn's
+grid search.
+"""
 
 import functools
 import sys
@@ -7,22 +9,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rigs import disturbed, small_network
 from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
-from fluoro_calib_ros.calibration.job import calibrate
-from fluoro_calib_ros.calibration.network import measured_network
-from fluoro_calib_ros.calibration.self_calibration import Options
-from fluoro_calib_ros.distortion.selection import CrossValidation, exposure_folds
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.initial_network import measured_network
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.distortion.cross_validation import CrossValidation, exposure_folds
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
-from rigs import disturbed, small_network
-
-sys.path.append(str(Path(__file__).resolve().parent.parent))   # benchmarks are not installed
-from benchmarks.peers import TIGHT, ColmapAdjustment, seen_in, with_datum  # noqa: E402
+sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed
+from benchmarks.peers import TIGHT, ColmapAdjustment, seen_in, with_datum
 
 pytestmark = pytest.mark.long
 
@@ -31,26 +32,37 @@ def small_problem():
     """Network, start values and noise: six exposures of some thirty targets, heavy tails."""
     network, truth = small_network(6, 40, noise_px=0.3, nu=4.0, seed=2, seen=0.8)
     network = replace(network, sigma=np.ones(len(network.uv)))
-    return *seen_in(network, disturbed(truth, degrees=0.2, mm=2.0), 2), Noise('student_t', 0.4, 4.0)
+    return *seen_in(network, disturbed(truth, degrees=0.2, mm=2.0), 2), Noise(
+        'student_t', 0.4, 4.0
+    )
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def real_problem():
-    """The same of 15 exposures of some 132 targets with false matches, the distortion taken off, from resections."""
+    """The same of 15 exposures of some 132 targets with false matches, the distortion taken off,
+    from resections.
+    """
     rig = virtual_rig(1)
     exposures = simulate_exposures(rig, 15, 1, matched=(130, 134))
-    frames = [replace(frame, uv=uv) for frame, uv in zip(exposures.frames['a'], exposures.undistorted['a'])]
+    frames = [
+        replace(frame, uv=uv)
+        for frame, uv in zip(exposures.frames['a'], exposures.undistorted['a'])
+    ]
     measured = measured_network({'a': frames}, rig.phantom)
     return *seen_in(measured.network, measured.start, 2), Noise('student_t', 0.22, 5.0)
 
 
 def all_held(network):
-    """Every object point stays at its survey: the exposures share nothing but the interior orientation."""
+    """Every object point stays at its survey: the exposures share nothing but the interior
+    orientation.
+    """
     return np.ones(len(network.survey_mm), dtype=bool)
 
 
 def few_held(network):
-    """Some object points fix the datum, and those that only two exposures show; all others are unknown."""
+    """Some object points fix the datum, and those that only two exposures show; all others are
+    unknown.
+    """
     return (np.arange(len(network.survey_mm)) % 10 == 0) | (np.bincount(network.point) < 3)
 
 
@@ -78,7 +90,9 @@ def test_adjustment_is_that_of_colmap(problem, held_points):
     covariance = noise.information_factor(ours.q) * precision(network, ours).interior[0]
     expected = colmap.interior_covariance()
     np.testing.assert_allclose(np.sqrt(np.diag(covariance)), np.sqrt(np.diag(expected)), rtol=1e-6)
-    np.testing.assert_allclose(covariance, expected, rtol=1e-5, atol=1e-6 * np.diag(expected).max())
+    np.testing.assert_allclose(
+        covariance, expected, rtol=1e-5, atol=1e-6 * np.diag(expected).max()
+    )
 
 
 @pytest.mark.parametrize('seed', [1, 2, 3])
@@ -86,17 +100,29 @@ def test_k_of_a_calibration_is_that_of_grid_search(seed):
     """Values of a real calibration, the same folds of whole exposures, every error counted alike."""
     rig = virtual_rig(seed)
     frames = {'a': simulate_exposures(rig, 15, seed, matched=(130, 134)).frames['a']}
-    run = calibrate(frames, rig.phantom, Options('knn', max_iterations=2)).runs['a']
-    network, inside = run.measured.network, np.flatnonzero(run.trained)
+    run = calibrate(frames, rig.phantom, CalibrationOptions('knn', max_iterations=2)).runs['a']
+    network = run.measured.network
+    inside = np.flatnonzero(run.trained)
     # Of coincident pixels either may come first among the neighbours.
     inside = inside[np.sort(np.unique(network.uv[inside], axis=0, return_index=True)[1])]
-    uv, values = network.uv[inside], (run.after.residuals + run.correction)[inside]
-    fold, candidates = exposure_folds(network.exposure[inside]), np.arange(1, 41)
+    uv = network.uv[inside]
+    values = (run.after.residuals + run.correction)[inside]
+    fold = exposure_folds(network.exposure[inside])
+    candidates = np.arange(1, 41)
 
-    search = GridSearchCV(KNeighborsRegressor(), {'n_neighbors': candidates}, cv=PredefinedSplit(fold), refit=False,
-                          scoring=lambda model, x, y: -np.sum((y - model.predict(x)) ** 2))
+    search = GridSearchCV(
+        KNeighborsRegressor(),
+        {'n_neighbors': candidates},
+        cv=PredefinedSplit(fold),
+        refit=False,
+        scoring=lambda model, x, y: -np.sum((y - model.predict(x)) ** 2),
+    )
     search.fit(uv, values)
-    scores = CrossValidation('knn', uv, fold, candidates).scores(values, np.tile(np.eye(2), (len(uv), 1, 1)))
-    np.testing.assert_allclose(scores, -len(np.unique(fold)) * search.cv_results_['mean_test_score'], rtol=1e-9)
+    scores = CrossValidation('knn', uv, fold, candidates).scores(
+        values, np.tile(np.eye(2), (len(uv), 1, 1))
+    )
+    np.testing.assert_allclose(
+        scores, -len(np.unique(fold)) * search.cv_results_['mean_test_score'], rtol=1e-9
+    )
     assert candidates[np.argmin(scores)] == search.best_params_['n_neighbors']
     assert 1 < candidates[np.argmin(scores)] < 40 and len(uv) > 1700

@@ -9,14 +9,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rigs
 from scipy.spatial import Delaunay
 
-import rigs
 from fluoro_calib_ros.calibration.result import INVALID, OK, OUTSIDE
 from fluoro_calib_ros.distortion import grid as grid_module
 from fluoro_calib_ros.distortion.grid import CHUNK, LIMIT_PX, CorrectionGrid
 from fluoro_calib_ros.distortion.models import CorrectionModel, no_correction
-from fluoro_calib_ros.photogrammetry.observations import points_on_image
+from fluoro_calib_ros.exposures.frame import points_on_image
 
 pytestmark = pytest.mark.long
 
@@ -37,14 +37,16 @@ def looked_up(grid, uv):
 
 
 def any_pixels(grid, n=6000, seed=0):
-    """Pixels anywhere, and where cells are worst: corners, middles of their edges, middles, and their borders."""
+    """Pixels anywhere, and where cells are worst: corners, middles of their edges, middles, and
+    their borders.
+    """
     rng = np.random.default_rng(seed)
     uv = rng.uniform(-0.5, np.array(grid.image_size) - 0.5, (n, 2))
     for part, halves in ((slice(0, n // 4), 1), (slice(n // 4, n // 2), 2)):
         for c, line in enumerate(grid.nodes):
             all_of = np.linspace(line[0], line[-1], halves * (len(line) - 1) + 1)
             uv[part, c] = rng.choice(all_of, len(uv[part]))
-    uv[n // 2:5 * n // 8, 0] = rng.choice(grid.nodes[0], len(uv[n // 2:5 * n // 8]))
+    uv[n // 2 : 5 * n // 8, 0] = rng.choice(grid.nodes[0], len(uv[n // 2 : 5 * n // 8]))
     return uv
 
 
@@ -70,15 +72,19 @@ def training(n=300, seed=0, noise=0.1, size=SIZE):
 
 # ---- accuracy
 
+
 @pytest.mark.parametrize('kind', SMOOTH)
 def test_the_correction_is_the_models_but_for_a_hundredth_of_a_pixel(kind):
-    """Anywhere, where cells are worst by design, and around the pixels that were found to be worst."""
+    """Anywhere, where cells are worst by design, and around the pixels that were found to be
+    worst.
+    """
     calibration = calibration_of(kind)
-    grid, model = calibration.grid, calibration.model
+    grid = calibration.grid
+    model = calibration.model
     uv = any_pixels(grid)
     found = difference(grid, model, uv)
     rng = np.random.default_rng(1)
-    for _ in range(3):   # climb
+    for _ in range(3):  # climb
         worst = uv[np.argsort(found)[-40:]]
         near = (worst[:, None] + rng.uniform(-1, 1, (40, 40, 2)) * grid.cell_px).reshape(-1, 2)
         uv = np.concatenate([worst, near[points_on_image(near, grid.image_size)]])
@@ -86,7 +92,8 @@ def test_the_correction_is_the_models_but_for_a_hundredth_of_a_pixel(kind):
     assert found.max() <= LIMIT_PX
     stated = max(grid.error_px, grid.error_outside_px)
     assert stated <= LIMIT_PX and grid.error_px <= LIMIT_PX
-    # What is stated is measured at middles: what bends has its largest error there, a kink may have it beside.
+    # What is stated is measured at middles: what bends has its largest error there, a kink may
+    # have it beside.
     assert found.max() <= 1.5 * stated + 1e-9 and found.max() >= 0.5 * stated
 
 
@@ -102,7 +109,9 @@ def test_at_corners_of_cells_the_values_are_the_models(kind):
 
 
 def test_nearest_neighbours_are_answered_from_within_their_cell():
-    """Piecewise constant: the lookup lies between the values at the corners of the cell, which is small."""
+    """Piecewise constant: the lookup lies between the values at the corners of the cell, which is
+    small.
+    """
     calibration = calibration_of('knn')
     grid = calibration.grid
     assert grid.cell_px == min(grid_module.CELL_PX)
@@ -124,17 +133,25 @@ def test_standard_deviations(kind):
     assert np.abs(sd - exact).max() <= 0.03 * np.median(exact)
 
 
-@pytest.mark.parametrize('kind, k', [('knn', 1), ('knn', 7), ('local_linear', 6), ('local_linear', 40)])
+@pytest.mark.parametrize(
+    'kind, k', [('knn', 1), ('knn', 7), ('local_linear', 6), ('local_linear', 40)]
+)
 @pytest.mark.parametrize('points', ['even', 'few', 'clusters', 'duplicates', 'beside'])
 def test_corners_have_the_models_neighbours_however_training_points_lie(kind, k, points):
     rng = np.random.default_rng(7)
     uv, duv = training()
     if points == 'few':
-        uv, duv = uv[:40], duv[:40]
+        uv = uv[:40]
+        duv = duv[:40]
     if points == 'clusters':
-        uv = np.clip(np.concatenate([rng.normal(c, 6, (100, 2)) for c in ([20, 20], [100, 30], [60, 80])]), 0, 92)
+        uv = np.clip(
+            np.concatenate([rng.normal(c, 6, (100, 2)) for c in ([20, 20], [100, 30], [60, 80])]),
+            0,
+            92,
+        )
     if points == 'duplicates' and k < 40:
-        uv, duv = np.repeat(uv[:60], k + 1, axis=0), np.repeat(duv[:60], k + 1, axis=0)
+        uv = np.repeat(uv[:60], k + 1, axis=0)
+        duv = np.repeat(duv[:60], k + 1, axis=0)
     if points == 'beside':
         uv = uv * 0.2
     model = CorrectionModel(kind, k, uv, duv, noise_px=0.2)
@@ -165,7 +182,9 @@ def test_a_grid_that_does_not_reach_the_accuracy_says_so():
 
 @pytest.mark.parametrize('k, noise, height', [(12, 0.1, 0.1), (30, 0.3, 0.3)])
 def test_cells_that_are_not_accurate_enough_are_divided(k, noise, height):
-    """Few neighbours, so kinks; pixels in the divided cells, on their edges and on the edges of their parts."""
+    """Few neighbours, so kinks; pixels in the divided cells, on their edges and on the edges of
+    their parts.
+    """
     uv, duv = training(1500, noise=noise, size=(500, 400))
     model = CorrectionModel('local_linear', k, uv, height * duv)
     grid = CorrectionGrid(model, (500, 400))
@@ -175,16 +194,23 @@ def test_cells_that_are_not_accurate_enough_are_divided(k, noise, height):
     j, i = np.nonzero(inner)
     rng = np.random.default_rng(11)
     at = rng.choice([0, 0.25, 0.5, 1, 1e-9, *rng.random(5)], (2, 20, len(j)))
-    uv = np.stack([(line[n] + part * (line[n + 1] - line[n])).ravel()
-                   for line, n, part in zip(grid.nodes, (i, j), at)], axis=1)
+    uv = np.stack(
+        [
+            (line[n] + part * (line[n + 1] - line[n])).ravel()
+            for line, n, part in zip(grid.nodes, (i, j), at)
+        ],
+        axis=1,
+    )
     uv = np.concatenate([uv, any_pixels(grid, 20_000)])
     found = difference(grid, model, uv)
     status = looked_up(grid, uv)[2]
     assert found.max() <= LIMIT_PX and set(status) <= {OK, OUTSIDE}
     assert not (model.outside(uv) & (status == OK)).any()
-    one_by_one = [grid.look_up(uv[n:n + 1, 0], uv[n:n + 1, 1]) for n in range(300)]
+    one_by_one = [grid.look_up(uv[n : n + 1, 0], uv[n : n + 1, 1]) for n in range(300)]
     values, status = grid.look_up(*uv.T)
-    assert np.concatenate([v for v, _ in one_by_one], axis=1).tobytes() == values[:, :300].tobytes()
+    assert (
+        np.concatenate([v for v, _ in one_by_one], axis=1).tobytes() == values[:, :300].tobytes()
+    )
     assert np.concatenate([s for _, s in one_by_one]).tobytes() == status[:300].tobytes()
 
 
@@ -198,11 +224,13 @@ def test_a_large_image_gets_larger_cells(monkeypatch):
     uv, duv = training()
     model = CorrectionModel('local_linear', 40, uv, duv)
     found = []
-    for memory in (10 ** 9, 300_000, 80_000, 20_000, 3_000):
+    for memory in (10**9, 300_000, 80_000, 20_000, 3_000):
         monkeypatch.setattr(grid_module, 'MEMORY', memory)
         grid = CorrectionGrid(model, SIZE)
         found.append(grid.cell_px)
-        assert difference(grid, model, any_pixels(grid)).max() <= 1.6 * max(grid.error_px, grid.error_outside_px)
+        assert difference(grid, model, any_pixels(grid)).max() <= 1.6 * max(
+            grid.error_px, grid.error_outside_px
+        )
     assert found[0] == 2 and found == sorted(found) and found[-1] > 8
 
 
@@ -213,22 +241,31 @@ def test_images_of_any_size(size):
     grid = CorrectionGrid(model, size)
     uv = any_pixels(grid, 800)
     assert (looked_up(grid, uv)[2] != INVALID).all()
-    assert difference(grid, model, uv).max() <= max(2 * max(grid.error_px, grid.error_outside_px), 1e-8)
+    assert difference(grid, model, uv).max() <= max(
+        2 * max(grid.error_px, grid.error_outside_px), 1e-8
+    )
 
 
 # ---- status
 
+
 @pytest.mark.parametrize('kind', KINDS)
 def test_ok_is_a_promise_and_outside_begins_less_than_a_cell_before(kind):
     calibration = calibration_of(kind)
-    grid, model = calibration.grid, calibration.model
+    grid = calibration.grid
+    model = calibration.model
     uv = any_pixels(grid, 20_000)
-    status, outside = looked_up(grid, uv)[2], model.outside(uv)
+    status = looked_up(grid, uv)[2]
+    outside = model.outside(uv)
     assert set(status) <= {OK, OUTSIDE}
     assert not (outside & (status == OK)).any()
     too_early = uv[~outside & (status == OUTSIDE)]
-    near = np.array([model.outside(too_early + step) for step in grid.cell_px * np.array(
-        [[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)])])
+    near = np.array(
+        [
+            model.outside(too_early + step)
+            for step in grid.cell_px * np.array([[i, j] for i in (-1, 0, 1) for j in (-1, 0, 1)])
+        ]
+    )
     assert near.any(axis=0).all()
     assert (status == OUTSIDE).any() == outside.any() == (kind != 'none')
 
@@ -238,10 +275,12 @@ def test_outside_against_a_triangulation():
     uv = rng.normal([60, 45], 12, (200, 2))
     grid = CorrectionGrid(CorrectionModel('knn', 3, uv, np.zeros((200, 2))), SIZE)
     query = any_pixels(grid)
-    inside = np.array([Delaunay(uv).find_simplex(c) >= 0 for c in corners_of(grid, query)]).all(axis=0)
+    inside = np.array([Delaunay(uv).find_simplex(c) >= 0 for c in corners_of(grid, query)]).all(
+        axis=0
+    )
     border = np.zeros(len(query), dtype=bool)
     for line, x in zip(grid.nodes, query.T):
-        border |= np.abs(x[:, None] - line).min(axis=1) < 1e-6   # in either of two cells
+        border |= np.abs(x[:, None] - line).min(axis=1) < 1e-6  # in either of two cells
     assert 0.1 < inside.mean() < 0.9 and 0.1 < border.mean() < 0.9
     np.testing.assert_array_equal((looked_up(grid, query)[2] == OK)[~border], inside[~border])
 
@@ -258,15 +297,40 @@ def test_training_points_on_a_line_enclose_nothing():
 def test_points_at_the_edge_and_off_the_image(kind):
     calibration = calibration_of(kind)
     w, h = calibration.image_size
-    on = np.array([[u, v] for u in (-0.5, 0, w / 2, w - 1, w - 0.5) for v in (-0.5, 0, h / 3, h - 1, h - 0.5)])
-    off = np.array([[-0.5 - 1e-6, 5], [5, -0.5 - 1e-6], [w - 0.5 + 1e-6, 5], [5, h - 0.5 + 1e-6], [np.nan, 5],
-                    [5, np.nan], [np.nan, np.nan], [np.inf, 5], [5, np.inf], [-np.inf, 5], [5, -np.inf],
-                    [np.inf, -np.inf], [1e300, 5], [5, -1e300], [-3, 5], [5, 1e5], [2.0 ** 63, 2.0 ** 31]])
+    on = np.array(
+        [
+            [u, v]
+            for u in (-0.5, 0, w / 2, w - 1, w - 0.5)
+            for v in (-0.5, 0, h / 3, h - 1, h - 0.5)
+        ]
+    )
+    off = np.array(
+        [
+            [-0.5 - 1e-6, 5],
+            [5, -0.5 - 1e-6],
+            [w - 0.5 + 1e-6, 5],
+            [5, h - 0.5 + 1e-6],
+            [np.nan, 5],
+            [5, np.nan],
+            [np.nan, np.nan],
+            [np.inf, 5],
+            [5, np.inf],
+            [-np.inf, 5],
+            [5, -np.inf],
+            [np.inf, -np.inf],
+            [1e300, 5],
+            [5, -1e300],
+            [-3, 5],
+            [5, 1e5],
+            [2.0**63, 2.0**31],
+        ]
+    )
     order = np.random.default_rng(0).permutation(len(on) + len(off))
     uv = np.concatenate([on, off])[order]
     with warnings.catch_warnings():
         warnings.simplefilter('error')
-        found, exact = calibration.correct(uv), calibration.correct(uv, exact=True)
+        found = calibration.correct(uv)
+        exact = calibration.correct(uv, exact=True)
     good = points_on_image(uv, calibration.image_size)
     for each in (found, exact):
         np.testing.assert_array_equal(each.status == INVALID, ~good)
@@ -277,6 +341,7 @@ def test_points_at_the_edge_and_off_the_image(kind):
 
 # ---- the same numbers from every way in
 
+
 def test_frames_and_large_arrays_get_the_same_bits():
     calibration = calibration_of('collocation')
     uv = np.random.default_rng(5).uniform(-20, 1040, (6 * CHUNK + 77, 2))
@@ -284,13 +349,37 @@ def test_frames_and_large_arrays_get_the_same_bits():
     whole = calibration.correct(uv, sigma)
     assert 0.9 < (whole.status != INVALID).mean() < 1
     start = 0
-    for size in [0, 1, 2, 29, 30, 31, 32, 33, 64, 500, 512, 513, 1024, 1025, 2048, 2049, CHUNK - 1, CHUNK, CHUNK + 1]:
+    for size in [
+        0,
+        1,
+        2,
+        29,
+        30,
+        31,
+        32,
+        33,
+        64,
+        500,
+        512,
+        513,
+        1024,
+        1025,
+        2048,
+        2049,
+        CHUNK - 1,
+        CHUNK,
+        CHUNK + 1,
+    ]:
         part = slice(start, start + size)
-        once, again = calibration.correct(uv[part], sigma[part]), calibration.correct(uv[part], sigma[part])
+        once = calibration.correct(uv[part], sigma[part])
+        again = calibration.correct(uv[part], sigma[part])
         arrays = calibration.correct_arrays(uv[part, 0].copy(), uv[part, 1].copy(), sigma[part])
         for each in (once, again):
             for name in ('uv', 'sigma', 'status'):
-                assert getattr(each, name).tobytes() == getattr(whole, name)[part].tobytes(), (size, name)
+                assert getattr(each, name).tobytes() == getattr(whole, name)[part].tobytes(), (
+                    size,
+                    name,
+                )
         assert np.stack(arrays[:2], axis=1).tobytes() == whole.uv[part].tobytes()
         assert arrays[2].tobytes() == whole.sigma[part].tobytes()
         assert arrays[3].tobytes() == looked_up(calibration.grid, uv[part])[1].tobytes()
@@ -302,7 +391,8 @@ def test_frames_and_large_arrays_get_the_same_bits():
 def test_results_are_put_where_they_are_wanted():
     grid = calibration_of('parametric').grid
     u, v = np.random.default_rng(7).uniform(0, 1000, (2, CHUNK + 500))
-    values, status = np.empty((3, len(u))), np.empty(len(u), dtype=np.uint8)
+    values = np.empty((3, len(u)))
+    status = np.empty(len(u), dtype=np.uint8)
     got = grid.look_up(u, v, values, status)
     assert got[0] is values and got[1] is status
     again = grid.look_up(u, v)
@@ -317,7 +407,10 @@ def test_two_grids_of_one_calibration_are_the_same():
     for kind in ('local_linear', 'collocation'):
         calibration = calibration_of(kind)
         other = replace(calibration)
-        assert other.grid is not calibration.grid and other.calibration_id == calibration.calibration_id
+        assert (
+            other.grid is not calibration.grid
+            and other.calibration_id == calibration.calibration_id
+        )
         uv = any_pixels(calibration.grid, 2000)
         assert other.correct(uv).uv.tobytes() == calibration.correct(uv).uv.tobytes()
 
@@ -326,7 +419,7 @@ def test_a_grid_survives_a_copy():
     calibration = calibration_of('parametric')
     uv = any_pixels(calibration.grid, 100)
     calibration.correct(uv[::-1])
-    other = copy.deepcopy(calibration.grid)   # by the same protocol as for another process
+    other = copy.deepcopy(calibration.grid)  # by the same protocol as for another process
     assert looked_up(other, uv)[0].tobytes() == looked_up(calibration.grid, uv)[0].tobytes()
 
 
@@ -334,22 +427,33 @@ def test_sigma_is_that_of_observation_and_correction_together():
     calibration = calibration_of('collocation')
     uv = np.array([[300.0, 400.0], [700.5, 500.25]])
     sd = looked_up(calibration.grid, uv)[1]
-    np.testing.assert_allclose(calibration.correct(uv).sigma, np.hypot(calibration.image_sd, sd), rtol=1e-12)
-    np.testing.assert_allclose(calibration.correct(uv, [2.0, 0.01]).sigma, np.hypot([2.0, 0.01], sd), rtol=1e-12)
-    np.testing.assert_allclose(calibration.correct(uv, [2.0, 0.01], exact=True).sigma,
-                               np.hypot([2.0, 0.01], calibration.model.evaluate(uv).sd), rtol=1e-12)
+    np.testing.assert_allclose(
+        calibration.correct(uv).sigma, np.hypot(calibration.image_sd, sd), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        calibration.correct(uv, [2.0, 0.01]).sigma, np.hypot([2.0, 0.01], sd), rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        calibration.correct(uv, [2.0, 0.01], exact=True).sigma,
+        np.hypot([2.0, 0.01], calibration.model.evaluate(uv).sd),
+        rtol=1e-12,
+    )
 
 
 # ---- many calls, many threads
 
+
 def test_threads_share_a_grid():
-    """Frames of different lengths at the same time, first lookups included: everyone gets their own numbers."""
+    """Frames of different lengths at the same time, first lookups included: everyone gets their
+    own numbers.
+    """
     grid = CorrectionGrid(calibration_of('collocation').model, (1024, 1024))
     rng = np.random.default_rng(8)
     frames = [rng.uniform(0, 1000, (2, n)) for n in (30, 31, 30, 503, 5000, 20_000, 1, 30)]
     expected = [grid.look_up(u.copy(), v.copy())[0].tobytes() for u, v in frames]
     grid = copy.deepcopy(grid)
-    wrong, start = [], threading.Barrier(len(frames))
+    wrong = []
+    start = threading.Barrier(len(frames))
 
     def work(number):
         start.wait()
@@ -368,7 +472,9 @@ def test_threads_share_a_grid():
 def test_memory_does_not_grow_with_the_number_of_frames():
     calibration = calibration_of('local_linear')
     rng = np.random.default_rng(9)
-    frames = [rng.uniform(-5, 1030, (2, n)) for n in (1, 10, 29, 30, 31, 200, 503, 600, 3000, 9000)]
+    frames = [
+        rng.uniform(-5, 1030, (2, n)) for n in (1, 10, 29, 30, 31, 200, 503, 600, 3000, 9000)
+    ]
 
     def correct_all(times):
         for _ in range(times):
@@ -394,7 +500,7 @@ def test_no_correction():
     assert grid.error_px == grid.sd_error_px == 0
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def sparse(kind):
     """A calibration of five exposures, which leave large parts of the image uncovered."""
     return rigs.calibrated('a', 5, model=kind).calibrations['a']

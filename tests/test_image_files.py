@@ -1,4 +1,6 @@
-"""fluoro-calib correct for images: files, stacks, folders and videos, and what users get wrong with them."""
+"""fluoro-calib correct for images: files, stacks, folders and videos, and what users get wrong
+with them.
+"""
 
 import io
 import json
@@ -10,16 +12,17 @@ from dataclasses import replace
 import cv2
 import numpy as np
 import pytest
-
 import rigs
+
 from fluoro_calib_ros.distortion.models import CorrectionModel
-from fluoro_calib_ros.files import images, tiff
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.files import image_files as images
+from fluoro_calib_ros.files import tiff
 from fluoro_calib_ros.files.calibration import save_calibration
-from fluoro_calib_ros.files.images import IMAGES, correct_images
-from fluoro_calib_ros.images.encoded import decode, encode
-from fluoro_calib_ros.images.undistortion import ImageCorrector
-from fluoro_calib_ros.photogrammetry.observations import DataError
-from fluoro_calib_ros.simulation.images import bead_image
+from fluoro_calib_ros.files.image_files import IMAGES, correct_images
+from fluoro_calib_ros.images.codec import decode, encode
+from fluoro_calib_ros.images.corrector import ImageCorrector
+from fluoro_calib_ros.simulation.bead_images import bead_image
 
 SIZE = (128, 96)
 BEADS = [[30.2, 20.9], [60.5, 50.1], [100.0, 80.4], [20.3, 75.7]]
@@ -37,11 +40,20 @@ def stack_of(count, dtype=np.uint8):
 
 def a_calibration(name):
     """Calibration for small images: a pincushion of some pixels."""
-    uv = np.stack(np.meshgrid(*(np.linspace(-0.5, s - 0.5, 12) for s in SIZE)), axis=-1).reshape(-1, 2)
+    uv = np.stack(np.meshgrid(*(np.linspace(-0.5, s - 0.5, 12) for s in SIZE)), axis=-1).reshape(
+        -1, 2
+    )
     x = (uv - 0.5 * np.array(SIZE)) / 64
-    model = CorrectionModel('local_linear', 6, uv, 4 * x * (x ** 2).sum(axis=1, keepdims=True), 0.2, 0.0)
-    return replace(rigs.calibrated('a', 5, model='none').calibrations['a'], fluoroscope=name, model=model,
-                   image_size=SIZE, train_exposure=np.zeros(len(uv), dtype=np.int64))
+    model = CorrectionModel(
+        'local_linear', 6, uv, 4 * x * (x**2).sum(axis=1, keepdims=True), 0.2, 0.0
+    )
+    return replace(
+        rigs.calibrated('a', 5, model='none').calibrations['a'],
+        fluoroscope=name,
+        model=model,
+        image_size=SIZE,
+        train_exposure=np.zeros(len(uv), dtype=np.int64),
+    )
 
 
 @pytest.fixture(scope='module')
@@ -73,8 +85,14 @@ def correct(source, calibration, out, *more):
 def video_of(path, images, rate=29.97, codec='FFV1', colour=False):
     """Write a video."""
     depth = cv2.CV_8U if images[0].dtype == np.uint8 else cv2.CV_16U
-    video = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter_fourcc(*codec), rate, images[0].shape[1::-1],
-                            [cv2.VIDEOWRITER_PROP_IS_COLOR, int(colour), cv2.VIDEOWRITER_PROP_DEPTH, depth])
+    video = cv2.VideoWriter(
+        str(path),
+        cv2.CAP_FFMPEG,
+        cv2.VideoWriter_fourcc(*codec),
+        rate,
+        images[0].shape[1::-1],
+        [cv2.VIDEOWRITER_PROP_IS_COLOR, int(colour), cv2.VIDEOWRITER_PROP_DEPTH, depth],
+    )
     for image in images:
         video.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR) if colour else image)
     video.release()
@@ -94,17 +112,26 @@ def frames_of(path, deep=False):
 
 # ---- good ones
 
+
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 @pytest.mark.parametrize('ending', [e for e in LOSSLESS if e != '.bmp'] + ['.PNG'])
 def test_image_file(one, corrector, tmp_path, capfd, ending, dtype):
     """Pixel for pixel, in 8 and 16 bits."""
-    image, out = image_of(0, dtype), tmp_path / f'out{ending}'
+    image = image_of(0, dtype)
+    out = tmp_path / f'out{ending}'
     (tmp_path / f'in{ending}').write_bytes(encode(image, ending.lower()))
     assert correct(tmp_path / f'in{ending}', one, out, '--json') == 0
     said = capfd.readouterr()
-    assert said.err == '' and np.array_equal(cv2.imread(str(out), cv2.IMREAD_UNCHANGED), corrector.correct(image))
+    assert said.err == '' and np.array_equal(
+        cv2.imread(str(out), cv2.IMREAD_UNCHANGED), corrector.correct(image)
+    )
     got = json.loads(said.out)
-    assert (got['kind'], got['images'], got['fluoroscope'], got['image_size']) == ('image', 1, 'a', list(SIZE))
+    assert (got['kind'], got['images'], got['fluoroscope'], got['image_size']) == (
+        'image',
+        1,
+        'a',
+        list(SIZE),
+    )
     assert got['out'] == str(out) and got['empty_pixels'] == int((~corrector.mask).sum()) > 0
     assert sorted(os.listdir(tmp_path)) == sorted([f'in{ending}', f'out{ending}'])
 
@@ -116,7 +143,9 @@ def test_formats_are_those_of_the_names(one, corrector, tmp_path):
         out = tmp_path / f'out{ending}'
         assert correct(tmp_path / 'in.bmp', one, out) == 0
         got = decode(out.read_bytes()).astype(float)
-        assert np.abs(got - corrector.correct(image_of())).max() <= (12 if ending.startswith('.j') else 0)
+        assert np.abs(got - corrector.correct(image_of())).max() <= (
+            12 if ending.startswith('.j') else 0
+        )
     assert (tmp_path / 'out.png').read_bytes().startswith(b'\x89PNG')
     assert (tmp_path / 'out.jpg').read_bytes().startswith(b'\xff\xd8')
 
@@ -132,7 +161,7 @@ def test_cubic_is_another_image(one, corrector, tmp_path):
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 def test_stack(one, corrector, tmp_path, monkeypatch, dtype):
     """Page by page, however many are read at once."""
-    monkeypatch.setattr('fluoro_calib_ros.files.images.AT_ONCE', 3 * 128 * 96)
+    monkeypatch.setattr('fluoro_calib_ros.files.image_files.AT_ONCE', 3 * 128 * 96)
     pages = stack_of(8, dtype)
     assert cv2.imwritemulti(str(tmp_path / 'in.tif'), pages)
     assert correct(tmp_path / 'in.tif', one, tmp_path / 'out.tiff') == 0
@@ -165,8 +194,11 @@ def test_tiff_with_large_offsets(tmp_path, monkeypatch, large, order):
 
 
 def test_folder(one, corrector, tmp_path, capfd):
-    """All images of it, under their names; other files are passed over, and what is there already stays."""
-    source, out = tmp_path / 'in', tmp_path / 'out'
+    """All images of it, under their names; other files are passed over, and what is there already
+    stays.
+    """
+    source = tmp_path / 'in'
+    out = tmp_path / 'out'
     source.mkdir()
     out.mkdir()
     (out / 'note.txt').write_text('mine')
@@ -182,16 +214,28 @@ def test_folder(one, corrector, tmp_path, capfd):
     assert 'passed over: readme.txt' in said.err
     assert sorted(os.listdir(out)) == ['0.png', '1.png', '2.png', 'note.txt', 'stack.tif']
     for n in range(3):
-        assert np.array_equal(decode((out / f'{n}.png').read_bytes()), corrector.correct(image_of(n)))
+        assert np.array_equal(
+            decode((out / f'{n}.png').read_bytes()), corrector.correct(image_of(n))
+        )
     assert tiff.count_pages(out / 'stack.tif') == 2
     assert sorted(os.listdir(tmp_path)) == ['in', 'out']
 
 
-@pytest.mark.parametrize('ending, dtype, colour', [('.avi', np.uint8, False), ('.mkv', np.uint8, True),
-                                                   ('.mkv', np.uint16, False), ('.avi', np.uint16, False)])
+@pytest.mark.parametrize(
+    'ending, dtype, colour',
+    [
+        ('.avi', np.uint8, False),
+        ('.mkv', np.uint8, True),
+        ('.mkv', np.uint16, False),
+        ('.avi', np.uint16, False),
+    ],
+)
 def test_video(one, corrector, tmp_path, ending, dtype, colour):
-    """Without loss, in 8 and 16 bits, with its frame rate; a video in colours that are all grey is grey."""
-    images, out = stack_of(7, dtype), tmp_path / f'out{ending}'
+    """Without loss, in 8 and 16 bits, with its frame rate; a video in colours that are all grey is
+    grey.
+    """
+    images = stack_of(7, dtype)
+    out = tmp_path / f'out{ending}'
     video_of(tmp_path / 'in.avi', images, colour=colour)
     assert correct(tmp_path / 'in.avi', one, out) == 0
     got, rate = frames_of(out, dtype == np.uint16)
@@ -207,10 +251,16 @@ def test_video_as_mp4_and_as_a_stack(one, corrector, tmp_path):
     wanted = np.array([corrector.correct(image) for image in images])
     assert correct(tmp_path / 'in.avi', one, tmp_path / 'out.mp4') == 0
     got, rate = frames_of(tmp_path / 'out.mp4')
-    assert rate == pytest.approx(120) and got.shape == wanted.shape and np.abs(got - wanted.astype(float)).mean() < 6
+    assert (
+        rate == pytest.approx(120)
+        and got.shape == wanted.shape
+        and np.abs(got - wanted.astype(float)).mean() < 6
+    )
     assert correct(tmp_path / 'out.mp4', one, tmp_path / 'again.mp4') == 0
     assert correct(tmp_path / 'in.avi', one, tmp_path / 'out.tif') == 0
-    assert np.array_equal(cv2.imreadmulti(str(tmp_path / 'out.tif'), flags=cv2.IMREAD_UNCHANGED)[1], wanted)
+    assert np.array_equal(
+        cv2.imreadmulti(str(tmp_path / 'out.tif'), flags=cv2.IMREAD_UNCHANGED)[1], wanted
+    )
 
 
 def test_fluoroscope_is_chosen(both, tmp_path):
@@ -223,7 +273,9 @@ def test_fluoroscope_is_chosen(both, tmp_path):
 def test_progress_is_told(one, corrector, tmp_path):
     video_of(tmp_path / 'in.avi', stack_of(5))
     told = []
-    done = correct_images(tmp_path / 'in.avi', tmp_path / 'out.avi', corrector, lambda *numbers: told.append(numbers))
+    done = correct_images(
+        tmp_path / 'in.avi', tmp_path / 'out.avi', corrector, lambda *numbers: told.append(numbers)
+    )
     assert told == [(n + 1, 5) for n in range(5)] and (done.kind, done.images) == ('video', 5)
 
 
@@ -234,6 +286,7 @@ def test_bar_only_on_a_terminal(one, tmp_path, capfd, monkeypatch):
     class Terminal(io.StringIO):
         def isatty(self):
             return True
+
     monkeypatch.setattr('sys.stderr', Terminal())
     assert correct(tmp_path / 'in.avi', one, tmp_path / 'out.avi', '--json') == 0
     shown = sys.stderr.getvalue()
@@ -242,6 +295,7 @@ def test_bar_only_on_a_terminal(one, tmp_path, capfd, monkeypatch):
 
 
 # ---- bad ones
+
 
 def said(capfd, *arguments):
     """The one sentence with which the command fails."""
@@ -257,9 +311,12 @@ def flipped(content):
     return bytes(content)
 
 
-PNG, TIF = encode(image_of(), '.png'), cv2.imencodemulti('.tif', stack_of(4, np.uint16))[1].tobytes()
-COLOUR = cv2.imencode('.png', np.stack([image_of(), image_of(1), image_of(2)], axis=-1))[1].tobytes()
-BAD = {   # file: content, what is said
+PNG = encode(image_of(), '.png')
+TIF = cv2.imencodemulti('.tif', stack_of(4, np.uint16))[1].tobytes()
+COLOUR = cv2.imencode('.png', np.stack([image_of(), image_of(1), image_of(2)], axis=-1))[
+    1
+].tobytes()
+BAD = {  # file: content, what is said
     'no.xyz': (b'x', 'what a file with the ending .xyz has is not known'),
     'text.png': (b'this is text', 'no image that can be decoded, or it is damaged'),
     'empty.png': (b'', 'the file is empty'),
@@ -268,23 +325,30 @@ BAD = {   # file: content, what is said
     'cut.jpg': (encode(image_of(), '.jpg')[:-200], 'damaged'),
     'cut.bmp': (encode(image_of(), '.bmp')[:-200], 'damaged'),
     'cut.pgm': (encode(image_of(), '.pgm')[:-200], 'damaged'),
-    'cut.tif': (TIF[:len(TIF) * 2 // 3], 'it is cut off or damaged'),
+    'cut.tif': (TIF[: len(TIF) * 2 // 3], 'it is cut off or damaged'),
     'cut_little.tif': (TIF[:-5], 'page 4 of 4 is damaged or cut off'),
     'head.tif': (TIF[:3], 'this is no TIFF file'),
     'text.tif': (b'this is text', 'this is no TIFF file'),
     'text.avi': (b'this is text', 'no video that can be read'),
     'empty.mp4': (b'', 'no video that can be read'),
     'colour.png': (COLOUR, 'this is a colour image'),
-    'float.tif': (cv2.imencode('.tif', image_of().astype(np.float32))[1].tobytes(), 'pixels of float32'),
-    'small.png': (encode(image_of()[:50], '.png'),
-                  'the image is 128 x 50 px, but the calibration is for 128 x 96 px')}
+    'float.tif': (
+        cv2.imencode('.tif', image_of().astype(np.float32))[1].tobytes(),
+        'pixels of float32',
+    ),
+    'small.png': (
+        encode(image_of()[:50], '.png'),
+        'the image is 128 x 50 px, but the calibration is for 128 x 96 px',
+    ),
+}
 
 
 @pytest.mark.parametrize('name', BAD)
 def test_bad_source(one, tmp_path, capfd, name):
     """One sentence with its name; what was there before stays, and nothing else is left."""
     content, sentence = BAD[name]
-    source, out = tmp_path / name, tmp_path / f'out.{name.rpartition(".")[2]}'
+    source = tmp_path / name
+    out = tmp_path / f'out.{name.rpartition(".")[2]}'
     source.write_bytes(content)
     out.write_text('earlier')
     text = said(capfd, source, one, out)
@@ -294,23 +358,27 @@ def test_bad_source(one, tmp_path, capfd, name):
 
 @pytest.mark.parametrize('ending, codec', [('.avi', 'FFV1'), ('.mkv', 'FFV1'), ('.mp4', 'mp4v')])
 def test_cut_video(one, tmp_path, capfd, ending, codec):
-    source, out = tmp_path / f'in{ending}', tmp_path / 'out.avi'
+    source = tmp_path / f'in{ending}'
+    out = tmp_path / 'out.avi'
     video_of(source, stack_of(12), codec=codec)
-    source.write_bytes(source.read_bytes()[:-source.stat().st_size // 3])
+    source.write_bytes(source.read_bytes()[: -source.stat().st_size // 3])
     text = said(capfd, source, one, out)
     assert str(source) in text and 'damaged' in text and os.listdir(tmp_path) == [source.name]
 
 
 def test_bad_image_in_the_midst(one, tmp_path, capfd):
     """Of a folder, a stack or a video: its place is said, and nothing is written."""
-    source, out = tmp_path / 'in', tmp_path / 'out'
+    source = tmp_path / 'in'
+    out = tmp_path / 'out'
     source.mkdir()
     for n in range(3):
-        (source / f'{n}.png').write_bytes(encode(image_of(n)[:96 - 2 * (n == 1)], '.png'))
+        (source / f'{n}.png').write_bytes(encode(image_of(n)[: 96 - 2 * (n == 1)], '.png'))
     assert f'{source / "1.png"}: the image is 128 x 94 px' in said(capfd, source, one, out)
     assert os.listdir(tmp_path) == ['in']
     cv2.imwritemulti(str(tmp_path / 'in.tif'), [image_of(), image_of(), image_of()[:50]])
-    assert 'in.tif, page 3: the image is 128 x 50 px' in said(capfd, tmp_path / 'in.tif', one, tmp_path / 'out.tif')
+    assert 'in.tif, page 3: the image is 128 x 50 px' in said(
+        capfd, tmp_path / 'in.tif', one, tmp_path / 'out.tif'
+    )
     assert sorted(os.listdir(tmp_path)) == ['in', 'in.tif']
 
 
@@ -324,31 +392,44 @@ def test_outputs_that_cannot_be(one, both, tmp_path, capfd):
     (tmp_path / 'folder').mkdir()
     (tmp_path / 'empty').mkdir()
     for source, out, sentence in (
-            (eight, 'nowhere/x.png', 'there is no folder'), (eight, 'x.xyz', 'the ending .xyz is none of an image'),
-            (eight, 'x', 'the ending (none) is none'), (eight, 'x.avi', 'the ending .avi is none of an image'),
-            (eight, '8.png', 'this is the source itself'), (eight, 'folder', 'this is a folder'),
-            (deep, 'x.jpg', '16 bits cannot be written as jpg'), (deep, 'x.bmp', '16 bits cannot be written as bmp'),
-            (stack, 'x.png', 'a stack cannot be written as .png, take tif, tiff'),
-            (stack, 'x.avi', 'a stack cannot be written as .avi'),
-            (video, 'x.mp4', '16 bits cannot be written as mp4, take avi or mkv'),
-            (video, 'x.png', 'a video cannot be written as .png, take tif, tiff, avi, mkv, mp4'),
-            (tmp_path / 'empty', 'x', 'there are no images in this folder'),
-            (tmp_path / 'nothing.png', 'x.png', 'there is no such file'),
-            (tmp_path / 'nothing.avi', 'x.avi', 'there is no such file')):
+        (eight, 'nowhere/x.png', 'there is no folder'),
+        (eight, 'x.xyz', 'the ending .xyz is none of an image'),
+        (eight, 'x', 'the ending (none) is none'),
+        (eight, 'x.avi', 'the ending .avi is none of an image'),
+        (eight, '8.png', 'this is the source itself'),
+        (eight, 'folder', 'this is a folder'),
+        (deep, 'x.jpg', '16 bits cannot be written as jpg'),
+        (deep, 'x.bmp', '16 bits cannot be written as bmp'),
+        (stack, 'x.png', 'a stack cannot be written as .png, take tif, tiff'),
+        (stack, 'x.avi', 'a stack cannot be written as .avi'),
+        (video, 'x.mp4', '16 bits cannot be written as mp4, take avi or mkv'),
+        (video, 'x.png', 'a video cannot be written as .png, take tif, tiff, avi, mkv, mp4'),
+        (tmp_path / 'empty', 'x', 'there are no images in this folder'),
+        (tmp_path / 'nothing.png', 'x.png', 'there is no such file'),
+        (tmp_path / 'nothing.avi', 'x.avi', 'there is no such file'),
+    ):
         assert sentence in said(capfd, source, one, tmp_path / out)
-    assert 'calibrations of a, b: say which with --fluoroscope' in said(capfd, eight, both, tmp_path / 'x.png')
+    assert 'calibrations of a, b: say which with --fluoroscope' in said(
+        capfd, eight, both, tmp_path / 'x.png'
+    )
     assert "there is no calibration of fluoroscope 'c', only of a, b" in said(
-        capfd, eight, both, tmp_path / 'x.png', '--fluoroscope', 'c')
+        capfd, eight, both, tmp_path / 'x.png', '--fluoroscope', 'c'
+    )
     assert len(os.listdir(tmp_path)) == 6
 
 
 def test_names_that_are_no_text(one, tmp_path, capfd):
-    """An image may have one; what OpenCV reads or writes by its name may not: it would end the process."""
+    """An image may have one; what OpenCV reads or writes by its name may not: it would end the
+    process.
+    """
     odd = [tmp_path / os.fsdecode(b'\xff' + ending) for ending in (b'.png', b'.tif', b'.avi')]
     odd[0].write_bytes(encode(image_of(), '.png'))
     cv2.imwritemulti(str(tmp_path / 's.tif'), stack_of(3))
     video_of(tmp_path / 'v.avi', stack_of(3))
-    assert correct(odd[0], one, tmp_path / 'out.png') == 0 and correct(tmp_path / 's.tif', one, odd[1]) == 0
+    assert (
+        correct(odd[0], one, tmp_path / 'out.png') == 0
+        and correct(tmp_path / 's.tif', one, odd[1]) == 0
+    )
     capfd.readouterr()
     os.replace(tmp_path / 's.tif', odd[1])
     assert 'the name is not UTF-8 text, rename it' in said(capfd, odd[1], one, tmp_path / 'x.tif')
@@ -365,8 +446,12 @@ def test_folder_in_the_way_of_an_image(one, tmp_path, capfd):
     for name in ('a.png', 'b.png'):
         (tmp_path / 'in' / name).write_bytes(encode(image_of(), '.png'))
     assert f'{tmp_path / "out" / "b.png"}: cannot be written, this is a folder' in said(
-        capfd, tmp_path / 'in', one, tmp_path / 'out')
-    assert os.listdir(tmp_path / 'out') == ['b.png'] and sorted(os.listdir(tmp_path)) == ['in', 'out']
+        capfd, tmp_path / 'in', one, tmp_path / 'out'
+    )
+    assert os.listdir(tmp_path / 'out') == ['b.png'] and sorted(os.listdir(tmp_path)) == [
+        'in',
+        'out',
+    ]
 
 
 def test_odd_sizes_of_videos(tmp_path):

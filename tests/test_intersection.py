@@ -1,4 +1,6 @@
-"""Points in space: orientation of a rig, epipolar check, intersection of rays, matching of views, recordings."""
+"""Points in space: orientation of a rig, epipolar check, intersection of rays, matching of views,
+recordings.
+"""
 
 from dataclasses import replace
 
@@ -8,41 +10,70 @@ import pytest
 from rigs import calibrated
 from scipy.optimize import least_squares
 
-from fluoro_calib_ros.photogrammetry.observations import DataError, Frame
+from fluoro_calib_ros.drift.rig_watch import clusters_of
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.reconstruction.correspondence import matched
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry, epipolar_residuals
-from fluoro_calib_ros.reconstruction.intersection import (FAILED, OK, OUTSIDE, REJECTED, SINGLE_VIEW, Intersector,
-                                                          _derivative_functions)
-from fluoro_calib_ros.reconstruction.matching import matched
-from fluoro_calib_ros.reconstruction.orientation import RigOrientation
-from fluoro_calib_ros.reconstruction.recording import reconstruct_recording
-from fluoro_calib_ros.reconstruction.watching import clusters_of
+from fluoro_calib_ros.reconstruction.intersection import (
+    FAILED,
+    OK,
+    OUTSIDE,
+    REJECTED,
+    SINGLE_VIEW,
+    Intersector,
+    _derivative_functions,
+)
+from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 SIGMA = 0.25
 
 
 def orientation_of(names=('a', 'b'), uncertain=1.0, seed=1):
-    """RigOrientation of a virtual rig, true, with a full covariance of uncertain times a realistic size."""
-    fluoroscopes, count = virtual_rig(seed, names=names).fluoroscopes, 9 * len(names)
+    """RigOrientation of a virtual rig, true, with a full covariance of uncertain times a realistic
+    size.
+    """
+    fluoroscopes = virtual_rig(seed, names=names).fluoroscopes
+    count = 9 * len(names)
     spread = np.random.default_rng(seed).normal(size=(count, count)) / np.sqrt(count)
-    root = spread * np.tile([0.03] * 3 + [2e-5] * 3 + [0.2, 0.2, 0.3], len(names))[:, None] * uncertain
-    return RigOrientation(names, *(np.array([getattr(f, name) for f in fluoroscopes]) for name in (
-        'interior', 'rotation', 'position_mm')), root @ root.T, 'rig', 'capture', names)
+    root = (
+        spread
+        * np.tile([0.03] * 3 + [2e-5] * 3 + [0.2, 0.2, 0.3], len(names))[:, None]
+        * uncertain
+    )
+    return RigOrientation(
+        names,
+        *(
+            np.array([getattr(f, name) for f in fluoroscopes])
+            for name in ('interior', 'rotation', 'position_mm')
+        ),
+        root @ root.T,
+        'rig',
+        'capture',
+        names,
+    )
 
 
 def moved(orientation, step):
     """The orientation after a step (9F,) of its unknowns."""
     step = np.reshape(step, (-1, 9))
-    return replace(orientation, interior=orientation.interior + step[:, 6:],
-                   rotation=matrix_from_vector(step[:, 3:6]) @ orientation.rotation,
-                   position_mm=orientation.position_mm + step[:, :3])
+    return replace(
+        orientation,
+        interior=orientation.interior + step[:, 6:],
+        rotation=matrix_from_vector(step[:, 3:6]) @ orientation.rotation,
+        position_mm=orientation.position_mm + step[:, :3],
+    )
 
 
 def projected(orientation, xyz):
     """Image points (F, n, 2) of points (n, 3), written out point by point with Eq. 1."""
     out = []
-    for (xp, yp, c), rotation, position in zip(orientation.interior, orientation.rotation, orientation.position_mm):
+    for (xp, yp, c), rotation, position in zip(
+        orientation.interior, orientation.rotation, orientation.position_mm
+    ):
         x = (xyz - position) @ rotation.T
         out.append(np.column_stack([xp + c * x[:, 0] / x[:, 2], yp + c * x[:, 1] / x[:, 2]]))
     return np.array(out)
@@ -71,33 +102,54 @@ STEPS = [1e-2] * 3 + [1e-6] * 3 + [1e-2] * 3
 
 @pytest.mark.parametrize('names', [('a', 'b'), ('a', 'b', 'c')])
 def test_intersection_is_the_least_squares_solution(names):
-    """The same point as scipy finds for every point by itself, with sigma of its own for every image point."""
+    """The same point as scipy finds for every point by itself, with sigma of its own for every
+    image point.
+    """
     orientation = orientation_of(names)
     _, uv, sigma = seen(orientation, 12)
     sigma = sigma * np.random.default_rng(3).uniform(0.5, 2, sigma.shape)
     found = Intersector(orientation, reject=None).intersect(uv, sigma)
     for k in range(12):
-        peer = least_squares(lambda x, k=k: ((projected(orientation, x[None])[:, 0] - uv[:, k])
-                                             / sigma[:, k, None]).ravel(), np.zeros(3), xtol=1e-15, ftol=1e-15,
-                             gtol=1e-15)
+        peer = least_squares(
+            lambda x, k=k: (
+                (projected(orientation, x[None])[:, 0] - uv[:, k]) / sigma[:, k, None]
+            ).ravel(),
+            np.zeros(3),
+            xtol=1e-15,
+            ftol=1e-15,
+            gtol=1e-15,
+        )
         np.testing.assert_allclose(found.xyz_mm[k], peer.x, atol=1e-5)
-        np.testing.assert_allclose(found.covariance_noise[k], np.linalg.inv(peer.jac.T @ peer.jac), rtol=1e-3,
-                                   atol=1e-6)
+        np.testing.assert_allclose(
+            found.covariance_noise[k], np.linalg.inv(peer.jac.T @ peer.jac), rtol=1e-3, atol=1e-6
+        )
         left = projected(orientation, peer.x[None])[:, 0] - uv[:, k]
-        np.testing.assert_allclose(found.residual[k], np.sqrt(np.mean(left ** 2)), rtol=1e-3)
-    assert (found.status == OK).all() and (found.rays == len(names)).all() and (found.left_out == -1).all()
+        np.testing.assert_allclose(found.residual[k], np.sqrt(np.mean(left**2)), rtol=1e-3)
+    assert (
+        (found.status == OK).all()
+        and (found.rays == len(names)).all()
+        and (found.left_out == -1).all()
+    )
 
 
 def test_pycolmap_triangulates_the_same_points():
-    """An independent program; it minimises angles, which for equal weights differs by less than the noise does."""
+    """An independent program; it minimises angles, which for equal weights differs by less than
+    the noise does.
+    """
     orientation = orientation_of()
     xyz, uv, sigma = seen(orientation, 10)
     found = Intersector(orientation).intersect(uv, sigma)
     cameras = []
-    for xp, yp, c in orientation.interior:   # its pixels begin at the corner of the image
-        cameras.append(pycolmap.Camera(model='SIMPLE_PINHOLE', width=1024, height=1024, params=[c, xp + 0.5, yp + 0.5]))
-    poses = [pycolmap.Rigid3d(np.column_stack([r, -r @ t]))
-             for r, t in zip(orientation.rotation, orientation.position_mm)]
+    for xp, yp, c in orientation.interior:  # its pixels begin at the corner of the image
+        cameras.append(
+            pycolmap.Camera(
+                model='SIMPLE_PINHOLE', width=1024, height=1024, params=[c, xp + 0.5, yp + 0.5]
+            )
+        )
+    poses = [
+        pycolmap.Rigid3d(np.column_stack([r, -r @ t]))
+        for r, t in zip(orientation.rotation, orientation.position_mm)
+    ]
     for k in range(10):
         peer = pycolmap.estimate_triangulation(uv[:, k] + 0.5, poses, cameras)
         np.testing.assert_allclose(found.xyz_mm[k], peer['xyz'], atol=0.02)
@@ -110,52 +162,76 @@ def test_derivatives_of_the_image_points_by_the_orientation():
     functions = _derivative_functions(orientation)
     for f in range(2):
         x = orientation.rotation[f] @ (xyz[0] - orientation.position_mm[f])
-        (x, y), near = x[:2] / x[2], 1 / x[2]
+        (x, y) = x[:2] / x[2]
+        near = 1 / x[2]
         values = np.array([1, x, y, x * x, y * y, x * y, near, x * near, y * near])
         analytic = np.einsum('k,kij->ij', values, functions[f])
-        np.testing.assert_allclose(analytic, numeric[f, :, 9 * f:9 * f + 9], rtol=1e-5, atol=1e-4)
-        assert np.abs(np.delete(numeric[f], np.r_[9 * f:9 * f + 9], axis=1)).max() == 0
+        np.testing.assert_allclose(
+            analytic, numeric[f, :, 9 * f : 9 * f + 9], rtol=1e-5, atol=1e-4
+        )
+        assert np.abs(np.delete(numeric[f], np.r_[9 * f : 9 * f + 9], axis=1)).max() == 0
 
 
 @pytest.mark.parametrize('names', [('a', 'b'), ('a', 'b', 'c')])
 def test_covariance_is_that_of_noise_and_orientation(names):
-    """By the law of propagation, with the derivatives of the intersected point as finite differences."""
+    """By the law of propagation, with the derivatives of the intersected point as finite
+    differences.
+    """
     orientation = orientation_of(names)
     _, uv, sigma = seen(orientation, 5, noise_px=0)
     found = Intersector(orientation).intersect(uv, sigma)
-    by_rig = central(lambda step: Intersector(moved(orientation, step)).intersect(uv, sigma).xyz_mm, 9 * len(names),
-                     STEPS)
-    by_image = central(lambda step: Intersector(orientation).intersect(
-        uv + step.reshape(len(names), 1, 2), sigma).xyz_mm, 2 * len(names), [1e-2])
-    noise = by_image @ by_image.transpose(0, 2, 1) * SIGMA ** 2
+    by_rig = central(
+        lambda step: Intersector(moved(orientation, step)).intersect(uv, sigma).xyz_mm,
+        9 * len(names),
+        STEPS,
+    )
+    by_image = central(
+        lambda step: (
+            Intersector(orientation).intersect(uv + step.reshape(len(names), 1, 2), sigma).xyz_mm
+        ),
+        2 * len(names),
+        [1e-2],
+    )
+    noise = by_image @ by_image.transpose(0, 2, 1) * SIGMA**2
     np.testing.assert_allclose(found.covariance_noise, noise, rtol=1e-4, atol=1e-7)
     every = noise + by_rig @ orientation.covariance @ by_rig.transpose(0, 2, 1)
     np.testing.assert_allclose(found.covariance, every, rtol=1e-3, atol=1e-6)
-    np.testing.assert_allclose(found.sd_mm, np.sqrt(np.diagonal(every, axis1=1, axis2=2)), rtol=1e-3)
+    np.testing.assert_allclose(
+        found.sd_mm, np.sqrt(np.diagonal(every, axis1=1, axis2=2)), rtol=1e-3
+    )
 
 
 def test_covariance_against_monte_carlo():
     """Points, epipolar distances and the test of the rays: normalised squares with a mean of one."""
     orientation = orientation_of()
     xyz, uv, sigma = seen(orientation, 20, noise_px=0)
-    rng, root = np.random.default_rng(5), orientation.root()
-    squares, noise_only, tests, distances = [], [], [], []
+    rng = np.random.default_rng(5)
+    root = orientation.root()
+    squares = []
+    noise_only = []
+    tests = []
+    distances = []
     known = Intersector(orientation, reject=None)
     for _ in range(600):
         noisy = uv + rng.normal(0, SIGMA, uv.shape)
         wrong = moved(orientation, root @ rng.normal(size=len(root)))
         found = Intersector(wrong, reject=None).intersect(noisy, sigma)
         error = found.xyz_mm - xyz
-        squares.append(np.einsum('ni,nij,nj->n', error, np.linalg.inv(found.covariance), error) / 3)
-        tests.append(found.standardised ** 2)
+        squares.append(
+            np.einsum('ni,nij,nj->n', error, np.linalg.inv(found.covariance), error) / 3
+        )
+        tests.append(found.standardised**2)
         distance = epipolar_residuals(wrong, 'a', 'b', *noisy, SIGMA, SIGMA)
         distances.append((distance.residual / distance.sd_total) ** 2)
         error = known.intersect(noisy, sigma).xyz_mm - xyz
-        noise_only.append(np.einsum('ni,nij,nj->n', error, np.linalg.inv(found.covariance_noise), error) / 3)
+        noise_only.append(
+            np.einsum('ni,nij,nj->n', error, np.linalg.inv(found.covariance_noise), error) / 3
+        )
     assert [np.mean(a) for a in (squares, tests, distances)] == pytest.approx([1, 1, 1], abs=0.1)
     assert np.mean(noise_only) == pytest.approx(1, abs=0.03)
     assert np.trace(known.intersect(uv, sigma).covariance[0]) > 1.2 * np.trace(
-        known.intersect(uv, sigma).covariance_noise[0])
+        known.intersect(uv, sigma).covariance_noise[0]
+    )
 
 
 def test_epipolar_distance_and_its_standard_deviations():
@@ -165,26 +241,49 @@ def test_epipolar_distance_and_its_standard_deviations():
     geometry = EpipolarGeometry(orientation, 'a', 'b')
     sigma = np.linspace(0.1, 0.8, 8), np.linspace(0.5, 0.2, 8)
     found = geometry.residuals(*uv, *sigma)
-    by_a, by_b = (central(lambda step, side=side: geometry.residuals(
-        *(uv + (np.arange(2) == side)[:, None, None] * step), *sigma).residual, 2, [1e-3]) for side in (0, 1))
-    np.testing.assert_allclose(found.factor_a[:, None] * found.normal_a, by_a, rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(found.factor_b[:, None] * found.normal_b, by_b, rtol=1e-3, atol=1e-4)
-    np.testing.assert_allclose(found.factor_a ** 2 + found.factor_b ** 2, 1)
-    np.testing.assert_allclose(found.sd, np.hypot(found.factor_a * sigma[0], found.factor_b * sigma[1]))
-    by_rig = central(lambda step: epipolar_residuals(moved(orientation, step), 'a', 'b', *uv, *sigma).residual, 18,
-                     STEPS)
+    by_a, by_b = (
+        central(
+            lambda step, side=side: (
+                geometry.residuals(
+                    *(uv + (np.arange(2) == side)[:, None, None] * step), *sigma
+                ).residual
+            ),
+            2,
+            [1e-3],
+        )
+        for side in (0, 1)
+    )
+    np.testing.assert_allclose(
+        found.factor_a[:, None] * found.normal_a, by_a, rtol=1e-3, atol=1e-4
+    )
+    np.testing.assert_allclose(
+        found.factor_b[:, None] * found.normal_b, by_b, rtol=1e-3, atol=1e-4
+    )
+    np.testing.assert_allclose(found.factor_a**2 + found.factor_b**2, 1)
+    np.testing.assert_allclose(
+        found.sd, np.hypot(found.factor_a * sigma[0], found.factor_b * sigma[1])
+    )
+    by_rig = central(
+        lambda step: epipolar_residuals(moved(orientation, step), 'a', 'b', *uv, *sigma).residual,
+        18,
+        STEPS,
+    )
     of_rig = np.einsum('ni,ij,nj->n', by_rig, orientation.covariance, by_rig)
-    np.testing.assert_allclose(found.sd_total ** 2, found.sd ** 2 + of_rig, rtol=1e-3)
+    np.testing.assert_allclose(found.sd_total**2, found.sd**2 + of_rig, rtol=1e-3)
 
 
 def test_epipolar_distance_is_the_smallest_shift_that_makes_the_rays_meet():
-    """For two views of equal sigma it is the length of the residuals, and standardised what the intersection tells."""
+    """For two views of equal sigma it is the length of the residuals, and standardised what the
+    intersection tells.
+    """
     orientation = orientation_of()
     _, uv, sigma = seen(orientation, 8)
     distance = epipolar_residuals(orientation, 'b', 'a', *uv[::-1], SIGMA, SIGMA)
     points = Intersector(orientation, reject=None).intersect(uv, sigma)
     np.testing.assert_allclose(np.abs(distance.residual), 2 * points.residual, rtol=1e-3)
-    np.testing.assert_allclose(np.abs(distance.residual) / distance.sd_total, points.standardised, rtol=1e-3)
+    np.testing.assert_allclose(
+        np.abs(distance.residual) / distance.sd_total, points.standardised, rtol=1e-3
+    )
     other = epipolar_residuals(orientation, 'a', 'b', *uv, SIGMA, SIGMA)
     np.testing.assert_allclose(np.abs(other.residual), np.abs(distance.residual), rtol=1e-9)
 
@@ -192,7 +291,8 @@ def test_epipolar_distance_is_the_smallest_shift_that_makes_the_rays_meet():
 def test_epipolar_nan_stays_nan():
     orientation = orientation_of()
     _, uv, sigma = seen(orientation, 4)
-    uv[0, 1], sigma[1, 2] = np.nan, np.nan
+    uv[0, 1] = np.nan
+    sigma[1, 2] = np.nan
     found = epipolar_residuals(orientation, 'a', 'b', *uv, *sigma)
     assert np.isnan(found.residual).tolist() == [False, True, False, False]
     assert np.isnan(found.sd_total).tolist() == [False, True, True, False]
@@ -207,7 +307,11 @@ def test_false_match_of_two_views_is_rejected():
     uv[1, 7] += 8 * normal[7, ::-1] * (1, -1)
     found = Intersector(orientation).intersect(uv, sigma)
     assert np.flatnonzero(found.status == REJECTED).tolist() == [4]
-    assert np.isnan(found.xyz_mm[4]).all() and np.isnan(found.covariance[4]).all() and found.standardised[4] > 4
+    assert (
+        np.isnan(found.xyz_mm[4]).all()
+        and np.isnan(found.covariance[4]).all()
+        and found.standardised[4] > 4
+    )
     assert np.isnan(found.covariance_noise[4]).all() and found.residual[4] > 1
     good = np.delete(np.arange(30), [4, 7])
     assert np.abs(found.xyz_mm[good] - xyz[good]).max() < 0.6 and (found.status[good] == OK).all()
@@ -219,7 +323,8 @@ def test_false_match_of_two_views_is_rejected():
 def test_false_match_of_more_views_loses_its_ray(names):
     orientation = orientation_of(names, uncertain=0.3)
     xyz, uv, sigma = seen(orientation, 40)
-    rng, count = np.random.default_rng(1), len(names)
+    rng = np.random.default_rng(1)
+    count = len(names)
     false = np.arange(20) % count
     uv[false, np.arange(20)] += rng.choice([-1, 1], (20, 2)) * rng.uniform(20, 50, (20, 2))
     found = Intersector(orientation).intersect(uv, sigma)
@@ -238,14 +343,19 @@ def test_points_that_few_fluoroscopes_see():
     """Every point by the rays it has, as if the others were not there."""
     orientation = orientation_of(('a', 'b', 'c'))
     _, uv, sigma = seen(orientation, 6)
-    uv[0, 0], uv[2, 1], sigma[1, 2] = np.nan, np.nan, np.nan
-    uv[:2, 3], uv[:, 4] = np.nan, np.nan
+    uv[0, 0] = np.nan
+    uv[2, 1] = np.nan
+    sigma[1, 2] = np.nan
+    uv[:2, 3] = np.nan
+    uv[:, 4] = np.nan
     found = Intersector(orientation).intersect(uv, sigma)
     assert found.rays.tolist() == [2, 2, 2, 1, 0, 3]
     assert found.status.tolist() == [OK, OK, OK, SINGLE_VIEW, SINGLE_VIEW, OK]
     for k, names in enumerate([('b', 'c'), ('a', 'b'), ('a', 'c')]):
         rows = [orientation.number(name) for name in names]
-        alone = Intersector(orientation.subset(names)).intersect(uv[rows][:, k:k + 1], sigma[rows][:, k:k + 1])
+        alone = Intersector(orientation.subset(names)).intersect(
+            uv[rows][:, k : k + 1], sigma[rows][:, k : k + 1]
+        )
         np.testing.assert_allclose(found.xyz_mm[k], alone.xyz_mm[0], atol=1e-5)
         np.testing.assert_allclose(found.covariance[k], alone.covariance[0], rtol=1e-3, atol=1e-6)
     assert np.isnan(found.xyz_mm[3:5]).all() and np.isnan(found.residual[3:5]).all()
@@ -271,14 +381,23 @@ def test_rays_that_do_not_meet_in_front_of_the_sources():
     across = orientation.rotation[1] @ orientation.rotation[0].T
     direction = np.array([0.0, 0.0, 1.0])
     parallel = [[0, 0], (across @ direction)[:2] / (across @ direction)[2]]
-    uv = orientation.interior[:, None, :2] + orientation.interior[:, None, 2:] * np.array(parallel)[:, None]
+    uv = (
+        orientation.interior[:, None, :2]
+        + orientation.interior[:, None, 2:] * np.array(parallel)[:, None]
+    )
     behind = 3 * (orientation.position_mm[0] + orientation.position_mm[1])
     uv = np.concatenate([uv, projected(orientation, behind[None])], axis=1)
     for reject in (None, 4.0):
         found = Intersector(orientation, reject).intersect(uv, np.ones((2, 2)))
         assert found.status.tolist() == [FAILED] * 2 and np.isnan(found.xyz_mm).all()
-    same = replace(orientation, rotation=orientation.rotation[[0, 0]], position_mm=orientation.position_mm[[0, 0]])
-    assert set(Intersector(same).intersect(np.full((2, 3, 2), 400.0), np.ones((2, 3))).status) == {FAILED}
+    same = replace(
+        orientation,
+        rotation=orientation.rotation[[0, 0]],
+        position_mm=orientation.position_mm[[0, 0]],
+    )
+    assert set(Intersector(same).intersect(np.full((2, 3, 2), 400.0), np.ones((2, 3))).status) == {
+        FAILED
+    }
     with pytest.raises(DataError, match='sources in one place'):
         EpipolarGeometry(same, 'a', 'b')
 
@@ -295,19 +414,41 @@ def test_empty_frame_and_wrong_shapes():
         Intersector(orientation_of(), reject=0)
 
 
-@pytest.mark.parametrize('change, sentence', [
-    ({'fluoroscopes': ('a', 'a')}, 'the fluoroscopes are a, a, and each is to have a name of its own'),
-    ({'calibration_ids': ('a',)}, '2 fluoroscopes, but 1 calibrations'),
-    ({'optical_frame_ids': ('a',)}, '2 fluoroscopes, but 1 optical frames'),
-    ({'source': 'guess'}, "its source is one of capture, joint calibration, not 'guess'"),
-    ({'frame_id': ''}, 'the rig frame has no name'),
-    ({'position_mm': np.zeros(3)}, r'position_mm has shape \(3,\), not \(2, 3\)'),
-    ({'position_mm': np.full((2, 3), np.nan)}, 'position_mm holds nan, which is not a finite number'),
-    ({'interior': np.array([[1, 1, 100], [1, 1, -100.0]])}, 'the principal distance of fluoroscope b is -100 px'),
-    ({'rotation': np.tile(np.diag([1, 1, -1.0]), (2, 1, 1))}, 'the rotation of fluoroscope a is no rotation matrix'),
-    ({'rotation': np.tile(1.01 * np.eye(3), (2, 1, 1))}, 'the rotation of fluoroscope a is no rotation matrix'),
-    ({'covariance': np.eye(18) + np.eye(18, k=1)}, 'its covariance is not symmetric'),
-    ({'covariance': np.ones((18, 18)) - np.eye(18)}, 'its covariance has a negative eigenvalue')])
+@pytest.mark.parametrize(
+    'change, sentence',
+    [
+        (
+            {'fluoroscopes': ('a', 'a')},
+            'the fluoroscopes are a, a, and each is to have a name of its own',
+        ),
+        ({'calibration_ids': ('a',)}, '2 fluoroscopes, but 1 calibrations'),
+        ({'optical_frame_ids': ('a',)}, '2 fluoroscopes, but 1 optical frames'),
+        ({'source': 'guess'}, "its source is one of capture, joint calibration, not 'guess'"),
+        ({'frame_id': ''}, 'the rig frame has no name'),
+        ({'position_mm': np.zeros(3)}, r'position_mm has shape \(3,\), not \(2, 3\)'),
+        (
+            {'position_mm': np.full((2, 3), np.nan)},
+            'position_mm holds nan, which is not a finite number',
+        ),
+        (
+            {'interior': np.array([[1, 1, 100], [1, 1, -100.0]])},
+            'the principal distance of fluoroscope b is -100 px',
+        ),
+        (
+            {'rotation': np.tile(np.diag([1, 1, -1.0]), (2, 1, 1))},
+            'the rotation of fluoroscope a is no rotation matrix',
+        ),
+        (
+            {'rotation': np.tile(1.01 * np.eye(3), (2, 1, 1))},
+            'the rotation of fluoroscope a is no rotation matrix',
+        ),
+        ({'covariance': np.eye(18) + np.eye(18, k=1)}, 'its covariance is not symmetric'),
+        (
+            {'covariance': np.ones((18, 18)) - np.eye(18)},
+            'its covariance has a negative eigenvalue',
+        ),
+    ],
+)
 def test_a_wrong_orientation_is_refused_in_a_sentence(change, sentence):
     with pytest.raises(DataError, match='^rig orientation: ' + sentence):
         replace(orientation_of(), **change)
@@ -322,47 +463,87 @@ def test_orientation_by_name():
     np.testing.assert_array_equal(part.rotation, orientation.rotation[[2, 0]])
     np.testing.assert_array_equal(part.covariance[:9, 9:], orientation.covariance[18:, :9])
     np.testing.assert_array_equal(part.sd_mm, orientation.sd_mm[[2, 0]])
-    np.testing.assert_allclose(orientation.root() @ orientation.root().T, orientation.covariance, atol=1e-12)
+    np.testing.assert_allclose(
+        orientation.root() @ orientation.root().T, orientation.covariance, atol=1e-12
+    )
     with pytest.raises(DataError, match="there is no fluoroscope 'd', only a, b, c"):
         orientation.subset(['a', 'd'])
     assert replace(orientation).orientation_id == orientation.orientation_id
-    assert len({orientation.orientation_id, part.orientation_id, replace(orientation, stamp_ns=1).orientation_id}) == 3
+    assert (
+        len(
+            {
+                orientation.orientation_id,
+                part.orientation_id,
+                replace(orientation, stamp_ns=1).orientation_id,
+            }
+        )
+        == 3
+    )
     orientation.check_calibrations({'a': 'a', 'b': 'b', 'c': 'c', 'd': 'x'})
     with pytest.raises(DataError, match='there is no calibration of its fluoroscope c'):
         orientation.check_calibrations({'a': 'a', 'b': 'b'})
-    with pytest.raises(DataError, match='it belongs to the calibration b of fluoroscope b, but that at hand is x; '):
+    with pytest.raises(
+        DataError,
+        match='it belongs to the calibration b of fluoroscope b, but that at hand is x; ',
+    ):
         orientation.check_calibrations({'a': 'a', 'b': 'x', 'c': 'c'})
 
 
 def test_views_are_matched_by_id():
     uv = [np.arange(6.0).reshape(3, 2), np.arange(8.0).reshape(4, 2) + 100]
-    sigma, outside = [np.ones(3), np.full(4, 2.0)], [np.array([True, False, False]), np.zeros(4, dtype=bool)]
+    sigma = [np.ones(3), np.full(4, 2.0)]
+    outside = [np.array([True, False, False]), np.zeros(4, dtype=bool)]
     ids, points, sd, beyond = matched([[7, 2, 9], [2, 5, 7, 1]], uv, sigma, outside)
     assert ids.tolist() == [1, 2, 5, 7, 9]
     np.testing.assert_array_equal(points[0], [[np.nan] * 2, [2, 3], [np.nan] * 2, [0, 1], [4, 5]])
-    np.testing.assert_array_equal(points[1], [[106, 107], [100, 101], [102, 103], [104, 105], [np.nan] * 2])
+    np.testing.assert_array_equal(
+        points[1], [[106, 107], [100, 101], [102, 103], [104, 105], [np.nan] * 2]
+    )
     np.testing.assert_array_equal(np.isnan(sd), np.isnan(points[:, :, 0]))
     assert beyond[0].tolist() == [False, False, False, True, False] and not beyond[1].any()
     same = np.array([7, 2, 9])
-    ids, points, sd, beyond = matched([same, same.copy()], [uv[0], uv[1][:3]], [sigma[0], sigma[1][:3]])
+    ids, points, sd, beyond = matched(
+        [same, same.copy()], [uv[0], uv[1][:3]], [sigma[0], sigma[1][:3]]
+    )
     assert ids.tolist() == [7, 2, 9] and beyond is None
     np.testing.assert_array_equal(points, [uv[0], uv[1][:3]])
     assert sd.shape == (2, 3)
 
 
 def recording(count=3, **change):
-    """Frames of fluoroscopes a and b, of three targets each, and what is needed to reconstruct them."""
+    """Frames of fluoroscopes a and b, of three targets each, and what is needed to reconstruct
+    them.
+    """
     rig = virtual_rig(1)
-    calibrations = {name: calibrated(name, 5, model='parametric').calibrations[name] for name in ('a', 'b')}
-    orientation = replace(orientation_of(), calibration_ids=tuple(c.calibration_id for c in calibrations.values()))
+    calibrations = {
+        name: calibrated(name, 5, model='parametric').calibrations[name] for name in ('a', 'b')
+    }
+    orientation = replace(
+        orientation_of(), calibration_ids=tuple(c.calibration_id for c in calibrations.values())
+    )
     xyz = np.array([[10.0, 20, 30], [-10, 0, 5], [40, -20, 10]])
-    frames = {f.name: [Frame(f.name, k + 1, np.array([3, 1, 2]), f.distortion.distort(f.ideal(xyz)), f.image_size, None,
-                             k * 10 ** 7) for k in range(count)] for f in rig.fluoroscopes}
+    frames = {
+        f.name: [
+            Frame(
+                f.name,
+                k + 1,
+                np.array([3, 1, 2]),
+                f.distortion.distort(f.ideal(xyz)),
+                f.image_size,
+                None,
+                k * 10**7,
+            )
+            for k in range(count)
+        ]
+        for f in rig.fluoroscopes
+    }
     return frames, calibrations, Intersector(replace(orientation, **change)), xyz
 
 
 def test_recording_frame_by_frame():
-    """Observed points are corrected first; frames without partner are counted, by number or by time."""
+    """Observed points are corrected first; frames without partner are counted, by number or by
+    time.
+    """
     frames, calibrations, intersector, xyz = recording()
     frames['b'] = [replace(frames['b'][0], target_id=np.array([3, 1, 8])), *frames['b'][2:]]
     found, unpaired = reconstruct_recording(frames, calibrations, intersector)
@@ -379,9 +560,13 @@ def test_recording_frame_by_frame():
 def test_wrong_recordings_are_refused_in_a_sentence():
     frames, calibrations, intersector, _ = recording(1)
     for change, sentence in (
-            ({'image_size': (512, 512)}, 'fluoroscope b, frame 1: the image is 512 x 512 px, but the calibration is '
-                                         'for 1024 x 1024 px'),
-            ({'target_id': np.array([1, 2, 1])}, 'fluoroscope b, frame 1: target 1 is there 2 times')):
+        (
+            {'image_size': (512, 512)},
+            'fluoroscope b, frame 1: the image is 512 x 512 px, but the calibration is '
+            'for 1024 x 1024 px',
+        ),
+        ({'target_id': np.array([1, 2, 1])}, 'fluoroscope b, frame 1: target 1 is there 2 times'),
+    ):
         wrong = {**frames, 'b': [replace(frames['b'][0], **change)]}
         with pytest.raises(DataError, match=sentence):
             reconstruct_recording(wrong, calibrations, intersector)
@@ -389,12 +574,17 @@ def test_wrong_recordings_are_refused_in_a_sentence():
         reconstruct_recording({'a': frames['a']}, calibrations, intersector)
 
 
-@pytest.mark.parametrize('texts, sentence', [
-    (['1001 1002'], "does not declare a cluster, as 'tibia: 1001 1002 1003' does"),
-    (['tibia:'], 'does not declare a cluster'), (['tibia: 1 x'], 'does not declare a cluster'),
-    (['tibia: 1'], 'cluster tibia: it is two beads or more'),
-    (['tibia: 1 2', 'tibia: 3 4'], 'two clusters have the same name'),
-    (['tibia: 1 2', 'femur: 2 3'], 'target 2 is in two clusters')])
+@pytest.mark.parametrize(
+    'texts, sentence',
+    [
+        (['1001 1002'], "does not declare a cluster, as 'tibia: 1001 1002 1003' does"),
+        (['tibia:'], 'does not declare a cluster'),
+        (['tibia: 1 x'], 'does not declare a cluster'),
+        (['tibia: 1'], 'cluster tibia: it is two beads or more'),
+        (['tibia: 1 2', 'tibia: 3 4'], 'two clusters have the same name'),
+        (['tibia: 1 2', 'femur: 2 3'], 'target 2 is in two clusters'),
+    ],
+)
 def test_declared_clusters_that_are_none(texts, sentence):
     with pytest.raises(ValueError, match=sentence):
         clusters_of(texts)
@@ -402,4 +592,6 @@ def test_declared_clusters_that_are_none(texts, sentence):
 
 def test_declared_clusters():
     assert [(c.name, c.target_id) for c in clusters_of(['tibia: 1 2,3', 'my femur :4 5'])] == [
-        ('tibia', (1, 2, 3)), ('my femur', (4, 5))]
+        ('tibia', (1, 2, 3)),
+        ('my femur', (4, 5)),
+    ]

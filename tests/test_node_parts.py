@@ -1,4 +1,6 @@
-"""Parts of the nodes that need no graph: images of odd layouts, calibrations that are none, and taking them over."""
+"""Parts of the nodes that need no graph: images of odd layouts, calibrations that are none, and
+taking them over.
+"""
 
 import threading
 from array import array
@@ -7,39 +9,53 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import rigs
 from sensor_msgs.msg import Image
 
-import rigs
 from fluoro_calib_ros.distortion.models import CorrectionModel
-from fluoro_calib_ros.images.undistortion import ImageCorrector
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.nodes.calibrations import Calibrations
 from fluoro_calib_ros.nodes.checks import Refused
 from fluoro_calib_ros.nodes.conversion import calibration_from_message, message_from_calibration
 from fluoro_calib_ros.nodes.orienting import Orienting
 from fluoro_calib_ros.nodes.pictures import Pictures
 from fluoro_calib_ros.nodes.support import check_timeout, path_of, sentence_of
-from fluoro_calib_ros.photogrammetry.observations import DataError
 
 SIZE = (64, 48)
 
 
 @pytest.fixture(scope='module')
 def calibration():
-    uv = np.stack(np.meshgrid(*(np.linspace(-0.5, s - 0.5, 8) for s in SIZE)), axis=-1).reshape(-1, 2)
+    uv = np.stack(np.meshgrid(*(np.linspace(-0.5, s - 0.5, 8) for s in SIZE)), axis=-1).reshape(
+        -1, 2
+    )
     model = CorrectionModel('local_linear', 6, uv, np.ones_like(uv), 0.2, 0.0)
-    return replace(rigs.calibrated('a', 5, model='none').calibrations['a'], fluoroscope='a', model=model,
-                   image_size=SIZE, train_exposure=np.zeros(len(uv), dtype=np.int64))
+    return replace(
+        rigs.calibrated('a', 5, model='none').calibrations['a'],
+        fluoroscope='a',
+        model=model,
+        image_size=SIZE,
+        train_exposure=np.zeros(len(uv), dtype=np.int64),
+    )
 
 
 # ---- images
+
 
 @pytest.mark.parametrize('gap', [0, 1, 2, 7])
 def test_rows_of_16_bits_may_begin_at_any_byte(calibration, gap):
     width, height = SIZE
     pixels = np.arange(width * height, dtype=np.uint16).reshape(height, width)
     rows = np.zeros((height, 2 * width + gap), np.uint8)
-    rows[:, :2 * width] = pixels.view(np.uint8)
-    message = Image(width=width, height=height, encoding='mono16', step=rows.shape[1], data=array('B', rows.tobytes()))
+    rows[:, : 2 * width] = pixels.view(np.uint8)
+    message = Image(
+        width=width,
+        height=height,
+        encoding='mono16',
+        step=rows.shape[1],
+        data=array('B', rows.tobytes()),
+    )
     image, _ = Pictures('a').array_of(message, calibration)
     corrector = ImageCorrector(calibration)
     assert np.array_equal(corrector.correct(image), corrector.correct(pixels))
@@ -48,7 +64,7 @@ def test_rows_of_16_bits_may_begin_at_any_byte(calibration, gap):
 def test_names_of_any_length_are_cut_short(calibration):
     """A sentence goes into the log, and into the diagnostics every second."""
     width, height = SIZE
-    message = Image(width=width, height=height, encoding='x' * 10 ** 6, step=width)
+    message = Image(width=width, height=height, encoding='x' * 10**6, step=width)
     with pytest.raises(Refused) as refused:
         Pictures('a').array_of(message, calibration)
     assert 'its encoding' in str(refused.value) and len(str(refused.value)) < 600
@@ -56,11 +72,17 @@ def test_names_of_any_length_are_cut_short(calibration):
 
 # ---- calibrations
 
-@pytest.mark.parametrize('change, said', [
-    ({'interior': np.array([np.nan, 0, 0])}, 'interior holds nan'),
-    ({'image_sd': np.nan}, 'image_sd holds nan'),
-    ({'image_sd': -1.0}, 'image_sd holds -1.0'),
-    ({'image_size': (0, 48)}, 'image_size holds 0')], ids=lambda x: x if isinstance(x, str) else '')
+
+@pytest.mark.parametrize(
+    'change, said',
+    [
+        ({'interior': np.array([np.nan, 0, 0])}, 'interior holds nan'),
+        ({'image_sd': np.nan}, 'image_sd holds nan'),
+        ({'image_sd': -1.0}, 'image_sd holds -1.0'),
+        ({'image_size': (0, 48)}, 'image_size holds 0'),
+    ],
+    ids=lambda x: x if isinstance(x, str) else '',
+)
 def test_calibration_with_impossible_numbers_is_refused(calibration, change, said):
     """What no file can hold comes in by no message either, though its id belongs to it."""
     message = message_from_calibration(replace(calibration, **change))
@@ -69,15 +91,31 @@ def test_calibration_with_impossible_numbers_is_refused(calibration, change, sai
 
 
 class Inbox:
-    """A Calibrations of one fluoroscope, with what it has taken and refused; preparing waits for go."""
+    """A Calibrations of one fluoroscope, with what it has taken and refused; preparing waits for
+    go.
+    """
 
     def __init__(self, fault=None):
-        self.taken, self.refused, self.go, self.began = [], [], threading.Event(), threading.Semaphore(0)
-        self._fault, self.most, self._now, self.ended = fault, 0, 0, threading.Semaphore(0)
-        node = SimpleNamespace(create_subscription=self._subscribe, destroy_subscription=lambda _: None,
-                               get_logger=lambda: SimpleNamespace(error=lambda text: None))
-        self.calibrations = Calibrations(node, ['a'], self._prepare, self._take,
-                                         lambda name, sentence: self.refused.append(sentence))
+        self.taken = []
+        self.refused = []
+        self.go = threading.Event()
+        self.began = threading.Semaphore(0)
+        self._fault = fault
+        self.most = 0
+        self._now = 0
+        self.ended = threading.Semaphore(0)
+        node = SimpleNamespace(
+            create_subscription=self._subscribe,
+            destroy_subscription=lambda _: None,
+            get_logger=lambda: SimpleNamespace(error=lambda text: None),
+        )
+        self.calibrations = Calibrations(
+            node,
+            ['a'],
+            self._prepare,
+            self._take,
+            lambda name, sentence: self.refused.append(sentence),
+        )
 
     def _subscribe(self, kind, topic, callback, qos):
         self.put = callback
@@ -102,13 +140,13 @@ def test_of_a_flood_of_calibrations_one_is_prepared_at_a_time_and_the_last_one_s
     for number in range(50):
         inbox.put(message_from_calibration(replace(calibration, stamp_ns=number)))
         if number == 0:
-            assert inbox.began.acquire(timeout=60)   # the first is at work
+            assert inbox.began.acquire(timeout=60)  # the first is at work
     inbox.go.set()
-    assert all(inbox.ended.acquire(timeout=60) for _ in range(2))   # what came last was next
+    assert all(inbox.ended.acquire(timeout=60) for _ in range(2))  # what came last was next
     assert inbox.taken == [0, 49] and inbox.most == 1 and inbox.calibrations.of('a') == 49
     inbox.put(message_from_calibration(replace(calibration, stamp_ns=99)))
     assert all(inbox.began.acquire(timeout=60) for _ in range(2))
-    inbox.calibrations.close()   # waits for what is being prepared
+    inbox.calibrations.close()  # waits for what is being prepared
     assert inbox.taken[-1] == 99
 
 
@@ -119,37 +157,62 @@ def test_calibration_that_cannot_be_prepared_is_refused_whatever_the_reason(cali
     inbox.put(message_from_calibration(calibration))
     assert inbox.began.acquire(timeout=60)
     inbox.calibrations.close()
-    assert inbox.refused == [sentence_of(fault)] and not inbox.taken and inbox.calibrations.of('a') is None
+    assert (
+        inbox.refused == [sentence_of(fault)]
+        and not inbox.taken
+        and inbox.calibrations.of('a') is None
+    )
 
 
 # ---- orientation, and what requests may ask
 
+
 def test_orientation_of_calibrations_that_have_changed_meanwhile_is_none(monkeypatch):
-    """A self-calibration may end while a capture is being adjusted: what belongs to the old one is not published."""
-    now, old = ({name: SimpleNamespace(calibration_id=f'{name}-{age}') for name in 'ab'} for age in ('new', 'old'))
+    """A self-calibration may end while a capture is being adjusted: what belongs to the old one is
+    not published.
+    """
+    now, old = (
+        {name: SimpleNamespace(calibration_id=f'{name}-{age}') for name in 'ab'}
+        for age in ('new', 'old')
+    )
     found = SimpleNamespace(fluoroscopes=('a', 'b'), calibration_ids=('a-old', 'b-old'))
     held = dict(old)
 
     class Here(Orienting):
         def __init__(self):
-            self._names, self._phantom, self._rig_frame, self._timeout = ('a', 'b'), None, 'rig', 5.0
-            self._calibrations, self._capture = lambda: held, None
-            self._node = SimpleNamespace(create_timer=lambda *_, **__: None, destroy_timer=lambda _: None)
+            self._names = ('a', 'b')
+            self._phantom = None
+            self._rig_frame = 'rig'
+            self._timeout = 5.0
+            self._calibrations = lambda: held
+            self._capture = None
+            self._node = SimpleNamespace(
+                create_timer=lambda *_, **__: None, destroy_timer=lambda _: None
+            )
 
         async def _beside(self, function):
             held.update(now)
             return found
+
     here = Here()
     asked = here._captured(SimpleNamespace(timeout_sec=1.0, frames=1))
-    asked.send(None)   # it waits for its frames
+    asked.send(None)  # it waits for its frames
     here.take({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
     with pytest.raises(DataError, match='the calibrations have changed meanwhile'):
         asked.send(None)
 
 
-@pytest.mark.parametrize('seconds, said', [(0.0, 'seconds, not 0.0'), (-1.0, 'seconds, not -1.0'),
-                                           (np.nan, 'seconds, not nan'), (1e10, 'seconds, at most 86400, not'),
-                                           (1e300, 'at most 86400, not 1e[+]300'), (np.inf, 'at most 86400, not inf')])
+@pytest.mark.parametrize(
+    'seconds, said',
+    [
+        (0.0, 'seconds, not 0.0'),
+        (-1.0, 'seconds, not -1.0'),
+        (np.nan, 'seconds, not nan'),
+        (1e10, 'seconds, at most 86400, not'),
+        (1e300, 'at most 86400, not 1e[+]300'),
+        (np.inf, 'at most 86400, not inf'),
+    ],
+)
 def test_timeout_for_which_nobody_can_wait(seconds, said):
     with pytest.raises(ValueError, match=f'timeout_sec is a time in .*{said}'):
         check_timeout(seconds)

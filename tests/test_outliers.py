@@ -4,13 +4,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rigs
 from threadpoolctl import threadpool_limits
 
-import rigs
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.noise import Noise
-from fluoro_calib_ros.photogrammetry.outliers import find_outliers, image_statistics, target_statistics
+from fluoro_calib_ros.photogrammetry.outliers import (
+    find_outliers,
+    image_statistics,
+    target_statistics,
+)
 from fluoro_calib_ros.photogrammetry.precision import precision
 
 SHAPE = dict(exposures=10, targets=60, noise_px=0.25)
@@ -29,16 +33,24 @@ def adjusted(network, truth, loss='student_t'):
 
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t', 'huber'])
 def test_false_alarms_on_clean_data(loss):
-    """At 1 % for all together hardly any of 20 networks raises one; the single statistics have their quantiles."""
-    alarms, image, target = 0, [], []
+    """At 1 % for all together hardly any of 20 networks raises one; the single statistics have
+    their quantiles.
+    """
+    alarms = 0
+    image = []
+    target = []
     for seed in range(20):
         network, truth = rigs.small_network(seed=seed, **SHAPE)
         result, precise = adjusted(network, truth, loss)
         found = find_outliers(network, result, precise)
         alarms += len(found.image_point) + len(found.target)
-        value, critical = image_statistics(network, result, precise, 0.05 * np.isfinite(result.q).sum())
+        value, critical = image_statistics(
+            network, result, precise, 0.05 * np.isfinite(result.q).sum()
+        )
         image.append(np.mean(value > critical))
-        (value, _, _), critical = target_statistics(network, result, precise, 0.05 * len(network.survey_mm))
+        (value, _, _), critical = target_statistics(
+            network, result, precise, 0.05 * len(network.survey_mm)
+        )
         target.append(np.mean(value > critical))
     assert alarms <= 2
     assert np.mean(image) == pytest.approx(0.05, abs=0.02)
@@ -47,7 +59,8 @@ def test_false_alarms_on_clean_data(loss):
 
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t', 'huber'])
 def test_a_gross_error_of_two_pixels_is_found(loss):
-    found_rows, others = 0, 0
+    found_rows = 0
+    others = 0
     for seed in range(20):
         network, truth = rigs.small_network(seed=seed, **SHAPE)
         rng = np.random.default_rng(seed)
@@ -64,7 +77,8 @@ def test_a_gross_error_of_two_pixels_is_found(loss):
 
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t'])
 def test_a_bead_moved_by_two_millimetres_is_found(loss):
-    hits, others = 0, 0
+    hits = 0
+    others = 0
     for seed in range(15):
         network, truth = rigs.small_network(seed=seed, **SHAPE)
         survey = network.survey_mm.copy()

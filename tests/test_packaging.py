@@ -13,11 +13,15 @@ import pytest
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 MSG_DEFS = ROOT / 'msg_defs'
-INTERFACES = sorted(path for kind in ('msg', 'srv', 'action') for path in MSG_DEFS.glob(f'{kind}/*.{kind}'))
+INTERFACES = sorted(
+    path for kind in ('msg', 'srv', 'action') for path in MSG_DEFS.glob(f'{kind}/*.{kind}')
+)
 
 
 def package_xml(folder):
-    """Return the text of the fields of a package.xml that both packages share, and its dependencies."""
+    """Return the text of the fields of a package.xml that both packages share, and its
+    dependencies.
+    """
     root = ElementTree.parse(folder / 'package.xml').getroot()
     fields = {tag: root.findtext(tag) for tag in ('name', 'version', 'license', 'maintainer')}
     fields['email'] = root.find('maintainer').get('email')
@@ -36,21 +40,31 @@ def test_metadata_agree():
     written = dict(re.findall(r"^    (\w+)='([^']*)'", setup, re.MULTILINE))
     assert written['version'] == ours['version']
     assert written['license'] == ours['license']
-    assert (written['maintainer'], written['maintainer_email']) == (ours['maintainer'], ours['email'])
+    assert (written['maintainer'], written['maintainer_email']) == (
+        ours['maintainer'],
+        ours['email'],
+    )
     assert (ROOT / 'resource' / ours['name']).is_file()
     assert (ROOT / 'LICENSE').read_bytes() == (MSG_DEFS / 'LICENSE').read_bytes()
-    assert f"project({messages['name']})" in (MSG_DEFS / 'CMakeLists.txt').read_text()
+    assert f'project({messages["name"]})' in (MSG_DEFS / 'CMakeLists.txt').read_text()
 
 
 def test_scripts_go_where_ros2_run_looks():
     """On a colcon install the scripts go into lib/<package>."""
     config = configparser.ConfigParser()
     config.read(ROOT / 'setup.cfg')
-    assert config['develop']['script_dir'] == config['install']['install_scripts'] == '$base/lib/fluoro_calib_ros'
+    assert (
+        config['develop']['script_dir']
+        == config['install']['install_scripts']
+        == '$base/lib/fluoro_calib_ros'
+    )
 
 
 @pytest.mark.parametrize(
-    'entry', importlib.metadata.distribution('fluoro_calib_ros').entry_points, ids=lambda entry: entry.name)
+    'entry',
+    importlib.metadata.distribution('fluoro_calib_ros').entry_points,
+    ids=lambda entry: entry.name,
+)
 def test_console_script_has_its_module(entry):
     """Every console script names a module that exists and defines its function."""
     spec = importlib.util.find_spec(entry.module)
@@ -60,7 +74,9 @@ def test_console_script_has_its_module(entry):
 
 def test_every_interface_is_built():
     """CMakeLists.txt lists just the interface files that are there."""
-    listed = re.findall(r'"((?:msg|srv|action)/\w+\.\w+)"', (MSG_DEFS / 'CMakeLists.txt').read_text())
+    listed = re.findall(
+        r'"((?:msg|srv|action)/\w+\.\w+)"', (MSG_DEFS / 'CMakeLists.txt').read_text()
+    )
     assert sorted(listed) == sorted(str(path.relative_to(MSG_DEFS)) for path in INTERFACES)
 
 
@@ -74,7 +90,11 @@ def test_every_field_says_what_it_is(path):
         where = f'{path.name}:{number}: {line}'
         assert comment.strip(), where
         kind = field.split()[0].rstrip('[]0123456789')
-        if re.fullmatch(r'float\d+|u?int\d+', kind) and '=' not in field and 'target_id' not in field:
+        if (
+            re.fullmatch(r'float\d+|u?int\d+', kind)
+            and '=' not in field
+            and 'target_id' not in field
+        ):
             assert re.search(r'\[[^\]]+\]', comment) or 'the same' in comment, where
 
 
@@ -82,28 +102,49 @@ def test_messages_without_ros():
     """The bag writer reads the message definitions from inside the package, where ROS need not be."""
     folder = ROOT / 'fluoro_calib_ros' / 'bags' / 'msg'
     assert sorted(path.name for path in folder.glob('*.msg')) == sorted(
-        path.name for path in INTERFACES if path.suffix == '.msg')
+        path.name for path in INTERFACES if path.suffix == '.msg'
+    )
 
 
 def test_lock_is_exact():
     """The lock file pins every package to one version, and has every package of requirements.in."""
-    pins = [line for line in (ROOT / 'requirements.lock').read_text().splitlines() if not line.startswith('#')]
+    pins = [
+        line
+        for line in (ROOT / 'requirements.lock').read_text().splitlines()
+        if not line.startswith('#')
+    ]
     assert all(re.fullmatch(r'[\w.-]+==[\w.]+( ; python_version .*)?', pin) for pin in pins)
-    wanted = [re.split(r'[\[<=>]', line)[0].strip() for line in (ROOT / 'requirements.in').read_text().splitlines()
-              if line.strip() and not line.startswith('#')]
+    wanted = [
+        re.split(r'[\[<=>]', line)[0].strip()
+        for line in (ROOT / 'requirements.in').read_text().splitlines()
+        if line.strip() and not line.startswith('#')
+    ]
     locked = {pin.split('==')[0] for pin in pins}
     assert not {name.lower().replace('_', '-') for name in wanted} - locked
 
 
 def project_files():
-    """Paths of the files of the project: those git knows, in an unpacked archive all but what is made here."""
-    listing = subprocess.run(['git', 'ls-files', '--cached', '--others', '--exclude-standard', '-z'],
-                             cwd=ROOT, capture_output=True, check=False)
+    """Paths of the files of the project: those git knows, in an unpacked archive all but what is
+    made here.
+    """
+    listing = subprocess.run(
+        ['git', 'ls-files', '--cached', '--others', '--exclude-standard', '-z'],
+        cwd=ROOT,
+        capture_output=True,
+        check=False,
+    )
     if not listing.returncode:
         return [ROOT / name.decode() for name in filter(None, listing.stdout.split(b'\0'))]
     made = {line.strip().strip('/') for line in (ROOT / '.gitignore').read_text().splitlines()}
-    return [path for path in ROOT.rglob('*')
-            if not any(fnmatch.fnmatch(part, pattern) for part in path.relative_to(ROOT).parts for pattern in made)]
+    return [
+        path
+        for path in ROOT.rglob('*')
+        if not any(
+            fnmatch.fnmatch(part, pattern)
+            for part in path.relative_to(ROOT).parts
+            for pattern in made
+        )
+    ]
 
 
 def test_no_path_of_a_machine():
@@ -117,4 +158,4 @@ def test_no_path_of_a_machine():
             if b'\0' in content[:8192]:
                 continue
             found = foreign.search(content)
-            assert not found, f'{path}: {content[found.start():found.start() + 60]!r}'
+            assert not found, f'{path}: {content[found.start() : found.start() + 60]!r}'

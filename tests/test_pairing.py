@@ -1,4 +1,6 @@
-"""Exposures of three fluoroscopes or more, with views missing: which come out, when, in which order, and the counts."""
+"""Exposures of three fluoroscopes or more, with views missing: which come out, when, in which
+order, and the counts.
+"""
 
 import itertools
 from dataclasses import dataclass, replace
@@ -6,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.reconstruction.pairing import ExposurePairer, exposure_pairer, recorded_pairer
+from fluoro_calib_ros.exposures.pairing import ExposurePairer, exposure_pairer, recorded_pairer
 
 MS = 1_000_000
 BY = ('frame_number', 'stamp')
@@ -28,17 +30,31 @@ def frame(name, row, first=1, jitter_ns=0):
 
 def streams(rng, names, count, loss, jitter_ms=0.9):
     """{name: [Frame, ...]} of count exposures, each view lost with the probability loss."""
-    return {name: [frame(name, row, 1, int(rng.uniform(0, jitter_ms) * MS)) for row in range(count)
-                   if rng.random() >= loss] for name in names}
+    return {
+        name: [
+            frame(name, row, 1, int(rng.uniform(0, jitter_ms) * MS))
+            for row in range(count)
+            if rng.random() >= loss
+        ]
+        for name in names
+    }
 
 
 def merged(rng, of_each, most_behind=None):
-    """Frames of streams in a random order that keeps that of each, none more than so many exposures behind others."""
-    left, out = {name: list(of_one) for name, of_one in of_each.items()}, []
+    """Frames of streams in a random order that keeps that of each, none more than so many
+    exposures behind others.
+    """
+    left = {name: list(of_one) for name, of_one in of_each.items()}
+    out = []
     while any(left.values()):
         first = min(of_one[0].row for of_one in left.values() if of_one)
-        name = rng.choice([name for name, of_one in left.items() if of_one and (
-            most_behind is None or of_one[0].row <= first + most_behind)])
+        name = rng.choice(
+            [
+                name
+                for name, of_one in left.items()
+                if of_one and (most_behind is None or of_one[0].row <= first + most_behind)
+            ]
+        )
         out.append(left[name].pop(0))
     return out
 
@@ -46,7 +62,10 @@ def merged(rng, of_each, most_behind=None):
 def expected(of_each, fewest=2):
     """[(row, names)] of the exposures of which enough views are there."""
     rows = sorted({f.row for of_one in of_each.values() for f in of_one})
-    there = [(row, {name for name, of_one in of_each.items() if row in {f.row for f in of_one}}) for row in rows]
+    there = [
+        (row, {name for name, of_one in of_each.items() if row in {f.row for f in of_one}})
+        for row in rows
+    ]
     return [(row, names) for row, names in there if len(names) >= fewest]
 
 
@@ -54,17 +73,26 @@ def paired(pairer, frames, flush=True):
     """[(row, names)] of what comes out, all views of which are of one exposure."""
     exposures = [e for f in frames for e in pairer.add(f)]
     exposures += pairer.flush() if flush else ()
-    assert all(len({f.row for f in e.values()}) == 1 and all(f.fluoroscope == name for name, f in e.items())
-               for e in exposures)
+    assert all(
+        len({f.row for f in e.values()}) == 1
+        and all(f.fluoroscope == name for name, f in e.items())
+        for e in exposures
+    )
     return [(next(iter(e.values())).row, set(e)) for e in exposures]
 
 
 @pytest.mark.parametrize('by', BY)
 @pytest.mark.parametrize('lost', list(itertools.product([(), (0,), (1,), (0, 1)], repeat=3)))
-def test_in_every_order_of_arrival_every_exposure_of_two_views_comes_out_once_and_in_order(by, lost):
-    """All orders of two exposures and a complete third one, of three streams that are in order themselves."""
-    of_each = {name: [frame(name, row, 1, k * MS // 2) for row in range(3) if row not in gone]
-               for k, (name, gone) in enumerate(zip('abc', lost))}
+def test_in_every_order_of_arrival_every_exposure_of_two_views_comes_out_once_and_in_order(
+    by, lost
+):
+    """All orders of two exposures and a complete third one, of three streams that are in order
+    themselves.
+    """
+    of_each = {
+        name: [frame(name, row, 1, k * MS // 2) for row in range(3) if row not in gone]
+        for k, (name, gone) in enumerate(zip('abc', lost))
+    }
     wanted = expected(of_each)
     places = ''.join(name * len(of_one) for name, of_one in of_each.items())
     for order in set(itertools.permutations(places)):
@@ -72,30 +100,39 @@ def test_in_every_order_of_arrival_every_exposure_of_two_views_comes_out_once_an
         pairer = recorded_pairer('abc', by)
         assert paired(pairer, [next(rows[name]) for name in order], flush=False) == wanted
         assert sum(pairer.unpaired.values()) == len(order) - sum(len(names) for _, names in wanted)
-        assert sum(pairer.late.values()) == 0 and pairer.incomplete == sum(len(names) < 3 for _, names in wanted)
+        assert sum(pairer.late.values()) == 0 and pairer.incomplete == sum(
+            len(names) < 3 for _, names in wanted
+        )
 
 
 @pytest.mark.parametrize('seed', range(30))
 def test_random_losses_jitter_and_delays(seed):
-    """Three to five fluoroscopes: what is late by less than the patience, and the frames lost before it, is waited
-    for."""
+    """Three to five fluoroscopes: what is late by less than the patience, and the frames lost
+    before it, is waited for.
+    """
     rng = np.random.default_rng(seed)
-    names, patience = 'abcde'[:3 + seed % 3], int(rng.integers(24, 40))
+    names = 'abcde'[: 3 + seed % 3]
+    patience = int(rng.integers(24, 40))
     of_each = streams(rng, names, 300, rng.choice([0.0, 0.1, 0.3]))
     frames = merged(rng, of_each, patience // 2)
     pairer = exposure_pairer(names, BY[seed % 2], 1 * MS, 64, patience)
     assert paired(pairer, frames) == expected(of_each)
     assert sum(pairer.late.values()) == 0 and pairer.incomplete == sum(
-        len(views) < len(names) for _, views in expected(of_each))
+        len(views) < len(names) for _, views in expected(of_each)
+    )
 
 
 @pytest.mark.parametrize('seed', range(30))
 def test_delays_beyond_the_patience_cost_views_and_nothing_else(seed):
-    """In order, each at most once, every frame in an exposure or counted, and queues as long as is allowed."""
+    """In order, each at most once, every frame in an exposure or counted, and queues as long as is
+    allowed.
+    """
     rng = np.random.default_rng(seed)
-    waiting, patience = int(rng.integers(1, 12)), int(rng.integers(1, 12))
+    waiting = int(rng.integers(1, 12))
+    patience = int(rng.integers(1, 12))
     of_each = streams(rng, 'abc', 300, 0.2)
-    frames, whole = merged(rng, of_each), dict(expected(of_each))
+    frames = merged(rng, of_each)
+    whole = dict(expected(of_each))
     pairer = exposure_pairer('abc', BY[seed % 2], 1 * MS, waiting, patience)
     found = []
     for f in frames:
@@ -103,7 +140,9 @@ def test_delays_beyond_the_patience_cost_views_and_nothing_else(seed):
         assert max(len(queue) for queue in pairer._queues.values()) <= waiting
     found += paired(pairer, [])
     rows = [row for row, _ in found]
-    assert rows == sorted(set(rows)) and all(2 <= len(views) and views <= whole[row] for row, views in found)
+    assert rows == sorted(set(rows)) and all(
+        len(views) >= 2 and views <= whole[row] for row, views in found
+    )
     assert len(frames) == sum(len(views) for _, views in found) + sum(pairer.unpaired.values())
     assert all(pairer.late[name] <= pairer.unpaired[name] for name in 'abc')
     assert pairer.incomplete == sum(len(views) < 3 for _, views in found)
@@ -112,83 +151,141 @@ def test_delays_beyond_the_patience_cost_views_and_nothing_else(seed):
 @pytest.mark.parametrize('by', BY)
 def test_a_lost_view_is_certain_with_the_next_frame(by):
     pairer = exposure_pairer('abc', by, 1 * MS)
-    out = [[sorted(e) for e in pairer.add(f)] for f in (
-        frame('a', 0), frame('b', 0), frame('a', 1), frame('c', 1), frame('b', 1))]
+    out = [
+        [sorted(e) for e in pairer.add(f)]
+        for f in (frame('a', 0), frame('b', 0), frame('a', 1), frame('c', 1), frame('b', 1))
+    ]
     assert out == [[], [], [], [['a', 'b']], [['a', 'b', 'c']]]
 
 
 @pytest.mark.parametrize('by', BY)
 def test_a_silent_fluoroscope_is_waited_for_once_and_taken_up_again(by):
-    """Then the others come out with their own last frame; it comes back at their pace, a frame late at first."""
-    pairer, out = exposure_pairer('abc', by, 1 * MS, 64, 5), []
+    """Then the others come out with their own last frame; it comes back at their pace, a frame
+    late at first.
+    """
+    pairer = exposure_pairer('abc', by, 1 * MS, 64, 5)
+    out = []
     for row in range(20):
         out.append(sum((paired(pairer, [frame(name, row)], flush=False) for name in 'ab'), []))
     assert [len(some) for some in out] == [0] * 5 + [6] + [1] * 14 and pairer.silent == {'c'}
-    assert paired(pairer, [frame('c', 19)], flush=False) == [] and pairer.late['c'] == 1 and not pairer.silent
+    assert (
+        paired(pairer, [frame('c', 19)], flush=False) == []
+        and pairer.late['c'] == 1
+        and not pairer.silent
+    )
     for row in range(20, 23):
-        assert paired(pairer, [frame(name, row) for name in 'abc'], flush=False) == [(row, {'a', 'b', 'c'})]
+        assert paired(pairer, [frame(name, row) for name in 'abc'], flush=False) == [
+            (row, {'a', 'b', 'c'})
+        ]
     assert pairer.incomplete == 20 and pairer.unpaired == {'a': 0, 'b': 0, 'c': 1}
 
 
 def test_one_that_lags_for_good_stays_out_and_the_others_are_not_delayed():
     """Far behind, or numbered otherwise, before or after: what it sends is counted."""
-    for first in (-1000, 1000, 10 ** 6):
-        pairer, out = exposure_pairer('abc', waiting=8, patience=5), []
+    for first in (-1000, 1000, 10**6):
+        pairer = exposure_pairer('abc', waiting=8, patience=5)
+        out = []
         for row in range(2000, 2100):
-            out.append(paired(pairer, [frame('a', row), frame('c', row, 1 + first), frame('b', row)], flush=False))
+            out.append(
+                paired(
+                    pairer,
+                    [frame('a', row), frame('c', row, 1 + first), frame('b', row)],
+                    flush=False,
+                )
+            )
         assert sum(out, []) == [(row, {'a', 'b'}) for row in range(2000, 2100)]
         assert all(len(some) == 1 for some in out[6:])
         assert pairer.unpaired['a'] == pairer.unpaired['b'] == 0 and pairer.unpaired['c'] >= 90
 
 
 def test_one_alone_waits_as_long_as_its_queue():
-    """A single view is of no use: it is not given up for patience, and the pair comes out when its partner comes."""
+    """A single view is of no use: it is not given up for patience, and the pair comes out when its
+    partner comes.
+    """
     pairer = exposure_pairer('abc', waiting=8, patience=2)
     assert paired(pairer, [frame('a', row) for row in range(10)], flush=False) == []
     assert pairer.unpaired == {'a': 2, 'b': 0, 'c': 0} and not pairer.silent
-    assert paired(pairer, [frame('b', row) for row in range(10)], flush=False) == [(row, {'a', 'b'})
-                                                                                  for row in range(2, 10)]
+    assert paired(pairer, [frame('b', row) for row in range(10)], flush=False) == [
+        (row, {'a', 'b'}) for row in range(2, 10)
+    ]
     assert pairer.unpaired == {'a': 2, 'b': 2, 'c': 0}
 
 
 @pytest.mark.parametrize('count', [5, 200])
 @pytest.mark.parametrize('later', [True, False])
 def test_streams_that_begin_anew(count, later):
-    """Fluoroscopes started anew, or a recording played again: by number, with stamps that go on or fall back."""
+    """Fluoroscopes started anew, or a recording played again: by number, with stamps that go on or
+    fall back.
+    """
     pairer = exposure_pairer('abc', waiting=64)
     for turn in range(3):
-        frames = [replace(frame(name, row), stamp_ns=(turn if later else 0) * 10 ** 12 + row * 10 ** 9 // 2)
-                  for row in range(count) for name in 'abc' if name != 'c' or row != 1]
+        frames = [
+            replace(frame(name, row), stamp_ns=(turn if later else 0) * 10**12 + row * 10**9 // 2)
+            for row in range(count)
+            for name in 'abc'
+            if name != 'c' or row != 1
+        ]
         rows = paired(pairer, frames, flush=False)
         assert rows == [(row, {'a', 'b'} if row == 1 else {'a', 'b', 'c'}) for row in range(count)]
     assert sum(pairer.unpaired.values()) == 0
     by_stamp = exposure_pairer('abc', 'stamp')
     for turn in range(2):
-        assert len(paired(by_stamp, [frame(name, row) for row in range(200) for name in 'abc'], flush=False)) == 200
+        assert (
+            len(
+                paired(
+                    by_stamp,
+                    [frame(name, row) for row in range(200) for name in 'abc'],
+                    flush=False,
+                )
+            )
+            == 200
+        )
 
 
 def test_what_waits_comes_out_when_a_stream_begins_anew():
     pairer = exposure_pairer('abc')
     assert not paired(pairer, [frame('a', 500), frame('b', 500), frame('a', 501)], flush=False)
-    assert paired(pairer, [replace(frame('a', 0), stamp_ns=10 ** 12)], flush=False) == [(500, {'a', 'b'})]
+    assert paired(pairer, [replace(frame('a', 0), stamp_ns=10**12)], flush=False) == [
+        (500, {'a', 'b'})
+    ]
     assert pairer.unpaired == {'a': 1, 'b': 0, 'c': 0}
 
 
 @pytest.mark.parametrize('by', BY)
 def test_frames_that_come_again_or_out_of_their_order_are_late(by):
     pairer = exposure_pairer('abc', by, 1 * MS)
-    frames = [frame('a', 5), frame('a', 5), frame('a', 4), frame('b', 5), frame('c', 5), frame('c', 5), frame('b', 4)]
+    frames = [
+        frame('a', 5),
+        frame('a', 5),
+        frame('a', 4),
+        frame('b', 5),
+        frame('c', 5),
+        frame('c', 5),
+        frame('b', 4),
+    ]
     assert paired(pairer, frames) == [(5, {'a', 'b', 'c'})]
     assert pairer.late == pairer.unpaired == {'a': 2, 'b': 1, 'c': 1}
 
 
 def test_by_stamp_exposures_are_numbered():
-    """And belong together by time, however they are numbered, within the tolerance of the earliest."""
+    """And belong together by time, however they are numbered, within the tolerance of the
+    earliest.
+    """
     pairer = exposure_pairer('abc', 'stamp', 2 * MS)
-    frames = [Frame('b', 70, 1 * MS, 0), Frame('a', 5, 0, 0), Frame('c', 9, 2 * MS, 0), Frame('a', 6, 10 * MS, 1),
-              Frame('b', 71, 12 * MS, 1), Frame('c', 8, 12 * MS + 1, 2), Frame('a', 7, 20 * MS, 3)]
+    frames = [
+        Frame('b', 70, 1 * MS, 0),
+        Frame('a', 5, 0, 0),
+        Frame('c', 9, 2 * MS, 0),
+        Frame('a', 6, 10 * MS, 1),
+        Frame('b', 71, 12 * MS, 1),
+        Frame('c', 8, 12 * MS + 1, 2),
+        Frame('a', 7, 20 * MS, 3),
+    ]
     found = [e for f in frames for e in pairer.add(f)]
-    assert [{name: f.number for name, f in e.items()} for e in found] == [{'a': 1, 'b': 1, 'c': 1}, {'a': 2, 'b': 2}]
+    assert [{name: f.number for name, f in e.items()} for e in found] == [
+        {'a': 1, 'b': 1, 'c': 1},
+        {'a': 2, 'b': 2},
+    ]
 
 
 @pytest.mark.parametrize('by', BY)
@@ -197,8 +294,15 @@ def test_two_fluoroscopes_are_paired_as_before(by):
     pairer = exposure_pairer('ab', by, 1 * MS, 3, 1)
     assert not isinstance(pairer, ExposurePairer)
     assert paired(pairer, [frame('a', row) for row in range(5)], flush=False) == []
-    assert paired(pairer, [frame('b', row) for row in (1, 4, 2)], flush=False) == [(4, {'a', 'b'}), (2, {'a', 'b'})]
-    assert list(pairer.flush()) == [] and pairer.unpaired == {'a': 3, 'b': 1} and pairer.late == {'a': 0, 'b': 1}
+    assert paired(pairer, [frame('b', row) for row in (1, 4, 2)], flush=False) == [
+        (4, {'a', 'b'}),
+        (2, {'a', 'b'}),
+    ]
+    assert (
+        list(pairer.flush()) == []
+        and pairer.unpaired == {'a': 3, 'b': 1}
+        and pairer.late == {'a': 0, 'b': 1}
+    )
     assert pairer.incomplete == 0 and not pairer.silent
 
 

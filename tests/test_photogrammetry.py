@@ -4,17 +4,29 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rigs
 from scipy import integrate, optimize, stats
 from scipy.spatial.transform import Rotation
 
-import rigs
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import Frame, points_on_image, validate_frame
+from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian, to_sensor
 from fluoro_calib_ros.photogrammetry.noise import HUBER_DELTA, INLIER_Q, LOSSES, NU_RANGE, Noise
-from fluoro_calib_ros.photogrammetry.observations import DataError, Frame, Phantom, check_frame, points_on_image
 from fluoro_calib_ros.photogrammetry.resection import (
-    decompose, direct_linear_transformation, principal_distance_of, resect, robust_dlt)
+    decompose,
+    direct_linear_transformation,
+    principal_distance_of,
+    resect,
+    robust_dlt,
+)
 from fluoro_calib_ros.photogrammetry.rotations import (
-    cross_matrix, matrix_from_quaternion, matrix_from_vector, quaternion_from_matrix, rotation_angle)
+    cross_matrix,
+    matrix_from_quaternion,
+    matrix_from_vector,
+    quaternion_from_matrix,
+    rotation_angle,
+)
 
 ANGLES = [0.0, 1e-15, 1e-9, 1e-5, 0.3, np.pi / 2, 3.0, np.pi - 1e-5, np.pi - 1e-9, np.pi]
 
@@ -23,10 +35,13 @@ def some_axes():
     """Unit vectors: the six axes, and others."""
     rng = np.random.default_rng(1)
     other = rng.normal(size=(40, 3))
-    return np.concatenate([np.eye(3), -np.eye(3), other / np.linalg.norm(other, axis=1, keepdims=True)])
+    return np.concatenate(
+        [np.eye(3), -np.eye(3), other / np.linalg.norm(other, axis=1, keepdims=True)]
+    )
 
 
 # ---- rotations
+
 
 @pytest.mark.parametrize('angle', ANGLES)
 def test_rotation_matrices_of_vectors_and_quaternions_equal_scipy(angle):
@@ -34,7 +49,9 @@ def test_rotation_matrices_of_vectors_and_quaternions_equal_scipy(angle):
     theirs = Rotation.from_rotvec(vectors)
     np.testing.assert_allclose(matrix_from_vector(vectors), theirs.as_matrix(), rtol=0, atol=1e-14)
     quaternions = theirs.as_quat()[:, [3, 0, 1, 2]]
-    np.testing.assert_allclose(matrix_from_quaternion(quaternions), theirs.as_matrix(), rtol=0, atol=1e-14)
+    np.testing.assert_allclose(
+        matrix_from_quaternion(quaternions), theirs.as_matrix(), rtol=0, atol=1e-14
+    )
 
 
 @pytest.mark.parametrize('angle', ANGLES)
@@ -57,61 +74,100 @@ def test_rotation_angle_is_exact_near_zero_and_pi(angle):
 
 def test_rotation_vectors_keep_small_turns_to_the_last_digit():
     w = np.array([3e-9, -4e-9, 1e-9])
-    np.testing.assert_allclose(matrix_from_vector(w) - np.eye(3), cross_matrix(w), rtol=0, atol=2e-17)
+    np.testing.assert_allclose(
+        matrix_from_vector(w) - np.eye(3), cross_matrix(w), rtol=0, atol=2e-17
+    )
 
 
 def test_quaternions_are_normalised_and_turn_as_agreed():
     """w, x, y, z: a quarter turn about z takes x to y, whatever the quaternion's length."""
-    np.testing.assert_allclose(matrix_from_quaternion([3.0, 0, 0, 3.0]) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+    np.testing.assert_allclose(
+        matrix_from_quaternion([3.0, 0, 0, 3.0]) @ [1, 0, 0], [0, 1, 0], atol=1e-15
+    )
     np.testing.assert_allclose(cross_matrix([1.0, 0, 0]) @ [0, 1, 0], [0, 0, 1])
 
 
 # ---- collinearity
 
+
 def test_image_coordinates_follow_the_convention():
-    """The axis meets the image in (xp, yp); u grows to the right (x), v downwards (y), both as c X/Z."""
+    """The axis meets the image in (xp, yp); u grows to the right (x), v downwards (y), both as c
+    X/Z.
+    """
     interior = np.array([500.0, 520.0, 4000.0])
-    points = np.array([[0.0, 0, 1000], [10, 0, 1000], [0, 10, 1000], [10, -20, 2000], [0, 0, -1000]])
+    points = np.array(
+        [[0.0, 0, 1000], [10, 0, 1000], [0, 10, 1000], [10, -20, 2000], [0, 0, -1000]]
+    )
     uv = project(np.tile(np.eye(3), (5, 1, 1)), np.zeros((5, 3)), points, interior)
-    np.testing.assert_allclose(uv[:4], [[500, 520], [540, 520], [500, 560], [520, 480]], rtol=1e-14)
+    np.testing.assert_allclose(
+        uv[:4], [[500, 520], [540, 520], [500, 560], [520, 480]], rtol=1e-14
+    )
     assert np.isnan(uv[4]).all(), 'a point behind the source has no image'
 
 
 def test_source_and_rotation_are_relative_to_the_phantom():
     """X = R (P - T): the source itself is the origin of the sensor frame."""
     rotation = matrix_from_vector([0.1, 0.5, -0.3])
-    np.testing.assert_allclose(to_sensor(rotation[None], np.array([[1.0, 2, 3]]), np.array([[1.0, 2, 3]])), 0)
-    np.testing.assert_allclose(to_sensor(rotation[None], np.array([[1.0, 2, 3]]), np.array([[2.0, 2, 3]]))[0],
-                               rotation[:, 0])
+    np.testing.assert_allclose(
+        to_sensor(rotation[None], np.array([[1.0, 2, 3]]), np.array([[1.0, 2, 3]])), 0
+    )
+    np.testing.assert_allclose(
+        to_sensor(rotation[None], np.array([[1.0, 2, 3]]), np.array([[2.0, 2, 3]]))[0],
+        rotation[:, 0],
+    )
 
 
 def test_analytic_derivatives_equal_central_differences():
     network, truth = rigs.small_network(exposures=3, targets=20, fluoroscopes=2)
     rotation, position, points, interior = truth.per_image_point(network)
-    uv, d_exterior, d_point, d_interior = project_with_jacobian(rotation, position, points, interior)
+    uv, d_exterior, d_point, d_interior = project_with_jacobian(
+        rotation, position, points, interior
+    )
     np.testing.assert_allclose(uv, project(rotation, position, points, interior), rtol=1e-14)
 
     def differences(image, h):
         return np.stack([(image(h * e) - image(-h * e)) / (2 * h) for e in np.eye(3)], axis=2)
 
     numeric = {
-        'source': (d_exterior[:, :, :3],
-                   differences(lambda d: project(rotation, position + d, points, interior), 1e-2)),
-        'turn': (d_exterior[:, :, 3:],
-                 differences(lambda d: project(matrix_from_vector(d) @ rotation, position, points, interior), 1e-5)),
-        'point': (d_point, differences(lambda d: project(rotation, position, points + d, interior), 1e-2)),
-        'interior': (d_interior, differences(lambda d: project(rotation, position, points, interior + d), 1e-1))}
+        'source': (
+            d_exterior[:, :, :3],
+            differences(lambda d: project(rotation, position + d, points, interior), 1e-2),
+        ),
+        'turn': (
+            d_exterior[:, :, 3:],
+            differences(
+                lambda d: project(matrix_from_vector(d) @ rotation, position, points, interior),
+                1e-5,
+            ),
+        ),
+        'point': (
+            d_point,
+            differences(lambda d: project(rotation, position, points + d, interior), 1e-2),
+        ),
+        'interior': (
+            d_interior,
+            differences(lambda d: project(rotation, position, points, interior + d), 1e-1),
+        ),
+    }
     for name, (analytic, other) in numeric.items():
         assert np.max(np.abs(analytic - other)) < 1e-7 * np.max(np.abs(other)), name
 
 
 # ---- resection
 
+
 def one_exposure(seed=0, targets=60):
-    """Object points, their exact image points, and the exterior and interior orientation behind them."""
+    """Object points, their exact image points, and the exterior and interior orientation behind
+    them.
+    """
     network, truth = rigs.small_network(exposures=1, targets=targets, seed=seed, seen=1.0)
-    return truth.points_mm, project(*truth.per_image_point(network)), truth.rotation[0], truth.position_mm[0], \
-        truth.interior[0]
+    return (
+        truth.points_mm,
+        project(*truth.per_image_point(network)),
+        truth.rotation[0],
+        truth.position_mm[0],
+        truth.interior[0],
+    )
 
 
 @pytest.mark.parametrize('seed', range(5))
@@ -126,7 +182,9 @@ def test_resection_of_exact_data_is_exact(seed):
 
 
 def test_projection_matrix_gives_back_its_parts():
-    """decompose: calibration matrix with positive diagonal, rotation and source, whatever the matrix's sign."""
+    """decompose: calibration matrix with positive diagonal, rotation and source, whatever the
+    matrix's sign.
+    """
     _, _, rotation, position, (xp, yp, c) = one_exposure()
     k = np.array([[c, 0, xp], [0, c, yp], [0, 0, 1]])
     projection = k @ rotation @ np.column_stack([np.eye(3), -position])
@@ -139,7 +197,8 @@ def test_projection_matrix_gives_back_its_parts():
 def test_direct_linear_transformation_obeys_its_weights():
     """Points of weight zero play no part."""
     xyz, uv, *_ = one_exposure()
-    spoilt, weights = uv.copy(), np.ones(len(uv))
+    spoilt = uv.copy()
+    weights = np.ones(len(uv))
     spoilt[::4] += 200
     weights[::4] = 0
     p = direct_linear_transformation(xyz, spoilt, weights)
@@ -149,7 +208,9 @@ def test_direct_linear_transformation_obeys_its_weights():
 
 @pytest.mark.parametrize('seed', range(4))
 def test_resection_withstands_false_matches_and_distortion(seed):
-    """A fifth of the targets bear the id of another one, the image is distorted by 10 px and noisy."""
+    """A fifth of the targets bear the id of another one, the image is distorted by 10 px and
+    noisy.
+    """
     xyz, uv, rotation, position, interior = one_exposure(seed, targets=100)
     rng = np.random.default_rng(seed)
     x = (uv - 511.5) / 512
@@ -159,27 +220,45 @@ def test_resection_withstands_false_matches_and_distortion(seed):
     assert principal_distance_of(robust_dlt(xyz, uv)) == pytest.approx(interior[2], rel=0.04)
     found = resect(xyz, uv, interior)
     assert rotation_angle(found.rotation @ rotation.T) < np.deg2rad(0.3)
-    assert np.linalg.norm(found.position_mm - position) < 15   # of 1500 mm; what the distortion does
+    assert (
+        np.linalg.norm(found.position_mm - position) < 15
+    )  # of 1500 mm; what the distortion does
     assert found.scale < 3
-    moved_far = np.linalg.norm(uv[false] - project(np.tile(rotation, (20, 1, 1)), np.tile(position, (20, 1)),
-                                                   xyz[false], interior), axis=1) > 40
+    moved_far = (
+        np.linalg.norm(
+            uv[false]
+            - project(
+                np.tile(rotation, (20, 1, 1)), np.tile(position, (20, 1)), xyz[false], interior
+            ),
+            axis=1,
+        )
+        > 40
+    )
     assert moved_far.sum() > 10 and not found.inliers[false[moved_far]].any()
     true = np.setdiff1d(np.arange(100), false)
     assert found.inliers[true].mean() > 0.9
 
 
-@pytest.mark.parametrize('spoil, said', [
-    (lambda xyz: xyz[:7], '7 targets are too few for a resection, 8 are needed'),
-    (lambda xyz: xyz * (1, 1, 0), 'all targets lie in one plane'),
-    (lambda xyz: xyz @ np.diag([1, 1, 1e-4]) @ matrix_from_vector([1.0, 2, 3]), 'all targets lie in one plane')])
+@pytest.mark.parametrize(
+    'spoil, said',
+    [
+        (lambda xyz: xyz[:7], '7 targets are too few for a resection, 8 are needed'),
+        (lambda xyz: xyz * (1, 1, 0), 'all targets lie in one plane'),
+        (
+            lambda xyz: xyz @ np.diag([1, 1, 1e-4]) @ matrix_from_vector([1.0, 2, 3]),
+            'all targets lie in one plane',
+        ),
+    ],
+)
 def test_resection_refuses_too_few_and_planar_targets(spoil, said):
     xyz, uv, _, _, interior = one_exposure()
     xyz = spoil(xyz)
     with pytest.raises(DataError, match=said):
-        resect(xyz, uv[:len(xyz)], interior)
+        resect(xyz, uv[: len(xyz)], interior)
 
 
 # ---- noise
+
 
 def bivariate_t(rng, n, nu, scale):
     return scale * rng.normal(size=(n, 2)) / np.sqrt(rng.chisquare(nu, (n, 1)) / nu)
@@ -188,7 +267,9 @@ def bivariate_t(rng, n, nu, scale):
 def test_cost_is_the_negative_log_likelihood_of_scipy():
     """With every constant, for a sigma of each image point."""
     rng = np.random.default_rng(2)
-    r, sigma, scale = rng.normal(0, 2, (50, 2)), rng.uniform(0.2, 3, 50), 0.7
+    r = rng.normal(0, 2, (50, 2))
+    sigma = rng.uniform(0.2, 3, 50)
+    scale = 0.7
     q = np.sum(r * r, axis=1) / (scale * sigma) ** 2
     shape = [np.eye(2) * (scale * s) ** 2 for s in sigma]
     theirs = -sum(stats.multivariate_t(np.zeros(2), s, df=4.3).logpdf(x) for x, s in zip(r, shape))
@@ -199,27 +280,43 @@ def test_cost_is_the_negative_log_likelihood_of_scipy():
 
 @pytest.mark.parametrize('loss', LOSSES)
 def test_density_of_every_loss_integrates_to_one(loss):
-    noise, sigma = Noise(loss, 0.6, 4.0), np.array([1.7])
-    unit = noise.scale * sigma[0]   # of the radius r [px]
-    inside, _ = integrate.quad(lambda r: 2 * np.pi * r * np.exp(-noise.cost(np.array([(r / unit) ** 2]), sigma)),
-                               0, np.inf, epsabs=1e-12)
+    noise = Noise(loss, 0.6, 4.0)
+    sigma = np.array([1.7])
+    unit = noise.scale * sigma[0]  # of the radius r [px]
+    inside, _ = integrate.quad(
+        lambda r: 2 * np.pi * r * np.exp(-noise.cost(np.array([(r / unit) ** 2]), sigma)),
+        0,
+        np.inf,
+        epsabs=1e-12,
+    )
     assert inside == pytest.approx(1, abs=1e-8)
 
 
 @pytest.mark.parametrize('loss', LOSSES)
 def test_weight_is_twice_the_slope_of_the_cost(loss):
-    noise, one, h = Noise(loss, 1.0, 4.0), np.ones(1), 1e-6
-    for q in (1e-4, 0.5, HUBER_DELTA ** 2 - 0.01, HUBER_DELTA ** 2 + 0.01, 30.0, 1e4):
+    noise = Noise(loss, 1.0, 4.0)
+    one = np.ones(1)
+    h = 1e-6
+    for q in (1e-4, 0.5, HUBER_DELTA**2 - 0.01, HUBER_DELTA**2 + 0.01, 30.0, 1e4):
         slope = (noise.cost(np.array([q + h]), one) - noise.cost(np.array([q - h]), one)) / (2 * h)
         assert noise.weight(np.array([q]))[0] == pytest.approx(2 * slope, rel=1e-4), q
 
 
-@pytest.mark.parametrize('loss, nu', [('student_t', 3.0), ('student_t', 10.0), ('huber', np.inf), ('huber', 3.0),
-                                      ('gaussian', np.inf)])
+@pytest.mark.parametrize(
+    'loss, nu',
+    [
+        ('student_t', 3.0),
+        ('student_t', 10.0),
+        ('huber', np.inf),
+        ('huber', 3.0),
+        ('gaussian', np.inf),
+    ],
+)
 def test_information_factor_against_monte_carlo(loss, nu):
     """Variance of 1500 location estimates of 100 points is 1 / (factor * sum of weights)."""
     rng = np.random.default_rng(5)
-    runs, n = 1500, 100
+    runs = 1500
+    n = 100
     x = rng.normal(size=(runs, n, 2))
     if np.isfinite(nu):
         x /= np.sqrt(rng.chisquare(nu, (runs, n, 1)) / nu)
@@ -231,13 +328,14 @@ def test_information_factor_against_monte_carlo(loss, nu):
     q = np.sum((x - place) ** 2, axis=2).ravel()
     expected = 1 / (noise.information_factor(q) * n * np.mean(noise.weight(q)))
     # 3000 estimates: their variance is known to 2.6 %.
-    assert np.mean(place ** 2) == pytest.approx(expected, rel=0.08)
+    assert np.mean(place**2) == pytest.approx(expected, rel=0.08)
 
 
 def test_information_factor_of_student_t_follows_from_its_definition():
     """E[w^2 q] / 2 over E[w], where q/2 has the F distribution with 2 and nu degrees of freedom."""
     for nu in (3.0, 5.0, 50.0):
-        noise, f = Noise(nu=nu), stats.f(2, nu)
+        noise = Noise(nu=nu)
+        f = stats.f(2, nu)
         score = integrate.quad(lambda x: noise.weight(2 * x) ** 2 * x * f.pdf(x), 0, np.inf)[0]
         weight = integrate.quad(lambda x: noise.weight(2 * x) * f.pdf(x), 0, np.inf)[0]
         assert noise.information_factor(np.zeros(1)) == pytest.approx(score / weight, rel=1e-6)
@@ -251,9 +349,11 @@ def test_scale_and_degrees_of_freedom_equal_direct_maximum_likelihood(nu):
 
     def cost(x):
         noise = Noise('student_t', np.exp(x[0]), np.exp(x[1]))
-        return noise.cost(squared / noise.scale ** 2, ones)
+        return noise.cost(squared / noise.scale**2, ones)
 
-    best = optimize.minimize(cost, np.log([0.5, 6.0]), method='Nelder-Mead', options={'xatol': 1e-6, 'fatol': 1e-6})
+    best = optimize.minimize(
+        cost, np.log([0.5, 6.0]), method='Nelder-Mead', options={'xatol': 1e-6, 'fatol': 1e-6}
+    )
     found = Noise('student_t', 1.0, 5.0).estimated(squared)
     assert cost(np.log([found.scale, found.nu])) - best.fun < 0.05
     assert found.scale == pytest.approx(np.exp(best.x[0]), rel=2e-3)
@@ -264,11 +364,13 @@ def test_scale_and_degrees_of_freedom_equal_direct_maximum_likelihood(nu):
 
 @pytest.mark.parametrize('loss', LOSSES)
 def test_scale_is_estimated_from_residuals_of_unequal_redundancy(loss):
-    """Residuals are smaller than the noise by the root of their redundancy numbers; the scale is the noise's."""
+    """Residuals are smaller than the noise by the root of their redundancy numbers; the scale is
+    the noise's.
+    """
     rng = np.random.default_rng(8)
     share = rng.choice([0.2, 0.9], 60_000)
     noise = rng.normal(0, 0.25, (len(share), 2))
-    found = Noise(loss).estimated(share * np.sum(noise ** 2, axis=1), 2 * (1 - share))
+    found = Noise(loss).estimated(share * np.sum(noise**2, axis=1), 2 * (1 - share))
     assert found.scale == pytest.approx(0.25, rel=0.015)
     if loss == 'student_t':
         assert found.nu > 60
@@ -276,10 +378,12 @@ def test_scale_is_estimated_from_residuals_of_unequal_redundancy(loss):
 
 @pytest.mark.parametrize('nu', [4.0, 200.0])
 def test_gross_errors_beside_the_student_t_leave_its_core_alone(nu):
-    """One in twenty false matches all over the image: scale and degrees of freedom are those without them."""
+    """One in twenty false matches all over the image: scale and degrees of freedom are those
+    without them.
+    """
     rng = np.random.default_rng(4)
     noise = bivariate_t(rng, 20_000, nu, 0.25)
-    squared = np.sum(noise ** 2, axis=1)
+    squared = np.sum(noise**2, axis=1)
     clean = Noise().estimated(squared)
     squared[:1000] = np.sum(rng.uniform(-300, 300, (1000, 2)) ** 2, axis=1)
     found = Noise(gross=0.01).estimated(squared)
@@ -287,12 +391,14 @@ def test_gross_errors_beside_the_student_t_leave_its_core_alone(nu):
     assert found.scale == pytest.approx(clean.scale, rel=0.02)
     assert 1 / found.nu == pytest.approx(1 / clean.nu, abs=0.02)
     assert Noise().estimated(squared).nu == pytest.approx(NU_RANGE[0], rel=1e-2)
-    weight = found.weight(squared / found.scale ** 2)
+    weight = found.weight(squared / found.scale**2)
     assert weight[:1000].max() < 0.2 and np.median(weight[:1000]) < 1e-6
 
 
 def test_robust_scale_withstands_false_matches():
-    """A tenth of huge residuals: Student-t and Huber keep the scale within some ten percent, Gauss does not."""
+    """A tenth of huge residuals: Student-t and Huber keep the scale within some ten percent, Gauss
+    does not.
+    """
     rng = np.random.default_rng(9)
     squared = np.sum(rng.normal(0, 0.25, (5000, 2)) ** 2, axis=1)
     squared[:500] = 1e4
@@ -312,7 +418,10 @@ def test_degrees_of_freedom_stay_within_their_range():
 
 def test_inliers_are_the_9999_of_10000_of_a_gaussian():
     assert stats.chi2(2).cdf(INLIER_Q) == pytest.approx(0.9999, abs=1e-12)
-    assert Noise().inliers(np.array([INLIER_Q * 0.999, INLIER_Q * 1.001])).tolist() == [True, False]
+    assert Noise().inliers(np.array([INLIER_Q * 0.999, INLIER_Q * 1.001])).tolist() == [
+        True,
+        False,
+    ]
 
 
 def test_unknown_loss_is_refused():
@@ -322,10 +431,17 @@ def test_unknown_loss_is_refused():
 
 # ---- observations
 
+
 def some_frame(**changes):
     rng = np.random.default_rng(3)
-    values = dict(fluoroscope='a', number=7, target_id=np.array([5, 3, 9, 4]), uv=rng.uniform(0, 500, (4, 2)),
-                  image_size=(640, 480), sigma=np.full(4, 0.2))
+    values = dict(
+        fluoroscope='a',
+        number=7,
+        target_id=np.array([5, 3, 9, 4]),
+        uv=rng.uniform(0, 500, (4, 2)),
+        image_size=(640, 480),
+        sigma=np.full(4, 0.2),
+    )
     return Frame(**{**values, **changes})
 
 
@@ -333,28 +449,57 @@ def some_phantom():
     return Phantom([9, 3, 4, 5], np.arange(12.0).reshape(4, 3), np.array([0.9, 0.3, 0.4, 0.5]))
 
 
-@pytest.mark.parametrize('changes, said', [
-    ({'target_id': np.array([], int), 'uv': np.zeros((0, 2)), 'sigma': None}, 'the frame is empty'),
-    ({'target_id': np.array([5, 3, 9])}, '3 target ids, but image points of shape'),
-    ({'sigma': np.ones(3)}, '4 target ids, but 3 values of sigma'),
-    ({'sigma': np.array([1, 1, 0, 1.0])}, 'sigma of target 9 is not a positive number'),
-    ({'sigma': np.array([1, np.nan, 1, 1.0])}, 'sigma of target 3 is not a positive number'),
-    ({'uv': np.array([[1, 1], [2, 2], [3, np.nan], [4, 4.0]])}, 'the image point of target 9 is not a number'),
-    ({'uv': np.array([[1, 1], [np.inf, 2], [3, 3], [4, 4.0]])}, 'the image point of target 3 is not a number'),
-    ({'uv': np.array([[1, 1], [2, 2], [3, 3], [639.6, 4]])}, 'target 4 is off the image of 640 x 480 px'),
-    ({'target_id': np.array([5, 3, 5, 4])}, 'target 5 is there 2 times'),
-    ({'target_id': np.array([5, 3, 8, 4])}, 'target 8 is not on the phantom'),
-    ({'image_size': (0, 480)}, 'the image size is 0 x 480 px'),
-    ({'image_size': (640, 481)}, r'the image is 640 x 481 px, but the calibration is for 640 x 480 px')])
+@pytest.mark.parametrize(
+    'changes, said',
+    [
+        (
+            {'target_id': np.array([], int), 'uv': np.zeros((0, 2)), 'sigma': None},
+            'the frame is empty',
+        ),
+        ({'target_id': np.array([5, 3, 9])}, '3 target ids, but image points of shape'),
+        ({'sigma': np.ones(3)}, '4 target ids, but 3 values of sigma'),
+        ({'sigma': np.array([1, 1, 0, 1.0])}, 'sigma of target 9 is not a positive number'),
+        ({'sigma': np.array([1, np.nan, 1, 1.0])}, 'sigma of target 3 is not a positive number'),
+        (
+            {'uv': np.array([[1, 1], [2, 2], [3, np.nan], [4, 4.0]])},
+            'the image point of target 9 is not a number',
+        ),
+        (
+            {'uv': np.array([[1, 1], [np.inf, 2], [3, 3], [4, 4.0]])},
+            'the image point of target 3 is not a number',
+        ),
+        (
+            {'uv': np.array([[1, 1], [2, 2], [3, 3], [639.6, 4]])},
+            'target 4 is off the image of 640 x 480 px',
+        ),
+        ({'target_id': np.array([5, 3, 5, 4])}, 'target 5 is there 2 times'),
+        ({'target_id': np.array([5, 3, 8, 4])}, 'target 8 is not on the phantom'),
+        ({'image_size': (0, 480)}, 'the image size is 0 x 480 px'),
+        (
+            {'image_size': (640, 481)},
+            r'the image is 640 x 481 px, but the calibration is for 640 x 480 px',
+        ),
+    ],
+)
 def test_a_wrong_frame_is_refused_by_name(changes, said):
     """One sentence that names fluoroscope, frame and cause."""
-    check_frame(some_frame(uv=np.full((4, 2), 9.0)), some_phantom(), (640, 480))
+    validate_frame(some_frame(uv=np.full((4, 2), 9.0)), some_phantom(), (640, 480))
     with pytest.raises(DataError, match=f'^fluoroscope a, frame 7: .*{said}'):
-        check_frame(some_frame(**changes), some_phantom(), (640, 480))
+        validate_frame(some_frame(**changes), some_phantom(), (640, 480))
 
 
 def test_the_image_reaches_half_a_pixel_beyond_its_outer_pixel_centres():
-    uv = np.array([[-0.5, -0.5], [639.5, 479.5], [-0.51, 0], [639.51, 0], [0, -0.51], [0, 479.51], [np.nan, 5]])
+    uv = np.array(
+        [
+            [-0.5, -0.5],
+            [639.5, 479.5],
+            [-0.51, 0],
+            [639.51, 0],
+            [0, -0.51],
+            [0, 479.51],
+            [np.nan, 5],
+        ]
+    )
     assert points_on_image(uv, (640, 480)).tolist() == [True, True] + [False] * 5
 
 
@@ -368,12 +513,22 @@ def test_phantom_is_sorted_and_found_by_id():
         phantom.xyz_mm[0, 0] = 1.0
 
 
-@pytest.mark.parametrize('changes, said', [
-    ({'target_id': [1, 2, 3, 1]}, 'target 1 is given twice'),
-    ({'target_id': [1, 2, 3]}, '3 target ids, but coordinates of shape'),
-    ({'xyz_mm': np.where(np.arange(12).reshape(4, 3) == 7, np.nan, 1.0)}, 'target 3 has a wrong coordinate'),
-    ({'sd_mm': [0.1, 0.0, 0.1, 0.1]}, 'target 2 has a wrong sd'),
-    ({'target_id': [1, 2, 3], 'xyz_mm': np.zeros((3, 3)), 'sd_mm': np.ones(3)}, '3 targets are too few')])
+@pytest.mark.parametrize(
+    'changes, said',
+    [
+        ({'target_id': [1, 2, 3, 1]}, 'target 1 is given twice'),
+        ({'target_id': [1, 2, 3]}, '3 target ids, but coordinates of shape'),
+        (
+            {'xyz_mm': np.where(np.arange(12).reshape(4, 3) == 7, np.nan, 1.0)},
+            'target 3 has a wrong coordinate',
+        ),
+        ({'sd_mm': [0.1, 0.0, 0.1, 0.1]}, 'target 2 has a wrong sd'),
+        (
+            {'target_id': [1, 2, 3], 'xyz_mm': np.zeros((3, 3)), 'sd_mm': np.ones(3)},
+            '3 targets are too few',
+        ),
+    ],
+)
 def test_a_wrong_phantom_is_refused(changes, said):
     good = {'target_id': [1, 2, 3, 4], 'xyz_mm': np.zeros((4, 3)), 'sd_mm': np.full(4, 0.1)}
     Phantom(**good)
@@ -387,4 +542,5 @@ def test_sorting_a_frame_keeps_its_rows_together():
     assert ordered.target_id.tolist() == [3, 4, 5, 9] == ordered.sigma.tolist()
     np.testing.assert_array_equal(ordered.uv, frame.uv[[1, 3, 0, 2]])
     assert replace(ordered, target_id=None, uv=None, sigma=None) == replace(
-        frame, target_id=None, uv=None, sigma=None)
+        frame, target_id=None, uv=None, sigma=None
+    )

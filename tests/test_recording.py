@@ -9,80 +9,125 @@ import numpy as np
 import pytest
 from rigs import calibrated, run
 
-from fluoro_calib_ros.bags.dataset import write_bag
 from fluoro_calib_ros.distortion.models import no_correction
+from fluoro_calib_ros.drift.rig_watch import RecordingWatch, RigWatch, clusters_of
+from fluoro_calib_ros.drift.watch import ERROR, DriftOptions
 from fluoro_calib_ros.files.calibration import save_calibration
 from fluoro_calib_ros.files.observations import write_observations_csv
-from fluoro_calib_ros.files.orientation import save_orientation
-from fluoro_calib_ros.reconstruction.drift import ERROR, DriftOptions
+from fluoro_calib_ros.files.rig_orientation import save_orientation
+from fluoro_calib_ros.jobs.dataset import write_bag
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
+from fluoro_calib_ros.reconstruction.correspondence import matched
 from fluoro_calib_ros.reconstruction.intersection import OK, SINGLE_VIEW, Intersector
-from fluoro_calib_ros.reconstruction.matching import matched
-from fluoro_calib_ros.reconstruction.orientation import RigOrientation
-from fluoro_calib_ros.reconstruction.recording import (CorrectedView, intersect_views, reconstruct_recording,
-                                                       watch_views)
-from fluoro_calib_ros.reconstruction.watching import RecordingWatch, RigWatch, clusters_of
+from fluoro_calib_ros.reconstruction.reconstruct import (
+    CorrectedView,
+    intersect_views,
+    reconstruct_recording,
+    watch_views,
+)
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 NOISE_PX = 0.25
 CLUSTERS = ('tibia: 1001 1002 1003 1004 1005 1006', 'femur: 1013 1014 1015 1016 1017 1018')
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def rig(names='abc'):
     """A rig without distortion."""
     return virtual_rig(2, strength=0.0, names=tuple(names), between_deg=60.0)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def known(names='abc'):
     """Calibrations and orientation of the rig, true, with a small covariance."""
-    one, f = calibrated('a', 5, model='parametric').calibrations['a'], rig(names).fluoroscopes
-    calibrations = {x.name: replace(
-        one, fluoroscope=x.name, interior=x.interior, model=no_correction(), train_exposure=np.zeros(0, dtype=int),
-        frame_id=f'{x.name}_optical', image_sd=NOISE_PX) for x in f}
+    one = calibrated('a', 5, model='parametric').calibrations['a']
+    f = rig(names).fluoroscopes
+    calibrations = {
+        x.name: replace(
+            one,
+            fluoroscope=x.name,
+            interior=x.interior,
+            model=no_correction(),
+            train_exposure=np.zeros(0, dtype=int),
+            frame_id=f'{x.name}_optical',
+            image_sd=NOISE_PX,
+        )
+        for x in f
+    }
     sd = np.tile([0.03] * 3 + [2e-5] * 3 + [0.1] * 3, len(names))
     orientation = RigOrientation(
-        tuple(names), np.stack([x.interior for x in f]), np.stack([x.rotation for x in f]),
-        np.stack([x.position_mm for x in f]), np.diag(sd ** 2), 'rig', 'capture',
-        tuple(c.calibration_id for c in calibrations.values()))
+        tuple(names),
+        np.stack([x.interior for x in f]),
+        np.stack([x.rotation for x in f]),
+        np.stack([x.position_mm for x in f]),
+        np.diag(sd**2),
+        'rig',
+        'capture',
+        tuple(c.calibration_id for c in calibrations.values()),
+    )
     return calibrations, orientation
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def tracking(seconds, rate_hz, names='abc'):
     return simulate_tracking(rig(names), seconds, rate_hz, seed=4, noise_px=NOISE_PX)
 
 
 def shifted(frames, name, begin_s, end_s=np.inf, size_px=1.0):
     """Frames whose left half of the image of a fluoroscope is shifted down between two times."""
+
     def change(frame):
         t = (frame.stamp_ns - frames[name][0].stamp_ns) / 1e9
-        return replace(frame, uv=frame.uv + np.column_stack([
-            np.zeros(len(frame.uv)), size_px * (frame.uv[:, 0] < 512) * (begin_s <= t < end_s)]))
+        return replace(
+            frame,
+            uv=frame.uv
+            + np.column_stack(
+                [
+                    np.zeros(len(frame.uv)),
+                    size_px * (frame.uv[:, 0] < 512) * (begin_s <= t < end_s),
+                ]
+            ),
+        )
+
     return {**frames, name: [change(frame) for frame in frames[name]]}
 
 
 def watched(frames, names, clusters=(), options=DriftOptions()):
     """RecordingWatch after a recording."""
     calibrations, orientation = known(names)
-    watch = RecordingWatch(orientation, {n: c.image_size for n, c in calibrations.items()}, options,
-                           clusters_of(clusters))
+    watch = RecordingWatch(
+        orientation,
+        {n: c.image_size for n, c in calibrations.items()},
+        options,
+        clusters_of(clusters),
+    )
     reconstruct_recording(frames, calibrations, Intersector(orientation), watch=watch)
     return watch
 
 
 # ---- views that are missing
 
+
 def test_a_missing_view_is_matched_as_one_that_sees_nothing():
-    ids, uv, sigma = np.array([7, 2, 9]), np.arange(6.0).reshape(3, 2), np.array([0.1, 0.2, 0.3])
+    ids = np.array([7, 2, 9])
+    uv = np.arange(6.0).reshape(3, 2)
+    sigma = np.array([0.1, 0.2, 0.3])
     for outside in (None, [np.array([True, False, False]), None, np.zeros(3, dtype=bool)]):
         found = matched([ids, None, ids], [uv, None, uv + 1], [sigma, None, sigma], outside)
         assert found[0].tolist() == [7, 2, 9]
         np.testing.assert_array_equal(found[1], [uv, np.full((3, 2), np.nan), uv + 1])
         np.testing.assert_array_equal(found[2], [sigma, np.full(3, np.nan), sigma])
-        assert found[3] is None if outside is None else found[3].tolist() == [[True, False, False]] + 2 * [3 * [False]]
+        assert (
+            found[3] is None
+            if outside is None
+            else found[3].tolist() == [[True, False, False]] + 2 * [3 * [False]]
+        )
     other = matched([ids[:2], None, ids], [uv[:2], None, uv], [sigma[:2], None, sigma])
-    assert other[0].tolist() == [2, 7, 9] and np.isnan(other[1][0, 2]).all() and np.isnan(other[2][1]).all()
+    assert (
+        other[0].tolist() == [2, 7, 9]
+        and np.isnan(other[1][0, 2]).all()
+        and np.isnan(other[2][1]).all()
+    )
 
 
 @pytest.mark.parametrize('missing', 'abc')
@@ -94,7 +139,9 @@ def test_without_a_view_the_points_are_those_of_the_others(missing):
     whole, _ = reconstruct_recording(frames, calibrations, Intersector(orientation))
     two, _ = reconstruct_recording(frames, calibrations, Intersector(orientation.subset(others)))
     kept = [f for f in frames[missing] if f.number % 2]
-    found, unpaired = reconstruct_recording({**frames, missing: kept}, calibrations, Intersector(orientation))
+    found, unpaired = reconstruct_recording(
+        {**frames, missing: kept}, calibrations, Intersector(orientation)
+    )
     assert [f.number for f in found] == [f.number for f in whole] and not any(unpaired.values())
     for frame, of_three, of_two in zip(found, whole, two):
         same = of_three if frame.number % 2 else of_two
@@ -102,24 +149,39 @@ def test_without_a_view_the_points_are_those_of_the_others(missing):
         assert frame.fluoroscopes == (('a', 'b', 'c') if frame.number % 2 else tuple(others))
         assert set(frame.points.rays) == {3 if frame.number % 2 else 2}
         np.testing.assert_allclose(frame.points.xyz_mm, same.points.xyz_mm, atol=1e-6)
-        np.testing.assert_allclose(frame.points.covariance, same.points.covariance, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(
+            frame.points.covariance, same.points.covariance, rtol=1e-5, atol=1e-6
+        )
     true = tracking(0.5, 40).points_mm
-    error = [np.sqrt(np.mean([np.sum((f.points.xyz_mm - true[f.number - 1]) ** 2, axis=1) for f in part]))
-             for part in (found[::2], found[1::2])]
+    error = [
+        np.sqrt(
+            np.mean([np.sum((f.points.xyz_mm - true[f.number - 1]) ** 2, axis=1) for f in part])
+        )
+        for part in (found[::2], found[1::2])
+    ]
     assert error[0] < 0.95 * error[1]
 
 
 @pytest.mark.parametrize('by', ['frame_number', 'stamp'])
 @pytest.mark.parametrize('seed', range(3))
 def test_every_exposure_of_two_views_is_reconstructed(by, seed):
-    """With views lost at random and one fluoroscope off for the second half: once each, in order of time."""
-    rng, (calibrations, orientation), frames = np.random.default_rng(seed), known(), tracking(0.5, 80).frames
+    """With views lost at random and one fluoroscope off for the second half: once each, in order
+    of time.
+    """
+    rng = np.random.default_rng(seed)
+    (calibrations, orientation) = known()
+    frames = tracking(0.5, 80).frames
     there = {name: rng.random(40) < 0.7 for name in 'abc'}
     there['b'][20:] = False
     kept = {name: [f for f, here in zip(frames[name], there[name]) if here] for name in 'abc'}
-    if by == 'stamp':   # numbered otherwise, with stamps that differ a little
-        kept = {name: [replace(f, number=f.number + 7 * k, stamp_ns=f.stamp_ns + 300_000 * k) for f in of_one]
-                for k, (name, of_one) in enumerate(kept.items())}
+    if by == 'stamp':  # numbered otherwise, with stamps that differ a little
+        kept = {
+            name: [
+                replace(f, number=f.number + 7 * k, stamp_ns=f.stamp_ns + 300_000 * k)
+                for f in of_one
+            ]
+            for k, (name, of_one) in enumerate(kept.items())
+        }
     found, unpaired = reconstruct_recording(kept, calibrations, Intersector(orientation), by)
     views = np.sum(list(there.values()), axis=0)
     rows = np.flatnonzero(views >= 2)
@@ -135,36 +197,56 @@ def test_a_target_that_one_view_of_two_sees_is_told():
     frames = {name: of_one[:1] for name, of_one in tracking(0.5, 40).frames.items() if name != 'c'}
     one = frames['a'][0]
     frames['a'] = [replace(one, target_id=one.target_id[3:], uv=one.uv[3:])]
-    (found,), _ = reconstruct_recording({**frames, 'c': []}, calibrations, Intersector(orientation))
+    (found,), _ = reconstruct_recording(
+        {**frames, 'c': []}, calibrations, Intersector(orientation)
+    )
     assert found.points.status.tolist() == 3 * [SINGLE_VIEW] + 21 * [OK]
 
 
 # ---- the drift watch of a recording
 
+
 def test_a_drift_of_a_recording_is_found_and_told():
     frames = shifted(tracking(30.0, 30.0, 'ab').frames, 'b', 16.0)
-    watch, start = watched(frames, 'ab'), frames['a'][0].stamp_ns
+    watch = watched(frames, 'ab')
+    start = frames['a'][0].stamp_ns
     found = watch.verdict()
     assert (found.level, found.level_at_end, found.state.fluoroscope) == ('error', 'error', 'b')
     assert found.state.level == ERROR and 'left' in found.state.place and found.state.size > 0.5
-    assert 16 < (found.found_ns - start) / 1e9 < 22 and abs((found.began_ns - start) / 1e9 - 16) < 1.5
+    assert (
+        16 < (found.found_ns - start) / 1e9 < 22 and abs((found.began_ns - start) / 1e9 - 16) < 1.5
+    )
     assert found.message.startswith('ERROR: the image of fluoroscope b has drifted by')
-    assert found.message.endswith(f'found {(found.found_ns - start) / 1e9:.1f} s after the beginning: '
-                                  'the calibration no longer holds')
+    assert found.message.endswith(
+        f'found {(found.found_ns - start) / 1e9:.1f} s after the beginning: '
+        'the calibration no longer holds'
+    )
     assert 18 < found.watched_s < 21
 
 
 @pytest.mark.long
 @pytest.mark.parametrize('outside', [True, False])
 def test_what_lies_beyond_the_calibrated_area_is_no_drift(outside):
-    """There the correction is extrapolated: it may be wrong by a pixel, and by another one elsewhere."""
+    """There the correction is extrapolated: it may be wrong by a pixel, and by another one
+    elsewhere.
+    """
     calibrations, orientation = known('ab')
     watch = RecordingWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
     frames = shifted(tracking(20, 120, 'ab').frames, 'a', 12.0)
     for exposure in zip(*(frames[name] for name in 'ab')):
-        views = [CorrectedView(f.target_id, f.uv, np.full(len(f.uv), NOISE_PX), np.full(len(f.uv), 0.02),
-                               outside & (f.fluoroscope == 'a') & (f.uv[:, 0] < 520)) for f in exposure]
-        watch_views(watch, exposure[0].stamp_ns, views, intersect_views(views, Intersector(orientation)))
+        views = [
+            CorrectedView(
+                f.target_id,
+                f.uv,
+                np.full(len(f.uv), NOISE_PX),
+                np.full(len(f.uv), 0.02),
+                outside & (f.fluoroscope == 'a') & (f.uv[:, 0] < 520),
+            )
+            for f in exposure
+        ]
+        watch_views(
+            watch, exposure[0].stamp_ns, views, intersect_views(views, Intersector(orientation))
+        )
     assert watch.verdict().level == ('ok' if outside else 'error')
 
 
@@ -183,13 +265,24 @@ def test_a_drift_that_has_gone_by_the_end_is_told_all_the_same():
     frames = shifted(tracking(45.0, 30.0, 'ab').frames, 'b', 14.0, 20.0)
     found = watched(frames, 'ab').verdict()
     assert (found.level, found.level_at_end) == ('error', 'ok') and found.state.fluoroscope == 'b'
-    assert 'after the beginning; it was gone at the end: the calibration no longer holds' in found.message
+    assert (
+        'after the beginning; it was gone at the end: the calibration no longer holds'
+        in found.message
+    )
 
 
 def test_a_healthy_recording_is_ok():
     found = watched(tracking(30.0, 30.0, 'ab').frames, 'ab', CLUSTERS).verdict()
-    assert (found.level, found.state, found.found_ns, found.level_at_end) == ('ok', None, None, 'ok')
-    assert found.message == f'no drift is seen in {found.watched_s:.1f} s' and 18 < found.watched_s < 21
+    assert (found.level, found.state, found.found_ns, found.level_at_end) == (
+        'ok',
+        None,
+        None,
+        'ok',
+    )
+    assert (
+        found.message == f'no drift is seen in {found.watched_s:.1f} s'
+        and 18 < found.watched_s < 21
+    )
 
 
 def test_what_cannot_be_told_is_not_called_ok():
@@ -197,27 +290,41 @@ def test_what_cannot_be_told_is_not_called_ok():
     frames = tracking(30.0, 30.0, 'ab').frames
     short = watched({name: of_one[:320] for name, of_one in frames.items()}, 'ab').verdict()
     assert short.level == 'learning' and short.message == (
-        'the recording is too short to tell a drift: it has 10.6 s, of which the first 10 s are learned')
+        'the recording is too short to tell a drift: it has 10.6 s, of which the first 10 s are learned'
+    )
     apart = {**frames, 'b': [replace(f, target_id=f.target_id + 100) for f in frames['b']]}
-    few = {name: [replace(f, target_id=f.target_id[:2], uv=f.uv[:2]) for f in of_one]
-           for name, of_one in frames.items()}
+    few = {
+        name: [replace(f, target_id=f.target_id[:2], uv=f.uv[:2]) for f in of_one]
+        for name, of_one in frames.items()
+    }
     for found in (watched(apart, 'ab').verdict(), watched(few, 'ab').verdict()):
-        assert found.level == 'unknown' and found.message == 'there are too few markers in two views to tell a drift'
+        assert (
+            found.level == 'unknown'
+            and found.message == 'there are too few markers in two views to tell a drift'
+        )
     assert watched({'a': [], 'b': []}, 'ab').verdict().level == 'learning'
 
 
 @pytest.mark.long
 def test_views_that_are_missing_are_no_drift_and_hide_none():
-    """Of three fluoroscopes one is off for half of the time and loses frames: its pairs have a start of their own."""
-    frames, rng = tracking(30.0, 30.0).frames, np.random.default_rng(1)
+    """Of three fluoroscopes one is off for half of the time and loses frames: its pairs have a
+    start of their own.
+    """
+    frames = tracking(30.0, 30.0).frames
+    rng = np.random.default_rng(1)
     kept = [f for k, f in enumerate(frames['c']) if k < 450 and rng.random() < 0.7]
     watch = watched({**frames, 'c': kept}, 'abc', CLUSTERS)
     assert watch.verdict().level == 'ok'
     found = watched(shifted({**frames, 'c': kept}, 'b', 18.0), 'abc', CLUSTERS).verdict()
-    assert found.level == 'error' and 'b' in found.state.fluoroscope and 'c' not in found.state.fluoroscope
+    assert (
+        found.level == 'error'
+        and 'b' in found.state.fluoroscope
+        and 'c' not in found.state.fluoroscope
+    )
 
 
 # ---- the command
+
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
@@ -231,12 +338,22 @@ def folder(tmp_path_factory):
     frames['c'] = frames['c'][::2][:200]
     write_bag(path / 'drifted', shifted(frames, 'b', 14.0))
     write_bag(path / 'short', {name: of_one[:40] for name, of_one in frames.items()})
-    write_observations_csv(path / 'short.csv', {name: of_one[:40] for name, of_one in frames.items()})
+    write_observations_csv(
+        path / 'short.csv', {name: of_one[:40] for name, of_one in frames.items()}
+    )
     return path
 
 
 def command(folder, source, *more):
-    return ('reconstruct', folder / source, '--calibration', folder / 'result', '--out', folder / 'out.csv', *more)
+    return (
+        'reconstruct',
+        folder / source,
+        '--calibration',
+        folder / 'result',
+        '--out',
+        folder / 'out.csv',
+        *more,
+    )
 
 
 def document(capsys, *arguments):
@@ -250,22 +367,41 @@ def test_reconstruct_tells_of_a_drift_and_of_missing_views(folder, capsys):
     """And writes the points all the same, with exit status 0."""
     said = document(capsys, *command(folder, 'drifted'))
     drift = said['drift']
-    assert said['frames'] == 660 and said['incomplete'] == 460 and said['unpaired'] == {'a': 0, 'b': 0, 'c': 0}
+    assert (
+        said['frames'] == 660
+        and said['incomplete'] == 460
+        and said['unpaired'] == {'a': 0, 'b': 0, 'c': 0}
+    )
     assert (drift['level'], drift['level_at_end'], drift['fluoroscope']) == ('error', 'error', 'b')
-    assert drift['size_px'] > 0.5 and drift['sd_px'] > 0 and 'left' in drift['place'] and len(drift['area_px']) == 4
+    assert (
+        drift['size_px'] > 0.5
+        and drift['sd_px'] > 0
+        and 'left' in drift['place']
+        and len(drift['area_px']) == 4
+    )
     assert 14 < drift['found_s'] < 20 and abs(drift['began_s'] - 14) < 1.5
     assert drift['found_stamp_ns'] - drift['began_stamp_ns'] == pytest.approx(
-        1e9 * (drift['found_s'] - drift['began_s']), abs=1e3)
+        1e9 * (drift['found_s'] - drift['began_s']), abs=1e3
+    )
     assert drift['evidence'] >= drift['threshold_error'] > drift['threshold_warn']
     with open(folder / 'out.csv', newline='') as file:
         rays = [int(row['rays']) for row in csv.DictReader(file)]
     assert len(rays) == 24 * 660 and 0.9 < np.mean(np.array(rays) == 2) / (460 / 660) < 1.1
-    assert run(*command(folder, 'drifted', '--cluster', CLUSTERS[0], '--cluster', CLUSTERS[1])) == 0
+    assert (
+        run(*command(folder, 'drifted', '--cluster', CLUSTERS[0], '--cluster', CLUSTERS[1])) == 0
+    )
     out = capsys.readouterr().out
     assert '460 of the frames without all fluoroscopes (a, b, c)' in out
-    assert 'drift watch: ERROR: the image of fluoroscope b has drifted by' in out and 'no longer holds' in out
-    assert document(capsys, *command(folder, 'drifted', '--cluster', CLUSTERS[0]))['drift']['observations'] > drift[
-        'observations']
+    assert (
+        'drift watch: ERROR: the image of fluoroscope b has drifted by' in out
+        and 'no longer holds' in out
+    )
+    assert (
+        document(capsys, *command(folder, 'drifted', '--cluster', CLUSTERS[0]))['drift'][
+            'observations'
+        ]
+        > drift['observations']
+    )
 
 
 def test_reconstruct_says_where_no_drift_can_be_told(folder, capsys):
@@ -276,16 +412,39 @@ def test_reconstruct_says_where_no_drift_can_be_told(folder, capsys):
     assert run(*command(folder, 'short', '--no-drift-watch')) == 0
     assert 'drift' not in capsys.readouterr().out
     table = document(capsys, *command(folder, 'short.csv'))
-    assert table['drift']['level'] == 'unknown' and 'does not tell the time' in table['drift']['message']
-    assert table['frames'] == 40 and table['incomplete'] == 20   # c takes every other one
+    assert (
+        table['drift']['level'] == 'unknown'
+        and 'does not tell the time' in table['drift']['message']
+    )
+    assert table['frames'] == 40 and table['incomplete'] == 20  # c takes every other one
 
 
-@pytest.mark.parametrize('source, more, sentence', [
-    ('short', ['--cluster', '1001 1002'], "--cluster: '1001 1002' does not declare a cluster, as 'tibia: 1001 1002"),
-    ('short', ['--cluster', 'tibia: 1'], '--cluster: cluster tibia: it is two beads or more'),
-    ('short', ['--cluster', 'tibia: 1 2', '--cluster', 'femur: 2 3'], '--cluster: target 2 is in two clusters'),
-    ('short', ['--cluster', 'tibia: 1 2', '--no-drift-watch'], 'it does not go with --no-drift-watch'),
-    ('short.csv', ['--cluster', 'tibia: 1 2'], 'a CSV file, does not tell the time of its exposures')])
+@pytest.mark.parametrize(
+    'source, more, sentence',
+    [
+        (
+            'short',
+            ['--cluster', '1001 1002'],
+            "--cluster: '1001 1002' does not declare a cluster, as 'tibia: 1001 1002",
+        ),
+        ('short', ['--cluster', 'tibia: 1'], '--cluster: cluster tibia: it is two beads or more'),
+        (
+            'short',
+            ['--cluster', 'tibia: 1 2', '--cluster', 'femur: 2 3'],
+            '--cluster: target 2 is in two clusters',
+        ),
+        (
+            'short',
+            ['--cluster', 'tibia: 1 2', '--no-drift-watch'],
+            'it does not go with --no-drift-watch',
+        ),
+        (
+            'short.csv',
+            ['--cluster', 'tibia: 1 2'],
+            'a CSV file, does not tell the time of its exposures',
+        ),
+    ],
+)
 def test_wrong_clusters_are_refused_in_a_sentence(folder, capsys, source, more, sentence):
     (folder / 'out.csv').unlink(missing_ok=True)
     assert run(*command(folder, source, *more)) == 2

@@ -1,45 +1,73 @@
-"""The virtual rig: repeatable, of the promised geometry, and with a truth that fits the observations."""
+"""The virtual rig: repeatable, of the promised geometry, and with a truth that fits the
+observations.
+"""
 
 import numpy as np
 import pytest
-
 import rigs
-from fluoro_calib_ros.calibration.coverage import Coverage
+
+from fluoro_calib_ros.exposures.coverage import Coverage
+from fluoro_calib_ros.exposures.frame import points_on_image, validate_frame
 from fluoro_calib_ros.photogrammetry.collinearity import project
-from fluoro_calib_ros.photogrammetry.observations import check_frame, points_on_image
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 from fluoro_calib_ros.simulation.distortion import random_field
 from fluoro_calib_ros.simulation.rig import (
-    BEADS, CUBE_MM, IMAGE_SIZE, START_NS, looking_at_origin, simulate_exposures, simulate_tracking, virtual_rig)
+    BEADS,
+    CUBE_MM,
+    IMAGE_SIZE,
+    START_NS,
+    looking_at_origin,
+    simulate_exposures,
+    simulate_tracking,
+    virtual_rig,
+)
 
 SEEDS = range(8)
-GRID = np.stack(np.meshgrid(np.arange(-0.5, 1024, 32.0), np.arange(-0.5, 1024, 32.0)), axis=2).reshape(-1, 2)
+GRID = np.stack(
+    np.meshgrid(np.arange(-0.5, 1024, 32.0), np.arange(-0.5, 1024, 32.0)), axis=2
+).reshape(-1, 2)
 
 
 def same_frames(one, other):
-    return all(np.array_equal(a.uv, b.uv) and np.array_equal(a.target_id, b.target_id)
-               and (a.number, a.stamp_ns, a.frame_id) == (b.number, b.stamp_ns, b.frame_id)
-               for name in one for a, b in zip(one[name], other[name], strict=True))
+    return all(
+        np.array_equal(a.uv, b.uv)
+        and np.array_equal(a.target_id, b.target_id)
+        and (a.number, a.stamp_ns, a.frame_id) == (b.number, b.stamp_ns, b.frame_id)
+        for name in one
+        for a, b in zip(one[name], other[name], strict=True)
+    )
 
 
 def test_the_same_seed_gives_the_same_numbers():
     """To the last bit; another seed gives another rig and other exposures."""
-    one, other, third = virtual_rig(3), virtual_rig(3), virtual_rig(4)
+    one = virtual_rig(3)
+    other = virtual_rig(3)
+    third = virtual_rig(4)
     np.testing.assert_array_equal(one.true_mm, other.true_mm)
     np.testing.assert_array_equal(one.phantom.xyz_mm, other.phantom.xyz_mm)
     for a, b in zip(one.fluoroscopes, other.fluoroscopes):
-        np.testing.assert_array_equal(np.r_[a.interior, a.position_mm, a.rotation.ravel(), a.distortion(GRID).ravel()],
-                                      np.r_[b.interior, b.position_mm, b.rotation.ravel(), b.distortion(GRID).ravel()])
+        np.testing.assert_array_equal(
+            np.r_[a.interior, a.position_mm, a.rotation.ravel(), a.distortion(GRID).ravel()],
+            np.r_[b.interior, b.position_mm, b.rotation.ravel(), b.distortion(GRID).ravel()],
+        )
     assert not np.array_equal(one.true_mm, third.true_mm)
     assert not np.array_equal(one.fluoroscopes[0].interior, third.fluoroscopes[0].interior)
-    assert same_frames(simulate_exposures(one, 3, 7).frames, simulate_exposures(other, 3, 7).frames)
-    assert not same_frames(simulate_exposures(one, 3, 7).frames, simulate_exposures(one, 3, 8).frames)
-    assert same_frames(simulate_tracking(one, 0.1, seed=7).frames, simulate_tracking(other, 0.1, seed=7).frames)
+    assert same_frames(
+        simulate_exposures(one, 3, 7).frames, simulate_exposures(other, 3, 7).frames
+    )
+    assert not same_frames(
+        simulate_exposures(one, 3, 7).frames, simulate_exposures(one, 3, 8).frames
+    )
+    assert same_frames(
+        simulate_tracking(one, 0.1, seed=7).frames, simulate_tracking(other, 0.1, seed=7).frames
+    )
 
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_sources_stand_where_they_are_said_to(seed):
-    """About 1.5 m from the middle, about 2 m apart, looking at it, image upright (v down is z of the rig down)."""
+    """About 1.5 m from the middle, about 2 m apart, looking at it, image upright (v down is z of
+    the rig down).
+    """
     a, b = virtual_rig(seed).fluoroscopes
     assert (a.name, b.name) == ('a', 'b')
     for f in (a, b):
@@ -54,15 +82,21 @@ def test_sources_stand_where_they_are_said_to(seed):
 
 
 def test_rigs_of_more_fluoroscopes():
-    """The default is what it was; of three, neighbours look across each other by the angle that is given."""
+    """The default is what it was; of three, neighbours look across each other by the angle that is
+    given.
+    """
     same = virtual_rig(3, between_deg=84.0).fluoroscopes
     for one, other in zip(virtual_rig(3).fluoroscopes, same):
         np.testing.assert_array_equal(one.rotation, other.rotation)
         np.testing.assert_array_equal(one.position_mm, other.position_mm)
     three = virtual_rig(3, names=('a', 'b', 'c'), between_deg=60.0)
     axes = np.array([f.rotation[2] for f in three.fluoroscopes])
-    np.testing.assert_allclose(np.rad2deg(np.arccos((axes @ axes.T)[[0, 1, 0], [1, 2, 2]])), [60, 60, 120], atol=6)
-    assert all(len(of_one[0].target_id) > 100 for of_one in simulate_exposures(three, 1).frames.values())
+    np.testing.assert_allclose(
+        np.rad2deg(np.arccos((axes @ axes.T)[[0, 1, 0], [1, 2, 2]])), [60, 60, 120], atol=6
+    )
+    assert all(
+        len(of_one[0].target_id) > 100 for of_one in simulate_exposures(three, 1).frames.values()
+    )
 
 
 def test_looking_at_the_origin_puts_it_on_the_axis():
@@ -78,35 +112,51 @@ def test_the_phantom_is_a_cube_of_503_beads_with_a_survey(seed):
     rig = virtual_rig(seed)
     assert rig.true_mm.shape == (BEADS, 3) == (503, 3)
     x, y, z = np.abs(rig.true_mm).T
-    on_x, on_y = np.isclose(x, CUBE_MM / 2, atol=1e-5), np.isclose(y, CUBE_MM / 2, atol=1e-5)
+    on_x = np.isclose(x, CUBE_MM / 2, atol=1e-5)
+    on_y = np.isclose(y, CUBE_MM / 2, atol=1e-5)
     assert (on_x ^ on_y).all() and max(x.max(), y.max(), z.max()) <= CUBE_MM / 2 + 1e-5
-    faces = [np.sum(on & (side * rig.true_mm[:, axis] > 0)) for axis, on in ((0, on_x), (1, on_y)) for side in (1, -1)]
+    faces = [
+        np.sum(on & (side * rig.true_mm[:, axis] > 0))
+        for axis, on in ((0, on_x), (1, on_y))
+        for side in (1, -1)
+    ]
     assert sorted(faces) == [125, 126, 126, 126]
     gaps = np.linalg.norm(rig.true_mm[:, None] - rig.true_mm[None], axis=2) + 1000 * np.eye(503)
     assert gaps.min() > 10
-    assert np.sqrt(np.mean((rig.phantom.xyz_mm - rig.true_mm) ** 2)) == pytest.approx(0.1, rel=0.08)
+    assert np.sqrt(np.mean((rig.phantom.xyz_mm - rig.true_mm) ** 2)) == pytest.approx(
+        0.1, rel=0.08
+    )
     assert (rig.phantom.sd_mm == 0.1).all()
     wide = virtual_rig(seed, survey_sd_mm=0.5)
-    assert np.sqrt(np.mean((wide.phantom.xyz_mm - wide.true_mm) ** 2)) == pytest.approx(0.5, rel=0.08)
+    assert np.sqrt(np.mean((wide.phantom.xyz_mm - wide.true_mm) ** 2)) == pytest.approx(
+        0.5, rel=0.08
+    )
     np.testing.assert_array_equal(wide.true_mm, rig.true_mm)
 
 
 @pytest.mark.parametrize('seed', range(20))
 def test_distortion_is_large_at_the_rim_and_small_in_the_middle(seed):
-    """14 to 17 px along the rim, 26 to 35 px in the corners; smooth; scaled by its strength, down to none."""
+    """14 to 17 px along the rim, 26 to 35 px in the corners; smooth; scaled by its strength, down
+    to none.
+    """
     field = random_field(np.random.default_rng(seed))
     size = np.linalg.norm(field(GRID), axis=1)
     rim = np.abs(GRID - 511.5).max(axis=1) > 511
     assert 14 < size[rim].mean() < 17.5 and 26 < size.max() < 35.5
-    assert size[rim].max() == size.max() and size[np.linalg.norm(GRID - 511.5, axis=1) < 200].max() < 8
+    assert (
+        size[rim].max() == size.max()
+        and size[np.linalg.norm(GRID - 511.5, axis=1) < 200].max() < 8
+    )
     assert np.linalg.norm(field(GRID + [1, 0]) - field(GRID), axis=1).max() < 0.2
-    np.testing.assert_allclose(random_field(np.random.default_rng(seed), 0.5)(GRID), field(GRID) / 2, rtol=1e-12)
+    np.testing.assert_allclose(
+        random_field(np.random.default_rng(seed), 0.5)(GRID), field(GRID) / 2, rtol=1e-12
+    )
     assert not random_field(np.random.default_rng(seed), 0.0)(GRID).any()
 
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_distort_is_the_inverse_of_the_correction(seed):
-    """undistorted = observed - correction(observed)."""
+    """Undistorted = observed - correction(observed)."""
     field = random_field(np.random.default_rng(seed))
     observed = field.distort(GRID)
     np.testing.assert_allclose(observed - field(observed), GRID, rtol=0, atol=1e-9)
@@ -122,11 +172,16 @@ def test_exposures_are_as_many_and_as_full_as_promised():
         assert [f.number for f in frames] == list(range(1, 21))
         assert [f.stamp_ns for f in frames] == [START_NS + j * 500_000_000 for j in range(20)]
         for f in frames:
-            check_frame(f, rig.phantom, IMAGE_SIZE)
+            validate_frame(f, rig.phantom, IMAGE_SIZE)
             assert f.fluoroscope == name and f.frame_id == f'{name}_optical' and f.sigma is None
             np.testing.assert_array_equal(f.uv, np.round(f.uv, 4))
-    later = simulate_exposures(rig, 2, 5, first_number=7, start_ns=99, interval_s=0.25, matched=(20, 20)).frames['b']
-    assert [(f.number, f.stamp_ns, len(f.target_id)) for f in later] == [(7, 99, 20), (8, 99 + 250_000_000, 20)]
+    later = simulate_exposures(
+        rig, 2, 5, first_number=7, start_ns=99, interval_s=0.25, matched=(20, 20)
+    ).frames['b']
+    assert [(f.number, f.stamp_ns, len(f.target_id)) for f in later] == [
+        (7, 99, 20),
+        (8, 99 + 250_000_000, 20),
+    ]
 
 
 def errors_of_image_points(rig, simulated):
@@ -143,9 +198,11 @@ def test_noise_and_false_matches_have_the_share_they_are_given():
     """A false match sits on another bead nearby; what is left is Gaussian noise."""
     rig = rigs.rig()
     for share, noise in ((0.01, 0.25), (0.2, 0.25), (0.0, 1.0)):
-        error = errors_of_image_points(rig, simulate_exposures(rig, 15, 6, noise_px=noise, false_matches=share))
+        error = errors_of_image_points(
+            rig, simulate_exposures(rig, 15, 6, noise_px=noise, false_matches=share)
+        )
         size = np.linalg.norm(error, axis=1)
-        false = size > 6 * noise   # beads of opposite faces may coincide even so
+        false = size > 6 * noise  # beads of opposite faces may coincide even so
         assert false.mean() == pytest.approx(share, abs=3 * np.sqrt(share / len(error)))
         assert np.sqrt(np.mean(error[~false] ** 2)) == pytest.approx(noise, rel=0.03)
         if share:
@@ -160,8 +217,12 @@ def test_the_exterior_orientation_of_a_pose_gives_the_image_points():
         for pose in simulated.poses:
             rotation, position = f.exterior(pose)
             n = len(rig.true_mm)
-            direct = project(np.tile(rotation, (n, 1, 1)), np.tile(position, (n, 1)), rig.true_mm, f.interior)
-            np.testing.assert_allclose(direct, f.ideal(rig.true_mm @ pose[0].T + pose[1]), atol=1e-8)
+            direct = project(
+                np.tile(rotation, (n, 1, 1)), np.tile(position, (n, 1)), rig.true_mm, f.interior
+            )
+            np.testing.assert_allclose(
+                direct, f.ideal(rig.true_mm @ pose[0].T + pose[1]), atol=1e-8
+            )
 
 
 def test_undistorted_points_are_the_observed_ones_without_distortion():
@@ -169,7 +230,9 @@ def test_undistorted_points_are_the_observed_ones_without_distortion():
     simulated = simulate_exposures(rig, 3, 6)
     for f in rig.fluoroscopes:
         for frame, undistorted in zip(simulated.frames[f.name], simulated.undistorted[f.name]):
-            np.testing.assert_allclose(undistorted, frame.uv - f.distortion(frame.uv), rtol=0, atol=1e-12)
+            np.testing.assert_allclose(
+                undistorted, frame.uv - f.distortion(frame.uv), rtol=0, atol=1e-12
+            )
 
 
 def test_the_image_is_covered_by_15_exposures():
@@ -188,23 +251,33 @@ def test_the_poses_turn_the_phantom_all_round():
 
 
 def test_tracking_shows_rigid_clusters_in_motion():
-    """Four clusters of six markers, visible throughout, with image points that belong to their positions."""
+    """Four clusters of six markers, visible throughout, with image points that belong to their
+    positions.
+    """
     rig = rigs.rig()
     tracking = simulate_tracking(rig, 2.0, 60.0, seed=1)
     assert tracking.points_mm.shape == (120, 24, 3)
     for cluster in range(4):
-        part = tracking.points_mm[:, 6 * cluster:6 * cluster + 6]
+        part = tracking.points_mm[:, 6 * cluster : 6 * cluster + 6]
         sides = np.linalg.norm(part[:, :, None] - part[:, None], axis=3)
         np.testing.assert_allclose(sides, np.broadcast_to(sides[0], sides.shape), atol=1e-9)
     assert np.ptp(tracking.points_mm, axis=0).max() > 50
     for f in rig.fluoroscopes:
         frames = tracking.frames[f.name]
-        assert [frame.stamp_ns for frame in frames[:3]] == [START_NS + round(k / 60 * 1e9) for k in range(3)]
+        assert [frame.stamp_ns for frame in frames[:3]] == [
+            START_NS + round(k / 60 * 1e9) for k in range(3)
+        ]
         observed = np.array([frame.uv for frame in frames])
         assert points_on_image(observed.reshape(-1, 2), IMAGE_SIZE).all()
         for k in (0, 119):
-            np.testing.assert_allclose(tracking.ideal[f.name][k], f.ideal(tracking.points_mm[k]), atol=1e-9)
-        error = observed.reshape(-1, 2) - f.distortion.distort(tracking.ideal[f.name].reshape(-1, 2))
-        assert np.sqrt(np.mean(error ** 2)) == pytest.approx(0.25, rel=0.05)
-        assert (frames[0].target_id == tracking.marker_id).all() and len(set(tracking.marker_id)) == 24
+            np.testing.assert_allclose(
+                tracking.ideal[f.name][k], f.ideal(tracking.points_mm[k]), atol=1e-9
+            )
+        error = observed.reshape(-1, 2) - f.distortion.distort(
+            tracking.ideal[f.name].reshape(-1, 2)
+        )
+        assert np.sqrt(np.mean(error**2)) == pytest.approx(0.25, rel=0.05)
+        assert (frames[0].target_id == tracking.marker_id).all() and len(
+            set(tracking.marker_id)
+        ) == 24
     assert not set(tracking.marker_id) & set(rig.phantom.target_id)

@@ -1,4 +1,6 @@
-"""Corrected images: where the beads of an image go, rims, folds, depths, and images that are not such."""
+"""Corrected images: where the beads of an image go, rims, folds, depths, and images that are not
+such.
+"""
 
 import functools
 import threading
@@ -6,26 +8,26 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rigs
 from scipy.ndimage import map_coordinates
 
-import rigs
 from fluoro_calib_ros.calibration.result import INVALID, OK, OUTSIDE
 from fluoro_calib_ros.distortion.models import CorrectionModel
-from fluoro_calib_ros.images.undistortion import LIMIT_PX, ImageCorrector
-from fluoro_calib_ros.photogrammetry.observations import DataError
-from fluoro_calib_ros.simulation.images import BEAD_PX, background, bead_image
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector
+from fluoro_calib_ros.simulation.bead_images import BEAD_PX, background, bead_image
 
 SIZE = (1024, 1024)
 DEPTHS = (np.uint8, np.uint16)
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def calibration(kind='auto'):
     """A calibration of the virtual rig."""
     return rigs.calibrated('a', model=kind).calibrations['a']
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def corrector(interpolation='linear', kind='auto'):
     """An ImageCorrector of it."""
     return ImageCorrector(calibration(kind), interpolation)
@@ -38,7 +40,9 @@ def with_model(model, size):
 
 def model_of(uv, duv, kind='local_linear', k=6):
     """A CorrectionModel of training points and corrections (n, 2) [px]."""
-    return CorrectionModel(kind, k, np.asarray(uv, dtype=float), np.asarray(duv, dtype=float), 0.2, 0.0)
+    return CorrectionModel(
+        kind, k, np.asarray(uv, dtype=float), np.asarray(duv, dtype=float), 0.2, 0.0
+    )
 
 
 def lattice(size, step=8.0):
@@ -50,27 +54,35 @@ def lattice(size, step=8.0):
 def random_image(dtype, size=SIZE):
     """Smooth noise: grey values over the whole range, without what interpolation cannot follow."""
     rng = np.random.default_rng(0)
-    y, x = np.mgrid[:size[1], :size[0]]
+    y, x = np.mgrid[: size[1], : size[0]]
     waves = sum(np.sin(x * a + y * b + c) for a, b, c in rng.uniform(-0.15, 0.15, (6, 3)))
     return np.rint((waves - waves.min()) / np.ptp(waves) * np.iinfo(dtype).max).astype(dtype)
 
 
 def off(image, light, uv, reach=9):
-    """Distances (n, 2) [px] of the blobs in an image (h, w), beside light (h, w) without them, from pixels uv (n, 2)
-    near them: least squares of a Gaussian with its first and second moments, on a plane."""
+    """Distances (n, 2) [px] of the blobs in an image (h, w), beside light (h, w) without them,
+    from pixels uv (n, 2) near them: least squares of a Gaussian with its first and second moments,
+    on a plane.
+    """
     taken = 1 - image / light
     out = []
     for u, v in uv:
-        part = np.s_[round(v) - reach:round(v) + reach + 1, round(u) - reach:round(u) + reach + 1]
+        part = np.s_[
+            round(v) - reach : round(v) + reach + 1, round(u) - reach : round(u) + reach + 1
+        ]
         y, x = np.mgrid[part].reshape(2, -1) - [[v], [u]]
-        blob, one = np.exp(-0.5 * (x * x + y * y) / BEAD_PX ** 2), np.ones_like(x)
-        columns = np.stack([*(blob * p for p in (one, x, y, x * x, y * y, x * y)), one, x, y], axis=1)
+        blob = np.exp(-0.5 * (x * x + y * y) / BEAD_PX**2)
+        one = np.ones_like(x)
+        columns = np.stack(
+            [*(blob * p for p in (one, x, y, x * x, y * y, x * y)), one, x, y], axis=1
+        )
         found = np.linalg.lstsq(columns, taken[part].ravel(), rcond=None)[0]
-        out.append(found[1:3] / found[0] * BEAD_PX ** 2)
+        out.append(found[1:3] / found[0] * BEAD_PX**2)
     return np.array(out)
 
 
 # ---- where things go
+
 
 @pytest.mark.long
 @pytest.mark.parametrize('kind', ['auto', 'local_linear', 'parametric'])
@@ -80,45 +92,60 @@ def test_every_pixel_shows_what_belongs_to_it(kind):
     corrected = calibration(kind).correct(this.source[:, this.mask].T)
     v, u = np.nonzero(this.mask)
     assert np.abs(corrected.uv - np.stack([u, v], axis=1)).max() < LIMIT_PX
-    assert np.mean(corrected.status == this.status[this.mask]) > 0.9999   # 32 bits may cross the rim of a cell
-    assert np.isnan(this.source[:, ~this.mask]).all() and not np.isnan(this.source[:, this.mask]).any()
+    assert (
+        np.mean(corrected.status == this.status[this.mask]) > 0.9999
+    )  # 32 bits may cross the rim of a cell
+    assert (
+        np.isnan(this.source[:, ~this.mask]).all()
+        and not np.isnan(this.source[:, this.mask]).any()
+    )
     assert {OK, OUTSIDE, INVALID} == set(np.unique(this.status).tolist())
 
 
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_beads_go_where_points_go(dtype, interpolation):
-    """Blobs drawn at observed positions lie, in the corrected image, where calibration.correct puts them: the true
-    distortion moves them by up to 17 px."""
-    at = np.stack(np.meshgrid(np.arange(62, 980, 60), np.arange(62, 980, 60)), axis=-1).reshape(-1, 2)
+    """Blobs drawn at observed positions lie, in the corrected image, where calibration.correct
+    puts them: the true distortion moves them by up to 17 px.
+    """
+    at = np.stack(np.meshgrid(np.arange(62, 980, 60), np.arange(62, 980, 60)), axis=-1).reshape(
+        -1, 2
+    )
     observed = at + np.random.default_rng(1).uniform(-9, 9, at.shape)
     wanted = calibration().correct(observed).uv
     assert np.abs(wanted - observed).max() > 10
     image = bead_image(observed, SIZE, dtype, noise=0.0)
-    light = corrector().correct(bead_image([], SIZE, np.uint16, noise=0.0)) / (65_535 / np.iinfo(dtype).max)
-    with np.errstate(divide='ignore', invalid='ignore'):   # at the rim, where there is nothing
+    light = corrector().correct(bead_image([], SIZE, np.uint16, noise=0.0)) / (
+        65_535 / np.iinfo(dtype).max
+    )
+    with np.errstate(divide='ignore', invalid='ignore'):  # at the rim, where there is nothing
         error = off(corrector(interpolation).correct(image), light, wanted)
-    assert np.sqrt(np.mean(error ** 2)) < 0.01 and np.abs(error).max() < 0.03
+    assert np.sqrt(np.mean(error**2)) < 0.01 and np.abs(error).max() < 0.03
 
 
 @pytest.mark.parametrize('interpolation, limit', [('linear', 1 / 64), ('cubic', 1 / 45)])
 def test_map_is_as_exact_as_said(interpolation, limit):
-    """On an image that tells where its pixels are: within what OpenCV's 1/32 px leave, and rounding."""
+    """On an image that tells where its pixels are: within what OpenCV's 1/32 px leave, and
+    rounding.
+    """
     this = corrector(interpolation)
     inner = this.mask & np.all((this.source > 1) & (this.source < 1022), axis=0)
     for axis, ramp in enumerate(np.mgrid[:1024, :1024][::-1] * 60):
         seen = this.correct(ramp.astype(np.uint16))[inner] / 60
         error = np.abs(seen - this.source[axis][inner])
         assert error.max() < limit + 0.5 / 60 + 1e-3
-        assert np.sqrt(np.mean(error ** 2)) < 0.012
+        assert np.sqrt(np.mean(error**2)) < 0.012
 
 
 @pytest.mark.parametrize('interpolation, order', [('linear', 1), ('cubic', 3)])
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_beside_scipy(dtype, interpolation, order):
-    """map_coordinates at the same sources gives the same image, but for 1/64 px of its slope. Its cubic is a spline
-    through the pixels, OpenCV's a convolution: on a smooth image the two are alike."""
-    image, this = random_image(dtype), corrector(interpolation)
+    """map_coordinates at the same sources gives the same image, but for 1/64 px of its slope. Its
+    cubic is a spline through the pixels, OpenCV's a convolution: on a smooth image the two are
+    alike.
+    """
+    image = random_image(dtype)
+    this = corrector(interpolation)
     source = np.nan_to_num(this.source.astype(float), nan=0.0)[::-1]
     wanted = map_coordinates(image.astype(float), source, order=order, mode='nearest')
     slope = np.hypot(*np.gradient(image.astype(float))).max()
@@ -129,30 +156,43 @@ def test_beside_scipy(dtype, interpolation, order):
 
 @pytest.mark.parametrize('interpolation, limit', [('linear', 0.02), ('cubic', 0.005)])
 def test_there_and_back(interpolation, limit):
-    """An image bent by the correction, and corrected, is the image again, but for what interpolation takes."""
-    this, image = corrector(interpolation), random_image(np.uint16)
+    """An image bent by the correction, and corrected, is the image again, but for what
+    interpolation takes.
+    """
+    this = corrector(interpolation)
+    image = random_image(np.uint16)
     v, u = np.mgrid[:1024, :1024].astype(float)
-    straight = calibration().correct(np.stack([u.ravel(), v.ravel()], axis=1)).uv.T.reshape(2, 1024, 1024)
+    straight = (
+        calibration().correct(np.stack([u.ravel(), v.ravel()], axis=1)).uv.T.reshape(2, 1024, 1024)
+    )
     bent = map_coordinates(image.astype(float), straight[::-1], order=3, mode='nearest')
     bent = np.clip(np.rint(bent), 0, 65_535).astype(np.uint16)
     inner = this.mask & np.all((this.source > 2) & (this.source < 1021), axis=0)
     inner[:3] = inner[-3:] = inner[:, :3] = inner[:, -3:] = False
-    before, after = (np.sqrt(np.mean((np.float64(x) - image)[inner] ** 2)) for x in (bent, this.correct(bent)))
+    before, after = (
+        np.sqrt(np.mean((np.float64(x) - image)[inner] ** 2)) for x in (bent, this.correct(bent))
+    )
     assert after < limit * before
 
 
 # ---- rims, folds and holes
 
+
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_constant_image_stays_constant(dtype, interpolation):
-    """Up to the rim of what was seen, where nothing of the border is mixed in; beyond it is the border."""
+    """Up to the rim of what was seen, where nothing of the border is mixed in; beyond it is the
+    border.
+    """
     this = ImageCorrector(calibration(), interpolation, border=7)
     value = np.iinfo(dtype).max
     got = this.correct(np.full(SIZE[::-1], value, dtype=dtype))
     assert (got[this.mask] == value).all() and (got[~this.mask] == 7).all()
     assert 0 < np.mean(~this.mask) < 0.05
-    assert corrector(interpolation).correct(np.full(SIZE[::-1], value, dtype=dtype))[~this.mask].max() == 0
+    assert (
+        corrector(interpolation).correct(np.full(SIZE[::-1], value, dtype=dtype))[~this.mask].max()
+        == 0
+    )
 
 
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
@@ -162,25 +202,29 @@ def test_without_distortion_nothing_changes(size, dtype, interpolation):
     """To the bit, up to the last pixel, on images of any size."""
     uv = lattice((40, 40))
     calibration_of_none = with_model(model_of(uv, 0 * uv, 'none', 0), size)
-    image = np.random.default_rng(0).integers(0, np.iinfo(dtype).max, size[::-1], dtype, endpoint=True)
+    image = np.random.default_rng(0).integers(
+        0, np.iinfo(dtype).max, size[::-1], dtype, endpoint=True
+    )
     this = ImageCorrector(calibration_of_none, interpolation)
     assert this.mask.all() and np.array_equal(this.correct(image), image)
 
 
 def test_shift():
     """A correction of whole pixels moves the image, and what was not seen is left empty."""
-    size, uv = (64, 48), lattice((64, 48))
+    size = (64, 48)
+    uv = lattice((64, 48))
     this = ImageCorrector(with_model(model_of(uv, np.tile([5.0, -3.0], (len(uv), 1))), size))
     image = np.random.default_rng(0).integers(1, 255, size[::-1]).astype(np.uint8)
     got = this.correct(image)
-    assert np.array_equal(got[3:, :-5], image[:-3, 5:])   # undistorted = observed - (5, -3)
+    assert np.array_equal(got[3:, :-5], image[:-3, 5:])  # undistorted = observed - (5, -3)
     assert not got[:3].any() and not got[:, -5:].any()
     assert np.array_equal(this.mask, got > 0)
 
 
 def test_source_in_the_outer_half_of_a_pixel():
     """It is on the image, and has the value of that pixel."""
-    size, uv = (32, 32), lattice((32, 32))
+    size = (32, 32)
+    uv = lattice((32, 32))
     this = ImageCorrector(with_model(model_of(uv, np.tile([0.4, 0.0], (len(uv), 1))), size))
     assert this.mask.all()
     assert (this.correct(np.full((32, 32), 200, np.uint8)) == 200).all()
@@ -188,10 +232,11 @@ def test_source_in_the_outer_half_of_a_pixel():
 
 def test_fold_is_left_empty():
     """A correction that grows faster than the image itself would show it mirrored."""
-    size, uv = (96, 96), lattice((96, 96), 4)
+    size = (96, 96)
+    uv = lattice((96, 96), 4)
     duv = np.zeros_like(uv)
     middle = np.abs(uv[:, 0] - 48) < 10
-    duv[:, 0] = np.clip((uv[:, 0] - 48) * 1.8, -18, 18)   # 1.8 px for each in a stripe of 20
+    duv[:, 0] = np.clip((uv[:, 0] - 48) * 1.8, -18, 18)  # 1.8 px for each in a stripe of 20
     this = ImageCorrector(with_model(model_of(uv, duv), size))
     assert middle.any() and this.mask.any() and not this.mask.all()
     step = np.diff(this.source[0], axis=1)
@@ -201,12 +246,13 @@ def test_fold_is_left_empty():
 
 
 def test_steps_of_nearest_neighbours_leave_few_holes():
-    """knn is piecewise constant: its sources exist all the same."""
+    """Knn is piecewise constant: its sources exist all the same."""
     this = corrector(kind='knn')
     assert np.mean(this.mask[100:-100, 100:-100]) > 0.99
 
 
 # ---- images, and what is none
+
 
 def test_sixteen_bits_are_kept():
     """Values that eight bits could not tell apart."""
@@ -217,19 +263,26 @@ def test_sixteen_bits_are_kept():
 
 
 def test_cubic_does_not_run_over():
-    """Beside a step from black to white cubic interpolation overshoots: values are cut off, not wrapped round."""
+    """Beside a step from black to white cubic interpolation overshoots: values are cut off, not
+    wrapped round.
+    """
     image = np.zeros(SIZE[::-1], np.uint8)
     image[:, 500:] = 255
     for dtype in DEPTHS:
         got = corrector('cubic').correct(image.astype(dtype) * (np.iinfo(dtype).max // 255))
-        assert (got[300:700, 300:480] == 0).all() and (got[300:700, 520:700] == np.iinfo(dtype).max).all()
+        assert (got[300:700, 300:480] == 0).all() and (
+            got[300:700, 520:700] == np.iinfo(dtype).max
+        ).all()
 
 
 def test_array_for_the_result_and_memory_with_gaps():
-    """The same numbers into an array that is there, from rows with a gap behind them, and from what cannot be
-    written."""
-    this, image = corrector(), random_image(np.uint16)
-    wanted, out = this.correct(image), np.empty_like(image)
+    """The same numbers into an array that is there, from rows with a gap behind them, and from
+    what cannot be written.
+    """
+    this = corrector()
+    image = random_image(np.uint16)
+    wanted = this.correct(image)
+    out = np.empty_like(image)
     assert this.correct(image, out) is out and np.array_equal(out, wanted)
     wide = np.zeros((1024, 1100), np.uint16)
     wide[:, :1024] = image
@@ -242,15 +295,21 @@ def test_array_for_the_result_and_memory_with_gaps():
 
 def test_images_of_the_wrong_kind():
     """One sentence for each."""
-    this, image = corrector(), np.zeros(SIZE[::-1], np.uint8)
-    for wrong, sentence in ((image[:-1], 'the image is 1024 x 1023 px, but the calibration is for 1024 x 1024 px'),
-                            (np.zeros((1024, 1024, 3), np.uint8), 'not grey, it has 1024 x 1024 x 3 values'),
-                            (image.astype(np.float32), 'pixels of float32, not of 8 or 16 bits'),
-                            (image.astype('>u2'), 'pixels of >u2, not of')):
+    this = corrector()
+    image = np.zeros(SIZE[::-1], np.uint8)
+    for wrong, sentence in (
+        (image[:-1], 'the image is 1024 x 1023 px, but the calibration is for 1024 x 1024 px'),
+        (np.zeros((1024, 1024, 3), np.uint8), 'not grey, it has 1024 x 1024 x 3 values'),
+        (image.astype(np.float32), 'pixels of float32, not of 8 or 16 bits'),
+        (image.astype('>u2'), 'pixels of >u2, not of'),
+    ):
         with pytest.raises(DataError, match=sentence):
             this.correct(wrong)
-    for out in (np.zeros((1024, 1023), np.uint8), np.zeros((1024, 1024), np.uint16),
-                np.zeros((2048, 1024), np.uint8)[::2]):
+    for out in (
+        np.zeros((1024, 1023), np.uint8),
+        np.zeros((1024, 1024), np.uint16),
+        np.zeros((2048, 1024), np.uint8)[::2],
+    ):
         with pytest.raises(DataError, match='array for the corrected image'):
             this.correct(image, out)
     with pytest.raises(DataError, match="one of linear, cubic, not 'nearest'"):
@@ -261,10 +320,14 @@ def test_images_of_the_wrong_kind():
 
 def test_threads_share_a_corrector():
     """The same numbers in each."""
-    image, results = random_image(np.uint8), {}
+    image = random_image(np.uint8)
+    results = {}
 
     def work(number):
-        results[number] = [corrector(i).correct(image) for i in ('linear', 'cubic') for _ in range(3)]
+        results[number] = [
+            corrector(i).correct(image) for i in ('linear', 'cubic') for _ in range(3)
+        ]
+
     threads = [threading.Thread(target=work, args=(n,)) for n in range(4)]
     for thread in threads:
         thread.start()
@@ -276,9 +339,12 @@ def test_threads_share_a_corrector():
 
 # ---- the renderer
 
+
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_virtual_image(dtype):
-    """Beads lie where they are asked for, the background is smooth, noise is as given and the same again."""
+    """Beads lie where they are asked for, the background is smooth, noise is as given and the same
+    again.
+    """
     uv = np.array([[100.3, 80.7], [200.0, 40.25], [-3.0, 50.0], [1000.0, 1000.0], [np.nan, 3.0]])
     size = (256, 200)
     clean = bead_image(uv, size, dtype, noise=0.0)
@@ -286,9 +352,10 @@ def test_virtual_image(dtype):
     assert clean.shape == size[::-1] and clean.dtype == dtype
     assert np.abs(off(clean, light, uv[:2])).max() < 0.01
     far = np.ones(clean.shape, bool)
-    far[30:120, :], far[:80, 170:230] = False, False
+    far[30:120, :] = False
+    far[:80, 170:230] = False
     assert np.abs(clean[far] - light[far]).max() <= 0.51
-    assert clean[50, 0] < 0.8 * light[50, 0]   # that of a bead beside the image
+    assert clean[50, 0] < 0.8 * light[50, 0]  # that of a bead beside the image
     noisy = bead_image(uv, size, dtype, noise=0.02, seed=3)
     assert np.array_equal(noisy, bead_image(uv, size, dtype, noise=0.02, seed=3))
     sd = np.std((noisy.astype(float) - clean)[far]) / np.iinfo(dtype).max

@@ -9,22 +9,48 @@ import numpy as np
 import pytest
 from rigs import calibrated, exposures, rig, run
 
-from fluoro_calib_ros.calibration.job import adjust_with, calibrate
-from fluoro_calib_ros.calibration.self_calibration import Options
-from fluoro_calib_ros.calibration.validation import (
-    BEADS_ALARM, Check, Validation, bead_checks, validate, validate_or_tell, verdict_of)
-from fluoro_calib_ros.calibration.validation_beads import Beads, distances, intersect
-from fluoro_calib_ros.calibration.validation_fields import difference, orientation_fields, place_name
-from fluoro_calib_ros.calibration.validation_residuals import (
-    ALARM, Residuals, common_trend, moved, residuals_of)
+from fluoro_calib_ros.calibration.calibrate import adjust_with, calibrate
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
-from fluoro_calib_ros.files.validation import read_sources, validation_document, write_sources
-from fluoro_calib_ros.photogrammetry.observations import DataError, Phantom
+from fluoro_calib_ros.files.calibration_sources import (
+    read_sources,
+    validation_document,
+    write_sources,
+)
 from fluoro_calib_ros.report.verdict import verdict_text
+from fluoro_calib_ros.validation.bead_check import Beads, distances, intersect
+from fluoro_calib_ros.validation.field_comparison import difference, orientation_fields, place_name
+from fluoro_calib_ros.validation.residual_tests import (
+    ALARM,
+    Residuals,
+    common_trend,
+    moved,
+    residuals_of,
+)
+from fluoro_calib_ros.validation.verdict import (
+    BEADS_ALARM,
+    Check,
+    Validation,
+    bead_checks,
+    validate,
+    validate_or_tell,
+    verdict_of,
+)
 
 pytestmark = pytest.mark.long
 
-CHECKS = ['halves', 'whiteness', 'worst_area', 'drift', 'held_out', 'exposures', 'beads', 'distances']
+CHECKS = [
+    'halves',
+    'whiteness',
+    'worst_area',
+    'drift',
+    'held_out',
+    'exposures',
+    'beads',
+    'distances',
+]
 SIZE = (1024, 1024)
 LOCAL = {'model': 'local_linear'}
 
@@ -33,17 +59,25 @@ def rippled(frames, height=1.0, middle=(400.0, 600.0)):
     """Frames whose later half has a local ripple [px] more."""
     out = []
     for i, frame in enumerate(frames):
-        bump = np.exp(-np.sum((frame.uv - middle) ** 2, axis=1) / (2 * 80.0 ** 2))
-        out.append(replace(frame, uv=frame.uv + (i >= len(frames) // 2) * height * bump[:, None] * (0.8, 0.6)))
+        bump = np.exp(-np.sum((frame.uv - middle) ** 2, axis=1) / (2 * 80.0**2))
+        out.append(
+            replace(
+                frame, uv=frame.uv + (i >= len(frames) // 2) * height * bump[:, None] * (0.8, 0.6)
+            )
+        )
     return out
 
 
-@functools.lru_cache(maxsize=None)
+@functools.cache
 def verdict(fault='', **options):
     """Validation of fluoroscope a of the rig with a fault in its exposures."""
     frames = {'a': exposures()['a'] if fault != 'drift' else rippled(exposures()['a'])}
-    job = calibrated('a', **options) if not fault else calibrate(frames, rig().phantom, Options(**options))
-    return validate(frames, rig().phantom, job.calibrations, Options(**options))
+    job = (
+        calibrated('a', **options)
+        if not fault
+        else calibrate(frames, rig().phantom, CalibrationOptions(**options))
+    )
+    return validate(frames, rig().phantom, job.calibrations, CalibrationOptions(**options))
 
 
 def failed(validation):
@@ -54,12 +88,14 @@ def failed(validation):
 def noise(seed, exposures=12, count=120, sd=0.25, trend=lambda uv, e: 0.0):
     """Residuals of white noise and a trend, function of pixels and exposure."""
     rng = np.random.default_rng(seed)
-    uv, e = rng.uniform(0, 1023, (exposures * count, 2)), np.repeat(np.arange(exposures), count)
+    uv = rng.uniform(0, 1023, (exposures * count, 2))
+    e = np.repeat(np.arange(exposures), count)
     r = rng.normal(0, sd, uv.shape) + trend(uv, e)
     return Residuals(uv, r, e, np.zeros(len(e), dtype=int), np.arange(exposures))
 
 
 # ---- the whole
+
 
 def test_a_good_calibration_passes():
     found = verdict(**LOCAL)
@@ -75,21 +111,29 @@ def test_a_distortion_without_a_model_fails():
     """By the trend in its residuals, and by exposures held out, whose residuals are no noise."""
     found = verdict(model='none')
     assert found.verdict == 'fail' and {'whiteness', 'worst_area', 'held_out'} <= failed(found)
-    assert '--model auto' in found.findings[0] and not any('survey of bead' in s for s in found.findings)
+    assert '--model auto' in found.findings[0] and not any(
+        'survey of bead' in s for s in found.findings
+    )
 
 
 def test_a_distortion_that_moves_fails_and_its_place_is_named():
     found = verdict('drift', **LOCAL)
     drift = next(check for check in found.checks if check.name == 'drift')
-    assert found.verdict == 'fail' and drift.passed is False and 'has changed between the exposures' in drift.sentence
+    assert (
+        found.verdict == 'fail'
+        and drift.passed is False
+        and 'has changed between the exposures' in drift.sentence
+    )
     assert np.linalg.norm(np.subtract(drift.place, (400, 600))) < 150
     assert drift.sentence in found.findings
 
 
 def test_too_few_exposures_for_halves_cannot_tell():
     frames = {'a': exposures()['a'][:5]}
-    job = calibrate(frames, rig().phantom, Options(max_iterations=3, **LOCAL))
-    found = validate(frames, rig().phantom, job.calibrations, Options(max_iterations=3, **LOCAL))
+    job = calibrate(frames, rig().phantom, CalibrationOptions(max_iterations=3, **LOCAL))
+    found = validate(
+        frames, rig().phantom, job.calibrations, CalibrationOptions(max_iterations=3, **LOCAL)
+    )
     halves = found.checks[0]
     assert halves.name == 'halves' and halves.passed is None and np.isnan(halves.value)
     assert '5 exposures are too few for two halves of 3 or more' in halves.sentence
@@ -97,18 +141,32 @@ def test_too_few_exposures_for_halves_cannot_tell():
 
 
 def test_both_fluoroscopes_in_one_adjustment_tell_their_progress_and_can_be_stopped():
-    options, frames = Options(max_iterations=1, k=40, **LOCAL), {n: f[:8] for n, f in exposures().items()}
+    options = CalibrationOptions(max_iterations=1, k=40, **LOCAL)
+    frames = {n: f[:8] for n, f in exposures().items()}
     job = calibrate(frames, rig().phantom, options, joint=True)
     steps = []
-    found = validate(frames, rig().phantom, job.calibrations, options, True, progress=lambda *step: steps.append(step))
+    found = validate(
+        frames,
+        rig().phantom,
+        job.calibrations,
+        options,
+        True,
+        progress=lambda *step: steps.append(step),
+    )
     assert [(c.name, c.fluoroscope) for c in found.checks] == [
-        *((name, f) for f in 'ab' for name in CHECKS[:6]), ('beads', ''), ('distances', '')]
-    assert [done for _, done, _ in steps] == list(range(6)) and {total for *_, total in steps} == {6}
+        *((name, f) for f in 'ab' for name in CHECKS[:6]),
+        ('beads', ''),
+        ('distances', ''),
+    ]
+    assert [done for _, done, _ in steps] == list(range(6)) and {total for *_, total in steps} == {
+        6
+    }
 
     def stop():
         raise KeyboardInterrupt
+
     with pytest.raises(KeyboardInterrupt):
-        validate(frames, rig().phantom, job.calibrations, options, True, check=stop)
+        validate(frames, rig().phantom, job.calibrations, options, True, raise_if_cancelled=stop)
 
 
 def test_what_cannot_be_adjusted_cannot_tell_why_not():
@@ -118,22 +176,27 @@ def test_what_cannot_be_adjusted_cannot_tell_why_not():
     with pytest.raises(DataError):
         validate(few, rig().phantom, calibrations)
     found = validate_or_tell(few, rig().phantom, calibrations)
-    assert found.verdict == 'cannot tell' and found.findings[0].startswith('the validation could not be made: fluoro')
+    assert found.verdict == 'cannot tell' and found.findings[0].startswith(
+        'the validation could not be made: fluoro'
+    )
 
 
 def test_a_verdict_is_fail_before_cannot_tell_before_pass():
     def of(*passed):
         return verdict_of([Check('x', '', 1.0, 2.0, 'px', p, 's') for p in passed])
+
     assert (of(True, True), of(True, None)) == ('pass', 'cannot tell')
     assert (of(None, False, True), of()) == ('fail', 'cannot tell')
 
 
 # ---- two halves
 
+
 def test_what_the_orientation_absorbs_is_no_difference():
     """A calibration whose rays are turned, shifted, scaled and tilted predicts the same."""
     one = calibrated('a', **LOCAL).calibrations['a']
-    model, (xp, yp, c) = one.model, one.interior
+    model = one.model
+    (xp, yp, c) = one.interior
     xy = (model.train_uv - model.train_duv - (xp, yp)) / c
     moved_by = (orientation_fields(xy) @ [1e-3, -2e-3, 3e-3, 1e-3, 5e-3, -4e-3]).reshape(-1, 2) * c
     other = replace(one, model=replace(model, train_duv=model.train_duv + moved_by))
@@ -143,8 +206,10 @@ def test_what_the_orientation_absorbs_is_no_difference():
 
 def test_a_real_difference_keeps_its_size_and_place():
     one = calibrated('a', **LOCAL).calibrations['a']
-    bump = np.exp(-np.sum((one.model.train_uv - (300, 300)) ** 2, axis=1) / (2 * 100 ** 2))
-    other = replace(one, model=replace(one.model, train_duv=one.model.train_duv + 2 * bump[:, None]))
+    bump = np.exp(-np.sum((one.model.train_uv - (300, 300)) ** 2, axis=1) / (2 * 100**2))
+    other = replace(
+        one, model=replace(one.model, train_duv=one.model.train_duv + 2 * bump[:, None])
+    )
     found = difference(one, other)
     assert found.normalised > 3 and np.linalg.norm(found.worst - (300, 300)) < 60
     assert 0.7 < np.abs(found.duv).max() < 2
@@ -153,16 +218,30 @@ def test_a_real_difference_keeps_its_size_and_place():
 def test_places_have_names():
     places = ((10, 10), (500, 10), (1000, 500), (500, 500), (1023.4, 1023.4), (-0.5, 900))
     names = [place_name(uv, SIZE) for uv in places]
-    assert names == ['upper left', 'upper middle', 'middle right', 'middle', 'lower right', 'lower left']
+    assert names == [
+        'upper left',
+        'upper middle',
+        'middle right',
+        'middle',
+        'lower right',
+        'lower left',
+    ]
 
 
 # ---- residuals
 
+
 def test_white_residuals_are_called_so_as_often_as_is_said():
-    """Also with an offset and turn of every exposure, which a test of single residuals would not bear."""
+    """Also with an offset and turn of every exposure, which a test of single residuals would not
+    bear.
+    """
+
     def of_exposure(uv, e):
         rng = np.random.default_rng(int(uv[0, 0] * 1e6))
-        return rng.normal(0, 0.1, (12, 2))[e] + (uv[:, ::-1] - 512) * rng.normal(0, 2e-4, 12)[e, None]
+        return (
+            rng.normal(0, 0.1, (12, 2))[e] + (uv[:, ::-1] - 512) * rng.normal(0, 2e-4, 12)[e, None]
+        )
+
     alarms = np.zeros(4)
     for seed in range(100):
         residuals = noise(seed, trend=of_exposure)
@@ -175,7 +254,12 @@ def test_white_residuals_are_called_so_as_often_as_is_said():
 
 def test_a_trend_is_found_with_its_size_and_place():
     def trend(uv, e):
-        return 0.5 * np.exp(-np.sum((uv - (700, 200)) ** 2, axis=1) / (2 * 100 ** 2))[:, None] * (0.6, 0.8)
+        return (
+            0.5
+            * np.exp(-np.sum((uv - (700, 200)) ** 2, axis=1) / (2 * 100**2))[:, None]
+            * (0.6, 0.8)
+        )
+
     found = common_trend(noise(1, trend=trend), SIZE)
     assert found.size > found.limit and found.cell_size > found.cell_limit
     assert np.linalg.norm(found.place - (700, 200)) < 100 and abs(found.cell_size - 0.45) < 0.15
@@ -193,12 +277,17 @@ def test_residuals_are_those_of_the_adjustment():
     held = adjust_with({'a': frames}, rig().phantom, job.calibrations)
     found = residuals_of(held, 'a', frames)
     calibration = job.calibrations['a']
-    assert len(found.uv) == sum(len(f.target_id) for f in frames) and list(found.numbers) == list(range(1, 16))
+    assert len(found.uv) == sum(len(f.target_id) for f in frames) and list(found.numbers) == list(
+        range(1, 16)
+    )
     inliers = found.inliers(calibration.image_sd)
-    np.testing.assert_allclose(np.sqrt(np.mean(inliers.r ** 2, axis=0)), held.fluoroscopes['a'].rmse_after, rtol=0.05)
+    np.testing.assert_allclose(
+        np.sqrt(np.mean(inliers.r**2, axis=0)), held.fluoroscopes['a'].rmse_after, rtol=0.05
+    )
 
 
 # ---- beads
+
 
 def phantom_with_a_wrong_bead(mm=3.0):
     """The survey of the rig with a bead out of place, and its id."""
@@ -213,11 +302,13 @@ def phantom_with_a_wrong_bead(mm=3.0):
 def test_a_bead_with_a_wrong_survey_is_named_with_its_size():
     phantom, wrong = phantom_with_a_wrong_bead()
     frames = {'a': exposures()['a']}
-    job = calibrate(frames, phantom, Options(max_iterations=6, **LOCAL))
-    beads, dist = bead_checks(intersect(adjust_with(frames, phantom, job.calibrations), frames, phantom))
+    job = calibrate(frames, phantom, CalibrationOptions(max_iterations=6, **LOCAL))
+    beads, dist = bead_checks(
+        intersect(adjust_with(frames, phantom, job.calibrations), frames, phantom)
+    )
     assert beads.passed is False and f'the survey of bead {wrong} is wrong by ' in beads.sentence
     assert abs(beads.value - 3.0) < 0.4 and beads.limit < 1.5
-    assert dist.passed   # without the bead that is named
+    assert dist.passed  # without the bead that is named
 
 
 def test_beads_from_images_keep_to_their_covariance():
@@ -226,31 +317,50 @@ def test_beads_from_images_keep_to_their_covariance():
     beads = intersect(held, frames, rig().phantom)
     assert len(beads.target_id) > 350 and 2.5 < np.mean(beads.chi2) < 3.5
     true = rig().true_mm[rig().phantom.index(beads.target_id)]
-    error = np.einsum('na,nab,nb->n', beads.xyz_mm - true, np.linalg.inv(beads.covariance), beads.xyz_mm - true)
+    error = np.einsum(
+        'na,nab,nb->n', beads.xyz_mm - true, np.linalg.inv(beads.covariance), beads.xyz_mm - true
+    )
     assert 2.0 < np.mean(error) < 4.0
     assert all(check.passed for check in bead_checks(beads)) and BEADS_ALARM < 0.01
 
 
 def test_distances_tell_scale_and_precision():
     rng = np.random.default_rng(0)
-    true, n = rng.uniform(-130, 130, (150, 3)), 150
-    beads = Beads(np.arange(n), 1.001 * true + rng.normal(0, 0.05, true.shape),
-                  np.tile(0.05 ** 2 * np.eye(3), (n, 1, 1)), np.full(n, 4), true + rng.normal(0, 0.1, true.shape),
-                  np.full(n, 0.1))
+    true = rng.uniform(-130, 130, (150, 3))
+    n = 150
+    beads = Beads(
+        np.arange(n),
+        1.001 * true + rng.normal(0, 0.05, true.shape),
+        np.tile(0.05**2 * np.eye(3), (n, 1, 1)),
+        np.full(n, 4),
+        true + rng.normal(0, 0.1, true.shape),
+        np.full(n, 0.1),
+    )
     found = distances(beads)
     assert abs(found.scale - 1e-3) < 4 * found.scale_sd < 1e-3
-    assert found.expected_mm == pytest.approx(np.sqrt(2 * (0.05 ** 2 + 0.1 ** 2)))
+    assert found.expected_mm == pytest.approx(np.sqrt(2 * (0.05**2 + 0.1**2)))
     straight = distances(replace(beads, xyz_mm=beads.xyz_mm / 1.001))
-    assert straight.rmse_mm == pytest.approx(found.expected_mm, rel=0.1) and found.rmse_mm > straight.rmse_mm
+    assert (
+        straight.rmse_mm == pytest.approx(found.expected_mm, rel=0.1)
+        and found.rmse_mm > straight.rmse_mm
+    )
     assert bead_checks(replace(beads, survey_sd_mm=np.full(n, 0.02)))[1].passed is False
 
 
 def test_few_beads_cannot_tell():
-    none = Beads(np.arange(2), np.zeros((2, 3)), np.zeros((2, 3, 3)), np.full(2, 4), np.zeros((2, 3)), np.ones(2))
+    none = Beads(
+        np.arange(2),
+        np.zeros((2, 3)),
+        np.zeros((2, 3, 3)),
+        np.full(2, 4),
+        np.zeros((2, 3)),
+        np.ones(2),
+    )
     assert [check.passed for check in bead_checks(none)] == [None, None]
 
 
 # ---- files, text and command
+
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
@@ -260,8 +370,25 @@ def folder(tmp_path_factory):
     lines = (root / 'calibration.csv').read_text().splitlines()
     few = [line for line in lines if not line.startswith('a,') or int(line.split(',')[1]) <= 8]
     (place / 'few.csv').write_text('\n'.join(few) + '\n')
-    assert run('calibrate', place / 'few.csv', '--image-size', '1024x1024', '--phantom', root / 'phantom.csv', '--out',
-               place / 'result', '--fluoroscopes', 'a', '--model', 'local_linear', '--max-iterations', 3) == 0
+    assert (
+        run(
+            'calibrate',
+            place / 'few.csv',
+            '--image-size',
+            '1024x1024',
+            '--phantom',
+            root / 'phantom.csv',
+            '--out',
+            place / 'result',
+            '--fluoroscopes',
+            'a',
+            '--model',
+            'local_linear',
+            '--max-iterations',
+            3,
+        )
+        == 0
+    )
     return place / 'result'
 
 
@@ -278,15 +405,17 @@ def test_sources_come_back_as_they_were(tmp_path):
     job = calibrated('a', **LOCAL)
     frames = exposures()['a']
     calibration = job.calibrations['a']
-    options = Options(k=20, loss='huber', **LOCAL)
+    options = CalibrationOptions(k=20, loss='huber', **LOCAL)
     save_calibration(str(tmp_path), calibration)
     (tmp_path / 'validation.json').write_text('of an earlier calibration')
     write_sources(tmp_path, {'a': frames}, rig().phantom, options, True, 4000.0)
     assert not (tmp_path / 'validation.json').exists()
     found = read_sources(tmp_path, load_calibrations(str(tmp_path)))
     assert (found.options, found.joint, found.principal_distance) == (options, True, 4000.0)
-    assert all(np.array_equal(f.sorted().uv, g.sorted().uv) and f.image_size == g.image_size
-               for f, g in zip(frames, found.frames['a']))
+    assert all(
+        np.array_equal(f.sorted().uv, g.sorted().uv) and f.image_size == g.image_size
+        for f, g in zip(frames, found.frames['a'])
+    )
 
 
 def test_the_command_writes_and_prints_the_verdict(folder, tmp_path, capsys):
@@ -303,30 +432,67 @@ def test_the_command_writes_and_prints_the_verdict(folder, tmp_path, capsys):
     assert document['calibration_id'] == ids
 
 
-def test_a_fail_is_written_and_ends_with_status_1_and_one_sentence(folder, tmp_path, capsys, monkeypatch):
+def test_a_fail_is_written_and_ends_with_status_1_and_one_sentence(
+    folder, tmp_path, capsys, monkeypatch
+):
     place = copied(folder, tmp_path / 'x')
     bad = Check('drift', 'a', 1.0, 0.1, 'px', False, 'fluoroscope a: it moved')
-    monkeypatch.setattr('fluoro_calib_ros.calibration.validation.validate',
-                        lambda *_: Validation('fail', (bad, bad), {'a': 'a-1'}, 1.0))
+    monkeypatch.setattr(
+        'fluoro_calib_ros.validation.verdict.validate',
+        lambda *_: Validation('fail', (bad, bad), {'a': 'a-1'}, 1.0),
+    )
     assert run('validate', place) == 1
     out, err = capsys.readouterr()
-    assert err == (f'fluoro-calib validate: {place}: the verdict is fail: fluoroscope a: it moved, '
-                   'and 1 more checks failed\n')
-    assert 'Verdict: fail' in out and json.loads((place / 'validation.json').read_text())['verdict'] == 'fail'
+    assert err == (
+        f'fluoro-calib validate: {place}: the verdict is fail: fluoroscope a: it moved, '
+        'and 1 more checks failed\n'
+    )
+    assert (
+        'Verdict: fail' in out
+        and json.loads((place / 'validation.json').read_text())['verdict'] == 'fail'
+    )
 
 
-@pytest.mark.parametrize('name, content, cause', [
-    ('observations.csv', None, 'there is no such file'), ('phantom.csv', None, 'there is no such file'),
-    ('options.json', None, 'calibrate again'), ('options.json', '{', 'row 1: this is not JSON'),
-    ('options.json', '{}', 'layout version None'),
-    ('options.json', '{"format_version": 1, "options": {"model": "x"}}', 'not options of a calibration'),
-    ('options.json', '{"format_version": 1, "options": {}, "joint": 3}', 'joint or principal_distance'),
-    ('options.json', '{"format_version": 1, "options": 7, "joint": true}', 'not options of a calibration'),
-    ('observations.csv', 'fluoroscope,exposure,target_id,u,v\na,1,1,5,x\n', "row 2: v is 'x'"),
-    ('observations.csv', 'fluoroscope,exposure,target_id,u,v\na,1,1,5,6\n', 'these are not the observations'),
-    ('observations.csv', 'fluoroscope,exposure,target_id,u,v\nb,1,1,5,6\n', 'no observations of fluoroscope a'),
-    ('a.calibration.npz', 'x', 'damaged')])
-def test_missing_and_damaged_files_are_told_in_one_sentence(folder, tmp_path, capsys, name, content, cause):
+@pytest.mark.parametrize(
+    'name, content, cause',
+    [
+        ('observations.csv', None, 'there is no such file'),
+        ('phantom.csv', None, 'there is no such file'),
+        ('options.json', None, 'calibrate again'),
+        ('options.json', '{', 'row 1: this is not JSON'),
+        ('options.json', '{}', 'layout version None'),
+        (
+            'options.json',
+            '{"format_version": 1, "options": {"model": "x"}}',
+            'not options of a calibration',
+        ),
+        (
+            'options.json',
+            '{"format_version": 1, "options": {}, "joint": 3}',
+            'joint or principal_distance',
+        ),
+        (
+            'options.json',
+            '{"format_version": 1, "options": 7, "joint": true}',
+            'not options of a calibration',
+        ),
+        ('observations.csv', 'fluoroscope,exposure,target_id,u,v\na,1,1,5,x\n', "row 2: v is 'x'"),
+        (
+            'observations.csv',
+            'fluoroscope,exposure,target_id,u,v\na,1,1,5,6\n',
+            'these are not the observations',
+        ),
+        (
+            'observations.csv',
+            'fluoroscope,exposure,target_id,u,v\nb,1,1,5,6\n',
+            'no observations of fluoroscope a',
+        ),
+        ('a.calibration.npz', 'x', 'damaged'),
+    ],
+)
+def test_missing_and_damaged_files_are_told_in_one_sentence(
+    folder, tmp_path, capsys, name, content, cause
+):
     place = copied(folder, tmp_path / 'x')
     (place / name).unlink() if content is None else (place / name).write_text(content)
     assert run('validate', place) == 1
@@ -336,16 +502,28 @@ def test_missing_and_damaged_files_are_told_in_one_sentence(folder, tmp_path, ca
 
 
 def test_an_unknown_fluoroscope_and_a_missing_folder_are_told(folder, tmp_path, capsys):
-    assert run('validate', folder, '--fluoroscopes', 'c') == 1 and run('validate', tmp_path / 'none') == 1
+    assert (
+        run('validate', folder, '--fluoroscopes', 'c') == 1
+        and run('validate', tmp_path / 'none') == 1
+    )
     err = capsys.readouterr().err
-    assert "no calibration of fluoroscope 'c', only of a" in err and 'there is no such folder' in err
+    assert (
+        "no calibration of fluoroscope 'c', only of a" in err and 'there is no such folder' in err
+    )
 
 
 def test_the_table_fits_a_terminal_and_tells_what_to_do():
-    checks = (Check('halves', 'a' * 60, 1.2, 2.0, 'predicted sd', True, 'fine'),
-              Check('held_out', 'a', np.nan, np.nan, '', None, 'not to be had ' * 20),
-              Check('drift', 'a', 0.3, 0.1, 'px', False, 'take them anew'))
+    checks = (
+        Check('halves', 'a' * 60, 1.2, 2.0, 'predicted sd', True, 'fine'),
+        Check('held_out', 'a', np.nan, np.nan, '', None, 'not to be had ' * 20),
+        Check('drift', 'a', 0.3, 0.1, 'px', False, 'take them anew'),
+    )
     text = verdict_text(Validation('fail', checks, {}, 3.0))
     assert max(map(len, text.splitlines())) <= 100
-    assert 'FAILED' in text and 'not made' in text and '- take them anew' in text and 'fine' not in text
+    assert (
+        'FAILED' in text
+        and 'not made' in text
+        and '- take them anew' in text
+        and 'fine' not in text
+    )
     json.dumps(validation_document(Validation('fail', checks[:1], {'a': 'x'}, 1.0)))

@@ -3,8 +3,9 @@
 
     tools/lock.py python3.10 python3.11 python3.12 python3.13
 
-Each interpreter resolves in a throw-away venv (nothing is installed); the answers are merged, with a
-marker wherever the Pythons differ. Run it with ALL supported Pythons, then `make setup && make test`.
+Each interpreter resolves in a throw-away venv (nothing is installed); the answers are merged, with
+a marker wherever the Pythons differ. Run it with ALL supported Pythons, then `make setup && make
+test`.
 """
 
 import json
@@ -27,20 +28,33 @@ def resolve(python):
         subprocess.run(pip + ['--upgrade', 'pip'], check=True)
         report = folder + '/report.json'
         subprocess.run(
-            pip + ['--dry-run', '--ignore-installed', '--report', report, '-r', str(ROOT / 'requirements.in')],
-            check=True)
+            pip
+            + [
+                '--dry-run',
+                '--ignore-installed',
+                '--report',
+                report,
+                '-r',
+                str(ROOT / 'requirements.in'),
+            ],
+            check=True,
+        )
         with open(report) as stream:
             data = json.load(stream)
-    pins = {item['metadata']['name'].lower().replace('_', '-').replace('.', '-'): item['metadata']['version']
-            for item in data['install']}
+    pins = {
+        item['metadata']['name'].lower().replace('_', '-').replace('.', '-'): item['metadata'][
+            'version'
+        ]
+        for item in data['install']
+    }
     return data['environment']['python_version'], pins
 
 
 def marker(pythons, known):
     """Return the environment marker that picks these Python versions out of the known ones."""
-    if pythons == known[-len(pythons):]:
+    if pythons == known[-len(pythons) :]:
         return f'python_version >= "{pythons[0]}"'
-    if pythons == known[:len(pythons)]:
+    if pythons == known[: len(pythons)]:
         return f'python_version <= "{pythons[-1]}"'
     return ' or '.join(f'python_version == "{python}"' for python in pythons)
 
@@ -64,7 +78,12 @@ def merge(answers):
 def main():
     if len(sys.argv) < 2:
         sys.exit(__doc__)
-    answers = dict(sorted((resolve(python) for python in sys.argv[1:]), key=lambda item: int(item[0].split('.')[1])))
+    answers = dict(
+        sorted(
+            (resolve(python) for python in sys.argv[1:]),
+            key=lambda item: int(item[0].split('.')[1]),
+        )
+    )
     text = HEAD.format(pythons=', '.join(answers)) + '\n'.join(merge(answers)) + '\n'
     (ROOT / 'requirements.lock').write_text(text)
 

@@ -1,9 +1,11 @@
 #!/usr/bin/env python3
-"""Make or refresh the project's .venv: packages, ROS 2, messages, this package. Called by tools/setup.sh.
+"""Make or refresh the project's .venv: packages, ROS 2, messages, this package. Called by
+tools/setup.sh.
 
-Standard library only. Each step leaves a stamp in .venv/.setup with a digest of what it was made from; a step
-whose stamp is right is not repeated, and a step that fails or is interrupted leaves none. Deleting .venv, moving
-the folder, another PYTHON, a changed lock file or a changed message are therefore all noticed.
+Standard library only. Each step leaves a stamp in .venv/.setup with a digest of what it was made
+from; a step whose stamp is right is not repeated, and a step that fails or is interrupted leaves
+none. Deleting .venv, moving the folder, another PYTHON, a changed lock file or a changed message
+are therefore all noticed.
 """
 
 import contextlib
@@ -30,19 +32,47 @@ LOG = BUILD / 'setup.log'
 LOCK = ROOT / 'requirements.lock'
 HOOK = ROOT / 'tools' / 'venv_hook.py'
 PACKAGE = 'fluoro_calib_ros'
-# tf2_msgs has no wheel: its one message that the nodes publish is built where ROS does not bring it
+# tf2_msgs has no wheel: its one message that the nodes publish is built where ROS does not bring
+# it
 MESSAGES = {'fluoro_calib_msgs': ROOT / 'msg_defs', 'tf2_msgs': ROOT / 'tools' / 'tf2_msgs'}
 
 BASE_PYTHON = getattr(sys, '_base_executable', None) or sys.executable
 VENV_PYTHON = str(VENV / 'bin' / 'python')
-SITE_PACKAGES = VENV / 'lib' / f'python{sys.version_info.major}.{sys.version_info.minor}' / 'site-packages'
+SITE_PACKAGES = (
+    VENV / 'lib' / f'python{sys.version_info.major}.{sys.version_info.minor}' / 'site-packages'
+)
 
-# What must not leak in from the shell: a sourced ROS, another venv, settings of pip, of an outer make.
+# What must not leak in from the shell: a sourced ROS, another venv, settings of pip, of an outer
+# make.
 FOREIGN = (
-    'AMENT_', 'COLCON_', 'ROS_', 'RMW_', '_ROS_WHEELS_', 'CMAKE_PREFIX_PATH', 'LD_LIBRARY_PATH', 'PYTHONPATH',
-    'PYTHONHOME', 'PYTHONSTARTUP', 'VIRTUAL_ENV', 'CONDA_PREFIX', 'PKG_CONFIG_PATH', 'PIP_TARGET', 'PIP_PREFIX',
-    'PIP_ROOT', 'PIP_USER', 'PIP_REQUIRE_VIRTUALENV', 'PIP_CONSTRAINT', 'PIP_REQUIREMENT', 'PIP_EDITABLE',
-    'PIP_NO_BINARY', 'MAKEFLAGS', 'MAKELEVEL', 'MFLAGS', 'MAKEFILES', 'DESTDIR')
+    'AMENT_',
+    'COLCON_',
+    'ROS_',
+    'RMW_',
+    '_ROS_WHEELS_',
+    'CMAKE_PREFIX_PATH',
+    'LD_LIBRARY_PATH',
+    'PYTHONPATH',
+    'PYTHONHOME',
+    'PYTHONSTARTUP',
+    'VIRTUAL_ENV',
+    'CONDA_PREFIX',
+    'PKG_CONFIG_PATH',
+    'PIP_TARGET',
+    'PIP_PREFIX',
+    'PIP_ROOT',
+    'PIP_USER',
+    'PIP_REQUIRE_VIRTUALENV',
+    'PIP_CONSTRAINT',
+    'PIP_REQUIREMENT',
+    'PIP_EDITABLE',
+    'PIP_NO_BINARY',
+    'MAKEFLAGS',
+    'MAKELEVEL',
+    'MFLAGS',
+    'MAKEFILES',
+    'DESTDIR',
+)
 
 
 class SetupError(Exception):
@@ -66,7 +96,13 @@ def run(*command):
         log.write('\n$ ' + ' '.join(shlex.quote(word) for word in command) + '\n')
         log.flush()
         process = subprocess.Popen(
-            command, cwd=ROOT, env=environment(), stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT)
+            command,
+            cwd=ROOT,
+            env=environment(),
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=subprocess.STDOUT,
+        )
         try:
             code = process.wait()
         except KeyboardInterrupt:  # Ctrl-C told the program too: let it stop by itself
@@ -87,10 +123,14 @@ def digest(*parts):
         if isinstance(part, str):
             total.update(part.encode() + b'\0')
             continue
-        files = sorted(path for path in part.rglob('*') if path.is_file()) if part.is_dir() else [part]
+        files = (
+            sorted(path for path in part.rglob('*') if path.is_file()) if part.is_dir() else [part]
+        )
         for path in files:
             if '__pycache__' not in path.parts and path.is_file():
-                total.update(str(path.relative_to(ROOT)).encode() + b'\0' + path.read_bytes() + b'\0')
+                total.update(
+                    str(path.relative_to(ROOT)).encode() + b'\0' + path.read_bytes() + b'\0'
+                )
     return total.hexdigest()
 
 
@@ -126,54 +166,80 @@ class Step:
         print(f'{time.monotonic() - start:.1f} s', flush=True)
 
 
-# ------------------------------------------------------------------------------------------------- the steps
+# -------------------------------------------------------------------------------------------------
+# the steps
+
 
 def check_machine():
     """Raise SetupError with one sentence for each thing that is missing."""
     missing = []
     version = f'{sys.version_info.major}.{sys.version_info.minor}'
     if sys.implementation.name != 'cpython':
-        missing.append(f'{BASE_PYTHON} is {sys.implementation.name}, but the ROS packages are for CPython: '
-                       'name a CPython with PYTHON=python3 make setup.')
+        missing.append(
+            f'{BASE_PYTHON} is {sys.implementation.name}, but the ROS packages are for CPython: '
+            'name a CPython with PYTHON=python3 make setup.'
+        )
     if sys.platform != 'linux' or platform.machine() != 'x86_64':
-        missing.append('The ROS 2 packages exist for Linux on x86_64 only, and this is '
-                       f'{platform.system()} on {platform.machine()}: use such a machine, or a ROS 2 Jazzy '
-                       'installation and colcon.')
+        missing.append(
+            'The ROS 2 packages exist for Linux on x86_64 only, and this is '
+            f'{platform.system()} on {platform.machine()}: use such a machine, or a ROS 2 Jazzy '
+            'installation and colcon.'
+        )
     else:
         libc, libc_version = platform.libc_ver()
         if libc != 'glibc' or tuple(int(part) for part in libc_version.split('.')[:2]) < (2, 28):
-            missing.append(f'The ROS 2 packages need glibc 2.28 or newer, and this is {libc or "another libc"} '
-                           f'{libc_version}: use a distribution of 2019 or later that is built on glibc.')
-    if subprocess.run([BASE_PYTHON, '-c', 'import venv, ensurepip'], env=environment(),
-                      stderr=subprocess.DEVNULL).returncode:
-        missing.append(f'Python {version} has no venv module: get it with '
-                       f"'sudo apt install python{version}-venv' (Debian, Ubuntu).")
+            missing.append(
+                f'The ROS 2 packages need glibc 2.28 or newer, and this is {libc or "another libc"} '
+                f'{libc_version}: use a distribution of 2019 or later that is built on glibc.'
+            )
+    if subprocess.run(
+        [BASE_PYTHON, '-c', 'import venv, ensurepip'], env=environment(), stderr=subprocess.DEVNULL
+    ).returncode:
+        missing.append(
+            f'Python {version} has no venv module: get it with '
+            f"'sudo apt install python{version}-venv' (Debian, Ubuntu)."
+        )
     if not (pathlib.Path(sysconfig.get_path('include')) / 'Python.h').is_file():
-        missing.append(f'Python {version} has no Python.h: get it with '
-                       f"'sudo apt install python{version}-dev' (Debian, Ubuntu) or "
-                       f"'sudo dnf install python{version}-devel' (Fedora).")
+        missing.append(
+            f'Python {version} has no Python.h: get it with '
+            f"'sudo apt install python{version}-dev' (Debian, Ubuntu) or "
+            f"'sudo dnf install python{version}-devel' (Fedora)."
+        )
     if not compiles():
-        missing.append("There is no working C and C++ compiler: get one with 'sudo apt install g++' (Debian, Ubuntu) "
-                       "or 'sudo dnf install gcc-c++' (Fedora), or name yours in CC and CXX.")
+        missing.append(
+            "There is no working C and C++ compiler: get one with 'sudo apt install g++' (Debian, Ubuntu) "
+            "or 'sudo dnf install gcc-c++' (Fedora), or name yours in CC and CXX."
+        )
     if not shutil.which('make'):
-        missing.append("There is no make: get it with 'sudo apt install make' (Debian, Ubuntu) or "
-                       "'sudo dnf install make' (Fedora).")
+        missing.append(
+            "There is no make: get it with 'sudo apt install make' (Debian, Ubuntu) or "
+            "'sudo dnf install make' (Fedora)."
+        )
     if missing:
         raise SetupError('\n'.join(missing))
 
 
 def compiles():
     """Tell whether a C and a C++ compiler turn a trivial source into a shared library."""
-    sources = (('CC', ('cc', 'gcc', 'clang'), 'c', '#include <stdio.h>\n'),
-               ('CXX', ('c++', 'g++', 'clang++'), 'c++', '#include <string>\n'))
+    sources = (
+        ('CC', ('cc', 'gcc', 'clang'), 'c', '#include <stdio.h>\n'),
+        ('CXX', ('c++', 'g++', 'clang++'), 'c++', '#include <string>\n'),
+    )
     for variable, names, language, source in sources:
         candidates = [os.environ[variable]] if os.environ.get(variable) else names
-        command = next((shlex.split(name) for name in candidates if shutil.which(shlex.split(name)[0])), None)
+        command = next(
+            (shlex.split(name) for name in candidates if shutil.which(shlex.split(name)[0])), None
+        )
         if command is None:
             return False
         output = BUILD / 'compiler_check.so'
-        answer = subprocess.run(command + ['-x', language, '-shared', '-fPIC', '-o', str(output), '-'],
-                                input=source, text=True, env=environment(), capture_output=True)
+        answer = subprocess.run(
+            command + ['-x', language, '-shared', '-fPIC', '-o', str(output), '-'],
+            input=source,
+            text=True,
+            env=environment(),
+            capture_output=True,
+        )
         output.unlink(missing_ok=True)
         if answer.returncode:
             with open(LOG, 'a') as log:
@@ -203,16 +269,26 @@ def make_venv():
 
 
 def rewrite_cmake_files():
-    """Point the wheels' exported CMake files, which name their builder's Python, to this Python and its numpy."""
+    """Point the wheels' exported CMake files, which name their builder's Python, to this Python
+    and its numpy.
+    """
     numpy_include = str(SITE_PACKAGES / 'numpy' / '_core' / 'include')
     python_include = sysconfig.get_path('include')
-    for path in list((VENV / 'share').rglob('*.cmake')) + list((VENV / 'lib' / 'cmake').rglob('*.cmake')):
+    for path in list((VENV / 'share').rglob('*.cmake')) + list(
+        (VENV / 'lib' / 'cmake').rglob('*.cmake')
+    ):
         text = path.read_text()
         if '/opt/python/' in text:
-            new = re.sub(r'/opt/python/[^;"\s]*/numpy/_core/include', lambda _: numpy_include, text)
-            new = re.sub(r'/opt/python/[^;"\s]*/include/python3\.\d+', lambda _: python_include, new)
+            new = re.sub(
+                r'/opt/python/[^;"\s]*/numpy/_core/include', lambda _: numpy_include, text
+            )
+            new = re.sub(
+                r'/opt/python/[^;"\s]*/include/python3\.\d+', lambda _: python_include, new
+            )
             if '/opt/python/' in new:
-                raise SetupError(f'{path} names a folder of the machine the wheel was built on, in a way not known here')
+                raise SetupError(
+                    f'{path} names a folder of the machine the wheel was built on, in a way not known here'
+                )
             path.write_text(new)
 
 
@@ -227,51 +303,102 @@ def install_hook():
 def build_messages():
     """Build the messages with colcon and install them into .venv."""
     for package in MESSAGES:
-        for pattern in (f'share/{package}', f'include/{package}', f'lib/lib{package}__*', f'lib/{package}',
-                        f'lib/python3*/site-packages/{package}*', f'share/ament_index/resource_index/*/{package}',
-                        f'share/colcon-core/packages/{package}'):
-            for name in glob.glob(str(VENV / pattern)):  # a message that is gone must not stay installed
+        for pattern in (
+            f'share/{package}',
+            f'include/{package}',
+            f'lib/lib{package}__*',
+            f'lib/{package}',
+            f'lib/python3*/site-packages/{package}*',
+            f'share/ament_index/resource_index/*/{package}',
+            f'share/colcon-core/packages/{package}',
+        ):
+            for name in glob.glob(
+                str(VENV / pattern)
+            ):  # a message that is gone must not stay installed
                 if os.path.isdir(name):
                     shutil.rmtree(name)
                 else:
                     os.remove(name)
     shutil.rmtree(BUILD / 'messages', ignore_errors=True)
-    run(str(VENV / 'bin' / 'colcon'), '--log-base', str(BUILD / 'colcon_log'), 'build',
-        '--base-paths', *(str(folder) for folder in MESSAGES.values()), '--build-base', str(BUILD / 'messages'),
-        '--install-base', str(VENV), '--merge-install', '--event-handlers', 'console_direct+',
-        '--cmake-args', f'-DPython3_EXECUTABLE={VENV_PYTHON}', '-DPython3_FIND_VIRTUALENV=ONLY',
-        '-DBUILD_TESTING=OFF', '-DCMAKE_BUILD_TYPE=Release')
-    run(VENV_PYTHON, '-c', 'import rclpy, fluoro_calib_msgs.msg as m, tf2_msgs.msg as t; '
-        'm.TargetObservations.__class__.__import_type_support__(); t.TFMessage.__class__.__import_type_support__()')
+    run(
+        str(VENV / 'bin' / 'colcon'),
+        '--log-base',
+        str(BUILD / 'colcon_log'),
+        'build',
+        '--base-paths',
+        *(str(folder) for folder in MESSAGES.values()),
+        '--build-base',
+        str(BUILD / 'messages'),
+        '--install-base',
+        str(VENV),
+        '--merge-install',
+        '--event-handlers',
+        'console_direct+',
+        '--cmake-args',
+        f'-DPython3_EXECUTABLE={VENV_PYTHON}',
+        '-DPython3_FIND_VIRTUALENV=ONLY',
+        '-DBUILD_TESTING=OFF',
+        '-DCMAKE_BUILD_TYPE=Release',
+    )
+    run(
+        VENV_PYTHON,
+        '-c',
+        'import rclpy, fluoro_calib_msgs.msg as m, tf2_msgs.msg as t; '
+        'm.TargetObservations.__class__.__import_type_support__(); t.TFMessage.__class__.__import_type_support__()',
+    )
 
 
 def install_package():
     """Install this package into .venv so that its sources are used where they are."""
-    run(VENV_PYTHON, '-m', 'pip', 'install', '--no-deps', '--no-build-isolation', '--editable', str(ROOT))
+    run(
+        VENV_PYTHON,
+        '-m',
+        'pip',
+        'install',
+        '--no-deps',
+        '--no-build-isolation',
+        '--editable',
+        str(ROOT),
+    )
     # an editable install leaves out data_files: what ROS looks up in share/ is linked
     share = VENV / 'share' / PACKAGE
     share.mkdir(parents=True, exist_ok=True)
     index = VENV / 'share' / 'ament_index' / 'resource_index' / 'packages'
-    for link, target in [(share / name, ROOT / name) for name in ('package.xml', 'launch', 'config')] + [
-            (index / PACKAGE, ROOT / 'resource' / PACKAGE)]:
+    for link, target in [
+        (share / name, ROOT / name) for name in ('package.xml', 'launch', 'config')
+    ] + [(index / PACKAGE, ROOT / 'resource' / PACKAGE)]:
         link.unlink(missing_ok=True)
         link.symlink_to(target)
 
 
 def steps():
     """Return the steps in their order, each naming what it depends on."""
-    venv = Step('packages', f'packages from {LOCK.name} into .venv', make_venv,
-                LOCK, str(ROOT), os.path.realpath(BASE_PYTHON), sys.version)
+    venv = Step(
+        'packages',
+        f'packages from {LOCK.name} into .venv',
+        make_venv,
+        LOCK,
+        str(ROOT),
+        os.path.realpath(BASE_PYTHON),
+        sys.version,
+    )
     return [
         venv,
         Step('hook', 'start-up hook', install_hook, venv.wanted, HOOK),
         Step('messages', 'ROS messages', build_messages, venv.wanted, *MESSAGES.values()),
-        Step('package', 'fluoro_calib_ros, editable', install_package, venv.wanted,
-             *(ROOT / name for name in ('setup.py', 'setup.cfg', 'package.xml', 'resource'))),
+        Step(
+            'package',
+            'fluoro_calib_ros, editable',
+            install_package,
+            venv.wanted,
+            *(ROOT / name for name in ('setup.py', 'setup.cfg', 'package.xml', 'resource')),
+        ),
     ]
 
 
-# ------------------------------------------------------------------------------------------------- the program
+# -------------------------------------------------------------------------------------------------
+# the program
+
 
 @contextlib.contextmanager
 def only_one():
@@ -306,7 +433,9 @@ def main():
         with only_one():
             set_up()
     except KeyboardInterrupt:
-        print('setup: interrupted; make setup goes on from the last finished step', file=sys.stderr)
+        print(
+            'setup: interrupted; make setup goes on from the last finished step', file=sys.stderr
+        )
         return 130
     except (SetupError, OSError) as error:
         tail = LOG.read_text(errors='replace').splitlines()[-25:] if LOG.exists() else []
@@ -315,7 +444,9 @@ def main():
         for line in str(error).splitlines():
             print(f'setup: {line}', file=sys.stderr)
         if tail:
-            print(f'setup: the lines above are the last of {LOG.relative_to(ROOT)}', file=sys.stderr)
+            print(
+                f'setup: the lines above are the last of {LOG.relative_to(ROOT)}', file=sys.stderr
+            )
         return 1
     return 0
 

@@ -1,10 +1,11 @@
 """Give every Python of the project's .venv the environment that ROS needs, with nothing sourced.
 
-tools/setup_env.py copies this file into the venv as fluoro_calib_venv.py, with a .pth file that imports it
-before anything else. The shared libraries of ROS are found by LD_LIBRARY_PATH only, which the loader reads
-when a process starts: so this starts Python once more, in place, with the right one. The ROS wheels bring
-the same (ros_wheels_bootstrapper), but theirs takes a mark left by another venv's process for its own,
-and leaves to chance which ROS comes first where one has been sourced.
+tools/setup_env.py copies this file into the venv as fluoro_calib_venv.py, with a .pth file that
+imports it before anything else. The shared libraries of ROS are found by LD_LIBRARY_PATH only,
+which the loader reads when a process starts: so this starts Python once more, in place, with the
+right one. The ROS wheels bring the same (ros_wheels_bootstrapper), but theirs takes a mark left by
+another venv's process for its own, and leaves to chance which ROS comes first where one has been
+sourced.
 """
 
 import os
@@ -15,7 +16,9 @@ MARK = '_ROS_WHEELS_BOOTSTRAP_COMPLETE'  # the wheels' own: set, their bootstrap
 
 
 def environment(old, prefix):
-    """Return the environment in which a Python of the venv `prefix` finds its own ROS and no other."""
+    """Return the environment in which a Python of the venv `prefix` finds its own ROS and no
+    other.
+    """
     new = dict(old)
 
     def entries(name):
@@ -24,18 +27,30 @@ def environment(old, prefix):
     def below(entry, folders):
         return any((entry + '/').startswith(folder.rstrip('/') + '/') for folder in folders)
 
-    # What else has been sourced is another ROS with its workspaces, or workspaces that were built upon this one.
-    others = [entry for entry in entries('AMENT_PREFIX_PATH') if os.path.realpath(entry) != os.path.realpath(prefix)]
+    # What else has been sourced is another ROS with its workspaces, or workspaces that were built
+    # upon this one.
+    others = [
+        entry
+        for entry in entries('AMENT_PREFIX_PATH')
+        if os.path.realpath(entry) != os.path.realpath(prefix)
+    ]
     foreign = any(os.path.exists(os.path.join(entry, 'lib', 'librcl.so')) for entry in others)
     dropped, overlays = (others, []) if foreign else ([], others)
 
     version = f'python{sys.version_info.major}.{sys.version_info.minor}'
     site_packages = os.path.join(prefix, 'lib', version, 'site-packages')
     libraries = [os.path.join(prefix, 'lib')]
-    libraries += sorted(os.path.join(site_packages, name) for name in os.listdir(site_packages)
-                        if name.startswith('ros_') and name.endswith('.libs'))
+    libraries += sorted(
+        os.path.join(site_packages, name)
+        for name in os.listdir(site_packages)
+        if name.startswith('ros_') and name.endswith('.libs')
+    )
 
-    for name, own in (('AMENT_PREFIX_PATH', [prefix]), ('LD_LIBRARY_PATH', libraries), ('PYTHONPATH', [])):
+    for name, own in (
+        ('AMENT_PREFIX_PATH', [prefix]),
+        ('LD_LIBRARY_PATH', libraries),
+        ('PYTHONPATH', []),
+    ):
         kept = [entry for entry in entries(name) if entry not in own and not below(entry, dropped)]
         first = [entry for entry in kept if below(entry, overlays)]
         value = first + own + [entry for entry in kept if entry not in first]
@@ -46,7 +61,9 @@ def environment(old, prefix):
     if foreign:
         new.pop('RMW_IMPLEMENTATION', None)  # the other ROS may have one that the wheels lack
     if not {'ROS_LOG_DIR', 'ROS_HOME'} & new.keys():
-        home = new.setdefault('HOME', os.path.expanduser('~'))  # rcl refuses to start where it cannot write its log
+        home = new.setdefault(
+            'HOME', os.path.expanduser('~')
+        )  # rcl refuses to start where it cannot write its log
         logs = [path for path in (home + '/.ros/log', home + '/.ros', home) if os.path.isdir(path)]
         if not logs or not os.access(logs[0], os.W_OK):
             new['ROS_LOG_DIR'] = os.path.join(tempfile.gettempdir(), f'ros_log_{os.getuid()}')

@@ -15,16 +15,21 @@ class Anderson:
 
     def restart(self):
         """Forget the earlier iterates: the map has changed."""
-        self._x, self._f = [], []
+        self._x = []
+        self._f = []
 
     def next(self, x, f, counted=slice(None)):
-        """Next iterate from the present one x and its image f; counted: entries whose residual is to be small."""
-        self._x, self._f = (self._x + [x])[-self._depth - 1:], (self._f + [f])[-self._depth - 1:]
+        """Next iterate from the present one x and its image f; counted: entries whose residual is
+        to be small.
+        """
+        self._x = (self._x + [x])[-self._depth - 1 :]
+        self._f = (self._f + [f])[-self._depth - 1 :]
         if len(self._x) == 1:
             return f
         residual = [(b - a)[counted].ravel() for a, b in zip(self._x, self._f)]
         d_residual = np.stack([b - a for a, b in zip(residual, residual[1:])], axis=1)
-        # Columns are scaled and small singular values left out: late differences are nearly parallel.
+        # Columns are scaled and small singular values left out: late differences are nearly
+        # parallel.
         scale = np.maximum(np.linalg.norm(d_residual, axis=0), 1e-300)
         gamma, *_ = np.linalg.lstsq(d_residual / scale, residual[-1], rcond=1e-6)
         return f - sum(g * (b - a) for g, a, b in zip(gamma / scale, self._f, self._f[1:]))

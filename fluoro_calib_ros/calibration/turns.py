@@ -1,8 +1,10 @@
-"""Adjustment of a network with its distortion among the unknowns, in turn with what it takes for known.
+"""Adjustment of a network with its distortion among the unknowns, in turn with what it takes for
+known.
 
-In the alternation of Chow et al. the orientations and object points take up part of the distortion before the
-regressor sees it. Here all are adjusted together; what is left to turns is the noise model and what a model of the
-distortion decides beside its coefficients: the prior of a signal, or which terms there are.
+In the alternation of Chow et al. the orientations and object points take up part of the distortion
+before the regressor sees it. Here all are adjusted together; what is left to turns is the noise
+model and what a model of the distortion decides beside its coefficients: the prior of a signal, or
+which terms there are.
 """
 
 from dataclasses import replace
@@ -10,37 +12,55 @@ from dataclasses import replace
 import numpy as np
 
 from ..photogrammetry.adjustment import adjust
-from ..photogrammetry.estimation import SETTLED, renewed_noise
-from ..photogrammetry.normal import normal_equations
+from ..photogrammetry.noise_estimation import SETTLED, renewed_noise
+from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks, solved
 
-TOLERANCE = 1e-5   # decrease of F that the last adjustment may leave
+TOLERANCE = 1e-5  # decrease of F that the last adjustment may leave
 
 
-def adjust_in_turns(measured, before, model, max_rounds, report, check=None):
-    """Adjust a network together with a model of its distortion; returns the network, Adjustment and convergence.
+def adjust_in_turns(measured, before, model, max_rounds, report, raise_if_cancelled=None):
+    """Adjust a network together with a model of its distortion; returns the network, Adjustment
+    and convergence.
 
-    before: Adjustment without correction; model: a Collocation or Terms, with with_additional (plain network -> with
-    additional parameters), zeros (coefficients of no correction), on_the_way (decrease of F that an adjustment before
-    the last may leave) and renew (network, Solved normal matrix, Adjustment -> whether nothing changed, coefficients
-    to go on with); report(Adjustment, change) after every adjustment, change the RMS change of the correction [px].
-    Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
+    before: Adjustment without correction; model: a Collocation or Terms, with with_additional
+    (plain network -> with additional parameters), zeros (coefficients of no correction),
+    on_the_way (decrease of F that an adjustment before the last may leave) and renew (network,
+    Solved normal matrix, Adjustment -> whether nothing changed, coefficients to go on with);
+    report(Adjustment, change) after every adjustment, change the RMS change of the correction
+    [px]. Raises numpy.linalg.LinAlgError where the network does not determine the unknowns.
     """
     correction = np.zeros_like(measured.network.uv)
-    zero, parameters, noise = correction, replace(before.parameters, additional=model.zeros()), before.noise
+    zero = correction
+    parameters = replace(before.parameters, additional=model.zeros())
+    noise = before.noise
     converged = False
     for turn in range(max_rounds):
-        network, final = model.with_additional(measured.network), converged or turn == max_rounds - 1
-        result = adjust(network, parameters, zero, noise, tolerance=TOLERANCE if final else model.on_the_way,
-                        check=check, noise_held=True)
-        last, correction = correction, network.added(result.parameters)
+        network = model.with_additional(measured.network)
+        final = converged or turn == max_rounds - 1
+        result = adjust(
+            network,
+            parameters,
+            zero,
+            noise,
+            tolerance=TOLERANCE if final else model.on_the_way,
+            raise_if_cancelled=raise_if_cancelled,
+            noise_held=True,
+        )
+        last = correction
+        correction = network.added(result.parameters)
         report(result, float(np.sqrt(np.mean((correction - last) ** 2))))
         if final:
             break
-        matrix = solved(network, normal_equations(network, result.parameters, zero, noise,
-                                                  noise.information_factor(result.q)))
+        matrix = solved(
+            network,
+            normal_equations(
+                network, result.parameters, zero, noise, noise.information_factor(result.q)
+            ),
+        )
         now = renewed_noise(network, result, covariance_blocks(network, matrix))
         converged, coefficients = model.renew(network, matrix, result)
         converged &= abs(now.scale - noise.scale) <= SETTLED * noise.scale
-        parameters, noise = replace(result.parameters, additional=coefficients), now
+        parameters = replace(result.parameters, additional=coefficients)
+        noise = now
     return network, result, bool(converged and result.converged)

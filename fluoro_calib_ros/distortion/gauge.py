@@ -1,14 +1,18 @@
 """The gauge between a free correction and the orientation of the sensor.
 
-A correction that can reproduce what a change of interior and exterior orientation does to the image
+A correction that can reproduce what a change of interior and exterior orientation does to the
+image
 competes with them. To first order these changes move an image point (x, y) = (u - xp, v - yp) by
   (1, 0), (0, 1)                        principal point,
   (x, y)                                principal distance,
   (-y, x)                               turn of the sensor about its axis,
   (x x, x y)/c, (x y, y y)/c            turn of the sensor about its rows and columns, less a shift
-(derivatives of the collinearity condition; the last three are common to all exposures and leave sources and
-object points where they are). The fitted correction is kept orthogonal to them. Where the interior orientation
-is held, only the turns are left, with their shifts: (-y, x), (c + x x/c, x y/c), (x y/c, c + y y/c).
+(derivatives of the collinearity condition; the last three are common to all exposures and leave
+sources and
+object points where they are). The fitted correction is kept orthogonal to them. Where the interior
+orientation
+is held, only the turns are left, with their shifts: (-y, x), (c + x x/c, x y/c), (x y/c, c + y
+y/c).
 """
 
 import numpy as np
@@ -19,18 +23,25 @@ def gauge_basis(uv, interior, interior_held=False):
 
     g is 6, or 3 where the interior orientation is held.
     """
-    length = 512.0   # any fixed one would do
+    length = 512.0  # any fixed one would do
     x, y = (np.asarray(uv) - interior[:2]).T / length
-    one, zero = np.ones_like(x), np.zeros_like(x)
+    one = np.ones_like(x)
+    zero = np.zeros_like(x)
     if interior_held:
         square = (length / interior[2]) ** 2
-        columns = [(-y, x), (one + square * x * x, square * x * y), (square * x * y, one + square * y * y)]
+        columns = [
+            (-y, x),
+            (one + square * x * x, square * x * y),
+            (square * x * y, one + square * y * y),
+        ]
     else:
         columns = [(one, zero), (zero, one), (x, y), (-y, x), (x * x, x * y), (x * y, y * y)]
     return np.stack([np.stack(column, axis=1) for column in columns], axis=2)
 
 
 def gauge_coefficients(uv, fitted, interior, interior_held=False):
-    """Coefficients (g,) of the part of fitted corrections (n, 2) at pixels uv (n, 2) that lies in the gauge."""
+    """Coefficients (g,) of the part of fitted corrections (n, 2) at pixels uv (n, 2) that lies in
+    the gauge.
+    """
     basis = gauge_basis(uv, interior, interior_held)
     return np.linalg.lstsq(basis.reshape(-1, basis.shape[2]), fitted.reshape(-1), rcond=None)[0]

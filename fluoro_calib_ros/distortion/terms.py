@@ -1,16 +1,17 @@
 """Terms of parametric distortion models as polynomials of the image coordinates.
 
-Radial and decentring terms after Brown, "Close-range camera calibration", Photogrammetric Engineering 37, 1971;
-affinity and shear after El-Hakim, 1986 (both in Luhmann et al., "Close-Range Photogrammetry and 3D Imaging", 2014,
-3.3); spiral, S-shape and higher polynomials are those of image intensifiers (Gronenschild, Medical Physics 24,
-1997; Lichti et al., IEEE Trans. Med. Imaging 34, 2015).
+Radial and decentring terms after Brown, "Close-range camera calibration", Photogrammetric
+Engineering 37, 1971; affinity and shear after El-Hakim, 1986 (both in Luhmann et al., "Close-Range
+Photogrammetry and 3D Imaging", 2014, 3.3); spiral, S-shape and higher polynomials are those of
+image intensifiers (Gronenschild, Medical Physics 24, 1997; Lichti et al., IEEE Trans. Med. Imaging
+34, 2015).
 """
 
-from functools import lru_cache
+from functools import cache
 
 import numpy as np
 
-HIGHEST = 7   # degree of the highest term
+HIGHEST = 7  # degree of the highest term
 
 
 def _powers(degree):
@@ -18,7 +19,9 @@ def _powers(degree):
 
 
 def _polynomial(degree, parts):
-    """Coefficients (2, m) of a term: parts are (axis, i, j, factor) for factor x^i y^j in u (axis 0) or v (axis 1)."""
+    """Coefficients (2, m) of a term: parts are (axis, i, j, factor) for factor x^i y^j in u (axis
+    0) or v (axis 1).
+    """
     number = {power: k for k, power in enumerate(_powers(degree))}
     out = np.zeros((2, len(number)))
     for axis, i, j, factor in parts:
@@ -29,6 +32,7 @@ def _polynomial(degree, parts):
 def _radial(order):
     """r^(2 order) (x, y)."""
     from math import comb
+
     parts = [(2 * k, 2 * (order - k), comb(order, k)) for k in range(order + 1)]
     return [(0, i + 1, j, f) for i, j, f in parts] + [(1, i, j + 1, f) for i, j, f in parts]
 
@@ -40,23 +44,56 @@ def _spiral(order):
 
 def _plain(degree):
     """x^i y^j of one degree, each in u and in v."""
-    return {f'{axis}: x{i}y{degree - i}': [('uv'.index(axis), i, degree - i, 1.0)]
-            for axis in 'uv' for i in range(degree + 1)}
+    return {
+        f'{axis}: x{i}y{degree - i}': [('uv'.index(axis), i, degree - i, 1.0)]
+        for axis in 'uv'
+        for i in range(degree + 1)
+    }
 
 
-GAUGE = {'shift u': [(0, 0, 0, 1.0)], 'shift v': [(1, 0, 0, 1.0)], 'scale': _radial(0), 'turn': _spiral(0),
-         'tilt u': [(0, 2, 0, 1.0), (1, 1, 1, 1.0)], 'tilt v': [(0, 1, 1, 1.0), (1, 0, 2, 1.0)]}
+GAUGE = {
+    'shift u': [(0, 0, 0, 1.0)],
+    'shift v': [(1, 0, 0, 1.0)],
+    'scale': _radial(0),
+    'turn': _spiral(0),
+    'tilt u': [(0, 2, 0, 1.0), (1, 1, 1, 1.0)],
+    'tilt v': [(0, 1, 1, 1.0), (1, 0, 2, 1.0)],
+}
 AFFINE = {'affinity': [(0, 1, 0, 1.0), (1, 0, 1, -1.0)], 'shear': [(0, 0, 1, 1.0), (1, 1, 0, 1.0)]}
-DECENTRING = {'decentring u': [(0, 2, 0, 3.0), (0, 0, 2, 1.0), (1, 1, 1, 2.0)],
-              'decentring v': [(1, 0, 2, 3.0), (1, 2, 0, 1.0), (0, 1, 1, 2.0)]}
+DECENTRING = {
+    'decentring u': [(0, 2, 0, 3.0), (0, 0, 2, 1.0), (1, 1, 1, 2.0)],
+    'decentring v': [(1, 0, 2, 3.0), (1, 2, 0, 1.0), (0, 1, 1, 2.0)],
+}
 # Of each degree the plain terms that, with gauge, decentring, radial and spiral, make it complete.
 SQUARES = {'u: x0y2': [(0, 0, 2, 1.0)], 'v: x2y0': [(1, 2, 0, 1.0)]}
-CUBES = {'S-shape u': [(0, 0, 3, 1.0)], 'S-shape v': [(1, 3, 0, 1.0)],
-         **{name: parts for name, parts in _plain(3).items() if name in ('u: x3y0', 'u: x1y2', 'u: x2y1', 'v: x2y1')}}
-# The expert's 31: radial 1 to 3, spiral 1 and 2, decentring, affinity and shear, then degrees two to five.
-EXPERT = {'radial 1': _radial(1), 'radial 2': _radial(2), 'radial 3': _radial(3),
-          'spiral 1': _spiral(1), 'spiral 2': _spiral(2), **DECENTRING, **AFFINE, **SQUARES, **CUBES, **_plain(4),
-          **{name: parts for name, parts in _plain(5).items() if name in ('u: x0y5', 'u: x5y0', 'v: x0y5', 'v: x5y0')}}
+CUBES = {
+    'S-shape u': [(0, 0, 3, 1.0)],
+    'S-shape v': [(1, 3, 0, 1.0)],
+    **{
+        name: parts
+        for name, parts in _plain(3).items()
+        if name in ('u: x3y0', 'u: x1y2', 'u: x2y1', 'v: x2y1')
+    },
+}
+# The expert's 31: radial 1 to 3, spiral 1 and 2, decentring, affinity and shear, then degrees two
+# to five.
+EXPERT = {
+    'radial 1': _radial(1),
+    'radial 2': _radial(2),
+    'radial 3': _radial(3),
+    'spiral 1': _spiral(1),
+    'spiral 2': _spiral(2),
+    **DECENTRING,
+    **AFFINE,
+    **SQUARES,
+    **CUBES,
+    **_plain(4),
+    **{
+        name: parts
+        for name, parts in _plain(5).items()
+        if name in ('u: x0y5', 'u: x5y0', 'v: x0y5', 'v: x5y0')
+    },
+}
 
 
 def expert_terms():
@@ -64,14 +101,22 @@ def expert_terms():
     return list(EXPERT), np.stack([_polynomial(HIGHEST, parts) for parts in EXPERT.values()])
 
 
-@lru_cache(maxsize=None)
+@cache
 def trend_transformation(degree):
-    """Matrix (2m, 2m) from coefficients of the polynomials of u, then v, to those of terms; and the number of terms.
+    """Matrix (2m, 2m) from coefficients of the polynomials of u, then v, to those of terms; and
+    the number of terms.
 
     The terms that are not gauge come first. degree 3, or -1 without a trend.
     """
     if degree < 0:
         return np.zeros((0, 0)), 0
-    own = {'radial 1': _radial(1), 'spiral 1': _spiral(1), **DECENTRING, **AFFINE, **SQUARES, **CUBES}
+    own = {
+        'radial 1': _radial(1),
+        'spiral 1': _spiral(1),
+        **DECENTRING,
+        **AFFINE,
+        **SQUARES,
+        **CUBES,
+    }
     columns = [_polynomial(degree, parts).ravel() for parts in [*own.values(), *GAUGE.values()]]
     return np.linalg.inv(np.stack(columns, axis=1)), len(own)

@@ -1,1 +1,3 @@
-"""Files: phantom, observations, calibration, image points and results, read with care and written whole."""
+"""Files: phantom, observations, calibration, image points and results, read with care and written
+whole.
+"""

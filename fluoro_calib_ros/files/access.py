@@ -3,7 +3,7 @@
 import os
 import re
 
-from ..photogrammetry.observations import DataError
+from ..errors import DataError
 
 _SAFE_NAME = re.compile(r'[A-Za-z0-9_-]{1,100}')
 
@@ -16,7 +16,8 @@ def cause_of(error):
 def read_bytes(path):
     """Content of the file path.
 
-    Raises DataError where there is no such file, where it is a folder, where it cannot be read or is empty.
+    Raises DataError where there is no such file, where it is a folder, where it cannot be read or
+    is empty.
     """
     try:
         with open(path, 'rb') as file:
@@ -25,7 +26,7 @@ def read_bytes(path):
         raise DataError(f'{path}: there is no such file') from None
     except IsADirectoryError:
         raise DataError(f'{path}: this is a folder, not a file') from None
-    except (OSError, ValueError) as error:   # ValueError: a NUL byte in the name
+    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
         cause = cause_of(error) if isinstance(error, OSError) else error
         raise DataError(f'{path}: cannot be read ({cause})') from None
     if not content:
@@ -34,21 +35,28 @@ def read_bytes(path):
 
 
 def read_text(path):
-    """Text of the file path, UTF-8 with or without a byte order mark. Raises DataError, see read_bytes."""
+    """Text of the file path, UTF-8 with or without a byte order mark. Raises DataError, see
+    read_bytes.
+    """
     content = read_bytes(path)
     try:
         return content.decode('utf-8-sig')
     except UnicodeDecodeError as error:
         row = content.count(b'\n', 0, error.start) + 1
-        raise DataError(f'{path}, row {row}: this is not UTF-8 text '
-                        f'(byte 0x{content[error.start]:02x})') from None
+        raise DataError(
+            f'{path}, row {row}: this is not UTF-8 text (byte 0x{content[error.start]:02x})'
+        ) from None
 
 
 def check_safe_name(name, where):
-    """Check that the name of a fluoroscope can be a file name: letters, digits, _ and -. Raises DataError."""
+    """Check that the name of a fluoroscope can be a file name: letters, digits, _ and -. Raises
+    DataError.
+    """
     if not _SAFE_NAME.fullmatch(str(name)):
-        raise DataError(f'{where}: the fluoroscope is called {name!r}, but a name consists of letters, digits, '
-                        f'_ and -, at most 100 of them')
+        raise DataError(
+            f'{where}: the fluoroscope is called {name!r}, but a name consists of letters, digits, '
+            f'_ and -, at most 100 of them'
+        )
 
 
 def make_folder(path):

@@ -4,18 +4,19 @@ import os
 import secrets
 from contextlib import contextmanager, suppress
 
-from ..photogrammetry.observations import DataError
+from ..errors import DataError
 from .access import cause_of
 
 
 @contextmanager
 def atomic_file(path, mode='wb'):
-    """Open path for writing; the content appears under that name only when the block has ended well.
+    """Open path for writing; the content appears under that name only when the block has ended
+    well.
 
-    mode 'wb' for bytes or 'w' for UTF-8 text (line ends as written). An exception in the block leaves what
-    was there before. Raises DataError where the file cannot be written.
+    mode 'wb' for bytes or 'w' for UTF-8 text (line ends as written). An exception in the block
+    leaves what was there before. Raises DataError where the file cannot be written.
     """
-    target = os.path.realpath(path)   # a link stays a link
+    target = os.path.realpath(path)  # a link stays a link
     folder, name = os.path.split(target)
     temporary = os.path.join(folder, f'.{name[:100]}.{secrets.token_hex(8)}.tmp')
     text = {} if 'b' in mode else {'encoding': 'utf-8', 'newline': ''}

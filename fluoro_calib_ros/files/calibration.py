@@ -7,12 +7,12 @@ import numpy as np
 from ..calibration.result import FluoroscopeCalibration
 from ..distortion.models import CorrectionModel
 from ..distortion.series import packed, unpacked
-from ..photogrammetry.observations import DataError
+from ..errors import DataError
 from .access import cause_of, check_safe_name, make_folder
 from .arrays import Field, array_of, read_arrays, values_of, write_arrays
 
-VERSION = 2   # of the layout
-READABLE = (1, 2)   # version 1 knew no series
+VERSION = 2  # of the layout
+READABLE = (1, 2)  # version 1 knew no series
 SUFFIX = '.calibration.npz'
 
 FIELDS = {
@@ -50,21 +50,31 @@ FIELDS = {
     'source_digest': Field('text'),
 }
 _SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
-_OF_MODEL = {'model_kind': 'kind', 'model_k': 'k', 'train_uv': 'train_uv', 'train_duv': 'train_duv',
-             'noise_px': 'noise_px', 'bias_px': 'bias_px'}   # array: attribute of the CorrectionModel
+_OF_MODEL = {
+    'model_kind': 'kind',
+    'model_k': 'k',
+    'train_uv': 'train_uv',
+    'train_duv': 'train_duv',
+    'noise_px': 'noise_px',
+    'bias_px': 'bias_px',
+}  # array: attribute of the CorrectionModel
 
 
 def calibration_path(directory, fluoroscope):
-    """Path of the calibration file of a fluoroscope in a directory. Raises DataError for an unsafe name."""
+    """Path of the calibration file of a fluoroscope in a directory. Raises DataError for an unsafe
+    name.
+    """
     check_safe_name(fluoroscope, directory)
     return os.path.join(directory, fluoroscope + SUFFIX)
 
 
 def save_calibration(directory, calibration):
-    """Write a FluoroscopeCalibration to directory, which is made where it is missing; returns the path.
+    """Write a FluoroscopeCalibration to directory, which is made where it is missing; returns the
+    path.
 
-    The same calibration gives the same bytes; its `seconds` are not kept. Raises DataError where it cannot be
-    written or holds something that could not be read again; a file that was there is then left as it was.
+    The same calibration gives the same bytes; its `seconds` are not kept. Raises DataError where
+    it cannot be written or holds something that could not be read again; a file that was there is
+    then left as it was.
     """
     path = calibration_path(directory, calibration.fluoroscope)
     arrays = checked_arrays(path, calibration)
@@ -74,17 +84,23 @@ def save_calibration(directory, calibration):
 
 
 def checked_arrays(where, calibration):
-    """The arrays {name: array} of a FluoroscopeCalibration. Raises DataError, beginning with where, for one that holds
-    what a calibration cannot hold, such as NaN."""
-    arrays = {name: array_of(where, name, _value_of(calibration, name), field) for name, field in FIELDS.items()}
+    """The arrays {name: array} of a FluoroscopeCalibration. Raises DataError, beginning with
+    where, for one that holds what a calibration cannot hold, such as NaN.
+    """
+    arrays = {
+        name: array_of(where, name, _value_of(calibration, name), field)
+        for name, field in FIELDS.items()
+    }
     _check_lengths(where, arrays)
     return arrays
 
 
 def load_calibration(path):
-    """The FluoroscopeCalibration in a file, equal to the saved one to the last bit; its seconds are NaN.
+    """The FluoroscopeCalibration in a file, equal to the saved one to the last bit; its seconds
+    are NaN.
 
-    Raises DataError for a file that is no calibration, is damaged, or has a layout this program does not know.
+    Raises DataError for a file that is no calibration, is damaged, or has a layout this program
+    does not know.
     """
     without_series = dict(zip(_SERIES, map(np.asarray, packed(None))))
     checked = read_arrays(path, FIELDS, READABLE, 'a calibration', {1: without_series})
@@ -93,10 +109,13 @@ def load_calibration(path):
 
 
 def load_calibrations(directory):
-    """All calibrations {fluoroscope: FluoroscopeCalibration} in a directory, by name. Raises DataError, also
-    where there is none."""
+    """All calibrations {fluoroscope: FluoroscopeCalibration} in a directory, by name. Raises
+    DataError, also where there is none.
+    """
     try:
-        names = sorted(name for name in os.listdir(directory) if name.endswith(SUFFIX) and name[0] != '.')
+        names = sorted(
+            name for name in os.listdir(directory) if name.endswith(SUFFIX) and name[0] != '.'
+        )
     except FileNotFoundError:
         raise DataError(f'{directory}: there is no such folder') from None
     except NotADirectoryError:
@@ -110,8 +129,10 @@ def load_calibrations(directory):
         path = os.path.join(directory, name)
         calibration = load_calibration(path)
         if calibration.fluoroscope + SUFFIX != name:
-            raise DataError(f'{path}: this is the calibration of fluoroscope {calibration.fluoroscope}, '
-                            f'its file is called {calibration.fluoroscope + SUFFIX}')
+            raise DataError(
+                f'{path}: this is the calibration of fluoroscope {calibration.fluoroscope}, '
+                f'its file is called {calibration.fluoroscope + SUFFIX}'
+            )
         out[calibration.fluoroscope] = calibration
     return out
 
@@ -122,7 +143,7 @@ def _value_of(calibration, name):
     if name in _OF_MODEL:
         return getattr(calibration.model, _OF_MODEL[name])
     if name == 'train_exposure' and not len(calibration.train_exposure):
-        return np.zeros(0, dtype=np.int64)   # an empty list would be one of floats
+        return np.zeros(0, dtype=np.int64)  # an empty list would be one of floats
     return getattr(calibration, name)
 
 
@@ -135,7 +156,8 @@ def _check_lengths(path, arrays):
 
 def _calibration(path, arrays):
     values = values_of(arrays)
-    identity, values['image_size'] = values.pop('calibration_id'), tuple(values['image_size'].tolist())
+    identity = values.pop('calibration_id')
+    values['image_size'] = tuple(values['image_size'].tolist())
     check_safe_name(values['fluoroscope'], path)
     model = {_OF_MODEL[name]: values.pop(name) for name in _OF_MODEL}
     series = [values.pop(name) for name in _SERIES]
@@ -145,6 +167,8 @@ def _calibration(path, arrays):
     except ValueError as error:
         raise DataError(f'{path}: {error}') from None
     if calibration.calibration_id != identity:
-        raise DataError(f'{path}: the content does not belong to its calibration_id {identity}, '
-                        f'the file was changed')
+        raise DataError(
+            f'{path}: the content does not belong to its calibration_id {identity}, '
+            f'the file was changed'
+        )
     return calibration

@@ -1,8 +1,9 @@
-"""Stacks of grey images in TIFF files: written page by page, and looked through before they are read.
+"""Stacks of grey images in TIFF files: written page by page, and looked through before they are
+read.
 
-OpenCV writes a stack from a list of all its images and reads what is left of a cut one without a word. A baseline
-file of uncompressed pages (TIFF 6.0; BigTIFF from 4 GB on) needs neither much memory nor time, and its directories
-tell how many pages there are.
+OpenCV writes a stack from a list of all its images and reads what is left of a cut one without a
+word. A baseline file of uncompressed pages (TIFF 6.0; BigTIFF from 4 GB on) needs neither much
+memory nor time, and its directories tell how many pages there are.
 """
 
 import os
@@ -10,22 +11,33 @@ import struct
 
 import numpy as np
 
-from ..photogrammetry.observations import DataError
+from ..errors import DataError
 from .access import cause_of
 
-CLASSIC_BYTES = 4 * 10 ** 9   # what a file with 32 bit offsets holds, with something to spare
-MOST_PAGES = 10 ** 6
-SHORT, LONG, LONG8 = 3, 4, 16   # types of a field
+CLASSIC_BYTES = 4 * 10**9  # what a file with 32 bit offsets holds, with something to spare
+MAX_PAGES = 10**6
+# types of a field
+SHORT = 3
+LONG = 4
+LONG8 = 16
 
 
 class TiffWriter:
-    """Writes pages (h, w) uint8 or uint16 into a binary file that can be searched; pages: most of them of nbytes each,
-    which decides the size of offsets."""
+    """Writes pages (h, w) uint8 or uint16 into a binary file that can be searched; pages: most of
+    them of nbytes each, which decides the size of offsets.
+    """
 
     def __init__(self, file, pages, nbytes):
-        self._file, self._big = file, pages * (nbytes + 1024) > CLASSIC_BYTES
-        self._link = 8 if self._big else 4   # where the place of the next directory is to be written
-        file.write(struct.pack('<2sHHHQ', b'II', 43, 8, 0, 0) if self._big else struct.pack('<2sHI', b'II', 42, 0))
+        self._file = file
+        self._big = pages * (nbytes + 1024) > CLASSIC_BYTES
+        self._link = (
+            8 if self._big else 4
+        )  # where the place of the next directory is to be written
+        file.write(
+            struct.pack('<2sHHHQ', b'II', 43, 8, 0, 0)
+            if self._big
+            else struct.pack('<2sHI', b'II', 42, 0)
+        )
 
     def write(self, image):
         """Add a page."""
@@ -36,9 +48,18 @@ class TiffWriter:
         directory = file.tell()
         height, width = image.shape
         place = LONG8 if self._big else LONG
-        fields = [(256, LONG, width), (257, LONG, height), (258, SHORT, 8 * image.itemsize), (259, SHORT, 1),
-                  (262, SHORT, 1), (273, place, at), (277, SHORT, 1), (278, LONG, height), (279, place, image.nbytes),
-                  (339, SHORT, 1)]
+        fields = [
+            (256, LONG, width),
+            (257, LONG, height),
+            (258, SHORT, 8 * image.itemsize),
+            (259, SHORT, 1),
+            (262, SHORT, 1),
+            (273, place, at),
+            (277, SHORT, 1),
+            (278, LONG, height),
+            (279, place, image.nbytes),
+            (339, SHORT, 1),
+        ]
         number, field, link = ('<Q', '<HHQQ', '<Q') if self._big else ('<H', '<HHII', '<I')
         file.write(struct.pack(number, len(fields)))
         for tag, kind, value in fields:
@@ -52,7 +73,9 @@ class TiffWriter:
 
 
 def count_pages(path):
-    """Number of pages of the TIFF file path. Raises DataError where it is none, or where it is cut off."""
+    """Number of pages of the TIFF file path. Raises DataError where it is none, or where it is cut
+    off.
+    """
     try:
         with open(path, 'rb') as file:
             return _count(file, os.fstat(file.fileno()).st_size)
@@ -78,10 +101,12 @@ def _count(file, size):
 
     def read(code):
         return struct.unpack(code, file.read(struct.calcsize(code)))[0]
-    pages, at = 0, read(link)
+
+    pages = 0
+    at = read(link)
     while at:
         pages += 1
-        if at >= size or pages > MOST_PAGES:
+        if at >= size or pages > MAX_PAGES:
             raise _Damaged
         file.seek(at)
         file.seek(at + struct.calcsize(number) + width * read(number))

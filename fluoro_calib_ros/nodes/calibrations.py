@@ -4,7 +4,7 @@ import threading
 
 from fluoro_calib_msgs.msg import FluoroscopeCalibration
 
-from ..photogrammetry.observations import DataError
+from ..errors import DataError
 from .conversion import calibration_from_message
 from .qos import LATCHED
 from .support import sentence_of
@@ -13,19 +13,30 @@ from .support import sentence_of
 class Calibrations:
     """The calibrations of fluoroscopes (names) that arrive at a node.
 
-    prepare(calibration): makes what the first frame needs, in a thread, and returns what is to be kept; taken(name,
-    prepared): called in that thread once it is kept; refused(name, error): why a calibration is none. What was kept
-    before stays until then: a frame sees one or the other, never half of each. Of calibrations that come while one is
-    being prepared the newest is next.
+    prepare(calibration): makes what the first frame needs, in a thread, and returns what is to be
+    kept; taken(name, prepared): called in that thread once it is kept; refused(name, error): why a
+    calibration is none. What was kept before stays until then: a frame sees one or the other,
+    never half of each. Of calibrations that come while one is being prepared the newest is next.
     """
 
     def __init__(self, node, names, prepare, taken, refused):
-        self._node, self._prepare, self._taken, self._refused = node, prepare, taken, refused
-        self._kept, self._next, self._threads = dict.fromkeys(names), {}, {}
-        self._lock = threading.Lock()   # of _next and _threads
-        self._inputs = [node.create_subscription(
-            FluoroscopeCalibration, f'{name}/calibration',
-            lambda message, name=name: self._on_calibration(name, message), LATCHED) for name in names]
+        self._node = node
+        self._prepare = prepare
+        self._taken = taken
+        self._refused = refused
+        self._kept = dict.fromkeys(names)
+        self._next = {}
+        self._threads = {}
+        self._lock = threading.Lock()  # of _next and _threads
+        self._inputs = [
+            node.create_subscription(
+                FluoroscopeCalibration,
+                f'{name}/calibration',
+                lambda message, name=name: self._on_calibration(name, message),
+                LATCHED,
+            )
+            for name in names
+        ]
 
     def of(self, name):
         """What is kept of a fluoroscope, None before its first calibration."""
@@ -35,8 +46,12 @@ class Calibrations:
         with self._lock:
             self._next[name] = message
             at_work = self._threads.get(name)
-            if at_work is None or not at_work.is_alive():   # one a fluoroscope, however many calibrations come
-                self._threads[name] = threading.Thread(target=self._work, args=(name,), daemon=True)
+            if (
+                at_work is None or not at_work.is_alive()
+            ):  # one a fluoroscope, however many calibrations come
+                self._threads[name] = threading.Thread(
+                    target=self._work, args=(name,), daemon=True
+                )
                 self._threads[name].start()
 
     def _work(self, name):
@@ -52,11 +67,17 @@ class Calibrations:
         try:
             calibration = calibration_from_message(message)
             if calibration.fluoroscope != name:
-                raise DataError(f'the calibration on topic {name}/calibration is of fluoroscope '
-                                f'{calibration.fluoroscope}')
+                raise DataError(
+                    f'the calibration on topic {name}/calibration is of fluoroscope '
+                    f'{calibration.fluoroscope}'
+                )
             prepared = self._prepare(calibration)
-        except Exception as error:   # a message may hold anything, and the stream goes on with the running one
-            self._node.get_logger().error(f'calibration refused, the running one stays: {sentence_of(error)}')
+        except (
+            Exception
+        ) as error:  # a message may hold anything, and the stream goes on with the running one
+            self._node.get_logger().error(
+                f'calibration refused, the running one stays: {sentence_of(error)}'
+            )
             self._refused(name, sentence_of(error))
             return
         self._kept[name] = prepared

@@ -19,14 +19,18 @@ class _Stream(Stream):
 
     def __init__(self, name):
         super().__init__()
-        self.checks, self.invalid_points = FrameChecks(name), 0
-        self.stamp = None   # seconds and nanoseconds of the newest frame
+        self.checks = FrameChecks(name)
+        self.invalid_points = 0
+        self.stamp = None  # seconds and nanoseconds of the newest frame
 
 
 class CorrectionNode(CorrectingNode):
     """Publishes corrected observations; nothing before there is a calibration."""
 
-    item, subject, topics, kinds = 'frame', 'target observations', ('target_observations',), KINDS
+    item = 'frame'
+    subject = 'target observations'
+    topics = ('target_observations',)
+    kinds = KINDS
     new_stream = _Stream
 
     def __init__(self):
@@ -34,11 +38,15 @@ class CorrectionNode(CorrectingNode):
 
     def make(self):
         """Make outputs, and take calibrations."""
-        self._corrected, self._info = {}, {}
+        self._corrected = {}
+        self._info = {}
         for name in self.names:
-            self._corrected[name] = self.publisher(CorrectedObservations, f'{name}/corrected_observations',
-                                                   OBSERVATIONS)
-            self._info[name] = info = self.create_publisher(CameraInfo, f'{name}/camera_info', LATCHED)
+            self._corrected[name] = self.publisher(
+                CorrectedObservations, f'{name}/corrected_observations', OBSERVATIONS
+            )
+            self._info[name] = info = self.create_publisher(
+                CameraInfo, f'{name}/camera_info', LATCHED
+            )
             self.kept(info, self.destroy_publisher, info)
         self.take_calibrations()
 
@@ -46,9 +54,13 @@ class CorrectionNode(CorrectingNode):
         """Take observations, all in one thread."""
         reader = self.reader(self.undecodable)
         for name in self.names:
-            reader.subscribe(TargetObservations, f'{name}/target_observations',
-                             lambda frame, info, name=name: self._on_frame(name, frame, info), OBSERVATIONS,
-                             observations_of)
+            reader.subscribe(
+                TargetObservations,
+                f'{name}/target_observations',
+                lambda frame, info, name=name: self._on_frame(name, frame, info),
+                OBSERVATIONS,
+                observations_of,
+            )
 
     # -- calibrations
 
@@ -62,15 +74,23 @@ class CorrectionNode(CorrectingNode):
         """Tell that a calibration is in use."""
         self._publish_info(name)
         grid = calibration.grid
-        self.get_logger().info(f'fluoroscope {name}: corrected with calibration {calibration.calibration_id} now '
-                               f'(grid of {grid.cell_px:g} px cells, within {grid.error_px:.4f} px of the model)')
+        self.get_logger().info(
+            f'fluoroscope {name}: corrected with calibration {calibration.calibration_id} now '
+            f'(grid of {grid.cell_px:g} px cells, within {grid.error_px:.4f} px of the model)'
+        )
 
     def _publish_info(self, name):
         calibration = self.calibrations.of(name)
         if calibration is not None:
             stamp = self.streams[name].stamp
-            self._info[name].publish(camera_info(calibration, self.get_clock().now().to_msg() if stamp is None
-                                                 else Time(sec=stamp[0], nanosec=stamp[1])))
+            self._info[name].publish(
+                camera_info(
+                    calibration,
+                    self.get_clock().now().to_msg()
+                    if stamp is None
+                    else Time(sec=stamp[0], nanosec=stamp[1]),
+                )
+            )
 
     # -- observations
 
@@ -89,7 +109,9 @@ class CorrectionNode(CorrectingNode):
             self.refuse(stream, error)
             return
         corrected = calibration.correct_arrays(*arrays)
-        self._corrected[name].publish(corrected_bytes(frame, calibration.calibration_id, corrected))
+        self._corrected[name].publish(
+            corrected_bytes(frame, calibration.calibration_id, corrected)
+        )
         stream.published(info)
         status = corrected[-1]
         if not len(status) or status.max() == INVALID:
@@ -104,8 +126,9 @@ class CorrectionNode(CorrectingNode):
             invalid = np.flatnonzero(status == INVALID)
             stream.invalid_points += len(invalid)
             number = np.frombuffer(frame.target_id, np.uint32)[invalid[0]]
-            stream.last_fault = (f'{where}: target {number} is not a point of the image, '
-                                 'it is published as INVALID')
+            stream.last_fault = (
+                f'{where}: target {number} is not a point of the image, it is published as INVALID'
+            )
         self.sentences.warn(stream.last_fault)
 
     # -- diagnostics
@@ -118,9 +141,12 @@ class CorrectionNode(CorrectingNode):
 
     def more(self, name, stream, calibration):
         """Further values of the diagnostics."""
-        return {'invalid points': stream.invalid_points, 'readers': self._corrected[name].get_subscription_count(),
-                'calibration': calibration.calibration_id if calibration else '',
-                'grid error [px]': f'{calibration.grid.error_px:.4f}' if calibration else ''}
+        return {
+            'invalid points': stream.invalid_points,
+            'readers': self._corrected[name].get_subscription_count(),
+            'calibration': calibration.calibration_id if calibration else '',
+            'grid error [px]': f'{calibration.grid.error_px:.4f}' if calibration else '',
+        }
 
 
 def main(args=None):

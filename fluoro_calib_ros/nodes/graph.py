@@ -24,7 +24,8 @@ class Graph:
             command += ['-p', f'{key}:={value}']
         log = open(self._directory / f'{name}.log', 'ab')
         with log:
-            # A session of its own: an interrupt from the keyboard reaches the nodes from here, in order.
+            # A session of its own: an interrupt from the keyboard reaches the nodes from here, in
+            # order.
             process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
         self._processes.append(process)
         return process
@@ -49,7 +50,9 @@ class Graph:
 
 
 def isolate():
-    """Keep this process and its children on this machine and off the graph of others, unless told otherwise."""
+    """Keep this process and its children on this machine and off the graph of others, unless told
+    otherwise.
+    """
     os.environ.setdefault('ROS_AUTOMATIC_DISCOVERY_RANGE', 'LOCALHOST')
     if 'ROS_DOMAIN_ID' not in os.environ:
         domains = [1 + (os.getpid() + i) % 100 for i in range(100)]
@@ -57,7 +60,9 @@ def isolate():
 
 
 def _is_free(domain):
-    """Whether nobody on this machine is in a ROS domain: the first participant has this port (DDSI-RTPS 9.6.1.1)."""
+    """Whether nobody on this machine is in a ROS domain: the first participant has this port
+    (DDSI-RTPS 9.6.1.1).
+    """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
         try:
             port.bind(('', 7400 + 250 * domain + 10))

@@ -1,13 +1,14 @@
 """Node that removes the distortion from the images of the fluoroscopes, live.
 
-Images of a fluoroscope are taken and corrected by a thread of its own: what costs time, the remap and the copies in and
-out of DDS, is done beside the other fluoroscopes as far as Python's lock allows.
+Images of a fluoroscope are taken and corrected by a thread of its own: what costs time, the remap
+and the copies in and out of DDS, is done beside the other fluoroscopes as far as Python's lock
+allows.
 """
 
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from ..images.undistortion import INTERPOLATIONS, ImageCorrector
+from ..images.corrector import INTERPOLATIONS, ImageCorrector
 from . import support
 from .checks import Refused
 from .conversion import camera_info
@@ -16,7 +17,10 @@ from .pictures import COMPRESSIONS, IMAGE_KINDS, Pictures, compressed, one_threa
 from .qos import IMAGES
 from .support import StartError, declare
 
-INPUTS = {'raw': ((Image, 'image_raw'),), 'compressed': ((CompressedImage, 'image_raw/compressed'),)}
+INPUTS = {
+    'raw': ((Image, 'image_raw'),),
+    'compressed': ((CompressedImage, 'image_raw/compressed'),),
+}
 INPUTS['both'] = INPUTS['raw'] + INPUTS['compressed']
 CORRECTED = 'image_corrected'
 
@@ -26,8 +30,9 @@ class _Calibrated:
 
     def __init__(self, calibration, interpolation):
         calibration.prepare()
-        self.calibration, self.corrector = calibration, ImageCorrector(calibration, interpolation)
-        self.info = camera_info(calibration, Time())   # its header is that of each image
+        self.calibration = calibration
+        self.corrector = ImageCorrector(calibration, interpolation)
+        self.info = camera_info(calibration, Time())  # its header is that of each image
 
 
 class _Stream(Stream):
@@ -35,24 +40,44 @@ class _Stream(Stream):
 
     def __init__(self, name):
         super().__init__()
-        self.pictures, self.compressed = Pictures(name), 0
+        self.pictures = Pictures(name)
+        self.compressed = 0
 
 
 class ImageNode(CorrectingNode):
     """Publishes corrected images and their CameraInfo; nothing before there is a calibration."""
 
-    item, subject, kinds = 'image', 'images', IMAGE_KINDS
+    item = 'image'
+    subject = 'images'
+    kinds = IMAGE_KINDS
     new_stream = _Stream
 
     def __init__(self):
         super().__init__('image_node')
-        self._interpolation = self._one_of('interpolation', 'linear', INTERPOLATIONS, 'between the pixels of the '
-                                           'observed image: linear, or cubic, which is sharper and takes longer')
-        self._inputs = INPUTS[self._one_of('inputs', 'both', INPUTS, 'what is subscribed to: raw, compressed or both; '
-                                           'a camera that offers both is to be taken in one form')]
+        self._interpolation = self._one_of(
+            'interpolation',
+            'linear',
+            INTERPOLATIONS,
+            'between the pixels of the '
+            'observed image: linear, or cubic, which is sharper and takes longer',
+        )
+        self._inputs = INPUTS[
+            self._one_of(
+                'inputs',
+                'both',
+                INPUTS,
+                'what is subscribed to: raw, compressed or both; '
+                'a camera that offers both is to be taken in one form',
+            )
+        ]
         self.topics = tuple(topic for _, topic in self._inputs)
-        self._format = self._one_of('compressed_format', 'png', COMPRESSIONS, 'format of compressed corrected images: '
-                                    'png (without loss) or jpeg; images of 16 bits are png')
+        self._format = self._one_of(
+            'compressed_format',
+            'png',
+            COMPRESSIONS,
+            'format of compressed corrected images: '
+            'png (without loss) or jpeg; images of 16 bits are png',
+        )
         self._quality = declare(self, 'jpeg_quality', 95, 'quality of jpeg', 1, 100)
         one_thread()
 
@@ -66,8 +91,12 @@ class ImageNode(CorrectingNode):
         """Make outputs, and take calibrations."""
         self._images, self._compressed, self._infos = (
             {name: self.publisher(kind, f'{name}/{topic}', IMAGES) for name in self.names}
-            for kind, topic in ((Image, CORRECTED), (CompressedImage, f'{CORRECTED}/compressed'),
-                                (CameraInfo, f'{CORRECTED}/camera_info')))
+            for kind, topic in (
+                (Image, CORRECTED),
+                (CompressedImage, f'{CORRECTED}/compressed'),
+                (CameraInfo, f'{CORRECTED}/camera_info'),
+            )
+        )
         self.take_calibrations()
 
     def listen(self):
@@ -75,8 +104,12 @@ class ImageNode(CorrectingNode):
         for name in self.names:
             reader = self.reader(self.undecodable)
             for kind, topic in self._inputs:
-                reader.subscribe(kind, f'{name}/{topic}',
-                                 lambda message, info, name=name: self._on_image(name, message, info), IMAGES)
+                reader.subscribe(
+                    kind,
+                    f'{name}/{topic}',
+                    lambda message, info, name=name: self._on_image(name, message, info),
+                    IMAGES,
+                )
 
     # -- calibrations
 
@@ -87,9 +120,11 @@ class ImageNode(CorrectingNode):
     def taken(self, name, calibrated):
         """Tell that a calibration is in use."""
         empty = int((~calibrated.corrector.mask).sum())
-        self.get_logger().info(f'fluoroscope {name}: images corrected with calibration '
-                               f'{calibrated.calibration.calibration_id} now ({empty} pixels are empty, nothing was '
-                               'seen there)')
+        self.get_logger().info(
+            f'fluoroscope {name}: images corrected with calibration '
+            f'{calibrated.calibration.calibration_id} now ({empty} pixels are empty, nothing was '
+            'seen there)'
+        )
 
     # -- images
 
@@ -108,7 +143,7 @@ class ImageNode(CorrectingNode):
             return
         out, pixels = stream.pictures.out(message.header, encoding, image.shape)
         calibrated.corrector.correct(image, pixels)
-        self._images[name].publish(out)   # this copies it
+        self._images[name].publish(out)  # this copies it
         calibrated.info.header = message.header
         self._infos[name].publish(calibrated.info)
         stream.published(info)
@@ -120,8 +155,10 @@ class ImageNode(CorrectingNode):
 
     def more(self, name, stream, calibrated):
         """Further values of the diagnostics."""
-        return {'images compressed': stream.compressed,
-                'calibration': calibrated.calibration.calibration_id if calibrated else ''}
+        return {
+            'images compressed': stream.compressed,
+            'calibration': calibrated.calibration.calibration_id if calibrated else '',
+        }
 
 
 def main(args=None):

@@ -1,4 +1,6 @@
-"""The orientation of the rig in the calibration node: captured on request, kept, saved and published."""
+"""The orientation of the rig in the calibration node: captured on request, kept, saved and
+published.
+"""
 
 import threading
 from pathlib import Path
@@ -8,9 +10,9 @@ from fluoro_calib_msgs.srv import Orient
 from rclpy.clock import Clock, ClockType
 from rclpy.task import Future
 
-from ..calibration.orientation import orientation_of_capture
-from ..files.orientation import load_orientation, orientation_path, save_orientation
-from ..photogrammetry.observations import DataError
+from ..calibration.rig_orientation import orientation_of_capture
+from ..errors import DataError
+from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
 from .qos import LATCHED
 from .spatial import message_from_orientation
 from .support import check_timeout
@@ -20,7 +22,9 @@ class _Capture:
     """A capture of the phantom in the rig frame: pairs of frames until there are enough."""
 
     def __init__(self, names, count):
-        self.frames, self._count, self.done = {name: [] for name in names}, count, Future()
+        self.frames = {name: [] for name in names}
+        self._count = count
+        self.done = Future()
 
     def take(self, pair):
         """Take a pair of frames."""
@@ -33,14 +37,21 @@ class _Capture:
 class Orienting:
     """The service orient of a node, and the orientation that is published on rig_orientation.
 
-    names of the fluoroscopes; phantom; rig_frame: name of the frame of a capture; timeout: longest wait of one [s];
-    directory(): where orientations are saved; calibrations(): those that hold now {fluoroscope: calibration}.
+    names of the fluoroscopes; phantom; rig_frame: name of the frame of a capture; timeout: longest
+    wait of one [s]; directory(): where orientations are saved; calibrations(): those that hold now
+    {fluoroscope: calibration}.
     """
 
     def __init__(self, node, names, phantom, rig_frame, timeout, directory, calibrations, group):
-        self._node, self._names, self._phantom, self._rig_frame = node, names, phantom, rig_frame
-        self._timeout, self._directory, self._calibrations = timeout, directory, calibrations
-        self._capture, self._present = None, None
+        self._node = node
+        self._names = names
+        self._phantom = phantom
+        self._rig_frame = rig_frame
+        self._timeout = timeout
+        self._directory = directory
+        self._calibrations = calibrations
+        self._capture = None
+        self._present = None
         self._output = node.create_publisher(RigOrientation, 'rig_orientation', LATCHED)
         node.create_service(Orient, 'orient', self._on_orient, callback_group=group)
 
@@ -70,13 +81,15 @@ class Orienting:
         orientation = load_orientation(path)
         if _belongs(orientation, calibrations):
             return orientation
-        self._node.get_logger().warning(f'{path}: the orientation of the rig belongs to other calibrations, it is not '
-                                        'used')
+        self._node.get_logger().warning(
+            f'{path}: the orientation of the rig belongs to other calibrations, it is not used'
+        )
         return None
 
     def after(self, calibrations, found):
-        """RigOrientation that belongs to new calibrations: the present one if it is a capture that still does, else
-        what was found, or None where that is the sentence why there is none."""
+        """RigOrientation that belongs to new calibrations: the present one if it is a capture that
+        still does, else what was found, or None where that is the sentence why there is none.
+        """
         now = self._present
         fits = now is not None and _belongs(now, {**self._calibrations(), **calibrations})
         if fits and now.source == 'capture':
@@ -97,16 +110,23 @@ class Orienting:
             self._node.get_logger().error(response.message)
             return response
         self.publish(orientation)
-        response.success, response.orientation_id = True, orientation.orientation_id
-        response.message = (f'{", ".join(orientation.fluoroscopes)} oriented in frame {orientation.frame_id} from '
-                            f'{orientation.exposures} captures of the phantom, sources within '
-                            f'{orientation.sd_mm.max():.2f} mm (standard deviation)')
+        response.success = True
+        response.orientation_id = orientation.orientation_id
+        response.message = (
+            f'{", ".join(orientation.fluoroscopes)} oriented in frame {orientation.frame_id} from '
+            f'{orientation.exposures} captures of the phantom, sources within '
+            f'{orientation.sd_mm.max():.2f} mm (standard deviation)'
+        )
         self._node.get_logger().info(response.message)
         return response
 
     async def _captured(self, request):
-        """RigOrientation from the next frames of all fluoroscopes. Raises DataError and ValueError."""
-        timeout, count, calibrations = request.timeout_sec or self._timeout, request.frames or 1, self._calibrations()
+        """RigOrientation from the next frames of all fluoroscopes. Raises DataError and
+        ValueError.
+        """
+        timeout = request.timeout_sec or self._timeout
+        count = request.frames or 1
+        calibrations = self._calibrations()
         check_timeout(timeout)
         missing = [name for name in self._names if name not in calibrations]
         if missing:
@@ -114,17 +134,25 @@ class Orienting:
         if self._capture is not None:
             raise DataError('another capture is waiting for its frames')
         waiting = self._capture = _Capture(self._names, count)
-        timer = self._node.create_timer(timeout, lambda: waiting.done.done() or waiting.done.set_result(False),
-                                        clock=Clock(clock_type=ClockType.STEADY_TIME))
+        timer = self._node.create_timer(
+            timeout,
+            lambda: waiting.done.done() or waiting.done.set_result(False),
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
         came = await waiting.done
         self._node.destroy_timer(timer)
         if not came:
             self._capture = None
-            raise DataError(f'{len(waiting.frames[self._names[0]])} of {count} frames of all fluoroscopes '
-                            f'({", ".join(self._names)}) came within {timeout:g} s')
+            raise DataError(
+                f'{len(waiting.frames[self._names[0]])} of {count} frames of all fluoroscopes '
+                f'({", ".join(self._names)}) came within {timeout:g} s'
+            )
         calibrations = dict(calibrations)
-        orientation = await self._beside(lambda: orientation_of_capture(waiting.frames, self._phantom, calibrations,
-                                                                        self._rig_frame))
+        orientation = await self._beside(
+            lambda: orientation_of_capture(
+                waiting.frames, self._phantom, calibrations, self._rig_frame
+            )
+        )
         if not _belongs(orientation, self._calibrations()):
             raise DataError('the calibrations have changed meanwhile, capture the phantom again')
         return orientation
@@ -139,7 +167,8 @@ class Orienting:
             except Exception as error:
                 done.set_exception(error)
             if self._node.executor is not None:
-                self._node.executor.wake()   # to look at what has been awaited
+                self._node.executor.wake()  # to look at what has been awaited
+
         threading.Thread(target=work, daemon=True).start()
         return done
 
@@ -147,4 +176,6 @@ class Orienting:
 def _belongs(orientation, calibrations):
     """Whether a RigOrientation belongs to calibrations {fluoroscope: calibration}."""
     return orientation.calibration_ids == tuple(
-        calibrations[name].calibration_id if name in calibrations else '' for name in orientation.fluoroscopes)
+        calibrations[name].calibration_id if name in calibrations else ''
+        for name in orientation.fluoroscopes
+    )

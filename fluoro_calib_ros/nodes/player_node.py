@@ -11,7 +11,7 @@ from rclpy.node import Node
 from rclpy.type_support import check_for_type_support
 
 from ..bags.reader import iterate_messages, topics_of
-from ..photogrammetry.observations import DataError
+from ..errors import DataError
 from . import support
 from .qos import LATCHED_RECORDED, OBSERVATIONS, overridable
 from .support import StartError, declare, sentence_of
@@ -25,8 +25,12 @@ class PlayerNode(Node):
         self._bag = declare(self, 'bag', '', 'bag to play: an .mcap file or a folder of rosbag2')
         self._rate = declare(self, 'rate', 1.0, 'speed against the recording', 0.001, 1e6)
         self._loop = declare(self, 'loop', False, 'play over and over')
-        self._readers = declare(self, 'wait_for_readers', 1, 'subscriptions of every topic to wait for', 0, 100)
-        self._namespace = declare(self, 'strip_prefix', '', 'beginning of the recorded topics that is left out')
+        self._readers = declare(
+            self, 'wait_for_readers', 1, 'subscriptions of every topic to wait for', 0, 100
+        )
+        self._namespace = declare(
+            self, 'strip_prefix', '', 'beginning of the recorded topics that is left out'
+        )
         wanted = list(declare(self, 'topics', [''], 'topics to play; empty: all'))
         if not self._bag:
             raise StartError('parameter bag is not set: it names the bag to play')
@@ -34,11 +38,18 @@ class PlayerNode(Node):
             found = topics_of(self._bag)
         except DataError as error:
             raise StartError(str(error)) from None
-        self._outputs = {topic: self._output(topic, info.type, is_latched(info)) for topic, info in found.items()
-                         if wanted in ([''], []) or topic in wanted}
-        self._outputs = {topic: output for topic, output in self._outputs.items() if output is not None}
+        self._outputs = {
+            topic: self._output(topic, info.type, is_latched(info))
+            for topic, info in found.items()
+            if wanted in ([''], []) or topic in wanted
+        }
+        self._outputs = {
+            topic: output for topic, output in self._outputs.items() if output is not None
+        }
         if not self._outputs:
-            raise StartError(f'{self._bag}: there is nothing to play among its topics {", ".join(found) or "(none)"}')
+            raise StartError(
+                f'{self._bag}: there is nothing to play among its topics {", ".join(found) or "(none)"}'
+            )
         if not any(found[topic].count for topic in self._outputs):
             raise StartError(f'{self._bag}: there are no messages on {", ".join(self._outputs)}')
         self.failed = False
@@ -47,20 +58,30 @@ class PlayerNode(Node):
         self._worker.start()
 
     def _output(self, topic, type_name, latched):
-        """Publisher of a recorded topic, relative so that it can be remapped; None for a type that is not here."""
+        """Publisher of a recorded topic, relative so that it can be remapped; None for a type that
+        is not here.
+        """
         package, _, name = type_name.partition('/msg/')
         try:
             message_type = getattr(import_module(f'{package or "no"}.msg'), name)
             check_for_type_support(message_type)
         except (ImportError, AttributeError):
-            self.get_logger().warning(f'{topic} is not played: the type {type_name or "(none)"} is not installed')
+            self.get_logger().warning(
+                f'{topic} is not played: the type {type_name or "(none)"} is not installed'
+            )
             return None
         relative = topic.removeprefix(self._namespace).lstrip('/')
         try:
-            return self.create_publisher(message_type, relative, LATCHED_RECORDED if latched else OBSERVATIONS,
-                                         qos_overriding_options=overridable())
+            return self.create_publisher(
+                message_type,
+                relative,
+                LATCHED_RECORDED if latched else OBSERVATIONS,
+                qos_overriding_options=overridable(),
+            )
         except NameValidationException as error:
-            raise StartError(f'{topic} cannot be played as {relative!r}: {sentence_of(error)}') from None
+            raise StartError(
+                f'{topic} cannot be played as {relative!r}: {sentence_of(error)}'
+            ) from None
 
     def _play(self):
         try:
@@ -69,13 +90,18 @@ class PlayerNode(Node):
                 self._play_once()
                 if not self._loop:
                     break
-            if not support.wait_until_taken(self._outputs.values(), self._stopping) and not self._stopping.is_set():
-                self.get_logger().warning('not all messages have arrived: a reader does not answer')
+            if (
+                not support.wait_until_taken(self._outputs.values(), self._stopping)
+                and not self._stopping.is_set()
+            ):
+                self.get_logger().warning(
+                    'not all messages have arrived: a reader does not answer'
+                )
         except DataError as error:
             self.get_logger().fatal(str(error))
             self.failed = True
         except Exception:
-            if rclpy.ok():   # else the node has been ended between two messages
+            if rclpy.ok():  # else the node has been ended between two messages
                 self.get_logger().fatal(traceback.format_exc())
                 self.failed = True
         finally:
@@ -84,7 +110,9 @@ class PlayerNode(Node):
 
     def _play_once(self):
         """Publish every message at its time."""
-        start, first, count = time.monotonic(), None, 0
+        start = time.monotonic()
+        first = None
+        count = 0
         for message in iterate_messages(self._bag, list(self._outputs)):
             first = message.log_time_ns if first is None else first
             due = start + (message.log_time_ns - first) * 1e-9 / self._rate

@@ -1,4 +1,6 @@
-"""What the nodes share: parameters with descriptions, diagnostics, logging that does not flood, start and end."""
+"""What the nodes share: parameters with descriptions, diagnostics, logging that does not flood,
+start and end.
+"""
 
 import os
 import re
@@ -24,14 +26,19 @@ from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.qos import qos_policy_name_from_kind
 from rclpy.signals import SignalHandlerOptions
 
-from ..photogrammetry.observations import DataError
+from ..errors import DataError
 from .qos import OBSERVATIONS, overridable
 from .streams import StreamReader
 
-OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
-SETTLING_S = 0.3   # in which readers get to know a publisher that knows them, several times what was measured
-LONGEST_S = 86400.0   # that somebody may ask a node to wait
-NAME = re.compile('[A-Za-z_][A-Za-z0-9_]{0,99}')   # of a fluoroscope: a file name, and part of a topic's
+OK = DiagnosticStatus.OK
+WARN = DiagnosticStatus.WARN
+ERROR = DiagnosticStatus.ERROR
+# in which readers get to know a publisher that knows them, several times what was measured
+SETTLING_S = 0.3
+LONGEST_S = 86400.0  # that somebody may ask a node to wait
+NAME = re.compile(
+    '[A-Za-z_][A-Za-z0-9_]{0,99}'
+)  # of a fluoroscope: a file name, and part of a topic's
 
 
 def declare(node, name, default, description, low=None, high=None):
@@ -45,15 +52,22 @@ def declare(node, name, default, description, low=None, high=None):
         value = node.declare_parameter(name, default, descriptor).value
     except ParameterException as error:
         raise StartError(f'parameter {name}: {error}') from None
-    return [] if value is None else value   # an empty list has no type, and is taken for a parameter that is not set
+    return (
+        [] if value is None else value
+    )  # an empty list has no type, and is taken for a parameter that is not set
 
 
 class Sentences:
-    """Logs sentences as they come, but at most a burst of them and then one a second; the rest is counted."""
+    """Logs sentences as they come, but at most a burst of them and then one a second; the rest is
+    counted.
+    """
 
     def __init__(self, logger, burst=20):
-        self._logger, self._allowance, self._burst = logger, float(burst), burst
-        self._last, self._hidden = time.monotonic(), 0
+        self._logger = logger
+        self._allowance = float(burst)
+        self._burst = burst
+        self._last = time.monotonic()
+        self._hidden = 0
 
     def warn(self, sentence):
         """Log a sentence as a warning, unless there have been too many."""
@@ -65,7 +79,8 @@ class Sentences:
             return
         more = f' ({self._hidden} more like this were not shown)' if self._hidden else ''
         self._logger.warning(sentence + more)
-        self._allowance, self._hidden = self._allowance - 1, 0
+        self._allowance = self._allowance - 1
+        self._hidden = 0
 
 
 class Diagnostics:
@@ -81,8 +96,9 @@ class Diagnostics:
         array.header.stamp = self._node.get_clock().now().to_msg()
         full_name = self._node.get_fully_qualified_name()
         for name, level, message, values in parts:
-            status = DiagnosticStatus(level=level, name=f'{full_name}: {name}', message=message,
-                                      hardware_id=name)
+            status = DiagnosticStatus(
+                level=level, name=f'{full_name}: {name}', message=message, hardware_id=name
+            )
             status.values = [KeyValue(key=key, value=str(value)) for key, value in values.items()]
             array.status.append(status)
         self._publisher.publish(array)
@@ -96,7 +112,8 @@ class Latencies:
     """The last latencies [ns], written by one thread and read by another."""
 
     def __init__(self, count=2000):
-        self._ring, self._number = np.zeros(count, dtype=np.int64), 0
+        self._ring = np.zeros(count, dtype=np.int64)
+        self._number = 0
 
     def add(self, nanoseconds):
         """Take a latency."""
@@ -107,12 +124,14 @@ class Latencies:
         """Diagnostic values; none where there are none."""
         if not self._number:
             return {}
-        p50, p99 = np.percentile(self._ring[:self._number], [50, 99]) * 1e-6
+        p50, p99 = np.percentile(self._ring[: self._number], [50, 99]) * 1e-6
         return {'latency p50 [ms]': f'{p50:.3f}', 'latency p99 [ms]': f'{p99:.3f}'}
 
 
 def _on_interrupt(end):
-    """Call end() from a thread at SIGINT or SIGTERM, whatever the main thread waits for; a second one exits at once."""
+    """Call end() from a thread at SIGINT or SIGTERM, whatever the main thread waits for; a second
+    one exits at once.
+    """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
     signal.set_wakeup_fd(writing)
@@ -131,29 +150,40 @@ def _on_interrupt(end):
 def _init(args):
     try:
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
-    except RCLError as error:   # arguments after --ros-args that are none
+    except RCLError as error:  # arguments after --ros-args that are none
         raise StartError(str(error).partition(', at /')[0]) from None
 
 
 class ManagedNode(LifecycleNode):
-    """Node with the lifecycle of ROS 2 that brings itself up, unless its parameter autostart is false.
+    """Node with the lifecycle of ROS 2 that brings itself up, unless its parameter autostart is
+    false.
 
-    It has its topics from configure on, and takes messages between activate and deactivate. open() makes what
-    configure makes, begin() what activate does; end() and close() take them back, in whatever state they are.
+    It has its topics from configure on, and takes messages between activate and deactivate. open()
+    makes what configure makes, begin() what activate does; end() and close() take them back, in
+    whatever state they are.
     """
 
     def __init__(self, name):
         super().__init__(name)
-        self._autostart = declare(self, 'autostart', True, 'configure and activate the node at its start; false: that '
-                                  'is left to whoever manages the lifecycle')
-        self.failed, self._starting, self._fault = False, False, ''
+        self._autostart = declare(
+            self,
+            'autostart',
+            True,
+            'configure and activate the node at its start; false: that '
+            'is left to whoever manages the lifecycle',
+        )
+        self.failed = False
+        self._starting = False
+        self._fault = ''
 
     def bring_up(self):
         """Configure and activate the node where it does so by itself. Raises StartError."""
         if self._autostart:
             self._starting = True
-            if not all(done() == TransitionCallbackReturn.SUCCESS for done in (self.trigger_configure,
-                                                                               self.trigger_activate)):
+            if not all(
+                done() == TransitionCallbackReturn.SUCCESS
+                for done in (self.trigger_configure, self.trigger_activate)
+            ):
                 raise StartError(self._fault)
             self._starting = False
 
@@ -178,7 +208,9 @@ class ManagedNode(LifecycleNode):
         return result
 
     def _tried(self, function, undo):
-        """Result of a transition by a function; where it fails, that is told and undone: rclpy would not say a word."""
+        """Result of a transition by a function; where it fails, that is told and undone: rclpy
+        would not say a word.
+        """
         try:
             function()
         except Exception as error:
@@ -209,25 +241,34 @@ class ManagedNode(LifecycleNode):
 
 
 class StreamNode(ManagedNode):
-    """Managed node with outputs, readers of streams, and its state in the diagnostics once a second.
+    """Managed node with outputs, readers of streams, and its state in the diagnostics once a
+    second.
 
-    make(): makes what it has from configure on, by publisher() and kept(); listen(): makes its readers, by reader();
-    report(): its state as Diagnostics.publish takes it; forget(): what it knows before the first message.
+    make(): makes what it has from configure on, by publisher() and kept(); listen(): makes its
+    readers, by reader(); report(): its state as Diagnostics.publish takes it; forget(): what it
+    knows before the first message.
     """
 
     def __init__(self, name):
         super().__init__(name)
         self.sentences = Sentences(self.get_logger())
-        self.readers, self._kept = [], ExitStack()
+        self.readers = []
+        self._kept = ExitStack()
 
     def kept(self, thing, take_back, *arguments):
-        """A thing for which take_back(*arguments) is called when the node is taken down, the last one first."""
+        """A thing for which take_back(*arguments) is called when the node is taken down, the last
+        one first.
+        """
         self._kept.callback(take_back, *arguments)
         return thing
 
     def publisher(self, kind, topic, qos):
-        """Publisher of a stream: silent while the node is not active, its quality of service can be overridden."""
-        made = self.create_lifecycle_publisher(kind, topic, qos, qos_overriding_options=overridable())
+        """Publisher of a stream: silent while the node is not active, its quality of service can
+        be overridden.
+        """
+        made = self.create_lifecycle_publisher(
+            kind, topic, qos, qos_overriding_options=overridable()
+        )
         return self.kept(made, self.destroy_publisher, made)
 
     def reader(self, on_undecodable):
@@ -262,7 +303,9 @@ class StreamNode(ManagedNode):
 
 
 def deafness(reader, sentences):
-    """Sentence for every topic {topic: sentence} on which nothing can come to a StreamReader, or None; told too."""
+    """Sentence for every topic {topic: sentence} on which nothing can come to a StreamReader, or
+    None; told too.
+    """
     found = {} if reader is None else reader.incompatible()
     for sentence in found.values():
         sentences.warn(sentence)
@@ -273,12 +316,16 @@ def fluoroscopes_of(node, least=1):
     """Declare the parameter fluoroscopes; returns the names. Raises StartError."""
     names = list(declare(node, 'fluoroscopes', ['a', 'b'], 'names of the fluoroscopes'))
     if len(names) < least or len(set(names)) != len(names):
-        raise StartError(f'parameter fluoroscopes: {names} is not a list of different names'
-                         + (f', {least} or more' if least > 1 else ''))
+        raise StartError(
+            f'parameter fluoroscopes: {names} is not a list of different names'
+            + (f', {least} or more' if least > 1 else '')
+        )
     for name in names:
         if not NAME.fullmatch(name):
-            raise StartError(f'parameter fluoroscopes: {name!r} cannot be part of the name of a topic, which consists '
-                             'of letters, digits and _, and does not begin with a digit')
+            raise StartError(
+                f'parameter fluoroscopes: {name!r} cannot be part of the name of a topic, which consists '
+                'of letters, digits and _, and does not begin with a digit'
+            )
     return names
 
 
@@ -298,20 +345,22 @@ def path_of(text):
 
 
 def run(make_node, args=None):
-    """Run a node until it is interrupted, or has ended by rclpy.shutdown(); exit status 1 and one sentence where it
-    cannot start, exit status 1 where its flag `failed` is set.
+    """Run a node until it is interrupted, or has ended by rclpy.shutdown(); exit status 1 and one
+    sentence where it cannot start, exit status 1 where its flag `failed` is set.
 
-    stop() of a node ends what its callbacks wait for. They end before the context does, which rclpy's own signal
-    handlers would take away from under them.
+    stop() of a node ends what its callbacks wait for. They end before the context does, which
+    rclpy's own signal handlers would take away from under them.
     """
-    ended, node, code = threading.Event(), None, 0
+    ended = threading.Event()
+    node = None
+    code = 0
     try:
         _init(args)
         executor = SingleThreadedExecutor()
 
         def end():
             ended.set()
-            executor.create_task(lambda: None)   # something to do, so that spin_once returns
+            executor.create_task(lambda: None)  # something to do, so that spin_once returns
 
         _on_interrupt(end)
         node = _made(make_node)
@@ -352,29 +401,41 @@ def sentence_of(error):
 def subscribe_observations(node, name, on_frame, on_deaf):
     """Subscribe a node to the target observations of a fluoroscope.
 
-    on_frame(name, message) for every frame; on_deaf(name, sentence) where nothing can come from a publisher,
-    since it offers less than is asked for.
+    on_frame(name, message) for every frame; on_deaf(name, sentence) where nothing can come from a
+    publisher, since it offers less than is asked for.
     """
     topic = f'{name}/target_observations'
 
     def incompatible(event):
         policy = qos_policy_name_from_kind(event.last_policy_kind)
-        on_deaf(name, f'topic {topic}: a publisher offers an incompatible quality of service ({policy}), '
-                      'nothing comes from it')
-    node.create_subscription(TargetObservations, topic, lambda message: on_frame(name, message), OBSERVATIONS,
-                             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
-                             qos_overriding_options=overridable())
+        on_deaf(
+            name,
+            f'topic {topic}: a publisher offers an incompatible quality of service ({policy}), '
+            'nothing comes from it',
+        )
+
+    node.create_subscription(
+        TargetObservations,
+        topic,
+        lambda message: on_frame(name, message),
+        OBSERVATIONS,
+        event_callbacks=SubscriptionEventCallbacks(incompatible_qos=incompatible),
+        qos_overriding_options=overridable(),
+    )
 
 
 def wait_for_readers(node, publishers, count, ending):
-    """Wait until each publisher of a node has so many readers, and these know it; ending: an Event that ends the
-    waiting.
+    """Wait until each publisher of a node has so many readers, and these know it; ending: an Event
+    that ends the waiting.
 
-    A publisher hears of a reader and the reader of it independently of each other. What is published between these
-    moments is lost, reliable or not, and nobody tells when the second one has come.
+    A publisher hears of a reader and the reader of it independently of each other. What is
+    published between these moments is lost, reliable or not, and nobody tells when the second one
+    has come.
     """
     while missing := [p.topic_name for p in publishers if p.get_subscription_count() < count]:
-        node.get_logger().info(f'waiting for {count} readers of {", ".join(missing)}', throttle_duration_sec=5.0)
+        node.get_logger().info(
+            f'waiting for {count} readers of {", ".join(missing)}', throttle_duration_sec=5.0
+        )
         if ending.wait(0.05):
             return
     if count:
@@ -382,8 +443,9 @@ def wait_for_readers(node, publishers, count, ending):
 
 
 def wait_until_taken(publishers, ending, seconds=10.0):
-    """Wait until all that was published has arrived; what is not acknowledged is lost when the process goes. Returns
-    whether it has, ending: an Event that ends the waiting."""
+    """Wait until all that was published has arrived; what is not acknowledged is lost when the
+    process goes. Returns whether it has, ending: an Event that ends the waiting.
+    """
     end = time.monotonic() + seconds
     for publisher in publishers:
         while not publisher.wait_for_all_acked(Duration(seconds=0.1)):
@@ -396,5 +458,6 @@ class StartError(RuntimeError):
     """Why a node cannot start, in one sentence."""
 
 
-# What names, parameters and overridden qualities of service that are none end in; RCLError is a RuntimeError.
+# What names, parameters and overridden qualities of service that are none end in; RCLError is a
+# RuntimeError.
 TOLD = (ParameterException, NameValidationException, RuntimeError, DataError)

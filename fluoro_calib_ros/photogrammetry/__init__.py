@@ -1,1 +1,3 @@
-"""Photogrammetry: collinearity, resection, robust bundle adjustment and precision. Arrays in, arrays out."""
+"""Photogrammetry: collinearity, resection, robust bundle adjustment and precision. Arrays in,
+arrays out.
+"""

@@ -1,9 +1,9 @@
 """The collinearity condition of an X-ray image and its derivatives.
 
-X = R (P - T);  u = xp + c X/Z,  v = yp + c Y/Z: Eq. 1 of Chow et al. turned by 180 degrees about x, so
-that z points from the source to the image. P is the object point [mm], T the source [mm], R the rotation
-phantom -> sensor, (xp, yp, c) the interior orientation [px]. A rotation is varied on the left,
-R -> exp([w]x) R, so that dX/dw = -[X]x.
+X = R (P - T);  u = xp + c X/Z,  v = yp + c Y/Z: Eq. 1 of Chow et al. turned by 180 degrees about
+x, so that z points from the source to the image. P is the object point [mm], T the source [mm], R
+the rotation phantom -> sensor, (xp, yp, c) the interior orientation [px]. A rotation is varied on
+the left, R -> exp([w]x) R, so that dX/dw = -[X]x.
 """
 
 import numpy as np
@@ -19,8 +19,8 @@ def to_sensor(rotation, position, points):
 def project(rotation, position, points, interior):
     """Image points (n, 2) [px] of object points (n, 3) [mm], one orientation for each.
 
-    rotation (n, 3, 3) phantom -> sensor, position (n, 3) [mm], interior (n, 3) or (3,) xp, yp, c [px].
-    A point that is not in front of the source gives NaN.
+    rotation (n, 3, 3) phantom -> sensor, position (n, 3) [mm], interior (n, 3) or (3,) xp, yp, c
+    [px]. A point that is not in front of the source gives NaN.
     """
     x = to_sensor(rotation, position, points)
     z = np.where(x[:, 2] > 0, x[:, 2], np.nan)

@@ -1,7 +1,7 @@
 """Rotations: unit quaternions (w, x, y, z), rotation matrices and rotation vectors.
 
-Source of the formulas: Diebel, "Representing Attitude: Euler Angles, Unit Quaternions, and Rotation
-Vectors", Stanford 2006. Quaternion and matrix of one rotation turn a vector the same way:
+Source of the formulas: Diebel, "Representing Attitude: Euler Angles, Unit Quaternions, and
+Rotation Vectors", Stanford 2006. Quaternion and matrix of one rotation turn a vector the same way:
 R(q) p = q p q*.
 """
 
@@ -9,12 +9,16 @@ import numpy as np
 
 
 def matrix_from_quaternion(q):
-    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in w, x, y, z; they are normalised first."""
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) in w, x, y, z; they are normalised
+    first.
+    """
     q = np.asarray(q, dtype=float)
     w, x, y, z = np.moveaxis(q / np.linalg.norm(q, axis=-1, keepdims=True), -1, 0)
-    rows = [[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]]
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
 
 
@@ -24,13 +28,24 @@ def quaternion_from_matrix(rotation):
     Of the four equivalent formulas the one with the largest divisor is used (Shepperd's method).
     """
     r = np.asarray(rotation, dtype=float)
-    xx, yy, zz = r[..., 0, 0], r[..., 1, 1], r[..., 2, 2]
-    a, b, c = r[..., 2, 1] - r[..., 1, 2], r[..., 0, 2] - r[..., 2, 0], r[..., 1, 0] - r[..., 0, 1]
-    d, e, f = r[..., 0, 1] + r[..., 1, 0], r[..., 0, 2] + r[..., 2, 0], r[..., 1, 2] + r[..., 2, 1]
-    candidates = np.stack([np.stack([1 + xx + yy + zz, a, b, c], axis=-1),
-                           np.stack([a, 1 + xx - yy - zz, d, e], axis=-1),
-                           np.stack([b, d, 1 - xx + yy - zz, f], axis=-1),
-                           np.stack([c, e, f, 1 - xx - yy + zz], axis=-1)], axis=-2)
+    xx = r[..., 0, 0]
+    yy = r[..., 1, 1]
+    zz = r[..., 2, 2]
+    a = r[..., 2, 1] - r[..., 1, 2]
+    b = r[..., 0, 2] - r[..., 2, 0]
+    c = r[..., 1, 0] - r[..., 0, 1]
+    d = r[..., 0, 1] + r[..., 1, 0]
+    e = r[..., 0, 2] + r[..., 2, 0]
+    f = r[..., 1, 2] + r[..., 2, 1]
+    candidates = np.stack(
+        [
+            np.stack([1 + xx + yy + zz, a, b, c], axis=-1),
+            np.stack([a, 1 + xx - yy - zz, d, e], axis=-1),
+            np.stack([b, d, 1 - xx + yy - zz, f], axis=-1),
+            np.stack([c, e, f, 1 - xx - yy + zz], axis=-1),
+        ],
+        axis=-2,
+    )
     largest = np.argmax(np.stack([candidates[..., i, i] for i in range(4)], axis=-1), axis=-1)
     q = np.take_along_axis(candidates, largest[..., None, None], axis=-2)[..., 0, :]
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
@@ -41,8 +56,12 @@ def cross_matrix(v):
     """Matrices (..., 3, 3) with cross_matrix(v) w = v x w, of vectors (..., 3)."""
     v = np.asarray(v, dtype=float)
     out = np.zeros(v.shape + (3,))
-    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
-    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    out[..., 0, 1] = -v[..., 2]
+    out[..., 0, 2] = v[..., 1]
+    out[..., 1, 2] = -v[..., 0]
+    out[..., 1, 0] = v[..., 2]
+    out[..., 2, 0] = -v[..., 1]
+    out[..., 2, 1] = v[..., 0]
     return out
 
 
@@ -60,7 +79,10 @@ def matrix_from_vector(w):
 def rotation_angle(rotation):
     """Angles (...) [rad] in [0, pi] of rotation matrices (..., 3, 3)."""
     r = np.asarray(rotation, dtype=float)
-    sine = 0.5 * np.sqrt((r[..., 2, 1] - r[..., 1, 2]) ** 2 + (r[..., 0, 2] - r[..., 2, 0]) ** 2
-                         + (r[..., 1, 0] - r[..., 0, 1]) ** 2)
+    sine = 0.5 * np.sqrt(
+        (r[..., 2, 1] - r[..., 1, 2]) ** 2
+        + (r[..., 0, 2] - r[..., 2, 0]) ** 2
+        + (r[..., 1, 0] - r[..., 0, 1]) ** 2
+    )
     cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1) - 1)
     return np.arctan2(sine, cosine)

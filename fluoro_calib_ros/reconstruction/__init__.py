@@ -1,1 +1,3 @@
-"""Points in space from two or more corrected views: orientation of the rig, epipolar check, intersection of rays."""
+"""Points in space from two or more corrected views: orientation of the rig, epipolar check,
+intersection of rays.
+"""

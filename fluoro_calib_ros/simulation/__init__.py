@@ -1,1 +1,3 @@
-"""A virtual dual fluoroscope: phantom, rig, distortion, exposures and moving markers, with their truth."""
+"""A virtual dual fluoroscope: phantom, rig, distortion, exposures and moving markers, with their
+truth.
+"""

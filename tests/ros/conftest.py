@@ -1,4 +1,6 @@
-"""Fixtures of the tests with real nodes: a ROS domain for the session, graphs, and a calibration to start from."""
+"""Fixtures of the tests with real nodes: a ROS domain for the session, graphs, and a calibration
+to start from.
+"""
 
 import shutil
 import subprocess
@@ -17,8 +19,9 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope='session')
 def ros(tmp_path_factory):
-    """rclpy in a ROS domain of this session's own; nodes inherit it by the environment."""
+    """Rclpy in a ROS domain of this session's own; nodes inherit it by the environment."""
     import rclpy
+
     domain, lock = free_domain()
     with pytest.MonkeyPatch.context() as patch, lock:
         patch.setenv('ROS_DOMAIN_ID', str(domain))
@@ -55,7 +58,9 @@ def pytest_runtest_makereport(item):
     if report.failed:
         for node in item.listchain():
             for graph in getattr(node, 'graphs', ()):
-                report.sections.extend(graph.last_words(end=node is item))   # others still need theirs
+                report.sections.extend(
+                    graph.last_words(end=node is item)
+                )  # others still need theirs
 
 
 @pytest.fixture(scope='session')
@@ -74,9 +79,22 @@ def tracking():
 def by_command(tmp_path_factory):
     """Two folders into which the command line has calibrated bags/calibration, one as the other."""
     folders = [tmp_path_factory.mktemp('by_command') for _ in range(2)]
-    commands = [subprocess.Popen([*entry_point('cli'), 'calibrate', BAGS / 'calibration', '--phantom',
-                                  BAGS / 'phantom.csv', '--out', folder], cwd=ROOT, stdout=subprocess.DEVNULL)
-                for folder in folders]
+    commands = [
+        subprocess.Popen(
+            [
+                *entry_point('cli'),
+                'calibrate',
+                BAGS / 'calibration',
+                '--phantom',
+                BAGS / 'phantom.csv',
+                '--out',
+                folder,
+            ],
+            cwd=ROOT,
+            stdout=subprocess.DEVNULL,
+        )
+        for folder in folders
+    ]
     assert [command.wait(240) for command in commands] == [0, 0]
     return folders
 

@@ -1,4 +1,6 @@
-"""Real nodes as processes, and a client that listens, publishes, calls and waits for conditions with a deadline."""
+"""Real nodes as processes, and a client that listens, publishes, calls and waits for conditions
+with a deadline.
+"""
 
 import fcntl
 import itertools
@@ -15,9 +17,23 @@ import numpy as np
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.action import SelfCalibrate
-from fluoro_calib_msgs.msg import (CalibrationStatus, CorrectedObservations, DriftStatus, FluoroscopeCalibration,
-                                   ReconstructedPoints, RigOrientation, TargetObservations)
-from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Orient, Reset, SaveCalibration
+from fluoro_calib_msgs.msg import (
+    CalibrationStatus,
+    CorrectedObservations,
+    DriftStatus,
+    FluoroscopeCalibration,
+    ReconstructedPoints,
+    RigOrientation,
+    TargetObservations,
+)
+from fluoro_calib_msgs.srv import (
+    Calibrate,
+    Capture,
+    LoadCalibration,
+    Orient,
+    Reset,
+    SaveCalibration,
+)
 from rcl_interfaces.srv import GetParameterTypes
 from rclpy.action import ActionClient
 from rclpy.executors import SingleThreadedExecutor
@@ -27,34 +43,54 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.nodes.conversion import message_from_frame
 from fluoro_calib_ros.nodes.qos import LATCHED, OBSERVATIONS
-from fluoro_calib_ros.photogrammetry.observations import Frame
 
 ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'
-DEADLINE = 60.0   # seconds; nothing takes a tenth of it on an idle machine
+DEADLINE = 60.0  # seconds; nothing takes a tenth of it on an idle machine
 NAMES = ('a', 'b')
-SUCCEEDED, CANCELED, ABORTED = GoalStatus.STATUS_SUCCEEDED, GoalStatus.STATUS_CANCELED, GoalStatus.STATUS_ABORTED
-TOPICS = {'target_observations': (TargetObservations, OBSERVATIONS),
-          'corrected_observations': (CorrectedObservations, OBSERVATIONS),
-          'calibration': (FluoroscopeCalibration, LATCHED), 'camera_info': (CameraInfo, LATCHED),
-          'calibration_status': (CalibrationStatus, 10), 'rig_orientation': (RigOrientation, LATCHED),
-          'points_with_covariance': (ReconstructedPoints, OBSERVATIONS), 'points': (PointCloud2, OBSERVATIONS),
-          'markers': (MarkerArray, OBSERVATIONS), 'drift': (DriftStatus, 10), 'tf_static': (TFMessage, LATCHED)}
+SUCCEEDED = GoalStatus.STATUS_SUCCEEDED
+CANCELED = GoalStatus.STATUS_CANCELED
+ABORTED = GoalStatus.STATUS_ABORTED
+TOPICS = {
+    'target_observations': (TargetObservations, OBSERVATIONS),
+    'corrected_observations': (CorrectedObservations, OBSERVATIONS),
+    'calibration': (FluoroscopeCalibration, LATCHED),
+    'camera_info': (CameraInfo, LATCHED),
+    'calibration_status': (CalibrationStatus, 10),
+    'rig_orientation': (RigOrientation, LATCHED),
+    'points_with_covariance': (ReconstructedPoints, OBSERVATIONS),
+    'points': (PointCloud2, OBSERVATIONS),
+    'markers': (MarkerArray, OBSERVATIONS),
+    'drift': (DriftStatus, 10),
+    'tf_static': (TFMessage, LATCHED),
+}
 
-SERVICES = {'calibrate': Calibrate, 'capture': Capture, 'collect_anew': Reset, 'load_calibration': LoadCalibration,
-            'orient': Orient, 'reset': Reset, 'save_calibration': SaveCalibration}
+SERVICES = {
+    'calibrate': Calibrate,
+    'capture': Capture,
+    'collect_anew': Reset,
+    'load_calibration': LoadCalibration,
+    'orient': Orient,
+    'reset': Reset,
+    'save_calibration': SaveCalibration,
+}
 
 
 def free_domain():
-    """A ROS domain that nobody on this machine uses, and the open file that keeps it for this session."""
+    """A ROS domain that nobody on this machine uses, and the open file that keeps it for this
+    session.
+    """
     for domain in (1 + (os.getpid() + i) % 100 for i in range(100)):
         lock = open(Path(tempfile.gettempdir()) / f'fluoro_calib_test_domain_{domain}.lock', 'a')
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)   # other sessions of these tests
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # other sessions of these tests
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
-                port.bind(('', 7400 + 250 * domain + 10))   # any other first participant of the domain
+                port.bind(
+                    ('', 7400 + 250 * domain + 10)
+                )  # any other first participant of the domain
             return domain, lock
         except OSError:
             lock.close()
@@ -73,8 +109,14 @@ class Process:
     def __init__(self, command, path):
         self.path = path
         with open(path, 'wb') as out:
-            self._process = subprocess.Popen(command, cwd=ROOT, stdout=out, stderr=out, start_new_session=True,
-                                             env={**os.environ, 'PYTHONFAULTHANDLER': '1'})
+            self._process = subprocess.Popen(
+                command,
+                cwd=ROOT,
+                stdout=out,
+                stderr=out,
+                start_new_session=True,
+                env={**os.environ, 'PYTHONFAULTHANDLER': '1'},
+            )
 
     @property
     def log(self):
@@ -115,16 +157,22 @@ class Graph:
 
     def __init__(self, directory):
         self.namespace = f'/rig{next(self._numbers)}'
-        self.directory, self.processes = directory, []
+        self.directory = directory
+        self.processes = []
         self.client = Client(self.namespace)
 
     def start(self, node, parameters=None, remaps=None, wait=True):
-        """Start a node with {parameter: value} and {from: to}; returns its Process once the client is connected."""
+        """Start a node with {parameter: value} and {from: to}; returns its Process once the client
+        is connected.
+        """
         number = len(self.processes)
         arguments = ['--ros-args']
         for key, value in (parameters or {}).items():
             arguments += ['-p', f'{key}:={value}']
-        for key, value in {'__ns': self.namespace, **(remaps or {})}.items():   # of two rules the first counts
+        for key, value in {
+            '__ns': self.namespace,
+            **(remaps or {}),
+        }.items():  # of two rules the first counts
             arguments += ['-r', f'{key}:={value}']
         process = Process(entry_point(node) + arguments, self.directory / f'{number}_{node}.log')
         self.processes.append(process)
@@ -133,47 +181,67 @@ class Graph:
         return process
 
     def calibration_node(self, directory, wait=True, **parameters):
-        return self.start('calibration_node', {'phantom': BAGS / 'phantom.csv', 'calibration_directory': directory,
-                                               **parameters}, wait=wait)
+        return self.start(
+            'calibration_node',
+            {'phantom': BAGS / 'phantom.csv', 'calibration_directory': directory, **parameters},
+            wait=wait,
+        )
 
     def both_nodes(self, directory, **parameters):
         """Start calibration node and correction node together; returns their processes by name."""
-        nodes = {'calibration_node': self.calibration_node(directory, wait=False, **parameters),
-                 'correction_node': self.start('correction_node', wait=False)}
+        nodes = {
+            'calibration_node': self.calibration_node(directory, wait=False, **parameters),
+            'correction_node': self.start('correction_node', wait=False),
+        }
         for name, process in nodes.items():
             self.client.connect(name, process)
         return nodes
 
     def whole_chain(self, directory, reconstruction=None, **parameters):
-        """Start the three nodes with the calibrations and the orientation of a folder, and wait until points can come
-        out; returns the processes by name."""
-        nodes = {**self.both_nodes(directory, **parameters),
-                 'reconstruction_node': self.start('reconstruction_node', reconstruction)}
+        """Start the three nodes with the calibrations and the orientation of a folder, and wait
+        until points can come out; returns the processes by name.
+        """
+        nodes = {
+            **self.both_nodes(directory, **parameters),
+            'reconstruction_node': self.start('reconstruction_node', reconstruction),
+        }
         for name in NAMES:
-            self.client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'), name)
-        self.client.wait_for_diagnostics('reconstruction_node', lambda s: value_of(s, 'orientation'), 'reconstruction')
+            self.client.wait_for_diagnostics(
+                'correction_node', lambda s: value_of(s, 'calibration'), name
+            )
+        self.client.wait_for_diagnostics(
+            'reconstruction_node', lambda s: value_of(s, 'orientation'), 'reconstruction'
+        )
         self.wait_for_readers(1)
         return nodes
 
     def wait_for_readers(self, count):
-        """Wait until the correction node knows so many readers of every output: what it publishes now reaches them."""
+        """Wait until the correction node knows so many readers of every output: what it publishes
+        now reaches them.
+        """
         for name in NAMES:
-            self.client.wait_for_diagnostics('correction_node',
-                                             lambda s: int(value_of(s, 'readers') or 0) >= count, name)
+            self.client.wait_for_diagnostics(
+                'correction_node', lambda s: int(value_of(s, 'readers') or 0) >= count, name
+            )
 
     def play(self, bag, readers, rate=10.0):
         """Play a bag to the end."""
-        player = self.start('player_node', {'bag': bag, 'rate': rate, 'wait_for_readers': readers}, wait=False)
+        player = self.start(
+            'player_node', {'bag': bag, 'rate': rate, 'wait_for_readers': readers}, wait=False
+        )
         self.client.wait_until(lambda: not player.running, what='the end of the player')
         assert player.wait() == 0, player.log
 
     def last_words(self, end):
-        """(title, text): what the client heard last of every node, and what the nodes printed; where they are to end,
-        with the places where their threads are."""
+        """(title, text): what the client heard last of every node, and what the nodes printed;
+        where they are to end, with the places where their threads are.
+        """
         for process in self.processes if end else ():
             process.abort()
-        heard = [(key, f'{status.message}\n' + '\n'.join(f'{v.key}: {v.value}' for v in status.values))
-                 for key, status in self.client.statuses.items()]
+        heard = [
+            (key, f'{status.message}\n' + '\n'.join(f'{v.key}: {v.value}' for v in status.values))
+            for key, status in self.client.statuses.items()
+        ]
         return heard + [(f'log of {p.path.name}', p.log) for p in self.processes]
 
     def close(self):
@@ -186,11 +254,15 @@ class Graph:
 
 
 class Client(Node):
-    """A user of the graph. What comes on a topic is in messages[topic], from the time at which it is listened to."""
+    """A user of the graph. What comes on a topic is in messages[topic], from the time at which it
+    is listened to.
+    """
 
     def __init__(self, namespace):
         super().__init__('client', namespace=namespace)
-        self.messages, self.statuses, self.feedback = {}, {}, []
+        self.messages = {}
+        self.statuses = {}
+        self.feedback = []
         self._spinner = SingleThreadedExecutor()
         self._spinner.add_node(self)
         self._callers = {}
@@ -198,8 +270,10 @@ class Client(Node):
             self.expect(kind, service)
         # A queue for a machine that is too busy for the rate.
         deep = QoSProfile(depth=1000, reliability=ReliabilityPolicy.RELIABLE)
-        self._outputs = {n: self.create_publisher(TargetObservations, f'{n}/target_observations', deep)
-                         for n in NAMES}
+        self._outputs = {
+            n: self.create_publisher(TargetObservations, f'{n}/target_observations', deep)
+            for n in NAMES
+        }
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
         for name in NAMES:
             self.listen(f'{name}/calibration_status')
@@ -220,8 +294,10 @@ class Client(Node):
             self._spinner.spin_once(timeout_sec=0.1)
 
     def publish_in_step(self, messages, came, ahead=OBSERVATIONS.depth // 4):
-        """Publish (fluoroscope, message) one after the other, never more than so many ahead of came(), the number that
-        has come back or never will: what is lost is then not lost in a queue."""
+        """Publish (fluoroscope, message) one after the other, never more than so many ahead of
+        came(), the number that has come back or never will: what is lost is then not lost in a
+        queue.
+        """
         for number, (name, message) in enumerate(messages):
             self.wait_until(lambda: number - came() < ahead, what='the nodes to keep up')
             self.publish_message(name, message)
@@ -233,23 +309,32 @@ class Client(Node):
 
     def connect(self, node, process):
         """Wait until everything of a node that has just been started is connected with the client."""
+
         def connected():
             assert process.running, f'{node} ended: {process.log}'
             if node == 'calibration_node':
-                return (self.subscriptions_matched('calibration_node') and self._action.server_is_ready()
-                        and all(self.count_publishers(f'{n}/calibration_status') for n in NAMES))
+                return (
+                    self.subscriptions_matched('calibration_node')
+                    and self._action.server_is_ready()
+                    and all(self.count_publishers(f'{n}/calibration_status') for n in NAMES)
+                )
             if node == 'correction_node':
                 return self.subscriptions_matched('correction_node') and all(
-                    self.count_publishers(f'{n}/corrected_observations') for n in NAMES)
+                    self.count_publishers(f'{n}/corrected_observations') for n in NAMES
+                )
             return any(name == node for name, _ in self.get_node_names_and_namespaces())
+
         self.wait_until(connected, what=f'{node} to come up')
         self.wait_until_known_to(node)
 
     def wait_until_known_to(self, node):
-        """Wait until a node knows all that the client has made so far: what it publishes before may be lost, and the
-        answers to what it asks. DDS tells of endpoints in the order in which they are made, so that a node which
-        answers a question of the newest knows the others too."""
-        newest, answers, asked = self.create_client(GetParameterTypes, f'{node}/get_parameter_types'), [], 0.0
+        """Wait until a node knows all that the client has made so far: what it publishes before
+        may be lost, and the answers to what it asks. DDS tells of endpoints in the order in which
+        they are made, so that a node which answers a question of the newest knows the others too.
+        """
+        newest = self.create_client(GetParameterTypes, f'{node}/get_parameter_types')
+        answers = []
+        asked = 0.0
 
         def answered():
             nonlocal asked
@@ -257,14 +342,21 @@ class Client(Node):
                 answers.append(newest.call_async(GetParameterTypes.Request()))
                 asked = time.monotonic()
             return any(answer.done() for answer in answers)
+
         self.wait_until(answered, what=f'{node} to know the client')
         self.destroy_client(newest)
 
     def subscriptions_matched(self, node):
-        """Whether a node listens to the observations, and what is published now reaches all who listen."""
+        """Whether a node listens to the observations, and what is published now reaches all who
+        listen.
+        """
         for name, output in self._outputs.items():
-            readers = self.get_subscriptions_info_by_topic(f'{self.get_namespace()}/{name}/target_observations')
-            if node not in [r.node_name for r in readers] or output.get_subscription_count() < len(readers):
+            readers = self.get_subscriptions_info_by_topic(
+                f'{self.get_namespace()}/{name}/target_observations'
+            )
+            if node not in [r.node_name for r in readers] or output.get_subscription_count() < len(
+                readers
+            ):
                 return False
         return True
 
@@ -284,7 +376,11 @@ class Client(Node):
 
     def status(self, name='a'):
         """Newest CalibrationStatus of a fluoroscope, None before the first."""
-        return self.messages[f'{name}/calibration_status'][-1] if self.messages[f'{name}/calibration_status'] else None
+        return (
+            self.messages[f'{name}/calibration_status'][-1]
+            if self.messages[f'{name}/calibration_status']
+            else None
+        )
 
     def wait_for_status(self, condition, name='a', what='a status'):
         """Newest CalibrationStatus once it fulfils condition(status)."""
@@ -294,7 +390,10 @@ class Client(Node):
     def wait_for_diagnostics(self, node, condition, name='a', what='a diagnostic'):
         """Newest DiagnosticStatus of a node about a fluoroscope once it fulfils condition(status)."""
         key = f'{node}: {name}'
-        self.wait_until(lambda: key in self.statuses and condition(self.statuses[key]), what=f'{what} of {node}')
+        self.wait_until(
+            lambda: key in self.statuses and condition(self.statuses[key]),
+            what=f'{what} of {node}',
+        )
         return self.statuses[key]
 
     def publish(self, frame):
@@ -305,10 +404,11 @@ class Client(Node):
         self._outputs[name].publish(message)
 
     def stream(self, pairs, rate, answered=None):
-        """Publish pairs of frames at a rate while the client spins, until end_stream(); .published counts them.
+        """Publish pairs of frames at a rate while the client spins, until end_stream(); .published
+        counts them.
 
-        answered() pairs have come back: never more than half a queue ahead of them, so that nothing can be lost
-        by design where the machine is too busy for the rate.
+        answered() pairs have come back: never more than half a queue ahead of them, so that
+        nothing can be lost by design where the machine is too busy for the rate.
         """
         self.published = 0
 
@@ -339,14 +439,20 @@ class Client(Node):
 
     def call(self, kind, service, **fields):
         """Answer of a service."""
-        return self.result_of(self.call_async(kind, service, **fields), what=f'the answer of {service}')
+        return self.result_of(
+            self.call_async(kind, service, **fields), what=f'the answer of {service}'
+        )
 
     def goal(self, **fields):
         """Handle of a goal that has been accepted; its feedback comes into .feedback."""
         self.feedback = []
         feedback = self.feedback
-        handle = self.result_of(self._action.send_goal_async(
-            SelfCalibrate.Goal(**fields), feedback_callback=lambda m: feedback.append(m.feedback)))
+        handle = self.result_of(
+            self._action.send_goal_async(
+                SelfCalibrate.Goal(**fields),
+                feedback_callback=lambda m: feedback.append(m.feedback),
+            )
+        )
         assert handle.accepted
         return handle
 
@@ -360,11 +466,21 @@ def value_of(status, key):
     return next((v.value for v in status.values if v.key == key), '')
 
 
-def standing(frame, count, first=1, rate=60.0, shift=0.0, noise=0.02, start_ns=10 ** 18):
-    """Frames of a phantom that stands as in frame, in a stream of rate; shift moves it by that many px a frame."""
+def standing(frame, count, first=1, rate=60.0, shift=0.0, noise=0.02, start_ns=10**18):
+    """Frames of a phantom that stands as in frame, in a stream of rate; shift moves it by that
+    many px a frame.
+    """
     rng = np.random.default_rng(0)
     for i in range(count):
         uv = frame.uv + rng.normal(0, noise, frame.uv.shape) + [shift * i, 0]
         keep = (uv < np.array(frame.image_size) - 1).all(axis=1)
-        yield Frame(frame.fluoroscope, first + i, frame.target_id[keep], uv[keep], frame.image_size, None,
-                    start_ns + round(i / rate * 1e9), frame.frame_id)
+        yield Frame(
+            frame.fluoroscope,
+            first + i,
+            frame.target_id[keep],
+            uv[keep],
+            frame.image_size,
+            None,
+            start_ns + round(i / rate * 1e9),
+            frame.frame_id,
+        )

@@ -1,4 +1,6 @@
-"""Frames with wrong content: told in one sentence, counted, and without harm to the frames after them."""
+"""Frames with wrong content: told in one sentence, counted, and without harm to the frames after
+them.
+"""
 
 import re
 from array import array
@@ -10,21 +12,26 @@ import pytest
 from fluoro_calib_ros.files.calibration import load_calibrations
 from fluoro_calib_ros.nodes.conversion import doubles, message_from_frame
 
-BOTH, COLLECTS = ('calibration_node', 'correction_node'), ('calibration_node',)
+BOTH = ('calibration_node', 'correction_node')
+COLLECTS = ('calibration_node',)
 
 
 def put(field, index, value):
     """A change of one element of an array of a message."""
+
     def change(message):
         getattr(message, field)[index] = value
+
     return change
 
 
 def put_all(**fields):
     """A change of whole fields of a message."""
+
     def change(message):
         for name, value in fields.items():
             setattr(message, name, value(message) if callable(value) else value)
+
     return change
 
 
@@ -36,9 +43,13 @@ def sigma_of(value):
     return put_all(sigma=lambda m: doubles([0.2] * (len(m.u) - 1) + [value]))
 
 
-BAD = {   # change of the message, nodes that refuse it, what they say
+BAD = {  # change of the message, nodes that refuse it, what they say
     'lengths': (put_all(u=lambda m: m.u[:-1]), BOTH, 'target ids, but'),
-    'sigma lengths': (put_all(sigma=doubles([0.2, 0.3])), BOTH, 'target ids, but 2 values of sigma'),
+    'sigma lengths': (
+        put_all(sigma=doubles([0.2, 0.3])),
+        BOTH,
+        'target ids, but 2 values of sigma',
+    ),
     'duplicate': (lambda m: put('target_id', 1, m.target_id[0])(m), BOTH, 'is there 2 times'),
     'image size': (put_all(image_width=512), BOTH, 'the image is 512 x 1024 px'),
     'no image size': (put_all(image_width=0, image_height=0), BOTH, '0 x 0 px'),
@@ -48,18 +59,30 @@ BAD = {   # change of the message, nodes that refuse it, what they say
     'NaN': (put('u', 3, np.nan), COLLECTS, 'is not a number'),
     'infinite': (put('v', 3, -np.inf), COLLECTS, 'is not a number'),
     'off the image': (put('v', 3, 1024.0), COLLECTS, 'is off the image of 1024 x 1024 px'),
-    'unknown target': (put('target_id', -1, 99999), COLLECTS, 'target 99999 is not on the phantom'),
-    'empty': (empty, COLLECTS, 'the frame is empty, it has no targets')}
-ONE_POINT = {'NaN', 'infinite', 'off the image'}   # the correction marks the point, and corrects the others
+    'unknown target': (
+        put('target_id', -1, 99999),
+        COLLECTS,
+        'target 99999 is not on the phantom',
+    ),
+    'empty': (empty, COLLECTS, 'the frame is empty, it has no targets'),
+}
+ONE_POINT = {
+    'NaN',
+    'infinite',
+    'off the image',
+}  # the correction marks the point, and corrects the others
 
 
 @pytest.fixture(scope='module')
 def rig(module_graph, by_command, exposures):
-    """Both nodes with a calibration, after all bad frames, each with a good one before and behind it.
+    """Both nodes with a calibration, after all bad frames, each with a good one before and behind
+    it.
 
     graph.bad {fault: frame number}, graph.corrected {frame number: message}.
     """
-    graph, client, frame = module_graph, module_graph.client, exposures['a'][0]
+    graph = module_graph
+    client = module_graph.client
+    frame = exposures['a'][0]
     graph.nodes = graph.both_nodes(by_command[0], collect='request')
     corrected = client.listen('a/corrected_observations')
     id = load_calibrations(by_command[0])['a'].calibration_id
@@ -73,7 +96,10 @@ def rig(module_graph, by_command, exposures):
         client.publish_message('a', message)
     graph.bad = {fault: 2 * i + 1 for i, fault in enumerate(BAD)}
     graph.published = len(changes)
-    client.wait_until(lambda: corrected and corrected[-1].frame_number == graph.published - 1, what='the last frame')
+    client.wait_until(
+        lambda: corrected and corrected[-1].frame_number == graph.published - 1,
+        what='the last frame',
+    )
     client.wait_for_status(lambda s: s.frames_received == graph.published)
     graph.corrected = {m.frame_number: m for m in corrected}
     return graph
@@ -81,7 +107,8 @@ def rig(module_graph, by_command, exposures):
 
 @pytest.mark.parametrize('fault', BAD)
 def test_bad_frame(rig, fault):
-    number, (_, refusing, sentence) = rig.bad[fault], BAD[fault]
+    number = rig.bad[fault]
+    (_, refusing, sentence) = BAD[fault]
     for node in refusing:
         lines = [line for line in rig.nodes[node].log.splitlines() if says(line, number)]
         assert len(lines) == 1 and sentence in lines[0]
@@ -93,25 +120,33 @@ def test_bad_frame(rig, fault):
     assert len(got.u) == len(got.v) == len(got.sigma) == len(got.target_id) == len(got.status)
     invalid = np.array(got.status) == got.INVALID
     assert invalid.sum() == (fault in ONE_POINT)
-    assert np.array_equal(np.isnan(got.u), invalid) and np.array_equal(np.isnan(got.sigma), invalid)
+    assert np.array_equal(np.isnan(got.u), invalid) and np.array_equal(
+        np.isnan(got.sigma), invalid
+    )
 
 
 def test_bad_frames_are_counted_and_reported(rig):
     client = rig.client
     for node in rig.nodes:
         refused = [number for fault, number in rig.bad.items() if node in BAD[fault][1]]
-        status = client.wait_for_diagnostics(node, lambda s: f'{len(refused)} frames refused' in s.message)
+        status = client.wait_for_diagnostics(
+            node, lambda s: f'{len(refused)} frames refused' in s.message
+        )
         assert status.level == b'\1'
     assert client.status().frames_rejected == len(BAD)
     values = {v.key: v.value for v in client.statuses['calibration_node: a'].values}
-    assert values['frames rejected'] == str(len(BAD)) and says(values['last fault'], rig.bad['empty'])
+    assert values['frames rejected'] == str(len(BAD)) and says(
+        values['last fault'], rig.bad['empty']
+    )
     values = {v.key: v.value for v in client.statuses['correction_node: a'].values}
-    assert values['invalid points'] == str(len(ONE_POINT)) and values['frames received'] == str(rig.published)
+    assert values['invalid points'] == str(len(ONE_POINT)) and values['frames received'] == str(
+        rig.published
+    )
 
 
 def says(sentence, number):
     """Whether a sentence names the fluoroscope and the frame."""
-    return 'fluoroscope a' in sentence and re.search(fr'frame {number}\b', sentence) is not None
+    return 'fluoroscope a' in sentence and re.search(rf'frame {number}\b', sentence) is not None
 
 
 def test_nodes_have_survived_without_traceback(rig):

@@ -1,4 +1,6 @@
-"""Collecting exposures: by capture, by a phantom that stands still, and pairs by number or by stamp."""
+"""Collecting exposures: by capture, by a phantom that stands still, and pairs by number or by
+stamp.
+"""
 
 from dataclasses import replace
 
@@ -6,7 +8,7 @@ from fluoro_calib_msgs.srv import Capture
 from ros_graph import NAMES, standing
 
 
-def pairs_of(exposures, i=0, count=10 ** 6, **options):
+def pairs_of(exposures, i=0, count=10**6, **options):
     """A stream of the phantom as in exposure i, moved by shift px a frame."""
     return zip(*(standing(exposures[n][i], count, **options) for n in NAMES))
 
@@ -16,17 +18,26 @@ def test_capture_takes_one_exposure_a_call(graph, exposures, tmp_path):
     graph.calibration_node(tmp_path / 'none', collect='request', capture_timeout=0.5)
     answer = client.call(Capture, 'capture')
     assert not answer.success and answer.exposures == 0
-    assert answer.message == 'no frame of all fluoroscopes (a, b) came within 0.5 s; frames received: a 0, b 0'
+    assert (
+        answer.message
+        == 'no frame of all fluoroscopes (a, b) came within 0.5 s; frames received: a 0, b 0'
+    )
     client.stream(pairs_of(exposures), 60.0)
     for number in (1, 2, 3):
         answer = client.call(Capture, 'capture', timeout_sec=30.0)
         assert answer.success and answer.exposures == number, answer.message
         assert f'captured, {number} exposures now' in answer.message
-    several = [client.call_async(Capture, 'capture', timeout_sec=30.0) for _ in range(8)]   # a service holds ten
+    several = [
+        client.call_async(Capture, 'capture', timeout_sec=30.0) for _ in range(8)
+    ]  # a service holds ten
     client.wait_until(lambda: all(one.done() for one in several), what='the captures')
-    assert sorted(one.result().exposures for one in several) == list(range(4, 12)), 'a frame for each'
+    assert sorted(one.result().exposures for one in several) == list(range(4, 12)), (
+        'a frame for each'
+    )
     published = client.published
-    client.wait_until(lambda: client.published > published + 30, what='frames that nobody captures')
+    client.wait_until(
+        lambda: client.published > published + 30, what='frames that nobody captures'
+    )
     client.end_stream()
     client.wait_for_status(lambda s: s.frames_received == client.published)
     assert client.status().exposures == 11
@@ -35,13 +46,18 @@ def test_capture_takes_one_exposure_a_call(graph, exposures, tmp_path):
 def test_capture_needs_all_fluoroscopes_and_a_new_frame(graph, exposures, tmp_path):
     client = graph.client
     graph.calibration_node(tmp_path / 'none', collect='request', capture_timeout=1.0)
-    client.stream(((frame,) for frame in standing(exposures['a'][0], 10 ** 6)), 60.0)
+    client.stream(((frame,) for frame in standing(exposures['a'][0], 10**6)), 60.0)
     answer = client.call(Capture, 'capture')
     client.end_stream()
-    assert not answer.success and 'no frame of all fluoroscopes (a, b) came within 1 s' in answer.message
-    client.stream((tuple(replace(exposures[n][0], number=7) for n in NAMES) for _ in range(10 ** 6)), 60.0)
+    assert (
+        not answer.success
+        and 'no frame of all fluoroscopes (a, b) came within 1 s' in answer.message
+    )
+    client.stream(
+        (tuple(replace(exposures[n][0], number=7) for n in NAMES) for _ in range(10**6)), 60.0
+    )
     assert client.call(Capture, 'capture', timeout_sec=30.0).success
-    answer = client.call(Capture, 'capture')   # only the same frame comes
+    answer = client.call(Capture, 'capture')  # only the same frame comes
     client.end_stream()
     assert not answer.success and answer.message == 'frame 7 is collected already'
     answer = client.call(Capture, 'capture', timeout_sec=-1.0)
@@ -49,20 +65,30 @@ def test_capture_needs_all_fluoroscopes_and_a_new_frame(graph, exposures, tmp_pa
 
 
 def test_standing_phantom_is_one_exposure_and_a_moving_one_none(graph, exposures, tmp_path):
-    client, sent = graph.client, 0
+    client = graph.client
+    sent = 0
     graph.calibration_node(tmp_path / 'none')
 
     def stream(count, **options):
         nonlocal sent
-        client.stream(pairs_of(exposures, count=count, first=sent + 1, start_ns=10 ** 18 + sent * 10 ** 9, **options),
-                      200)   # what counts is the stamps
-        client.wait_until(lambda: client.published == count, what=f'{count} frames to be published')
+        client.stream(
+            pairs_of(
+                exposures, count=count, first=sent + 1, start_ns=10**18 + sent * 10**9, **options
+            ),
+            200,
+        )  # what counts is the stamps
+        client.wait_until(
+            lambda: client.published == count, what=f'{count} frames to be published'
+        )
         client.end_stream()
         sent += count
-        return client.wait_for_status(lambda s: s.frames_received == sent, what='all frames counted').exposures
+        return client.wait_for_status(
+            lambda s: s.frames_received == sent, what='all frames counted'
+        ).exposures
 
     assert stream(60) == 1, 'stands'
-    # The first frame counts as a single shot where none has come in the time before: let it be the known pose
+    # The first frame counts as a single shot where none has come in the time before: let it be the
+    # known pose
     assert stream(60, shift=3.0) == 1, 'moves'
     assert stream(60, i=1) == 2, 'stands in a new pose'
     assert stream(30, i=1) == 2 and stream(30) == 2, 'stands where it has stood'
@@ -72,7 +98,9 @@ def test_simulated_phantom_is_collected_by_itself(graph, tmp_path):
     client = graph.client
     graph.calibration_node(tmp_path / 'none')
     graph.start('simulator_node', {'stand_time': 0.4, 'move_time': 0.4, 'rate': 60.0})
-    status = client.wait_for_status(lambda s: s.exposures >= 3, what='three exposures of the virtual rig')
+    status = client.wait_for_status(
+        lambda s: s.exposures >= 3, what='three exposures of the virtual rig'
+    )
     assert status.frames_rejected == 0 and status.observations > 3 * 120
     # no more than one in every turn of 0.8 s, and one on the way where it begins
     assert status.exposures <= status.frames_received / (0.8 * 60) + 2
@@ -82,10 +110,12 @@ def test_frames_without_partner_are_counted_and_reported(graph, exposures, tmp_p
     client = graph.client
     graph.calibration_node(tmp_path / 'none')
     for frame in standing(exposures['a'][0], 80):
-        client.publish(frame)   # nothing of b: 64 wait, the others are given up
+        client.publish(frame)  # nothing of b: 64 wait, the others are given up
     client.wait_for_status(lambda s: s.frames_received == 80)
     assert client.wait_for_status(lambda s: s.frames_unpaired == 16).exposures == 0
-    status = client.wait_for_diagnostics('calibration_node', lambda s: s.level == b'\1' and 'partner' in s.message)
+    status = client.wait_for_diagnostics(
+        'calibration_node', lambda s: s.level == b'\1' and 'partner' in s.message
+    )
     assert status.message == '16 frames without partner of the other fluoroscopes'
     assert {v.key: v.value for v in status.values}['frames unpaired'] == '16'
     assert client.wait_for_status(lambda s: True, 'b').frames_unpaired == 0
@@ -94,13 +124,16 @@ def test_frames_without_partner_are_counted_and_reported(graph, exposures, tmp_p
 def test_pairing_by_stamp(graph, exposures, tmp_path):
     client = graph.client
     graph.calibration_node(tmp_path / 'none', pair_by='stamp', pair_tolerance=0.002)
-    for a, b in list(zip(*exposures.values()))[:5]:   # numbers that have nothing to do with each other
+    for a, b in list(zip(*exposures.values()))[
+        :5
+    ]:  # numbers that have nothing to do with each other
         client.publish(replace(a, number=0))
         client.publish(replace(b, number=1000 - b.number, stamp_ns=b.stamp_ns + 1_500_000))
     status = client.wait_for_status(lambda s: s.exposures == 5)
     assert status.frames_unpaired == 0
-    a, b = exposures['a'][5], exposures['b'][5]
+    a = exposures['a'][5]
+    b = exposures['b'][5]
     client.publish(a)
-    client.publish(replace(b, stamp_ns=b.stamp_ns + 2_500_000))   # too far apart
+    client.publish(replace(b, stamp_ns=b.stamp_ns + 2_500_000))  # too far apart
     client.wait_for_status(lambda s: s.frames_received == 6)
     assert client.wait_for_status(lambda s: s.frames_received == 6, 'b').exposures == 5

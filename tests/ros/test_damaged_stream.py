@@ -1,4 +1,6 @@
-"""A stream of which every tenth message is damaged: all good ones come through, the bad ones are counted by kind."""
+"""A stream of which every tenth message is damaged: all good ones come through, the bad ones are
+counted by kind.
+"""
 
 import itertools
 
@@ -39,32 +41,56 @@ def off_the_image(message):
     message.v[3] = 5000.0
 
 
-KINDS = {'lengths': shorter, 'image size': other_size, 'frame id': other_frame, 'repeated target': repeated,
-         'sigma': bad_sigma, 'undecodable': None, 'NaN': no_number, 'off': off_the_image}
-ONE_POINT = ('NaN', 'off')   # of these frames the other points are corrected
+KINDS = {
+    'lengths': shorter,
+    'image size': other_size,
+    'frame id': other_frame,
+    'repeated target': repeated,
+    'sigma': bad_sigma,
+    'undecodable': None,
+    'NaN': no_number,
+    'off': off_the_image,
+}
+ONE_POINT = ('NaN', 'off')  # of these frames the other points are corrected
 COUNT = 1600
 
 
 @pytest.fixture(scope='module')
 def stream(module_graph, by_command, tracking):
-    """1,600 messages of each fluoroscope, every tenth of a damaged in turn in every way, and what came of them."""
-    graph, client = module_graph, module_graph.client
+    """1,600 messages of each fluoroscope, every tenth of a damaged in turn in every way, and what
+    came of them.
+    """
+    graph = module_graph
+    client = module_graph.client
     graph.nodes = graph.whole_chain(by_command[0])
     graph.corrected = {name: client.listen(f'{name}/corrected_observations') for name in NAMES}
     graph.points = client.listen('reconstruction/points_with_covariance')
-    client.wait_until(lambda: client.count_publishers('reconstruction/points_with_covariance'), what='the points')
+    client.wait_until(
+        lambda: client.count_publishers('reconstruction/points_with_covariance'), what='the points'
+    )
     graph.wait_for_readers(2)
     kinds = itertools.cycle(KINDS)
     graph.damaged = {number: next(kinds) for number in range(5, COUNT, 10)}
     damaged = {'a': graph.damaged, 'b': {}}
-    messages = [(name, message_of(tracking[name][number % 360], number, damaged[name].get(number)))
-                for number in range(COUNT) for name in NAMES]
+    messages = [
+        (name, message_of(tracking[name][number % 360], number, damaged[name].get(number)))
+        for number in range(COUNT)
+        for name in NAMES
+    ]
     last = graph.corrected['b'], graph.points
-    client.publish_in_step(messages, lambda: 2 * min(of_one[-1].frame_number if of_one else 0 for of_one in last))
+    client.publish_in_step(
+        messages, lambda: 2 * min(of_one[-1].frame_number if of_one else 0 for of_one in last)
+    )
     graph.good = [n for n in range(COUNT) if graph.damaged.get(n, 'NaN') in ONE_POINT]
-    client.wait_until(lambda: all(of_one and of_one[-1].frame_number == COUNT - 1
-                                  for of_one in graph.corrected.values()), what='the last corrected frames')
-    client.wait_until(lambda: graph.points and graph.points[-1].frame_number == COUNT - 1, what='the last points')
+    client.wait_until(
+        lambda: all(
+            of_one and of_one[-1].frame_number == COUNT - 1 for of_one in graph.corrected.values()
+        ),
+        what='the last corrected frames',
+    )
+    client.wait_until(
+        lambda: graph.points and graph.points[-1].frame_number == COUNT - 1, what='the last points'
+    )
     return graph
 
 
@@ -94,8 +120,9 @@ def test_single_bad_points_are_invalid_and_the_others_corrected(stream):
 
 def test_bad_frames_are_counted_by_kind(stream):
     each = len(stream.damaged) // len(KINDS)
-    status = stream.client.wait_for_diagnostics('correction_node',
-                                                lambda s: value_of(s, 'frames received') == str(COUNT))
+    status = stream.client.wait_for_diagnostics(
+        'correction_node', lambda s: value_of(s, 'frames received') == str(COUNT)
+    )
     for kind in KINDS:
         if kind not in ONE_POINT:
             assert value_of(status, f'refused: {kind}') == str(each), kind

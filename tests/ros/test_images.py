@@ -1,4 +1,6 @@
-"""The image node: images of all kinds come out corrected, wrong ones are told and counted, and calibrations change."""
+"""The image node: images of all kinds come out corrected, wrong ones are told and counted, and
+calibrations change.
+"""
 
 from array import array
 from dataclasses import replace
@@ -14,11 +16,11 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from fluoro_calib_ros.distortion.models import no_correction
 from fluoro_calib_ros.files.calibration import load_calibrations
-from fluoro_calib_ros.images.encoded import decode, encode
-from fluoro_calib_ros.images.undistortion import ImageCorrector
+from fluoro_calib_ros.images.codec import decode, encode
+from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.nodes.conversion import camera_info, message_from_calibration, to_stamp
 from fluoro_calib_ros.nodes.qos import IMAGES, LATCHED
-from fluoro_calib_ros.simulation.images import bead_image
+from fluoro_calib_ros.simulation.bead_images import bead_image
 
 SIZE = (1024, 1024)
 DEPTHS = {'mono8': np.uint8, 'mono16': np.uint16}
@@ -34,28 +36,46 @@ class Eyes:
     """What a client sees of the image node, and what it shows to it; topics of fluoroscope a."""
 
     def __init__(self, graph):
-        self.client, self.number = graph.client, 0
+        self.client = graph.client
+        self.number = 0
         self.raw = self.client.create_publisher(Image, 'a/image_raw', IMAGES)
-        self.compressed = self.client.create_publisher(CompressedImage, 'a/image_raw/compressed', IMAGES)
-        self.images, self.infos, self.small = [], [], []
+        self.compressed = self.client.create_publisher(
+            CompressedImage, 'a/image_raw/compressed', IMAGES
+        )
+        self.images = []
+        self.infos = []
+        self.small = []
         self.client.create_subscription(Image, 'a/image_corrected', self.images.append, IMAGES)
-        self.client.create_subscription(CameraInfo, 'a/image_corrected/camera_info', self.infos.append, IMAGES)
+        self.client.create_subscription(
+            CameraInfo, 'a/image_corrected/camera_info', self.infos.append, IMAGES
+        )
 
     def connected(self):
         """Whether the node listens, and is listened to."""
-        return (self.raw.get_subscription_count() and self.compressed.get_subscription_count()
-                and self.client.count_publishers('a/image_corrected/camera_info'))
+        return (
+            self.raw.get_subscription_count()
+            and self.compressed.get_subscription_count()
+            and self.client.count_publishers('a/image_corrected/camera_info')
+        )
 
     def stamped(self, message):
         """A message with a stamp of its own, which is returned too."""
         self.number += 1
-        message.header.stamp, message.header.frame_id = to_stamp(10 ** 18 + self.number), 'a_optical'
+        message.header.stamp = to_stamp(10**18 + self.number)
+        message.header.frame_id = 'a_optical'
         return message
 
     def message(self, image, encoding='mono8'):
         """Image message of an array."""
-        return self.stamped(Image(height=image.shape[0], width=image.shape[1], encoding=encoding,
-                                  step=image.shape[1] * image.itemsize, data=array('B', image.tobytes())))
+        return self.stamped(
+            Image(
+                height=image.shape[0],
+                width=image.shape[1],
+                encoding=encoding,
+                step=image.shape[1] * image.itemsize,
+                data=array('B', image.tobytes()),
+            )
+        )
 
     def answer(self, publisher, message):
         """Image and CameraInfo that come out for a message that goes in."""
@@ -67,21 +87,32 @@ class Eyes:
             for place, collected in enumerate((self.images, self.infos)):
                 found[place] = next((m for m in collected if m.header.stamp == stamp), None)
             return all(found)
+
         self.client.wait_until(both, what='the corrected image and its CameraInfo')
         self.images.clear()
         self.infos.clear()
         return found
 
     def diagnostics(self, condition, what='a diagnostic'):
-        """{key: value} of the node about fluoroscope a, once its status fulfils condition(values, status)."""
+        """{key: value} of the node about fluoroscope a, once its status fulfils condition(values,
+        status).
+        """
+
         def values(status):
             return {v.key: v.value for v in status.values}
-        return values(self.client.wait_for_diagnostics('image_node', lambda s: condition(values(s), s), what=what))
+
+        return values(
+            self.client.wait_for_diagnostics(
+                'image_node', lambda s: condition(values(s), s), what=what
+            )
+        )
 
 
 def pixels_of(message):
     """Array of an Image message."""
-    return np.frombuffer(message.data, DEPTHS[message.encoding]).reshape(message.height, message.width)
+    return np.frombuffer(message.data, DEPTHS[message.encoding]).reshape(
+        message.height, message.width
+    )
 
 
 @pytest.fixture(scope='module')
@@ -92,7 +123,8 @@ def eyes(module_graph, by_command):
     module_graph.node = module_graph.start('image_node', {'fluoroscopes': '[a]'})
     eyes = Eyes(module_graph)
     eyes.calibration = load_calibrations(by_command[0])['a']
-    eyes.corrector, eyes.node = ImageCorrector(eyes.calibration), module_graph.node
+    eyes.corrector = ImageCorrector(eyes.calibration)
+    eyes.node = module_graph.node
     eyes.client.wait_until(eyes.connected, what='the image node')
     eyes.client.wait_until_known_to('image_node')
     eyes.diagnostics(lambda v, _: v['calibration'] == eyes.calibration.calibration_id)
@@ -101,23 +133,31 @@ def eyes(module_graph, by_command):
 
 # ---- good ones
 
+
 @pytest.mark.parametrize('encoding', DEPTHS)
 @pytest.mark.parametrize('kind', ['raw', 'padded', 'other end first', 'compressed'])
 def test_image_comes_out_corrected(eyes, pictures, encoding, kind):
-    """Pixel for pixel as ImageCorrector makes it, with the header of the input, and the CameraInfo of the
-    calibration."""
+    """Pixel for pixel as ImageCorrector makes it, with the header of the input, and the CameraInfo
+    of the calibration.
+    """
     image = pictures[encoding]
     message = eyes.message(image, encoding)
     if kind == 'padded':
         step = message.step + 24
         rows = np.full((1024, step), 0xAA, np.uint8)
-        rows[:, :message.step] = image.view(np.uint8).reshape(1024, -1)
-        message.step, message.data = step, array('B', rows.tobytes())
+        rows[:, : message.step] = image.view(np.uint8).reshape(1024, -1)
+        message.step = step
+        message.data = array('B', rows.tobytes())
     elif kind == 'other end first':
-        message.is_bigendian, message.data = 1, array('B', image.astype(image.dtype.newbyteorder('>')).tobytes())
+        message.is_bigendian = 1
+        message.data = array('B', image.astype(image.dtype.newbyteorder('>')).tobytes())
     elif kind == 'compressed':
-        message = eyes.stamped(CompressedImage(format=f'{encoding}; png compressed {encoding}',
-                                               data=array('B', encode(image, '.png'))))
+        message = eyes.stamped(
+            CompressedImage(
+                format=f'{encoding}; png compressed {encoding}',
+                data=array('B', encode(image, '.png')),
+            )
+        )
     out, info = eyes.answer(eyes.compressed if kind == 'compressed' else eyes.raw, message)
     assert np.array_equal(pixels_of(out), eyes.corrector.correct(image))
     assert out.encoding == encoding and out.step == 1024 * image.itemsize and not out.is_bigendian
@@ -130,31 +170,41 @@ def test_corrected_images_are_compressed_for_who_listens(eyes, pictures):
     """And for nobody else: by format and depth of the pixels."""
     assert eyes.diagnostics(lambda v, _: True)['images compressed'] == '0'
     small = eyes.small
-    eyes.client.create_subscription(CompressedImage, 'a/image_corrected/compressed', small.append, IMAGES)
+    eyes.client.create_subscription(
+        CompressedImage, 'a/image_corrected/compressed', small.append, IMAGES
+    )
     eyes.client.wait_until(lambda: eyes.client.count_publishers('a/image_corrected/compressed'))
 
     def compressed():
         message = eyes.message(pictures['mono8'])
         eyes.answer(eyes.raw, message)
         return small
-    eyes.client.wait_until(compressed, what='the first compressed image: the node has found its listener')
+
+    eyes.client.wait_until(
+        compressed, what='the first compressed image: the node has found its listener'
+    )
     for encoding in DEPTHS:
         small.clear()
         message = eyes.message(pictures[encoding], encoding)
         eyes.answer(eyes.raw, message)
-        eyes.client.wait_until(lambda: any(m.header == message.header for m in small), what='a compressed image')
+        eyes.client.wait_until(
+            lambda: any(m.header == message.header for m in small), what='a compressed image'
+        )
         assert small[-1].format == f'{encoding}; png compressed {encoding}'
         assert np.array_equal(decode(small[-1].data), eyes.corrector.correct(pictures[encoding]))
 
 
 # ---- bad ones
 
+
 def changed(**fields):
     """A change of fields of an Image message."""
+
     def change(message):
         for name, value in fields.items():
             setattr(message, name, value(message) if callable(value) else value)
         return message
+
     return change
 
 
@@ -163,26 +213,54 @@ def of_array(image):
     return array('B', cv2.imencode('.png', image)[1].tobytes())
 
 
-BAD = {   # change of the message, kind, what is said
+BAD = {  # change of the message, kind, what is said
     'colours': (changed(encoding='rgb8'), 'encoding', "encoding 'rgb8' is not mono8 or mono16"),
     'no encoding': (changed(encoding=''), 'encoding', "encoding '' is not"),
-    'another size': (changed(width=512, step=512, data=lambda m: m.data[:512 * 1024]), 'image size',
-                     'the image is 512 x 1024 px, but the calibration is for 1024 x 1024 px'),
-    'too little data': (changed(data=lambda m: m.data[:-1]), 'image size', '1048575 bytes in rows of 1024'),
-    'too much data': (changed(data=lambda m: m.data + array('B', [0])), 'image size', '1048577 bytes in rows of 1024'),
+    'another size': (
+        changed(width=512, step=512, data=lambda m: m.data[: 512 * 1024]),
+        'image size',
+        'the image is 512 x 1024 px, but the calibration is for 1024 x 1024 px',
+    ),
+    'too little data': (
+        changed(data=lambda m: m.data[:-1]),
+        'image size',
+        '1048575 bytes in rows of 1024',
+    ),
+    'too much data': (
+        changed(data=lambda m: m.data + array('B', [0])),
+        'image size',
+        '1048577 bytes in rows of 1024',
+    ),
     'short rows': (changed(step=1000), 'image size', 'in rows of 1000'),
-    'no size': (changed(width=0, height=0, step=0, data=array('B')), 'image size', '0 bytes in rows of 0'),
-    'mono16 in half of its bytes': (changed(encoding='mono16'), 'image size', '1024 x 1024 px of mono16'),
-    'of another fluoroscope': (lambda m: (setattr(m.header, 'frame_id', 'b_optical'), m)[1], 'frame id',
-                               'the frame id is b_optical')}
+    'no size': (
+        changed(width=0, height=0, step=0, data=array('B')),
+        'image size',
+        '0 bytes in rows of 0',
+    ),
+    'mono16 in half of its bytes': (
+        changed(encoding='mono16'),
+        'image size',
+        '1024 x 1024 px of mono16',
+    ),
+    'of another fluoroscope': (
+        lambda m: (setattr(m.header, 'frame_id', 'b_optical'), m)[1],
+        'frame id',
+        'the frame id is b_optical',
+    ),
+}
 GREY = np.arange(1024 * 1024, dtype=np.uint32).reshape(1024, 1024).astype(np.uint8)
 BAD_COMPRESSED = {
     'empty': (array('B'), 'damaged', 'it has no data'),
     'no image': (array('B', b'this is no image'), 'damaged', 'no image that can be decoded'),
     'cut off': (of_array(GREY)[:-100], 'damaged', 'the PNG image is cut off'),
     'cut off jpeg': (array('B', encode(GREY, '.jpg'))[:-100], 'damaged', 'damaged'),
-    'in colours': (of_array(np.stack([GREY, GREY.T, GREY], axis=-1)), 'encoding', 'this is a colour image'),
-    'small': (of_array(GREY[:10]), 'image size', 'the image is 1024 x 10 px')}
+    'in colours': (
+        of_array(np.stack([GREY, GREY.T, GREY], axis=-1)),
+        'encoding',
+        'this is a colour image',
+    ),
+    'small': (of_array(GREY[:10]), 'image size', 'the image is 1024 x 10 px'),
+}
 
 
 @pytest.fixture(scope='module')
@@ -194,10 +272,14 @@ def after_bad_ones(eyes):
         eyes.answer(eyes.raw, eyes.message(GREY))
     for data, _, _ in BAD_COMPRESSED.values():
         eyes.compressed.publish(eyes.stamped(CompressedImage(format='a format', data=data)))
-        eyes.answer(eyes.compressed, eyes.stamped(CompressedImage(format='png', data=of_array(GREY))))
-    for publisher, message in ((eyes.raw, eyes.message(GREY)),
-                               (eyes.compressed, eyes.stamped(CompressedImage(format='png', data=of_array(GREY))))):
-        publisher.publish(serialize_message(message)[:500])   # what is no message at all
+        eyes.answer(
+            eyes.compressed, eyes.stamped(CompressedImage(format='png', data=of_array(GREY)))
+        )
+    for publisher, message in (
+        (eyes.raw, eyes.message(GREY)),
+        (eyes.compressed, eyes.stamped(CompressedImage(format='png', data=of_array(GREY)))),
+    ):
+        publisher.publish(serialize_message(message)[:500])  # what is no message at all
         eyes.answer(publisher, eyes.message(GREY) if publisher is eyes.raw else message)
     return eyes
 
@@ -206,12 +288,18 @@ def after_bad_ones(eyes):
 def test_bad_image_is_told_in_one_sentence(after_bad_ones, fault):
     _, kind, sentence = {**BAD, **BAD_COMPRESSED}[fault]
     lines = [line for line in after_bad_ones.node.log.splitlines() if sentence in line]
-    assert lines and all('image refused: fluoroscope a, image of 1000000000.0' in line for line in lines)
+    assert lines and all(
+        'image refused: fluoroscope a, image of 1000000000.0' in line for line in lines
+    )
 
 
 def test_bad_images_are_counted_by_kind(after_bad_ones):
-    kinds = [kind for _, kind, _ in (*BAD.values(), *BAD_COMPRESSED.values())] + ['undecodable'] * 2
-    values = after_bad_ones.diagnostics(lambda v, s: f'{len(kinds)} images refused' in s.message and s.level == b'\1')
+    kinds = [kind for _, kind, _ in (*BAD.values(), *BAD_COMPRESSED.values())] + [
+        'undecodable'
+    ] * 2
+    values = after_bad_ones.diagnostics(
+        lambda v, s: f'{len(kinds)} images refused' in s.message and s.level == b'\1'
+    )
     for kind in set(kinds):
         assert values[f'refused: {kind}'] == str(kinds.count(kind))
     assert int(values['images received']) == int(values['images corrected']) + len(kinds)
@@ -220,16 +308,24 @@ def test_bad_images_are_counted_by_kind(after_bad_ones):
 
 
 def test_lifecycle(after_bad_ones, pictures):
-    """Deactivated it takes nothing, cleaned up it has no topics; brought up again it has the latched calibration."""
-    eyes, image = after_bad_ones, pictures['mono8']
+    """Deactivated it takes nothing, cleaned up it has no topics; brought up again it has the
+    latched calibration.
+    """
+    eyes = after_bad_ones
+    image = pictures['mono8']
 
     def change(transition):
-        return eyes.client.call(ChangeState, 'image_node/change_state', transition=Transition(id=transition)).success
+        return eyes.client.call(
+            ChangeState, 'image_node/change_state', transition=Transition(id=transition)
+        ).success
+
     assert change(Transition.TRANSITION_DEACTIVATE)
     eyes.client.wait_until(lambda: not eyes.raw.get_subscription_count(), what='no subscription')
     eyes.diagnostics(lambda v, s: s.message == 'the node is not active')
     assert change(Transition.TRANSITION_CLEANUP)
-    eyes.client.wait_until(lambda: not eyes.client.count_publishers('a/image_corrected'), what='no publisher')
+    eyes.client.wait_until(
+        lambda: not eyes.client.count_publishers('a/image_corrected'), what='no publisher'
+    )
     assert change(Transition.TRANSITION_CONFIGURE) and change(Transition.TRANSITION_ACTIVATE)
     eyes.client.wait_until(eyes.connected, what='the image node')
     eyes.client.wait_until_known_to('image_node')
@@ -241,39 +337,53 @@ def test_lifecycle(after_bad_ones, pictures):
 
 # ---- calibrations
 
+
 def test_calibrations_change_between_two_images(graph, by_command, pictures):
-    """Without one nothing comes out; then every image is corrected wholly with one of them, and a wrong one changes
-    nothing."""
+    """Without one nothing comes out; then every image is corrected wholly with one of them, and a
+    wrong one changes nothing.
+    """
     graph.start('image_node', {'fluoroscopes': '[a]'})
-    eyes, image = Eyes(graph), pictures['mono8']
+    eyes = Eyes(graph)
+    image = pictures['mono8']
     latched = eyes.client.create_publisher(FluoroscopeCalibration, 'a/calibration', LATCHED)
-    eyes.client.wait_until(lambda: eyes.connected() and latched.get_subscription_count(), what='the image node')
+    eyes.client.wait_until(
+        lambda: eyes.connected() and latched.get_subscription_count(), what='the image node'
+    )
     eyes.client.wait_until_known_to('image_node')
     first = load_calibrations(by_command[0])['a']
     second = replace(first, model=no_correction(), train_exposure=np.zeros(0, dtype=np.int64))
     results = [ImageCorrector(c).correct(image).tobytes() for c in (first, second)]
     stream = eyes.client.create_timer(0.05, lambda: eyes.raw.publish(eyes.message(image)))
-    eyes.diagnostics(lambda v, s: int(v['images without calibration']) > 0 and 'no calibration yet' in s.message)
+    eyes.diagnostics(
+        lambda v, s: int(v['images without calibration']) > 0 and 'no calibration yet' in s.message
+    )
     assert not eyes.images and not eyes.infos
     for calibration, result in zip((first, second), results):
         latched.publish(message_from_calibration(calibration))
-        eyes.client.wait_until(lambda: eyes.images and eyes.images[-1].data.tobytes() == result, what='the calibration')
+        eyes.client.wait_until(
+            lambda: eyes.images and eyes.images[-1].data.tobytes() == result,
+            what='the calibration',
+        )
     wrong = message_from_calibration(first)
     wrong.xp += 1.0
     latched.publish(wrong)
     values = eyes.diagnostics(lambda v, _: 'does not belong to its id' in v['last fault'])
     eyes.client.destroy_timer(stream)
     assert values['calibration'] == second.calibration_id
-    came = [results.index(message.data.tobytes()) for message in eyes.images]   # it is one of them
+    came = [results.index(message.data.tobytes()) for message in eyes.images]  # it is one of them
     assert came == sorted(came) and set(came) == {0, 1}
 
 
 def test_wrong_parameters(graph):
     """The node does not start, and says why."""
-    wrong = {'interpolation': ('nearest', 'parameter interpolation is one of linear, cubic'),
-             'inputs': ('none', 'parameter inputs is one of raw, compressed, both'),
-             'compressed_format': ('gif', 'parameter compressed_format is one of png, jpeg'),
-             'jpeg_quality': (0, 'parameter jpeg_quality')}
-    processes = [graph.start('image_node', {name: value}, wait=False) for name, (value, _) in wrong.items()]
+    wrong = {
+        'interpolation': ('nearest', 'parameter interpolation is one of linear, cubic'),
+        'inputs': ('none', 'parameter inputs is one of raw, compressed, both'),
+        'compressed_format': ('gif', 'parameter compressed_format is one of png, jpeg'),
+        'jpeg_quality': (0, 'parameter jpeg_quality'),
+    }
+    processes = [
+        graph.start('image_node', {name: value}, wait=False) for name, (value, _) in wrong.items()
+    ]
     for process, (_, sentence) in zip(processes, wrong.values()):
         assert process.wait() == 1 and sentence in process.log and 'Traceback' not in process.log

@@ -1,4 +1,6 @@
-"""A self-calibration beside the stream: nothing stops for it, cancelled or refused it changes nothing."""
+"""A self-calibration beside the stream: nothing stops for it, cancelled or refused it changes
+nothing.
+"""
 
 import time
 
@@ -15,17 +17,27 @@ class Rig:
     """Both nodes with a calibration loaded and 15 exposures collected."""
 
     def __init__(self, graph, folder, exposures):
-        self.folder, self.client = folder, graph.client
+        self.folder = folder
+        self.client = graph.client
         # A queue for a machine that is too busy for the rate.
-        graph.both_nodes(folder, **{f'qos_overrides.{graph.namespace}/{n}/target_observations.subscription.depth': 5000
-                                    for n in NAMES})
+        graph.both_nodes(
+            folder,
+            **{
+                f'qos_overrides.{graph.namespace}/{n}/target_observations.subscription.depth': 5000
+                for n in NAMES
+            },
+        )
         for topic in ('calibration', 'corrected_observations'):
             for name in NAMES:
                 self.client.listen(f'{name}/{topic}')
         self.collect(exposures)
-        self.client.wait_until(lambda: all(self.messages('calibration').values()), what='the loaded calibrations')
+        self.client.wait_until(
+            lambda: all(self.messages('calibration').values()), what='the loaded calibrations'
+        )
         for name in NAMES:
-            self.client.wait_for_diagnostics('correction_node', lambda s: 'no calibration' not in s.message, name)
+            self.client.wait_for_diagnostics(
+                'correction_node', lambda s: 'no calibration' not in s.message, name
+            )
 
     def collect(self, exposures):
         """Publish exposures, and wait until all are collected."""
@@ -34,7 +46,9 @@ class Rig:
         for pair in pairs:
             for frame in pair:
                 self.client.publish(frame)
-        self.client.wait_for_status(lambda s: s.exposures == before + len(pairs), what=f'{len(pairs)} exposures')
+        self.client.wait_for_status(
+            lambda s: s.exposures == before + len(pairs), what=f'{len(pairs)} exposures'
+        )
 
     def messages(self, topic):
         return {n: self.client.messages[f'{n}/{topic}'] for n in NAMES}
@@ -54,22 +68,26 @@ def rig(module_graph, by_command, exposures, tmp_path_factory):
 
 
 def test_stream_goes_on_while_a_job_runs(rig, exposures):
-    client, rate = rig.client, 120.0
+    client = rig.client
+    rate = 120.0
     received = client.wait_for_status(lambda s: s.exposures == 15).frames_received
     corrected = rig.messages('corrected_observations')
     before = {n: len(m) for n, m in corrected.items()}
-    frames = [standing(exposures[n][0], 10 ** 6, 1000, rate) for n in NAMES]
+    frames = [standing(exposures[n][0], 10**6, 1000, rate) for n in NAMES]
     answer = client.goal().get_result_async()
 
     def came():
         return min(len(corrected[n]) - before[n] for n in NAMES)
 
     def taken():
-        """As came, but no more than some seconds ahead of what the calibration node has told that it took."""
+        """As came, but no more than some seconds ahead of what the calibration node has told that
+        it took.
+        """
         return min(came(), client.status().frames_received - received + round(2 * rate))
 
     client.stream(zip(*frames), rate, taken)
-    behind, counted = [], set()
+    behind = []
+    counted = set()
 
     def done():
         status = client.status()
@@ -84,15 +102,22 @@ def test_stream_goes_on_while_a_job_runs(rig, exposures):
     assert answer.result().status == SUCCEEDED
     assert during > 200 and len(counted) > 1, 'frames were counted while the job was running'
     assert np.median(behind) < 0.1 * rate, 'corrected frames lagged behind'
-    client.wait_for_status(lambda s: s.frames_received == received + during, what=f'all {during} frames counted')
-    client.wait_until(lambda: all(len(corrected[n]) == before[n] + during for n in NAMES), what='all corrected')
+    client.wait_for_status(
+        lambda s: s.frames_received == received + during, what=f'all {during} frames counted'
+    )
+    client.wait_until(
+        lambda: all(len(corrected[n]) == before[n] + during for n in NAMES), what='all corrected'
+    )
     for name in NAMES:
         assert client.status(name).exposures == 15 and client.status(name).frames_unpaired == 0
-        assert [m.frame_number for m in corrected[name][before[name]:]] == list(range(1000, 1000 + during))
+        assert [m.frame_number for m in corrected[name][before[name] :]] == list(
+            range(1000, 1000 + during)
+        )
 
 
 def test_cancelled_job_changes_nothing_and_the_next_one_works(rig):
-    client, before = rig.client, rig.state()
+    client = rig.client
+    before = rig.state()
     handle = client.goal()
     answer = handle.get_result_async()
     client.wait_until(lambda: client.feedback or answer.done(), what='the first feedback')
@@ -102,14 +127,21 @@ def test_cancelled_job_changes_nothing_and_the_next_one_works(rig):
     assert time.monotonic() - asked < 5
     assert not answer.result().result.success and 'cancelled' in answer.result().result.message
     assert rig.state() == before
-    client.wait_for_status(lambda s: s.state == CalibrationStatus.CALIBRATED, what='the end of the job in the status')
+    client.wait_for_status(
+        lambda s: s.state == CalibrationStatus.CALIBRATED, what='the end of the job in the status'
+    )
 
-    handle = client.goal(model='none', fluoroscopes=['b'])   # no correction: one round, quick
+    handle = client.goal(model='none', fluoroscopes=['b'])  # no correction: one round, quick
     assert client.result_of(handle.get_result_async()).status == SUCCEEDED
     files, published = rig.state()
-    assert files['a.calibration.npz'] == before[0]['a.calibration.npz'] and published['a'] == before[1]['a']
+    assert (
+        files['a.calibration.npz'] == before[0]['a.calibration.npz']
+        and published['a'] == before[1]['a']
+    )
     assert files['b.calibration.npz'] != before[0]['b.calibration.npz']
-    client.wait_until(lambda: rig.state()[1]['b'] == before[1]['b'] + 1, what='the new calibration of b')
+    client.wait_until(
+        lambda: rig.state()[1]['b'] == before[1]['b'] + 1, what='the new calibration of b'
+    )
 
 
 def test_second_request_is_refused_while_one_runs(rig):
@@ -126,14 +158,23 @@ def test_second_request_is_refused_while_one_runs(rig):
     assert client.result_of(answer).status == CANCELED
 
 
-@pytest.mark.parametrize('request_fields, message', [
-    ({'fluoroscopes': ['a', 'z']}, 'fluoroscope z is unknown, there are a, b'),
-    ({'model': 'spline'},
-     "model is one of auto, none, knn, local_linear, parametric, hybrid, collocation, not 'spline'"),
-    ({'interior': 'free'}, "interior is one of estimated, fixed, not 'free'"),
-    ({'loss': 'cauchy'}, "loss is one of student_t, huber, gaussian, not 'cauchy'"),
-    ({'principal_distance': -1.0}, 'principal_distance is a length in pixels, not -1.0'),
-    ({'principal_distance': float('nan')}, 'principal_distance is a length in pixels, not nan')])
+@pytest.mark.parametrize(
+    'request_fields, message',
+    [
+        ({'fluoroscopes': ['a', 'z']}, 'fluoroscope z is unknown, there are a, b'),
+        (
+            {'model': 'spline'},
+            "model is one of auto, none, knn, local_linear, parametric, hybrid, collocation, not 'spline'",
+        ),
+        ({'interior': 'free'}, "interior is one of estimated, fixed, not 'free'"),
+        ({'loss': 'cauchy'}, "loss is one of student_t, huber, gaussian, not 'cauchy'"),
+        ({'principal_distance': -1.0}, 'principal_distance is a length in pixels, not -1.0'),
+        (
+            {'principal_distance': float('nan')},
+            'principal_distance is a length in pixels, not nan',
+        ),
+    ],
+)
 def test_wrong_request_is_refused_in_a_sentence(rig, request_fields, message):
     before = rig.state()
     answer = rig.client.call(Calibrate, 'calibrate', **request_fields)
@@ -151,20 +192,27 @@ def test_too_few_exposures_are_refused(rig, exposures):
     rig.client.wait_for_status(lambda s: s.exposures == 0)
     rig.collect({n: f[:2] for n, f in exposures.items()})
     answer = rig.client.call(Calibrate, 'calibrate')
-    assert not answer.success and answer.message == 'fluoroscope a: 2 exposures are too few, 3 are needed'
+    assert (
+        not answer.success
+        and answer.message == 'fluoroscope a: 2 exposures are too few, 3 are needed'
+    )
     assert rig.state() == before
 
 
 def test_exposures_of_one_pose_are_refused(rig, exposures):
-    client, before = rig.client, rig.state()
+    client = rig.client
+    before = rig.state()
     client.call(Reset, 'reset')
     client.wait_for_status(lambda s: s.exposures == 0)
-    client.stream(zip(*(standing(exposures[n][0], 10 ** 6) for n in NAMES)), 30.0)
-    for _ in range(4):   # by itself the node takes a pose only once
+    client.stream(zip(*(standing(exposures[n][0], 10**6) for n in NAMES)), 30.0)
+    for _ in range(4):  # by itself the node takes a pose only once
         assert client.call(Capture, 'capture', timeout_sec=30.0).success
     client.end_stream()
     answer = client.call(Calibrate, 'calibrate')
     assert not answer.success and '\n' not in answer.message
-    assert answer.message.startswith('fluoroscope a: all ') and 'show the phantom in one pose' in answer.message
+    assert (
+        answer.message.startswith('fluoroscope a: all ')
+        and 'show the phantom in one pose' in answer.message
+    )
     assert rig.state() == before
     assert client.status().calibration_id

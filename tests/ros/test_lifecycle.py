@@ -20,13 +20,19 @@ NODES = ('correction_node', 'reconstruction_node', 'image_node')
 
 def expect(client, node):
     """Make what asks a node, before it is started."""
-    for kind, service in ((ChangeState, 'change_state'), (GetState, 'get_state'), (ListParameters, 'list_parameters'),
-                          (DescribeParameters, 'describe_parameters')):
+    for kind, service in (
+        (ChangeState, 'change_state'),
+        (GetState, 'get_state'),
+        (ListParameters, 'list_parameters'),
+        (DescribeParameters, 'describe_parameters'),
+    ):
         client.expect(kind, f'{node}/{service}')
 
 
 def change(client, node, transition):
-    return client.call(ChangeState, f'{node}/change_state', transition=Transition(id=transition)).success
+    return client.call(
+        ChangeState, f'{node}/change_state', transition=Transition(id=transition)
+    ).success
 
 
 def state(client, node):
@@ -43,21 +49,29 @@ def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, 
     assert state(client, 'correction_node') == State.PRIMARY_STATE_UNCONFIGURED
     assert not client.count_publishers('a/corrected_observations')
     frame = tracking['a'][0]
-    for turn in range(2):   # the second time after it was taken down altogether
+    for turn in range(2):  # the second time after it was taken down altogether
         assert change(client, 'correction_node', Transition.TRANSITION_CONFIGURE)
         assert state(client, 'correction_node') == State.PRIMARY_STATE_INACTIVE
-        client.wait_for_diagnostics('correction_node', lambda s: 'the node is not active' in s.message)
-        client.publish(replace(frame, number=100 * turn + 1))   # to nobody
+        client.wait_for_diagnostics(
+            'correction_node', lambda s: 'the node is not active' in s.message
+        )
+        client.publish(replace(frame, number=100 * turn + 1))  # to nobody
         assert change(client, 'correction_node', Transition.TRANSITION_ACTIVATE)
         assert state(client, 'correction_node') == State.PRIMARY_STATE_ACTIVE
-        client.wait_until(lambda: client.subscriptions_matched('correction_node'), what='the reader')
+        client.wait_until(
+            lambda: client.subscriptions_matched('correction_node'), what='the reader'
+        )
         client.wait_until_known_to('correction_node')
         client.publish(replace(frame, number=100 * turn + 2))
-        client.wait_until(lambda: corrected and corrected[-1].frame_number == 100 * turn + 2, what='the frame')
+        client.wait_until(
+            lambda: corrected and corrected[-1].frame_number == 100 * turn + 2, what='the frame'
+        )
         assert change(client, 'correction_node', Transition.TRANSITION_DEACTIVATE)
         client.publish(replace(frame, number=100 * turn + 3))
         assert change(client, 'correction_node', Transition.TRANSITION_CLEANUP)
-        client.wait_until(lambda: not client.count_publishers('a/corrected_observations'), what='its end')
+        client.wait_until(
+            lambda: not client.count_publishers('a/corrected_observations'), what='its end'
+        )
         client.statuses.clear()
     assert [m.frame_number for m in corrected] == [2, 102]
     assert node.end() == 0 and 'Traceback' not in node.log
@@ -66,10 +80,17 @@ def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, 
 @pytest.mark.parametrize('node', NODES)
 def test_every_transition_and_a_clean_end(graph, node):
     expect(graph.client, node)
-    process, client = graph.start(node), graph.client
+    process = graph.start(node)
+    client = graph.client
     T = Transition
-    for transition in (T.TRANSITION_DEACTIVATE, T.TRANSITION_ACTIVATE, T.TRANSITION_DEACTIVATE, T.TRANSITION_CLEANUP,
-                       T.TRANSITION_CONFIGURE, T.TRANSITION_ACTIVATE):
+    for transition in (
+        T.TRANSITION_DEACTIVATE,
+        T.TRANSITION_ACTIVATE,
+        T.TRANSITION_DEACTIVATE,
+        T.TRANSITION_CLEANUP,
+        T.TRANSITION_CONFIGURE,
+        T.TRANSITION_ACTIVATE,
+    ):
         assert change(client, node, transition), transition
     assert state(client, node) == State.PRIMARY_STATE_ACTIVE
     assert process.end() == 0 and 'Traceback' not in process.log
@@ -85,7 +106,8 @@ def test_shutdown_by_the_lifecycle(graph, by_command):
 
 def test_transition_that_fails_says_why_and_changes_nothing(graph):
     """A wrong quality of service shows only when the topics are made."""
-    client, topic = graph.client, f'qos_overrides.{graph.namespace}/a/target_observations.subscription.reliability'
+    client = graph.client
+    topic = f'qos_overrides.{graph.namespace}/a/target_observations.subscription.reliability'
     expect(client, 'correction_node')
     node = graph.start('correction_node', {'autostart': 'false', topic: 'luck'}, wait=False)
     client.wait_until_known_to('correction_node')
@@ -104,11 +126,23 @@ def test_nothing_is_left_of_what_was_taken_down(ros, kind):
     try:
         before = len(list(node.publishers))
         for _ in range(3):
-            for transition in (node.trigger_configure, node.trigger_activate, node.trigger_deactivate,
-                               node.trigger_cleanup):
+            for transition in (
+                node.trigger_configure,
+                node.trigger_activate,
+                node.trigger_deactivate,
+                node.trigger_cleanup,
+            ):
                 assert transition() == TransitionCallbackReturn.SUCCESS
         assert len(list(node.publishers)) == before
-        assert not any(map(len, (node._managed_entities, *map(list, (node.subscriptions, node.timers, node.clients)))))
+        assert not any(
+            map(
+                len,
+                (
+                    node._managed_entities,
+                    *map(list, (node.subscriptions, node.timers, node.clients)),
+                ),
+            )
+        )
     finally:
         node.destroy_node()
 
@@ -119,34 +153,52 @@ def test_every_parameter_says_what_it_is(graph, node):
     expect(client, node)
     graph.start(node)
     names = client.call(ListParameters, f'{node}/list_parameters').result.names
-    own = [n for n in names if not n.startswith('qos_overrides') and n not in ('use_sim_time', 'start_type_description_'
-                                                                               'service')]
-    described = client.call(DescribeParameters, f'{node}/describe_parameters', names=own).descriptors
+    own = [
+        n
+        for n in names
+        if not n.startswith('qos_overrides')
+        and n not in ('use_sim_time', 'start_type_description_service')
+    ]
+    described = client.call(
+        DescribeParameters, f'{node}/describe_parameters', names=own
+    ).descriptors
     assert 'autostart' in own and 'fluoroscopes' in own
     for descriptor in described:
         assert len(descriptor.description) > 10, descriptor.name
-        number = descriptor.type in (2, 3)   # integer, double
-        assert bool(descriptor.integer_range or descriptor.floating_point_range) == number, descriptor.name
+        number = descriptor.type in (2, 3)  # integer, double
+        assert bool(descriptor.integer_range or descriptor.floating_point_range) == number, (
+            descriptor.name
+        )
     assert any(n.startswith('qos_overrides.') and n.endswith('.depth') for n in names)
 
 
 def test_two_rigs_side_by_side(ros, request, graph, by_command, tracking, tmp_path):
-    """Two namespaces, one of them with simulated time: what comes to the one does not come to the other."""
+    """Two namespaces, one of them with simulated time: what comes to the one does not come to the
+    other.
+    """
     (tmp_path / 'other').mkdir()
     other = Graph(tmp_path / 'other')
     request.node.graphs = [*getattr(request.node, 'graphs', ()), other]
     try:
         graph.whole_chain(by_command[0])
         other.both_nodes(by_command[0])
-        simulated = other.start('reconstruction_node', {'use_sim_time': 'true', 'pair_by': 'stamp'})
+        simulated = other.start(
+            'reconstruction_node', {'use_sim_time': 'true', 'pair_by': 'stamp'}
+        )
         for one in (graph, other):
             one.points = one.client.listen('reconstruction/points_with_covariance')
-            one.client.wait_until(lambda: one.client.count_publishers('reconstruction/points_with_covariance'),
-                                  what='the nodes')
+            one.client.wait_until(
+                lambda: one.client.count_publishers('reconstruction/points_with_covariance'),
+                what='the nodes',
+            )
             one.wait_for_readers(1)
         other.client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'))
-        other.client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'), 'b')
-        other.client.wait_until(lambda: 'orientation rig-' in simulated.log, what='the orientation')
+        other.client.wait_for_diagnostics(
+            'correction_node', lambda s: value_of(s, 'calibration'), 'b'
+        )
+        other.client.wait_until(
+            lambda: 'orientation rig-' in simulated.log, what='the orientation'
+        )
         for row in range(20):
             for name in NAMES:
                 graph.client.publish(tracking[name][row])
@@ -155,12 +207,18 @@ def test_two_rigs_side_by_side(ros, request, graph, by_command, tracking, tmp_pa
         for one, count in ((graph, 20), (other, 10)):
             one.client.wait_until(lambda: len(one.points) >= count, what='the points')
         assert [m.frame_number for m in graph.points] == [f.number for f in tracking['a'][:20]]
-        assert [m.frame_number for m in other.points] == list(range(500, 510))   # though they were paired by stamp
+        assert [m.frame_number for m in other.points] == list(
+            range(500, 510)
+        )  # though they were paired by stamp
         clock = other.client.create_publisher(Clock, '/clock', 10)
-        ticks = iter(range(1, 10 ** 6))   # the timers of the node go by the simulated clock, and by nothing else
+        ticks = iter(
+            range(1, 10**6)
+        )  # the timers of the node go by the simulated clock, and by nothing else
+
         def ticking():
             clock.publish(Clock(clock=Time(sec=next(ticks))))
             return 'reconstruction_node: reconstruction' in other.client.statuses
+
         other.client.wait_until(ticking, what='diagnostics at simulated time')
         other.client.destroy_publisher(clock)
     finally:

@@ -1,24 +1,33 @@
-"""The orientation of the rig: from a calibration, from a capture of the phantom, and what belongs to what."""
+"""The orientation of the rig: from a calibration, from a capture of the phantom, and what belongs
+to what.
+"""
 
 import numpy as np
 from fluoro_calib_msgs.srv import Calibrate, Orient, Reset
 from ros_graph import BAGS, NAMES, value_of
 from test_reconstruction import coordinates, publish, truth
 
-from fluoro_calib_ros.files.orientation import load_orientation, orientation_path
+from fluoro_calib_ros.files.rig_orientation import load_orientation, orientation_path
 from fluoro_calib_ros.nodes.spatial import orientation_from_message
 
 
 def test_a_calibration_brings_the_orientation_and_the_stream_goes_on(graph, tmp_path, tracking):
-    """Calibrated in mid-stream, twice: every exposure is reconstructed with the orientation of its calibrations."""
+    """Calibrated in mid-stream, twice: every exposure is reconstructed with the orientation of its
+    calibrations.
+    """
     client = graph.client
     graph.both_nodes(tmp_path, collect='request', model='parametric')
     node = graph.start('reconstruction_node')
-    published, points = client.listen('rig_orientation'), client.listen('reconstruction/points_with_covariance')
+    published = client.listen('rig_orientation')
+    points = client.listen('reconstruction/points_with_covariance')
     corrected = {name: client.listen(f'{name}/corrected_observations') for name in NAMES}
-    client.wait_until(lambda: client.count_publishers('reconstruction/points_with_covariance'), what='the points')
+    client.wait_until(
+        lambda: client.count_publishers('reconstruction/points_with_covariance'), what='the points'
+    )
     graph.wait_for_readers(2)
-    client.wait_for_diagnostics('reconstruction_node', lambda s: 'no orientation' in s.message, 'reconstruction')
+    client.wait_for_diagnostics(
+        'reconstruction_node', lambda s: 'no orientation' in s.message, 'reconstruction'
+    )
     collect(graph)
     assert client.call(Calibrate, 'calibrate').success
     client.wait_until(lambda: published, what='the orientation')
@@ -27,16 +36,27 @@ def test_a_calibration_brings_the_orientation_and_the_stream_goes_on(graph, tmp_
         client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'), name)
     publish(client, tracking, range(50), answer='b/corrected_observations')
     client.wait_until(lambda: len(points) >= 50, what='the first points')
-    answer = client.call(Calibrate, 'calibrate', model='none')   # another calibration, another orientation
+    answer = client.call(
+        Calibrate, 'calibrate', model='none'
+    )  # another calibration, another orientation
     assert answer.success
     publish(client, tracking, range(50, 100), answer='b/corrected_observations')
     for f, name in enumerate(NAMES):
         client.wait_for_diagnostics(
-            'correction_node', lambda s: value_of(s, 'calibration') == answer.calibration_id[f], name)
+            'correction_node',
+            lambda s: value_of(s, 'calibration') == answer.calibration_id[f],
+            name,
+        )
     publish(client, tracking, range(100, 150), answer='b/corrected_observations')
-    client.wait_until(lambda: points[-1].frame_number == tracking['a'][149].number, what='the last points')
-    # No frame is lost by the correction, and an exposure is reconstructed wherever both views are of one orientation.
-    ids = {name: {m.frame_number: m.calibration_id for m in of_one} for name, of_one in corrected.items()}
+    client.wait_until(
+        lambda: points[-1].frame_number == tracking['a'][149].number, what='the last points'
+    )
+    # No frame is lost by the correction, and an exposure is reconstructed wherever both views are
+    # of one orientation.
+    ids = {
+        name: {m.frame_number: m.calibration_id for m in of_one}
+        for name, of_one in corrected.items()
+    }
     assert all(len(of_one) == len(ids[name]) == 150 for name, of_one in corrected.items())
     known = {tuple(m.calibration_id): m.orientation_id for m in published}
     assert len(known) == 2
@@ -47,7 +67,9 @@ def test_a_calibration_brings_the_orientation_and_the_stream_goes_on(graph, tmp_
 
 
 def collect(graph, readers=2):
-    """Play the recorded exposures, each taken by the collector as the phantom stands in another pose."""
+    """Play the recorded exposures, each taken by the collector as the phantom stands in another
+    pose.
+    """
     graph.client.call(Reset, 'collect_anew')
     graph.play(BAGS / 'calibration', readers=readers)
     for name in NAMES:
@@ -57,9 +79,12 @@ def collect(graph, readers=2):
 def test_a_capture_puts_the_points_into_the_rig_frame(graph, calibrated, tracking):
     client = graph.client
     graph.whole_chain(calibrated, rig_frame='lab')
-    published, points = client.listen('rig_orientation'), client.listen('reconstruction/points_with_covariance')
-    client.wait_until(lambda: published and client.count_publishers('reconstruction/points_with_covariance'),
-                      what='the first orientation')
+    published = client.listen('rig_orientation')
+    points = client.listen('reconstruction/points_with_covariance')
+    client.wait_until(
+        lambda: published and client.count_publishers('reconstruction/points_with_covariance'),
+        what='the first orientation',
+    )
     simulator = graph.start('simulator_node', {'scene': 'standing', 'rate': 20.0}, wait=False)
     answer = client.call(Orient, 'orient', frames=5, timeout_sec=30.0)
     assert answer.success, answer.message
@@ -67,7 +92,9 @@ def test_a_capture_puts_the_points_into_the_rig_frame(graph, calibrated, trackin
     for name in NAMES:
         client.listen(f'{name}/corrected_observations')
     graph.wait_for_readers(2)
-    client.wait_until(lambda: published[-1].orientation_id == answer.orientation_id, what='the new orientation')
+    client.wait_until(
+        lambda: published[-1].orientation_id == answer.orientation_id, what='the new orientation'
+    )
     message = published[-1]
     assert (message.source, message.header.frame_id, message.exposures) == ('capture', 'lab', 5)
     saved = load_orientation(orientation_path(calibrated))
@@ -75,18 +102,25 @@ def test_a_capture_puts_the_points_into_the_rig_frame(graph, calibrated, trackin
     sent = orientation_from_message(message)
     assert np.allclose(sent.position_mm, saved.position_mm, atol=1e-9)
     assert np.allclose(sent.covariance, saved.covariance, rtol=1e-9)
-    client.wait_for_diagnostics('reconstruction_node', lambda s: value_of(s, 'orientation') == answer.orientation_id,
-                                'reconstruction')
+    client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: value_of(s, 'orientation') == answer.orientation_id,
+        'reconstruction',
+    )
     publish(client, tracking, range(30), answer='b/corrected_observations')
 
-    def of_markers():   # points of the phantom may still be on their way
+    def of_markers():  # points of the phantom may still be on their way
         found = [m for m in points if len(m.target_id) and m.target_id[0] == 1001]
         return found if len(found) >= 30 else None
-    true, errors = truth(), []
+
+    true = truth()
+    errors = []
     for m in client.wait_until(of_markers, what='the points'):
         assert m.header.frame_id == 'lab' and m.orientation_id == answer.orientation_id
         errors.append((coordinates(m)[0] - true[m.frame_number])[np.array(m.status) <= 1])
-    assert np.sqrt((np.concatenate(errors) ** 2).sum(axis=1).mean()) < 0.25   # mm, against the truth itself
+    assert (
+        np.sqrt((np.concatenate(errors) ** 2).sum(axis=1).mean()) < 0.25
+    )  # mm, against the truth itself
 
 
 def test_what_an_orientation_needs_is_said(graph, tmp_path, calibrated):
@@ -95,10 +129,15 @@ def test_what_an_orientation_needs_is_said(graph, tmp_path, calibrated):
     answer = client.call(Orient, 'orient', timeout_sec=0.2)
     assert not answer.success and 'no calibration of fluoroscope a yet' in answer.message
     assert graph.processes[-1].end() == 0
-    client.wait_until(lambda: not client.count_publishers('rig_orientation'), what='the node to be gone')
+    client.wait_until(
+        lambda: not client.count_publishers('rig_orientation'), what='the node to be gone'
+    )
     graph.calibration_node(calibrated)
     answer = client.call(Orient, 'orient', timeout_sec=0.2, frames=3)
-    assert not answer.success and '0 of 3 frames of all fluoroscopes (a, b) came within 0.2 s' in answer.message
+    assert (
+        not answer.success
+        and '0 of 3 frames of all fluoroscopes (a, b) came within 0.2 s' in answer.message
+    )
 
 
 def test_exposures_are_collected_anew_on_demand(graph, by_command):
@@ -107,4 +146,6 @@ def test_exposures_are_collected_anew_on_demand(graph, by_command):
     collect(graph, readers=1)
     answer = client.call(Reset, 'collect_anew')
     assert answer.success and '15 exposures forgotten' in answer.message
-    assert client.wait_for_status(lambda s: s.exposures == 0).calibration_id, 'the calibration stays'
+    assert client.wait_for_status(lambda s: s.exposures == 0).calibration_id, (
+        'the calibration stays'
+    )

@@ -1,4 +1,6 @@
-"""Starting and ending of the nodes: a sentence where a node cannot start, and nothing but 0 at an interrupt."""
+"""Starting and ending of the nodes: a sentence where a node cannot start, and nothing but 0 at an
+interrupt.
+"""
 
 import shutil
 
@@ -27,13 +29,14 @@ def damaged_bag(folder):
     shutil.copytree(BAGS / 'tracking', folder / 'bag')
     file = folder / 'bag' / 'tracking_0.mcap'
     content = bytearray(file.read_bytes())
-    content[len(content) // 3] ^= 0xff   # within a chunk: it shows only while playing
+    content[len(content) // 3] ^= 0xFF  # within a chunk: it shows only while playing
     file.write_bytes(content)
     return {'bag': folder / 'bag', 'wait_for_readers': 0, 'rate': 1000.0}
 
 
 def foreign_bag(folder):
     from fluoro_calib_ros.bags.writer import BagWriter
+
     with BagWriter(folder / 'bag'):
         pass
     return {'bag': folder / 'bag'}
@@ -71,41 +74,111 @@ def bag_with_a_wrong_topic(folder):
 PHANTOM = {'phantom': BAGS / 'phantom.csv'}
 
 
-@pytest.mark.parametrize('node, parameters, sentence', [
-    ('calibration_node', {}, 'parameter phantom is not set'),
-    ('calibration_node', {'phantom': '/nowhere/phantom.csv'}, '/nowhere/phantom.csv: '),
-    ('calibration_node', bad_phantom, 'phantom.csv, row 5'),
-    ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'model': 'spline'}, 'model is one of'),
-    ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'pair_by': 'luck'}, 'pair_by is'),
-    ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'still_px': -1.0}, 'parameter still_px: '),
-    ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'fluoroscopes': '[a, a]'}, 'parameter fluoroscopes: '),
-    ('calibration_node', {'phantom': '~nobody_of_that_name/x.csv'}, 'x.csv: there is no such home folder'),
-    ('calibration_node', {**PHANTOM, 'calibration_directory': '~nobody_of_that_name'}, 'there is no such home folder'),
-    ('calibration_node', {**PHANTOM, 'fluoroscopes': "['a b']"}, "'a b' cannot be part of the name of a topic"),
-    ('correction_node', {'fluoroscopes': '[a, a]'}, 'parameter fluoroscopes: '),
-    ('correction_node', {'fluoroscopes': '[]'}, 'parameter fluoroscopes: [] is not a list of different names'),
-    ('correction_node', {'fluoroscopes': '[x/y]'}, "'x/y' cannot be part of the name of a topic"),
-    ('image_node', {'fluoroscopes': "['1']"}, "'1' cannot be part of the name of a topic"),
-    ('simulator_node', {'fluoroscopes': '[a-b]'}, "'a-b' cannot be part of the name of a topic"),
-    ('correction_node', {'qos_overrides./test/a/corrected_observations.publisher.reliability': 'luck',
-                         '__ns': '/test'}, 'Unexpected QoS override'),
-    ('correction_node', {'qos_overrides./test/a/target_observations.subscription.reliability': 'luck',
-                         '__ns': '/test'}, 'Unexpected QoS override'),
-    ('simulator_node', {'qos_overrides./test/a/target_observations.publisher.reliability': 'luck', '__ns': '/test'},
-     'Unexpected QoS override'),
-    ('simulator_node', {'scene': 'cat'}, 'parameter scene is'),
-    ('player_node', {}, 'parameter bag is not set'),
-    ('player_node', {'bag': '/nowhere/bag'}, '/nowhere/bag: there is no such bag'),
-    ('player_node', {'bag': BAGS / 'calibration', 'topics': '[/c/target_observations]'}, 'there is nothing to play'),
-    ('player_node', {'bag': BAGS / 'calibration', 'rate': 5}, 'parameter rate: '),   # an integer, not 5.0
-    ('player_node', {'bag': BAGS / 'tracking', 'strip_prefix': '/a/target_observations'}, "cannot be played as ''"),
-    ('player_node', foreign_bag, 'there is nothing to play'),
-    ('player_node', bag_without_messages, 'there are no messages on /x'),
-    ('player_node', bag_without_type, 'there is nothing to play'),
-    ('player_node', bag_of_no_message_type, 'there is nothing to play'),
-    ('player_node', bag_with_a_wrong_topic, "/x y cannot be played as 'x y'"),
-    ('player_node', damaged_bag, 'is damaged')],
-    ids=lambda value: value.__name__ if callable(value) else None)
+@pytest.mark.parametrize(
+    'node, parameters, sentence',
+    [
+        ('calibration_node', {}, 'parameter phantom is not set'),
+        ('calibration_node', {'phantom': '/nowhere/phantom.csv'}, '/nowhere/phantom.csv: '),
+        ('calibration_node', bad_phantom, 'phantom.csv, row 5'),
+        (
+            'calibration_node',
+            {'phantom': BAGS / 'phantom.csv', 'model': 'spline'},
+            'model is one of',
+        ),
+        ('calibration_node', {'phantom': BAGS / 'phantom.csv', 'pair_by': 'luck'}, 'pair_by is'),
+        (
+            'calibration_node',
+            {'phantom': BAGS / 'phantom.csv', 'still_px': -1.0},
+            'parameter still_px: ',
+        ),
+        (
+            'calibration_node',
+            {'phantom': BAGS / 'phantom.csv', 'fluoroscopes': '[a, a]'},
+            'parameter fluoroscopes: ',
+        ),
+        (
+            'calibration_node',
+            {'phantom': '~nobody_of_that_name/x.csv'},
+            'x.csv: there is no such home folder',
+        ),
+        (
+            'calibration_node',
+            {**PHANTOM, 'calibration_directory': '~nobody_of_that_name'},
+            'there is no such home folder',
+        ),
+        (
+            'calibration_node',
+            {**PHANTOM, 'fluoroscopes': "['a b']"},
+            "'a b' cannot be part of the name of a topic",
+        ),
+        ('correction_node', {'fluoroscopes': '[a, a]'}, 'parameter fluoroscopes: '),
+        (
+            'correction_node',
+            {'fluoroscopes': '[]'},
+            'parameter fluoroscopes: [] is not a list of different names',
+        ),
+        (
+            'correction_node',
+            {'fluoroscopes': '[x/y]'},
+            "'x/y' cannot be part of the name of a topic",
+        ),
+        ('image_node', {'fluoroscopes': "['1']"}, "'1' cannot be part of the name of a topic"),
+        (
+            'simulator_node',
+            {'fluoroscopes': '[a-b]'},
+            "'a-b' cannot be part of the name of a topic",
+        ),
+        (
+            'correction_node',
+            {
+                'qos_overrides./test/a/corrected_observations.publisher.reliability': 'luck',
+                '__ns': '/test',
+            },
+            'Unexpected QoS override',
+        ),
+        (
+            'correction_node',
+            {
+                'qos_overrides./test/a/target_observations.subscription.reliability': 'luck',
+                '__ns': '/test',
+            },
+            'Unexpected QoS override',
+        ),
+        (
+            'simulator_node',
+            {
+                'qos_overrides./test/a/target_observations.publisher.reliability': 'luck',
+                '__ns': '/test',
+            },
+            'Unexpected QoS override',
+        ),
+        ('simulator_node', {'scene': 'cat'}, 'parameter scene is'),
+        ('player_node', {}, 'parameter bag is not set'),
+        ('player_node', {'bag': '/nowhere/bag'}, '/nowhere/bag: there is no such bag'),
+        (
+            'player_node',
+            {'bag': BAGS / 'calibration', 'topics': '[/c/target_observations]'},
+            'there is nothing to play',
+        ),
+        (
+            'player_node',
+            {'bag': BAGS / 'calibration', 'rate': 5},
+            'parameter rate: ',
+        ),  # an integer, not 5.0
+        (
+            'player_node',
+            {'bag': BAGS / 'tracking', 'strip_prefix': '/a/target_observations'},
+            "cannot be played as ''",
+        ),
+        ('player_node', foreign_bag, 'there is nothing to play'),
+        ('player_node', bag_without_messages, 'there are no messages on /x'),
+        ('player_node', bag_without_type, 'there is nothing to play'),
+        ('player_node', bag_of_no_message_type, 'there is nothing to play'),
+        ('player_node', bag_with_a_wrong_topic, "/x y cannot be played as 'x y'"),
+        ('player_node', damaged_bag, 'is damaged'),
+    ],
+    ids=lambda value: value.__name__ if callable(value) else None,
+)
 def test_node_that_cannot_start_says_why(graph, tmp_path, node, parameters, sentence):
     parameters = dict(parameters(tmp_path) if callable(parameters) else parameters)
     namespace = {'__ns': parameters.pop('__ns')} if '__ns' in parameters else None
@@ -119,10 +192,16 @@ def test_node_that_cannot_start_says_why(graph, tmp_path, node, parameters, sent
 def test_interrupt_in_the_stream_ends_every_node_cleanly(graph, by_command, exposures):
     client = graph.client
     client.listen('a/corrected_observations')
-    nodes = [*graph.both_nodes(by_command[0]).values(),
-             graph.start('simulator_node', {'scene': 'markers', 'rate': 120.0}),
-             graph.start('player_node', {'bag': BAGS / 'tracking', 'loop': True, 'wait_for_readers': 1})]
-    client.wait_until(lambda: len(client.messages['a/corrected_observations']) > 100, what='corrected frames')
+    nodes = [
+        *graph.both_nodes(by_command[0]).values(),
+        graph.start('simulator_node', {'scene': 'markers', 'rate': 120.0}),
+        graph.start(
+            'player_node', {'bag': BAGS / 'tracking', 'loop': True, 'wait_for_readers': 1}
+        ),
+    ]
+    client.wait_until(
+        lambda: len(client.messages['a/corrected_observations']) > 100, what='corrected frames'
+    )
     for node in reversed(nodes):
         node.interrupt()
     client.wait_until(lambda: not any(n.running for n in nodes), 15, 'the nodes to end')
@@ -153,50 +232,86 @@ def test_two_rigs_in_namespaces_do_not_meet(graph, exposures, tmp_path):
     client = graph.client
     graph.calibration_node(tmp_path / 'none')
     other = graph.start('correction_node', remaps={'__ns': '/elsewhere'}, wait=False)
-    remapped = graph.start('correction_node', remaps={
-        '__node': 'second', '__ns': '/elsewhere',
-        **{f'{n}/target_observations': f'{graph.namespace}/{n}/target_observations' for n in NAMES}}, wait=False)
+    remapped = graph.start(
+        'correction_node',
+        remaps={
+            '__node': 'second',
+            '__ns': '/elsewhere',
+            **{
+                f'{n}/target_observations': f'{graph.namespace}/{n}/target_observations'
+                for n in NAMES
+            },
+        },
+        wait=False,
+    )
     client.wait_until(lambda: client.subscriptions_matched('second'), what='the remapped node')
-    # An interrupt that comes while a process still loads its modules would end it with another status.
-    client.wait_until(lambda: ('correction_node', '/elsewhere') in client.get_node_names_and_namespaces(),
-                      what='the other node')
+    # An interrupt that comes while a process still loads its modules would end it with another
+    # status.
+    client.wait_until(
+        lambda: ('correction_node', '/elsewhere') in client.get_node_names_and_namespaces(),
+        what='the other node',
+    )
     for frame in standing(exposures['a'][0], 3):
         client.publish(frame)
     client.wait_for_status(lambda s: s.frames_received == 3)
-    assert not any(r.node_namespace == '/elsewhere' and r.node_name == 'correction_node'
-                   for r in client.get_subscriptions_info_by_topic(f'{graph.namespace}/a/target_observations'))
+    assert not any(
+        r.node_namespace == '/elsewhere' and r.node_name == 'correction_node'
+        for r in client.get_subscriptions_info_by_topic(f'{graph.namespace}/a/target_observations')
+    )
     assert other.end() == 0 and remapped.end() == 0
 
 
 def test_requests_that_nobody_can_fulfil_are_answered(graph, tmp_path):
     """Times for which nobody can wait, and homes of nobody: the node says so, and stays."""
-    node, client = graph.calibration_node(tmp_path), graph.client
+    node = graph.calibration_node(tmp_path)
+    client = graph.client
     for seconds in (1e300, 1e10):
         answer = client.call(Capture, 'capture', timeout_sec=seconds)
-        assert not answer.success and 'timeout_sec is a time in seconds, at most 86400, not' in answer.message
+        assert (
+            not answer.success
+            and 'timeout_sec is a time in seconds, at most 86400, not' in answer.message
+        )
         assert not client.call(Orient, 'orient', timeout_sec=seconds).success
-    for kind, service in ((SaveCalibration, 'save_calibration'), (LoadCalibration, 'load_calibration')):
+    for kind, service in (
+        (SaveCalibration, 'save_calibration'),
+        (LoadCalibration, 'load_calibration'),
+    ):
         answer = client.call(kind, service, directory='~nobody_of_that_name/x')
-        assert not answer.success and '~nobody_of_that_name/x: there is no such home folder' in answer.message
+        assert (
+            not answer.success
+            and '~nobody_of_that_name/x: there is no such home folder' in answer.message
+        )
     assert node.end() == 0 and not any(word in node.log for word in TROUBLE), node.log
 
 
 def test_player_latches_what_was_latched(graph, by_command):
     """A recorded calibration is heard by a node that asks for latched ones."""
     from fluoro_calib_ros.bags.qos import PROFILES, to_yaml
+
     calibration = load_calibrations(by_command[0])['a']
     with open(graph.directory / 'latched.mcap', 'wb') as file:
         writer = Writer(file)
         writer.start('ros2', 'test')
-        schema = writer.register_schema('fluoro_calib_msgs/msg/FluoroscopeCalibration', 'ros2msg', b'string id')
-        channel = writer.register_channel('/a/calibration', 'cdr', schema,
-                                          {'offered_qos_profiles': to_yaml([PROFILES['latched']])})
-        writer.add_message(channel, 1, bytes(serialize_message(message_from_calibration(calibration))), 1)
+        schema = writer.register_schema(
+            'fluoro_calib_msgs/msg/FluoroscopeCalibration', 'ros2msg', b'string id'
+        )
+        channel = writer.register_channel(
+            '/a/calibration',
+            'cdr',
+            schema,
+            {'offered_qos_profiles': to_yaml([PROFILES['latched']])},
+        )
+        writer.add_message(
+            channel, 1, bytes(serialize_message(message_from_calibration(calibration))), 1
+        )
         writer.finish()
     graph.start('correction_node')
-    player = graph.start('player_node', {'bag': graph.directory / 'latched.mcap', 'wait_for_readers': 1}, wait=False)
-    graph.client.wait_for_diagnostics('correction_node',
-                                      lambda s: value_of(s, 'calibration') == calibration.calibration_id)
+    player = graph.start(
+        'player_node', {'bag': graph.directory / 'latched.mcap', 'wait_for_readers': 1}, wait=False
+    )
+    graph.client.wait_for_diagnostics(
+        'correction_node', lambda s: value_of(s, 'calibration') == calibration.calibration_id
+    )
     assert player.wait() == 0
 
 
@@ -205,8 +320,11 @@ def test_incompatible_publisher_is_reported(graph, tmp_path):
     client = graph.client
     graph.calibration_node(tmp_path)
     graph.start('correction_node')
-    publisher = client.create_publisher(TargetObservations, 'a/target_observations',
-                                        QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT))
+    publisher = client.create_publisher(
+        TargetObservations,
+        'a/target_observations',
+        QoSProfile(depth=5, reliability=ReliabilityPolicy.BEST_EFFORT),
+    )
     for node in ('calibration_node', 'correction_node'):
         status = client.wait_for_diagnostics(node, lambda s: 'incompatible' in s.message)
         assert status.level == b'\1'

@@ -1,4 +1,6 @@
-"""Three fluoroscopes, live: calibration, orientation, and points where a view is missing, as offline."""
+"""Three fluoroscopes, live: calibration, orientation, and points where a view is missing, as
+offline.
+"""
 
 import csv
 import json
@@ -10,16 +12,28 @@ from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from fluoro_calib_msgs.srv import Calibrate, LoadCalibration, Orient
 from ros_graph import entry_point, value_of
 
-from fluoro_calib_ros.bags.dataset import write_bag
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.jobs.dataset import write_bag
 from fluoro_calib_ros.nodes.conversion import message_from_frame
 from fluoro_calib_ros.nodes.qos import OBSERVATIONS
-from fluoro_calib_ros.photogrammetry.observations import Frame
-from fluoro_calib_ros.simulation.rig import START_NS, seen_beads, simulate_exposures, simulate_tracking, virtual_rig
+from fluoro_calib_ros.simulation.rig import (
+    START_NS,
+    seen_beads,
+    simulate_exposures,
+    simulate_tracking,
+    virtual_rig,
+)
 
 THREE = ('a', 'b', 'c')
-POSES, RATE_HZ, PATIENCE = 12, 15.0, 8
-FRAMES, SILENT, DRIFT = 360, 300, 210   # markers; frames of c end there, and b drifts from there on
-NUMBER, START = 10_001, START_NS + 10 ** 12
+POSES = 12
+RATE_HZ = 15.0
+PATIENCE = 8
+# markers; frames of c end there, and b drifts from there on
+FRAMES = 360
+SILENT = 300
+DRIFT = 210
+NUMBER = 10_001
+START = START_NS + 10**12
 
 
 def a_rig():
@@ -31,18 +45,25 @@ def standing(of_rig, number, stamp_ns):
     """A frame of each fluoroscope of the phantom standing in the rig frame."""
     rng = np.random.default_rng(number)
     for f in of_rig.fluoroscopes:
-        ids, uv = seen_beads(rng, f, of_rig.true_mm, of_rig.phantom.target_id, 0.25, 0.01, (130, 160))
+        ids, uv = seen_beads(
+            rng, f, of_rig.true_mm, of_rig.phantom.target_id, 0.25, 0.01, (130, 160)
+        )
         yield Frame(f.name, number, ids, uv, f.image_size, None, stamp_ns, f'{f.name}_optical')
 
 
 def started(graph, folder):
     """Start the three nodes for three fluoroscopes; returns the reconstruction node."""
-    client, three = graph.client, {'fluoroscopes': '[a, b, c]'}
-    client._outputs['c'] = client.create_publisher(TargetObservations, 'c/target_observations', OBSERVATIONS)
+    client = graph.client
+    three = {'fluoroscopes': '[a, b, c]'}
+    client._outputs['c'] = client.create_publisher(
+        TargetObservations, 'c/target_observations', OBSERVATIONS
+    )
     client.listen('c/calibration_status')
     graph.calibration_node(folder, **three)
     graph.start('correction_node', three)
-    node = graph.start('reconstruction_node', {**three, 'patience': PATIENCE, 'drift_rate': 1000.0})
+    node = graph.start(
+        'reconstruction_node', {**three, 'patience': PATIENCE, 'drift_rate': 1000.0}
+    )
     client.wait_until(lambda: client.subscriptions_matched('correction_node'), what='the readers')
     return node
 
@@ -56,46 +77,61 @@ def calibrated(graph, of_rig):
     client.wait_for_status(lambda s: s.exposures == POSES, 'c', 'all exposures')
     answer = client.call(Calibrate, 'calibrate', model='parametric')
     assert answer.success and list(answer.fluoroscope) == list(THREE), answer.message
-    future, numbers = client.call_async(Orient, 'orient', timeout_sec=30.0), iter(range(100, 1000))
+    future = client.call_async(Orient, 'orient', timeout_sec=30.0)
+    numbers = iter(range(100, 1000))
 
     def show():
         if not future.done():
             number = next(numbers)
-            for frame in standing(of_rig, number, START_NS + number * 10 ** 9):
+            for frame in standing(of_rig, number, START_NS + number * 10**9):
                 client.publish(frame)
         return future.done()
+
     client.wait_until(show, what='the orientation')
     assert future.result().success, future.result().message
     for name in THREE:
         client.wait_for_diagnostics('correction_node', lambda s: value_of(s, 'calibration'), name)
-    client.wait_for_diagnostics('reconstruction_node', lambda s: value_of(s, 'orientation') ==
-                                future.result().orientation_id, 'reconstruction')
+    client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: value_of(s, 'orientation') == future.result().orientation_id,
+        'reconstruction',
+    )
     return future.result().orientation_id
 
 
 def begin_anew(graph, node, markers, points):
-    """Have the drift watch begin anew with the orientation, after it has got all that it needs and nothing waits;
-    returns the DiagnosticStatus of then."""
-    client, key = graph.client, 'reconstruction_node: reconstruction'
+    """Have the drift watch begin anew with the orientation, after it has got all that it needs and
+    nothing waits; returns the DiagnosticStatus of then.
+    """
+    client = graph.client
+    key = 'reconstruction_node: reconstruction'
     for number in range(2000, NUMBER):
         for name in THREE:
-            client.publish(replace(markers[name][0], number=number, stamp_ns=START_NS + number * 10 ** 9))
+            client.publish(
+                replace(markers[name][0], number=number, stamp_ns=START_NS + number * 10**9)
+            )
         client.wait_until(lambda: points and points[-1].frame_number == number, what='the points')
         status = client.statuses.get('reconstruction_node: drift')
         if status is not None and value_of(status, 'observations') and max(points[-1].rays) == 3:
             break
     count = node.log.count('orientation rig-')
     assert client.call(LoadCalibration, 'load_calibration').success
-    client.wait_until(lambda: node.log.count('orientation rig-') > count, what='the orientation once more')
+    client.wait_until(
+        lambda: node.log.count('orientation rig-') > count, what='the orientation once more'
+    )
     client.statuses.pop(key)
     return client.wait_until(lambda: client.statuses.get(key), what='fresh counts')
 
 
 def marker_frames(of_rig):
-    """The tracking, its frames with a shift of 1 px in half of the image of b at the end; and without what c loses:
-    frames at random, and all at the end."""
-    tracking = simulate_tracking(of_rig, FRAMES / RATE_HZ, RATE_HZ, 5, start_ns=START, first_number=NUMBER)
-    frames, there = tracking.frames, np.random.default_rng(3).random(SILENT) > 0.3
+    """The tracking, its frames with a shift of 1 px in half of the image of b at the end; and
+    without what c loses: frames at random, and all at the end.
+    """
+    tracking = simulate_tracking(
+        of_rig, FRAMES / RATE_HZ, RATE_HZ, 5, start_ns=START, first_number=NUMBER
+    )
+    frames = tracking.frames
+    there = np.random.default_rng(3).random(SILENT) > 0.3
     for k in range(DRIFT, FRAMES):
         left = frames['b'][k].uv[:, 0] < 512
         frames['b'][k] = replace(frames['b'][k], uv=frames['b'][k].uv + np.outer(left, [0.0, 1.0]))
@@ -106,23 +142,35 @@ def marker_frames(of_rig):
 def streamed(client, kept, points):
     """Publish frames exposure by exposure, in step with the points; returns their messages."""
     by_number = {}
-    for frame in sorted((f for of_one in kept.values() for f in of_one), key=lambda f: (f.number, f.fluoroscope)):
+    for frame in sorted(
+        (f for of_one in kept.values() for f in of_one), key=lambda f: (f.number, f.fluoroscope)
+    ):
         by_number.setdefault(frame.number, []).append(frame)
-    before, sent = len(points), np.cumsum([0, *map(len, by_number.values())])
-    # As many ahead as it takes to find c silent, and no more: else it is taken for silent while its frames wait.
-    client.publish_in_step([(f.fluoroscope, message_from_frame(f)) for of_one in by_number.values() for f in of_one],
-                           lambda: sent[len(points) - before], 2 * (PATIENCE + 1))
+    before = len(points)
+    sent = np.cumsum([0, *map(len, by_number.values())])
+    # As many ahead as it takes to find c silent, and no more: else it is taken for silent while
+    # its frames wait.
+    client.publish_in_step(
+        [(f.fluoroscope, message_from_frame(f)) for of_one in by_number.values() for f in of_one],
+        lambda: sent[len(points) - before],
+        2 * (PATIENCE + 1),
+    )
     client.wait_until(lambda: len(points) - before >= FRAMES, what='the points of all exposures')
     return points[before:]
 
 
 def check_points(messages, tracking, there):
-    """Every exposure once, in order, of the rays that are there; those of three are more exact, as they say."""
+    """Every exposure once, in order, of the rays that are there; those of three are more exact, as
+    they say.
+    """
     assert [m.frame_number for m in messages] == list(range(NUMBER, NUMBER + FRAMES))
-    errors, sd = {2: [], 3: []}, {2: [], 3: []}
+    errors = {2: [], 3: []}
+    sd = {2: [], 3: []}
     for k, (message, three) in enumerate(zip(messages, there)):
         good = np.array(message.status) <= message.OUTSIDE
-        assert message.header.frame_id == 'rig' and set(np.array(message.rays)[good]) <= ({2, 3} if three else {2})
+        assert message.header.frame_id == 'rig' and set(np.array(message.rays)[good]) <= (
+            {2, 3} if three else {2}
+        )
         if k < DRIFT:
             assert good.mean() > 0.9
             full = good & (np.array(message.rays) == (3 if three else 2))
@@ -130,45 +178,91 @@ def check_points(messages, tracking, there):
             errors[3 if three else 2].append((xyz - tracking.points_mm[k])[full])
             variance = sum(np.array(getattr(message, f'cov_{c}')) for c in ('xx', 'yy', 'zz'))
             sd[3 if three else 2].append(1e3 * np.sqrt(variance)[full])
-    rms = {rays: np.sqrt(np.mean(np.sum(np.concatenate(e) ** 2, axis=1))) for rays, e in errors.items()}
+    rms = {
+        rays: np.sqrt(np.mean(np.sum(np.concatenate(e) ** 2, axis=1)))
+        for rays, e in errors.items()
+    }
     assert rms[3] < 0.95 * rms[2] < 0.3
     assert np.median(np.concatenate(sd[3])) < 0.9 * np.median(np.concatenate(sd[2]))
 
 
 def check_mixed(client, last, markers, points):
-    """Views without c, of which one was corrected with another calibration: they are not intersected. What fits is."""
-    before = int(value_of(client.statuses['reconstruction_node: reconstruction'], 'exposures without orientation'))
-    outputs = [client.create_publisher(CorrectedObservations, f'{name}/corrected_observations', OBSERVATIONS)
-               for name in 'ab']
-    client.wait_until(lambda: all(output.get_subscription_count() for output in outputs), what='the reader')
+    """Views without c, of which one was corrected with another calibration: they are not
+    intersected. What fits is.
+    """
+    before = int(
+        value_of(
+            client.statuses['reconstruction_node: reconstruction'], 'exposures without orientation'
+        )
+    )
+    outputs = [
+        client.create_publisher(
+            CorrectedObservations, f'{name}/corrected_observations', OBSERVATIONS
+        )
+        for name in 'ab'
+    ]
+    client.wait_until(
+        lambda: all(output.get_subscription_count() for output in outputs), what='the reader'
+    )
     client.wait_until_known_to('reconstruction_node')
-    for number, ids in ((20_001, ('a-other', last.calibration_id[1])), (20_002, last.calibration_id[:2])):
+    for number, ids in (
+        (20_001, ('a-other', last.calibration_id[1])),
+        (20_002, last.calibration_id[:2]),
+    ):
         for output, calibration_id, name in zip(outputs, ids, 'ab'):
             source = message_from_frame(markers[name][-1])
-            output.publish(CorrectedObservations(
-                header=source.header, frame_number=number, calibration_id=calibration_id, target_id=source.target_id,
-                u=source.u, v=source.v, sigma=[0.3] * len(source.u), correction_sd=[0.1] * len(source.u),
-                status=bytes(len(source.u))))
-    client.wait_until(lambda: points[-1].frame_number == 20_002, what='the points of the views that fit')
+            output.publish(
+                CorrectedObservations(
+                    header=source.header,
+                    frame_number=number,
+                    calibration_id=calibration_id,
+                    target_id=source.target_id,
+                    u=source.u,
+                    v=source.v,
+                    sigma=[0.3] * len(source.u),
+                    correction_sd=[0.1] * len(source.u),
+                    status=bytes(len(source.u)),
+                )
+            )
+    client.wait_until(
+        lambda: points[-1].frame_number == 20_002, what='the points of the views that fit'
+    )
     assert points[-2].frame_number == last.frame_number
-    client.wait_for_diagnostics('reconstruction_node', lambda s: int(value_of(
-        s, 'exposures without orientation')) == before + 1, 'reconstruction')
+    client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: int(value_of(s, 'exposures without orientation')) == before + 1,
+        'reconstruction',
+    )
 
 
 def offline(folder, kept, path):
     """Rows of points and result of the command line, for a bag of the same frames."""
     write_bag(path / 'bag', kept)
-    command = [*entry_point('cli'), 'reconstruct', path / 'bag', '--calibration', folder, '--out', path / 'out.csv',
-               '--json']
+    command = [
+        *entry_point('cli'),
+        'reconstruct',
+        path / 'bag',
+        '--calibration',
+        folder,
+        '--out',
+        path / 'out.csv',
+        '--json',
+    ]
     result = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
     with open(path / 'out.csv', newline='') as file:
         return list(csv.DictReader(file)), result
 
 
 def test_points_come_while_views_are_missing(graph, tmp_path):
-    """Frames of c are lost at random, then it is silent; b drifts meanwhile, and is found as in the recording."""
-    client, folder, of_rig = graph.client, tmp_path / 'calibration', a_rig()
-    points, drift = (client.listen(f'reconstruction/{name}') for name in ('points_with_covariance', 'drift'))
+    """Frames of c are lost at random, then it is silent; b drifts meanwhile, and is found as in
+    the recording.
+    """
+    client = graph.client
+    folder = tmp_path / 'calibration'
+    of_rig = a_rig()
+    points, drift = (
+        client.listen(f'reconstruction/{name}') for name in ('points_with_covariance', 'drift')
+    )
     node = started(graph, folder)
     oriented = calibrated(graph, of_rig)
     tracking, kept, there = marker_frames(of_rig)
@@ -176,9 +270,15 @@ def test_points_come_while_views_are_missing(graph, tmp_path):
     messages = streamed(client, kept, points)
     check_points(messages, tracking, there)
     assert all(m.orientation_id == oriented and len(m.calibration_id) == 3 for m in messages)
-    status = client.wait_for_diagnostics('reconstruction_node', lambda s: int(value_of(
-        s, 'exposures incomplete')) == int(value_of(before, 'exposures incomplete')) + FRAMES - there.sum(),
-        'reconstruction', 'the count of incomplete exposures')
+    status = client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: (
+            int(value_of(s, 'exposures incomplete'))
+            == int(value_of(before, 'exposures incomplete')) + FRAMES - there.sum()
+        ),
+        'reconstruction',
+        'the count of incomplete exposures',
+    )
     assert value_of(status, 'frames late') == value_of(before, 'frames late')
     assert status.message == 'nothing comes of c, points are of the others'
     rows, result = offline(folder, kept, tmp_path)
@@ -187,12 +287,26 @@ def test_points_come_while_views_are_missing(graph, tmp_path):
     assert [int(row['rays']) for row in rows] == [rays for m in messages for rays in m.rays]
     np.testing.assert_allclose(live, of_file, atol=1e-6)
     found = result['drift']
-    assert result['frames'] == FRAMES and result['incomplete'] == FRAMES - there.sum() and found['fluoroscope'] == 'b'
-    said = client.wait_until(lambda: drift and drift[-1].observations == found['observations'] and drift[-1],
-                             what='the state of the drift watch')
+    assert (
+        result['frames'] == FRAMES
+        and result['incomplete'] == FRAMES - there.sum()
+        and found['fluoroscope'] == 'b'
+    )
+    said = client.wait_until(
+        lambda: drift and drift[-1].observations == found['observations'] and drift[-1],
+        what='the state of the drift watch',
+    )
     assert found['level'] == 'error' and said.level == said.ERROR and said.fluoroscope == 'b'
-    np.testing.assert_allclose([said.size, said.sd, said.evidence, said.u0, said.v1],
-                               [found['size_px'], found['sd_px'], found['evidence'], found['area_px'][0],
-                                found['area_px'][3]], rtol=1e-6)
+    np.testing.assert_allclose(
+        [said.size, said.sd, said.evidence, said.u0, said.v1],
+        [
+            found['size_px'],
+            found['sd_px'],
+            found['evidence'],
+            found['area_px'][0],
+            found['area_px'][3],
+        ],
+        rtol=1e-6,
+    )
     check_mixed(client, messages[-1], tracking.frames, points)
     assert 'Traceback' not in node.log

@@ -4,13 +4,14 @@ import json
 
 from fluoro_calib_msgs.srv import Calibrate
 from ros_graph import SUCCEEDED
-from test_jobs import rig  # noqa: F401  a fixture
 
 
-def test_a_job_tells_its_verdict_where_it_is_asked_for(rig):  # noqa: F811
+def test_a_job_tells_its_verdict_where_it_is_asked_for(rig):
     """A model that corrects nothing is published, and its verdict is that it fails, and why."""
     client = rig.client
-    done = client.result_of(client.goal(model='none', fluoroscopes=['b'], validate=True).get_result_async())
+    done = client.result_of(
+        client.goal(model='none', fluoroscopes=['b'], validate=True).get_result_async()
+    )
     assert done.status == SUCCEEDED and done.result.verdict == 'fail'
     assert 'the residuals keep a trend of' in done.result.findings[0]
     assert done.result.message.endswith('; verdict: fail')
@@ -20,4 +21,6 @@ def test_a_job_tells_its_verdict_where_it_is_asked_for(rig):  # noqa: F811
 
     answer = client.call(Calibrate, 'calibrate', model='none', fluoroscopes=['b'])
     assert answer.success and answer.verdict == '' and not answer.findings
-    assert not (rig.folder / 'validation.json').exists(), 'it is the verdict on an earlier calibration'
+    assert not (rig.folder / 'validation.json').exists(), (
+        'it is the verdict on an earlier calibration'
+    )

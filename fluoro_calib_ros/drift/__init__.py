@@ -1,0 +1,1 @@
+"""The drift watch: tell from tracked markers that a calibration no longer holds."""

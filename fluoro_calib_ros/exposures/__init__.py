@@ -1,0 +1,1 @@
+"""Frames of image points and the phantom: validation, pairing and collecting."""

@@ -1,0 +1,109 @@
+"""Options: each declared once, with its default, choices, range, unit and description.
+
+A frozen dataclass declares its fields by `option`. The command line, the parameters of the nodes,
+config/ and docs/ are made from `declared`, or tested against it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any
+
+_KEY = 'option'
+
+
+@dataclasses.dataclass(frozen=True)
+class Option:
+    """One option of an options class.
+
+    Parameters
+    ----------
+    name : str
+    default : object
+    description : str
+        One phrase, without unit, range and choices.
+    choices : tuple of str
+        Empty where any value in the range is allowed.
+    minimum, maximum : float or None
+        Range, both ends included.
+    unit : str
+        Such as 's' or 'px'; empty for a number without one.
+    length : int or None
+        Number of components of a tuple.
+    """
+
+    name: str
+    default: Any
+    description: str
+    choices: tuple[str, ...] = ()
+    minimum: float | None = None
+    maximum: float | None = None
+    unit: str = ''
+    length: int | None = None
+
+    @property
+    def help(self) -> str:
+        """Description with unit and choices, for a command line or a parameter descriptor."""
+        unit = f' [{self.unit}]' if self.unit else ''
+        choices = f': {", ".join(self.choices)}' if self.choices else ''
+        return f'{self.description}{unit}{choices}'
+
+    def validate(self, value: Any) -> None:
+        """Raise ValueError, beginning with the name of the option, for a value it cannot have."""
+        if self.choices:
+            if value not in self.choices:
+                raise ValueError(f'{self.name} is one of {", ".join(self.choices)}, not {value!r}')
+        elif value is not None and (self.minimum is not None or self.maximum is not None):
+            values = value if isinstance(value, tuple) else (value,)
+            if not all(self._in_range(v) for v in values):
+                raise ValueError(f'{self.name} is {self._range()}, not {value!r}')
+
+    def _in_range(self, value: float) -> bool:
+        above = self.minimum is None or value >= self.minimum
+        below = self.maximum is None or value <= self.maximum
+        return bool(above and below)  # NaN is neither
+
+    def _range(self) -> str:
+        if self.minimum is None:
+            return f'{self.maximum:g} at most'
+        if self.maximum is None:
+            return f'{self.minimum:g} at least'
+        return f'between {self.minimum:g} and {self.maximum:g}'
+
+
+def option(
+    default: Any,
+    description: str,
+    *,
+    choices: Iterable[str] = (),
+    minimum: float | None = None,
+    maximum: float | None = None,
+    unit: str = '',
+    length: int | None = None,
+) -> Any:
+    """Declare a field of an options dataclass; see `Option` for the arguments."""
+    declaration = {
+        'description': description,
+        'choices': tuple(choices),
+        'minimum': minimum,
+        'maximum': maximum,
+        'unit': unit,
+        'length': length,
+    }
+    return dataclasses.field(default=default, metadata={_KEY: declaration})
+
+
+def declared(options: type | object) -> dict[str, Option]:
+    """Return the options that a dataclass declares, by name, in the order of declaration."""
+    return {
+        field.name: Option(field.name, field.default, **field.metadata[_KEY])
+        for field in dataclasses.fields(options)  # type: ignore[arg-type]
+        if _KEY in field.metadata
+    }
+
+
+def validate_options(options: object) -> None:
+    """Raise ValueError for the first option of an instance with a value it cannot have."""
+    for name, one in declared(options).items():
+        one.validate(getattr(options, name))

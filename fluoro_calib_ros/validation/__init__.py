@@ -1,0 +1,1 @@
+"""Validation: the verdict on a calibration."""

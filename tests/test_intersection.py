@@ -162,8 +162,8 @@ def test_derivatives_of_the_image_points_by_the_orientation():
     functions = _derivative_functions(orientation)
     for f in range(2):
         x = orientation.rotation[f] @ (xyz[0] - orientation.position_mm[f])
-        (x, y) = x[:2] / x[2]
         near = 1 / x[2]
+        x, y = x[:2] / x[2]
         values = np.array([1, x, y, x * x, y * y, x * y, near, x * near, y * near])
         analytic = np.einsum('k,kij->ij', values, functions[f])
         np.testing.assert_allclose(

@@ -338,7 +338,7 @@ def run_case(case):
 def errors_of_test(scene, case, calibrations):
     """RMSE (6,) [mm] of the test exposures, adjusted with the calibrations held.
 
-    The same as adjust_with, but for the start values, and without covariances and the adjustment
+    The same as adjust_with_calibrations, but for the start values, and without covariances and the adjustment
     before the correction, which are not needed here: a third of the time.
     """
     measured = scene.test_network(case.fluoroscopes, case.variant == KNOWN)

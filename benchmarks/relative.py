@@ -2,7 +2,7 @@
 benchmarks.relative`.
 
 Virtual rigs whose fluoroscopes see the phantom in the same pose in every exposure. Errors are
-those of other exposures, adjusted with the calibration held (adjust_with), against the truth of
+those of other exposures, adjusted with the calibration held (adjust_with_calibrations), against the truth of
 the rig.
 """
 
@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.calibrate import adjust_with, calibrate
+from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
@@ -53,7 +53,7 @@ def measure(rig, training, test, way, model):
         joint,
     )
     seconds = time.perf_counter() - began
-    found = adjust_with(test.frames, rig.phantom, job.calibrations)
+    found = adjust_with_calibrations(test.frames, rig.phantom, job.calibrations)
     points = found.targets.xyz_mm - rig.true_mm[found.targets.target_id - 1]
     first = {name: frames[0].number for name, frames in test.frames.items()}
     sources = []

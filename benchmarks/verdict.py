@@ -16,6 +16,7 @@ import numpy as np
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.report.tables import markdown_table
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
@@ -94,8 +95,9 @@ def measured(case, seed, model):
     fault, size, exposures, other, _ = CASES[case]
     frames, phantom = scene(seed, fault, size, exposures)
     options = CalibrationOptions(model=other or model)
+    request = CalibrationRequest({'a': frames}, phantom, options)
     calibrations = calibrate({'a': frames}, phantom, options).calibrations
-    found = validate({'a': frames}, phantom, calibrations, options)
+    found = validate(request, calibrations)
     return {
         'case': case,
         'seed': seed,

@@ -392,7 +392,7 @@ def calibrate(options):
 
 def adjust(options):
     """Adjust with calibrations held and write the result."""
-    from .calibration.calibrate import adjust_with
+    from .calibration.calibrate import adjust_with_calibrations
     from .files.phantom import read_phantom
 
     phantom = read_phantom(options.phantom)
@@ -404,7 +404,9 @@ def adjust(options):
             f'{options.calibration}: there is no calibration of fluoroscope {missing[0]}, '
             f'only of {", ".join(calibrations)}'
         )
-    job = adjust_with(frames, phantom, {name: calibrations[name] for name in frames}, options.loss)
+    job = adjust_with_calibrations(
+        frames, phantom, {name: calibrations[name] for name in frames}, options.loss
+    )
     _write_job(options, job)
 
 

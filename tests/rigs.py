@@ -32,7 +32,7 @@ def exposures(count=15, seed=1):
 
 @functools.cache
 def calibrated(name='a', count=15, **options):
-    """JobResult of fluoroscope name of the rig with the first exposures of 15."""
+    """CalibrationResult of fluoroscope name of the rig with the first exposures of 15."""
     return calibrate(
         {name: exposures()[name][:count]}, rig().phantom, CalibrationOptions(**options)
     )

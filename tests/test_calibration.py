@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from fluoro_calib_ros.calibration.anderson import Anderson
 from fluoro_calib_ros.calibration.calibrate import (
     Targets,
-    adjust_with,
+    adjust_with_calibrations,
     calibrate,
     combined_targets,
 )
@@ -144,13 +144,13 @@ def test_calibration_holds_for_exposures_it_has_not_seen():
     """
     test = simulate_exposures(rigs.rig(), 8, seed=77, first_number=100).frames['a']
     calibration = rigs.calibrated().calibrations['a']
-    job = adjust_with({'a': test}, PHANTOM, {'a': calibration})
+    job = adjust_with_calibrations({'a': test}, PHANTOM, {'a': calibration})
     figures = job.fluoroscopes['a']
     assert (figures.rmse_before > 4 * NOISE_PX).all() and (figures.rmse_after < NOISE_PX).all()
     np.testing.assert_array_equal(figures.interior, calibration.interior)
     assert job.calibrations['a'] is calibration and not figures.interior_sd.any()
     assert [e.exposure for e in figures.exposures] == list(range(100, 108))
-    without = adjust_with(
+    without = adjust_with_calibrations(
         {'a': test}, PHANTOM, {'a': rigs.calibrated(model='none').calibrations['a']}
     )
     assert target_error(job.targets) < 0.8 * target_error(without.targets)
@@ -158,7 +158,9 @@ def test_calibration_holds_for_exposures_it_has_not_seen():
 
 def test_a_single_exposure_can_be_adjusted():
     test = simulate_exposures(rigs.rig(), 1, seed=78).frames['a']
-    job = adjust_with({'a': test}, PHANTOM, {'a': rigs.calibrated().calibrations['a']})
+    job = adjust_with_calibrations(
+        {'a': test}, PHANTOM, {'a': rigs.calibrated().calibrations['a']}
+    )
     assert job.converged and len(job.fluoroscopes['a'].exposures) == 1
     # With one ray to a target the survey could take up all residuals: the noise is that of the
     # calibration.
@@ -172,7 +174,7 @@ def test_frames_of_another_image_size_are_not_adjusted_with_a_calibration():
         DataError,
         match='frame 1: the image is 2048 x 1024 px, but the calibration is for 1024 x 1024',
     ):
-        adjust_with({'a': other}, PHANTOM, {'a': rigs.calibrated().calibrations['a']})
+        adjust_with_calibrations({'a': other}, PHANTOM, {'a': rigs.calibrated().calibrations['a']})
 
 
 @pytest.mark.long

@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import gamma, kv
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.calibrate import adjust_with, calibrate
+from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.calibration.initial_network import measured_network
 from fluoro_calib_ros.calibration.model_choice import better_kind
 from fluoro_calib_ros.calibration.self_calibration import (
@@ -459,7 +459,7 @@ def test_out_of_sample_error_is_near_that_of_known_distortion(model, most):
     train = simulate_exposures(rig, 15, 1)
 
     def error(frames, tested, options):
-        job = adjust_with(
+        job = adjust_with_calibrations(
             {'a': tested}, rig.phantom, calibrate({'a': frames}, rig.phantom, options).calibrations
         )
         return np.sqrt(

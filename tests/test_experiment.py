@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fluoro_calib_ros.calibration.calibrate import adjust_with, calibrate
+from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.distortion.models import no_correction
 from fluoro_calib_ros.simulation.distortion import random_field
 
@@ -164,13 +164,13 @@ def test_failed_case_is_told(experiment, tmp_path):
 
 
 def test_tested_is_adjust_with():
-    """The test of a calibration gives what a user gets from adjust_with."""
+    """The test of a calibration gives what a user gets from adjust_with_calibrations."""
     case = Case(2, 'knn', ('a',), **SMALL)
     scene = scene_of(*case.scene)
     frames, _ = scene.training(None, False)
     job = calibrate({'a': frames['a']}, scene.rig.phantom, options_of(case))
     held_back = [f for i, f in enumerate(scene.recording.frames['a']) if i % case.every]
-    user = adjust_with({'a': held_back}, scene.rig.phantom, job.calibrations)
+    user = adjust_with_calibrations({'a': held_back}, scene.rig.phantom, job.calibrations)
     expected = scene.errors(
         user.targets.target_id,
         user.targets.xyz_mm,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fluoro_calib_ros.calibration.calibrate import adjust_with, calibrate
+from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.report.figures import (
@@ -103,7 +103,7 @@ def test_figures_without_model_or_runs(scene, job, plain, tmp_path):
     phantom, frames = scene
     names = {os.path.basename(path) for path in write_figures(plain, tmp_path)}
     assert names == {'residuals_histogram_a.png', 'residuals_position_a.png'}
-    adjusted = adjust_with({'a': frames['a']}, phantom, job.calibrations)
+    adjusted = adjust_with_calibrations({'a': frames['a']}, phantom, job.calibrations)
     assert write_figures(adjusted, tmp_path) == []
     rows = [line.split() for line in summary_table(adjusted).splitlines()]
     assert ['iterations', '-'] in rows and ['converged', 'yes'] in rows

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from rigs import calibrated, exposures, rig, run
 
-from fluoro_calib_ros.calibration.calibrate import adjust_with, calibrate
+from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
@@ -35,7 +36,7 @@ from fluoro_calib_ros.validation.verdict import (
     Validation,
     bead_checks,
     validate,
-    validate_or_tell,
+    validate_or_report,
     verdict_of,
 )
 
@@ -77,7 +78,8 @@ def verdict(fault='', **options):
         if not fault
         else calibrate(frames, rig().phantom, CalibrationOptions(**options))
     )
-    return validate(frames, rig().phantom, job.calibrations, CalibrationOptions(**options))
+    request = CalibrationRequest(frames, rig().phantom, CalibrationOptions(**options))
+    return validate(request, job.calibrations)
 
 
 def failed(validation):
@@ -131,9 +133,8 @@ def test_a_distortion_that_moves_fails_and_its_place_is_named():
 def test_too_few_exposures_for_halves_cannot_tell():
     frames = {'a': exposures()['a'][:5]}
     job = calibrate(frames, rig().phantom, CalibrationOptions(max_iterations=3, **LOCAL))
-    found = validate(
-        frames, rig().phantom, job.calibrations, CalibrationOptions(max_iterations=3, **LOCAL)
-    )
+    options = CalibrationOptions(max_iterations=3, **LOCAL)
+    found = validate(CalibrationRequest(frames, rig().phantom, options), job.calibrations)
     halves = found.checks[0]
     assert halves.name == 'halves' and halves.passed is None and np.isnan(halves.value)
     assert '5 exposures are too few for two halves of 3 or more' in halves.sentence
@@ -145,14 +146,8 @@ def test_both_fluoroscopes_in_one_adjustment_tell_their_progress_and_can_be_stop
     frames = {n: f[:8] for n, f in exposures().items()}
     job = calibrate(frames, rig().phantom, options, joint=True)
     steps = []
-    found = validate(
-        frames,
-        rig().phantom,
-        job.calibrations,
-        options,
-        True,
-        progress=lambda *step: steps.append(step),
-    )
+    request = CalibrationRequest(frames, rig().phantom, options, joint=True)
+    found = validate(request, job.calibrations, progress=lambda *step: steps.append(step))
     assert [(c.name, c.fluoroscope) for c in found.checks] == [
         *((name, f) for f in 'ab' for name in CHECKS[:6]),
         ('beads', ''),
@@ -166,16 +161,17 @@ def test_both_fluoroscopes_in_one_adjustment_tell_their_progress_and_can_be_stop
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        validate(frames, rig().phantom, job.calibrations, options, True, raise_if_cancelled=stop)
+        validate(request, job.calibrations, raise_if_cancelled=stop)
 
 
 def test_what_cannot_be_adjusted_cannot_tell_why_not():
     """For the node, whose calibration stays; the command ends with the sentence."""
     calibrations = calibrated('a', **LOCAL).calibrations
     few = {'a': [replace(f, target_id=f.target_id[:5], uv=f.uv[:5]) for f in exposures()['a']]}
+    request = CalibrationRequest(few, rig().phantom)
     with pytest.raises(DataError):
-        validate(few, rig().phantom, calibrations)
-    found = validate_or_tell(few, rig().phantom, calibrations)
+        validate(request, calibrations)
+    found = validate_or_report(request, calibrations)
     assert found.verdict == 'cannot tell' and found.findings[0].startswith(
         'the validation could not be made: fluoro'
     )
@@ -274,7 +270,7 @@ def test_a_change_is_found_with_its_size():
 def test_residuals_are_those_of_the_adjustment():
     job = calibrated('a', **LOCAL)
     frames = exposures()['a']
-    held = adjust_with({'a': frames}, rig().phantom, job.calibrations)
+    held = adjust_with_calibrations({'a': frames}, rig().phantom, job.calibrations)
     found = residuals_of(held, 'a', frames)
     calibration = job.calibrations['a']
     assert len(found.uv) == sum(len(f.target_id) for f in frames) and list(found.numbers) == list(
@@ -304,7 +300,7 @@ def test_a_bead_with_a_wrong_survey_is_named_with_its_size():
     frames = {'a': exposures()['a']}
     job = calibrate(frames, phantom, CalibrationOptions(max_iterations=6, **LOCAL))
     beads, dist = bead_checks(
-        intersect(adjust_with(frames, phantom, job.calibrations), frames, phantom)
+        intersect(adjust_with_calibrations(frames, phantom, job.calibrations), frames, phantom)
     )
     assert beads.passed is False and f'the survey of bead {wrong} is wrong by ' in beads.sentence
     assert abs(beads.value - 3.0) < 0.4 and beads.limit < 1.5
@@ -313,7 +309,7 @@ def test_a_bead_with_a_wrong_survey_is_named_with_its_size():
 
 def test_beads_from_images_keep_to_their_covariance():
     frames = {'a': exposures()['a']}
-    held = adjust_with(frames, rig().phantom, calibrated('a', **LOCAL).calibrations)
+    held = adjust_with_calibrations(frames, rig().phantom, calibrated('a', **LOCAL).calibrations)
     beads = intersect(held, frames, rig().phantom)
     assert len(beads.target_id) > 350 and 2.5 < np.mean(beads.chi2) < 3.5
     true = rig().true_mm[rig().phantom.index(beads.target_id)]
@@ -408,7 +404,9 @@ def test_sources_come_back_as_they_were(tmp_path):
     options = CalibrationOptions(k=20, loss='huber', **LOCAL)
     save_calibration(str(tmp_path), calibration)
     (tmp_path / 'validation.json').write_text('of an earlier calibration')
-    write_sources(tmp_path, {'a': frames}, rig().phantom, options, True, 4000.0)
+    write_sources(
+        tmp_path, CalibrationRequest({'a': frames}, rig().phantom, options, True, 4000.0)
+    )
     assert not (tmp_path / 'validation.json').exists()
     found = read_sources(tmp_path, load_calibrations(str(tmp_path)))
     assert (found.options, found.joint, found.principal_distance) == (options, True, 4000.0)

@@ -65,7 +65,7 @@ class Targets:
 
 
 @dataclass(frozen=True)
-class JobResult:
+class CalibrationResult:
     """Result of a job: figures and calibrations by fluoroscope, targets, and for the report the
     runs behind it.
 
@@ -101,7 +101,7 @@ def calibrate(
     """Self-calibrate fluoroscopes, one after the other or in one adjustment (joint).
 
     frames {fluoroscope: [Frame, ...]}; progress(fluoroscope, Round) after every round;
-    raise_if_cancelled() may raise to stop. Returns JobResult, the same to the last bit for the
+    raise_if_cancelled() may raise to stop. Returns CalibrationResult, the same to the last bit for the
     same observations, whatever their order. Raises DataError for observations that do not suffice,
     ValueError for a relative orientation that is to be constrained while the fluoroscopes are not
     adjusted together.
@@ -145,7 +145,7 @@ def calibrate(
                 calibrations[name] = _calibration(
                     run, f, name, options, digest_of_sources(frames[name], phantom), seconds
                 )
-    return JobResult(
+    return CalibrationResult(
         figures,
         calibrations,
         combined_targets(targets, phantom, options.datum == 'survey'),
@@ -168,11 +168,13 @@ def _judged(runs):
     )
 
 
-def adjust_with(frames, phantom, calibrations, loss='student_t', raise_if_cancelled=None):
+def adjust_with_calibrations(
+    frames, phantom, calibrations, loss='student_t', raise_if_cancelled=None
+):
     """Adjust frames with calibrations held: interior orientations and corrections are not changed.
 
     frames {fluoroscope: [Frame, ...]}, calibrations {fluoroscope: FluoroscopeCalibration}. All
-    fluoroscopes share the object points. Returns JobResult. Raises DataError for wrong frames,
+    fluoroscopes share the object points. Returns CalibrationResult. Raises DataError for wrong frames,
     also those of another image size than the calibration's.
     """
     began = time.perf_counter()
@@ -219,7 +221,7 @@ def adjust_with(frames, phantom, calibrations, loss='student_t', raise_if_cancel
         name: _figures(measured, before, after, precise, f, calibrations[name].model)
         for f, name in enumerate(frames)
     }
-    return JobResult(
+    return CalibrationResult(
         figures,
         dict(calibrations),
         _targets(measured, after, precise),

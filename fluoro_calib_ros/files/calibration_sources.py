@@ -4,13 +4,17 @@ options.json and validation.json in the folder of a calibration (docs/validate.m
 
 import dataclasses
 import json
-from dataclasses import dataclass, replace
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from ..calibration.options import CalibrationOptions
-from ..calibration.result import digest_of_sources
+from ..calibration.request import CalibrationRequest
+from ..calibration.result import FluoroscopeCalibration, digest_of_sources
 from ..errors import DataError
-from ..exposures.frame import validate_frame
+from ..exposures.frame import Frame, validate_frame
+from ..exposures.phantom import Phantom
 from .access import cause_of
 from .atomic import write_text
 from .json_file import plain, read_result, write_result
@@ -24,45 +28,54 @@ RESULT = 'validation.json'
 VERSION = 1  # of options.json
 
 
-@dataclass(frozen=True)
-class Sources:
-    """What `calibrate` was given: frames {fluoroscope: [Frame, ...]}, phantom, options, joint,
-    principal_distance.
-    """
+def write_sources(directory: str | os.PathLike[str], request: CalibrationRequest) -> None:
+    """Write what a calibration was made from, and delete the verdict on an earlier one.
 
-    frames: dict
-    phantom: object
-    options: CalibrationOptions
-    joint: bool = False
-    principal_distance: float | None = None
-
-
-def write_sources(directory, frames, phantom, options, joint=False, principal_distance=None):
-    """Write what a calibration was made of beside it, and delete the verdict on an earlier one.
-
-    Arguments as of `calibrate`. Raises DataError where it cannot be written.
+    Raises DataError where a file cannot be written.
     """
     directory = Path(directory)
     try:
         (directory / RESULT).unlink(missing_ok=True)
     except OSError as error:
         raise DataError(f'{directory / RESULT}: cannot be deleted ({cause_of(error)})') from None
-    write_observations_csv(directory / OBSERVATIONS, frames)
-    write_phantom(directory / PHANTOM, phantom)
+    write_observations_csv(directory / OBSERVATIONS, request.frames)
+    write_phantom(directory / PHANTOM, request.phantom)
     document = {
         'format_version': VERSION,
-        'options': dataclasses.asdict(options),
-        'joint': bool(joint),
-        'principal_distance': principal_distance,
+        'options': dataclasses.asdict(request.options),
+        'joint': bool(request.joint),
+        'principal_distance': request.principal_distance,
     }
     write_text(directory / OPTIONS, json.dumps(plain(document), indent=2, allow_nan=False) + '\n')
 
 
-def read_sources(directory, calibrations, frames=None, phantom=None):
-    """Sources of the calibrations {fluoroscope: FluoroscopeCalibration} in a directory.
+def read_sources(
+    directory: str | os.PathLike[str],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Mapping[str, Sequence[Frame]] | None = None,
+    phantom: Phantom | None = None,
+) -> CalibrationRequest:
+    """Read the request that the calibrations in a folder were made from.
 
-    frames, phantom: taken instead of the files where they are given. Raises DataError where a file
-    is missing or damaged, or where frames and phantom are not those the calibrations were made of.
+    Parameters
+    ----------
+    directory : path-like
+    calibrations : mapping of str to FluoroscopeCalibration
+        By fluoroscope.
+    frames : mapping of str to sequence of Frame, optional
+        Used instead of observations.csv.
+    phantom : Phantom, optional
+        Used instead of phantom.csv.
+
+    Returns
+    -------
+    CalibrationRequest
+
+    Raises
+    ------
+    DataError
+        For a file that is missing or damaged, and for frames or a phantom that the calibrations
+        were not made from.
     """
     directory = Path(directory)
     options, joint, distance = _read_options(directory / OPTIONS)
@@ -81,9 +94,8 @@ def read_sources(directory, calibrations, frames=None, phantom=None):
                 f'{where}: these are not the observations and the phantom of which the calibration of '
                 f'fluoroscope {name} was made'
             )
-    return Sources(
-        {name: frames[name] for name in calibrations}, phantom, options, joint, distance
-    )
+    used = {name: frames[name] for name in calibrations}
+    return CalibrationRequest(used, phantom, options, joint, distance)
 
 
 def _there(path, option=''):

@@ -6,7 +6,7 @@ from ..photogrammetry.rotations import quaternion_from_matrix
 
 
 def result_document(job):
-    """Dict of a JobResult: lengths in mm, pixels in px, angles in rad, each with the unit in its
+    """Dict of a CalibrationResult: lengths in mm, pixels in px, angles in rad, each with the unit in its
     name.
     """
     return {

@@ -24,15 +24,16 @@ from rclpy.task import Future
 from ..bags.reader import frame_from_message
 from ..calibration.initial_network import MIN_TARGETS_OF_EXPOSURE
 from ..calibration.options import MODELS, CalibrationOptions
+from ..calibration.request import CalibrationRequest
 from ..errors import DataError
 from ..exposures.collector import ExposureCollector, StillOptions
 from ..exposures.frame import validate_frame
 from ..exposures.pairing import FramePairer
 from ..files.calibration import SUFFIX, load_calibrations, save_calibration
-from ..files.calibration_sources import write_sources, write_validation
 from ..files.phantom import read_phantom
-from ..files.rig_orientation import save_orientation
-from ..jobs.worker_process import calibrate_beside
+from ..jobs.calibration import Rig
+from ..jobs.result_folder import save_outcome
+from ..jobs.worker_process import run_in_worker_process
 from . import support
 from .conversion import message_from_calibration
 from .orienting import Orienting
@@ -445,26 +446,24 @@ class CalibrationNode(Node):
             self.get_logger().warning(result.message)
             return False
         try:
-            job, validation, orientation, sources = await self._start_job(
-                request, progress, cancel_requested
-            )
+            outcome = await self._start_job(request, progress, cancel_requested)
             calibrations = {
-                n: replace(c, seconds=job.seconds) for n, c in job.calibrations.items()
+                name: replace(calibration, seconds=outcome.result.seconds)
+                for name, calibration in outcome.result.calibrations.items()
             }
-            for calibration in calibrations.values():
-                save_calibration(self._directory, calibration)
-            orientation = self._orienting.after(calibrations, orientation)
-            if orientation is not None:
-                save_orientation(self._directory, orientation)
-            write_sources(self._directory, *sources)
-            if validation is not None:
-                write_validation(self._directory, validation)
+            orientation = save_outcome(self._directory, outcome, self._orienting.present)
+            if outcome.orientation is None:
+                self.get_logger().warning(
+                    f'no new orientation of the rig: {outcome.orientation_note}'
+                )
+            if orientation is None:
+                self._orienting.clear()
             self._publish(calibrations, orientation)
-            _fill_result(result, job, calibrations)
-            for sentence in job.left_out:
+            _fill_result(result, outcome.result, calibrations)
+            for sentence in outcome.result.left_out:
                 self.get_logger().warning(f'not used: {sentence}')
             self.get_logger().info(result.message)
-            self._tell_verdict(result, validation)
+            self._report_verdict(result, outcome.validation)
         except Cancelled:
             result.message = 'cancelled, nothing was changed'
             self.get_logger().info(result.message)
@@ -483,26 +482,22 @@ class CalibrationNode(Node):
         return False
 
     def _start_job(self, request, progress, cancel_requested):
-        """Start a calibration; returns the Future of JobResult, Validation or None, RigOrientation
-        or the sentence why there is none, and what it is made of.
+        """Start a calibration in a worker process; returns the Future of its CalibrationOutcome.
 
         Raises DataError and ValueError.
         """
         frames = self._collector.frames(list(request.fluoroscopes))
         joint = self._joint and len(frames) > 1
-        sources = (
+        job = CalibrationRequest(
             frames,
             self._phantom,
             self._options_of(request, joint),
             joint,
             request.principal_distance or None,
         )
-        every = self._collector.frames([])
-        others = tuple(
-            (every[name], calibration)
-            for name, calibration in self._calibrations.items()
-            if name not in frames
-        )
+        others = {n: c for n, c in self._calibrations.items() if n not in frames}
+        all_frames = self._collector.frames()
+        rig = Rig(self._names, {name: all_frames[name] for name in others}, others)
         done = Future()
 
         def on_round(label, this):
@@ -510,18 +505,19 @@ class CalibrationNode(Node):
                 self._rounds[name] = this
             progress(label, this)
 
-        def check():
+        def raise_if_cancelled():
             if cancel_requested() or self._stopping.is_set():
                 raise Cancelled
 
         def wait():
             try:
                 done.set_result(
-                    (
-                        *calibrate_beside(
-                            *sources, on_round, check, request.validate, others, self._names
-                        ),
-                        sources,
+                    run_in_worker_process(
+                        job,
+                        validate=request.validate,
+                        rig=rig,
+                        progress=on_round,
+                        raise_if_cancelled=raise_if_cancelled,
                     )
                 )
             except Exception as error:
@@ -552,7 +548,7 @@ class CalibrationNode(Node):
             **fixed,
         )
 
-    def _tell_verdict(self, result, validation):
+    def _report_verdict(self, result, validation):
         """Fill in and log the verdict on a calibration, where one was asked for."""
         if validation is not None:
             result.verdict = validation.verdict

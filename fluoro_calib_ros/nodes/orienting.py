@@ -13,6 +13,7 @@ from rclpy.task import Future
 from ..calibration.rig_orientation import orientation_of_capture
 from ..errors import DataError
 from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
+from ..jobs.result_folder import belongs_to
 from .qos import LATCHED
 from .spatial import message_from_orientation
 from .support import check_timeout
@@ -62,11 +63,20 @@ class Orienting:
             if self._capture.done.done():
                 self._capture = None
 
+    @property
+    def present(self):
+        """The RigOrientation in use, or None."""
+        return self._present
+
     def publish(self, orientation):
         """Take an orientation over and publish it; None: there is no new one."""
         if orientation is not None:
             self._present = orientation
             self._output.publish(message_from_orientation(orientation))
+
+    def clear(self):
+        """Forget the present orientation: it does not belong to the calibrations any more."""
+        self._present = None
 
     def save(self, directory):
         """Save the present orientation, if there is one. Raises DataError."""
@@ -79,26 +89,12 @@ class Orienting:
         if not path.exists():
             return None
         orientation = load_orientation(path)
-        if _belongs(orientation, calibrations):
+        if belongs_to(orientation, calibrations):
             return orientation
         self._node.get_logger().warning(
             f'{path}: the orientation of the rig belongs to other calibrations, it is not used'
         )
         return None
-
-    def after(self, calibrations, found):
-        """RigOrientation that belongs to new calibrations: the present one if it is a capture that
-        still does, else what was found, or None where that is the sentence why there is none.
-        """
-        now = self._present
-        fits = now is not None and _belongs(now, {**self._calibrations(), **calibrations})
-        if fits and now.source == 'capture':
-            return now
-        if isinstance(found, str):
-            self._node.get_logger().warning(f'no new orientation of the rig: {found}')
-            self._present = now if fits else None
-            return None
-        return found
 
     async def _on_orient(self, request, response):
         """Answer with the orientation of a rig in which the phantom stands."""
@@ -153,7 +149,7 @@ class Orienting:
                 waiting.frames, self._phantom, calibrations, self._rig_frame
             )
         )
-        if not _belongs(orientation, self._calibrations()):
+        if not belongs_to(orientation, self._calibrations()):
             raise DataError('the calibrations have changed meanwhile, capture the phantom again')
         return orientation
 
@@ -171,11 +167,3 @@ class Orienting:
 
         threading.Thread(target=work, daemon=True).start()
         return done
-
-
-def _belongs(orientation, calibrations):
-    """Whether a RigOrientation belongs to calibrations {fluoroscope: calibration}."""
-    return orientation.calibration_ids == tuple(
-        calibrations[name].calibration_id if name in calibrations else ''
-        for name in orientation.fluoroscopes
-    )

@@ -48,7 +48,7 @@ MARGIN = (
 
 
 def write_figures(job, directory):
-    """Write the figures of a JobResult into a folder, which is made if need be; returns their
+    """Write the figures of a CalibrationResult into a folder, which is made if need be; returns their
     paths.
 
     For every run cost_<label>.png, for every fluoroscope residuals_histogram_, residuals_position_

@@ -12,7 +12,7 @@ COLUMN = 20
 
 
 def summary_table(job, latency_ms=None):
-    """Text of the figures of a JobResult, at most 100 columns wide: a column for each fluoroscope.
+    """Text of the figures of a CalibrationResult, at most 100 columns wide: a column for each fluoroscope.
 
     latency_ms: dict of the correction's latency, p50, p99 and max [ms], and the number of frames,
     or None.

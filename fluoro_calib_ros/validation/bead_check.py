@@ -87,7 +87,7 @@ def rays_of(job, name, frames):
 
 
 def intersect(job, frames, phantom):
-    """Beads of a JobResult from the images of all its fluoroscopes {name: [Frame, ...]}: Beads.
+    """Beads of a CalibrationResult from the images of all its fluoroscopes {name: [Frame, ...]}: Beads.
 
     The survey takes no part but by the orientations, which hang on all beads together. Robust:
     least absolute lengths first, then least squares of the image points that agree.

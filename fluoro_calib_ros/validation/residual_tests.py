@@ -67,7 +67,7 @@ class Trend:
 
 
 def residuals_of(job, name, frames):
-    """Residuals of the frames of fluoroscope `name` in the JobResult of an adjustment with a
+    """Residuals of the frames of fluoroscope `name` in the CalibrationResult of an adjustment with a
     calibration held.
     """
     figures = job.fluoroscopes[name]

@@ -6,16 +6,22 @@ parts of the exposures: two halves and FOLDS folds, so it takes some six times a
 calibration.
 """
 
+from __future__ import annotations
+
 import time
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.stats import chi2
 
-from ..calibration.calibrate import adjust_with, calibrate
+from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations, calibrate
 from ..calibration.initial_network import MIN_EXPOSURES
-from ..calibration.options import CalibrationOptions
+from ..calibration.request import CalibrationRequest
+from ..calibration.result import FluoroscopeCalibration
 from ..errors import DataError
+from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
 from .bead_check import distances, intersect
 from .field_comparison import difference, place_name
 from .residual_tests import common_trend, moved, residuals_of
@@ -85,93 +91,110 @@ class Validation:
 
 @dataclass(frozen=True)
 class _Scene:
-    """What is validated: frames that are used {fluoroscope: [Frame, ...]} in order, and what made
-    the calibrations.
-    """
+    """What is validated: the request with the frames that are used, in order, and its result."""
 
-    frames: dict
-    phantom: object
-    calibrations: dict
-    options: CalibrationOptions
-    joint: bool
-    principal_distance: float | None
-    raise_if_cancelled: object
+    request: CalibrationRequest
+    calibrations: Mapping[str, FluoroscopeCalibration]
+    raise_if_cancelled: Callable[[], None] | None
 
     @property
-    def groups(self):
+    def frames(self) -> Mapping[str, Sequence[Frame]]:
+        return self.request.frames
+
+    @property
+    def phantom(self) -> Phantom:
+        return self.request.phantom
+
+    @property
+    def groups(self) -> list[tuple[str, ...]]:
         """Names of the fluoroscopes that are calibrated together."""
-        return [tuple(self.frames)] if self.joint else [(name,) for name in self.frames]
+        return self.request.groups
 
-    def part(self, names, chosen):
-        """The frames of fluoroscopes names whose number in order chosen(i) accepts."""
-        return {name: [f for i, f in enumerate(self.frames[name]) if chosen(i)] for name in names}
+    def part(
+        self, names: Sequence[str], is_chosen: Callable[[int], bool]
+    ) -> dict[str, list[Frame]]:
+        """Return the frames of some fluoroscopes whose position in order is chosen."""
+        return {
+            name: [f for i, f in enumerate(self.frames[name]) if is_chosen(i)] for name in names
+        }
 
-    def calibrated(self, frames):
-        """Calibrations of a part of the frames. Raises DataError where it does not suffice."""
-        distance = self.principal_distance
-        if self.options.interior == 'fixed':  # the parts hold what the whole has held
+    def calibrated(
+        self, frames: Mapping[str, Sequence[Frame]]
+    ) -> dict[str, FluoroscopeCalibration]:
+        """Calibrate a part of the frames. Raises DataError where it does not suffice."""
+        options = self.request.options
+        distance = self.request.principal_distance
+        if options.interior == 'fixed':  # the parts hold what the whole held
             distance = float(np.mean([self.calibrations[name].interior[2] for name in frames]))
-        options = replace(
-            self.options, max_iterations=min(self.options.max_iterations, MAX_ROUNDS)
-        )
+        options = replace(options, max_iterations=min(options.max_iterations, MAX_ROUNDS))
         return calibrate(
             frames,
             self.phantom,
             options,
-            self.joint,
+            self.request.joint,
             distance,
             raise_if_cancelled=self.raise_if_cancelled,
         ).calibrations
 
-    def adjusted(self, frames, calibrations):
-        """JobResult of frames with calibrations held."""
-        return adjust_with(
+    def adjusted(
+        self,
+        frames: Mapping[str, Sequence[Frame]],
+        calibrations: Mapping[str, FluoroscopeCalibration],
+    ) -> CalibrationResult:
+        """Adjust frames with calibrations held."""
+        return adjust_with_calibrations(
             frames,
             self.phantom,
             calibrations,
-            self.options.loss,
+            self.request.options.loss,
             raise_if_cancelled=self.raise_if_cancelled,
         )
 
 
 def validate(
-    frames,
-    phantom,
-    calibrations,
-    options=CalibrationOptions(),
-    joint=False,
-    principal_distance=None,
-    progress=None,
-    raise_if_cancelled=None,
-):
-    """Validate calibrations with the exposures they were made of.
+    request: CalibrationRequest,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    progress: Callable[[str, int, int], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Validation:
+    """Validate calibrations with the exposures that they were made from.
 
-    frames {fluoroscope: [Frame, ...]}, phantom, options, joint and principal_distance: what
-    `calibrate` was given; calibrations {fluoroscope: FluoroscopeCalibration}: what it gave.
-    progress(sentence, done, total) before every step; raise_if_cancelled() may raise to stop.
-    Returns Validation. Raises DataError for frames that cannot be adjusted with the calibrations.
+    Parameters
+    ----------
+    request : CalibrationRequest
+        What the calibrations were made from.
+    calibrations : mapping of str to FluoroscopeCalibration
+        By fluoroscope.
+    progress : callable, optional
+        Called with the name of a step, the number of steps done and their total before each step.
+    raise_if_cancelled : callable, optional
+        Called before every step of an adjustment; may raise to stop.
+
+    Returns
+    -------
+    Validation
+
+    Raises
+    ------
+    DataError
+        For frames that cannot be adjusted with the calibrations.
     """
     began = time.perf_counter()
-    job = adjust_with(
-        frames, phantom, calibrations, options.loss, raise_if_cancelled=raise_if_cancelled
+    result = adjust_with_calibrations(
+        request.frames,
+        request.phantom,
+        calibrations,
+        request.options.loss,
+        raise_if_cancelled=raise_if_cancelled,
     )
-    used = {
-        name: {e.exposure for e in figures.exposures} for name, figures in job.fluoroscopes.items()
-    }
-    ordered = {
-        name: sorted((f for f in frames[name] if f.number in used[name]), key=lambda f: f.number)
-        for name in frames
-    }
-    scene = _Scene(
-        ordered, phantom, calibrations, options, joint, principal_distance, raise_if_cancelled
-    )
+    frames = _used_frames(request.frames, result)
+    scene = _Scene(replace(request, frames=frames), calibrations, raise_if_cancelled)
     steps = _Steps(progress, 1 + len(scene.groups) * (1 + FOLDS))
     steps('residuals and beads')
-    residuals = {name: residuals_of(job, name, ordered[name]) for name in ordered}
-    trends = {name: _trend_checks(scene, name, residuals[name]) for name in ordered}
-    beads = bead_checks(
-        intersect(job, ordered, phantom), any(not t[0].passed for t in trends.values())
-    )
+    residuals = {name: residuals_of(result, name, frames[name]) for name in frames}
+    trends = {name: _trend_checks(scene, name, residuals[name]) for name in frames}
+    has_trend = any(not t[0].passed for t in trends.values())
+    beads = bead_checks(intersect(result, frames, request.phantom), has_trend)
     checks = []
     for names in scene.groups:
         halves = _halves_checks(scene, names, steps)
@@ -187,27 +210,31 @@ def validate(
     )
 
 
-def validate_or_tell(frames, phantom, calibrations, *how):
-    """`validate`, with the verdict 'cannot tell' and its cause where it raises DataError: a
-    calibration stays one.
-    """
+def _used_frames(
+    frames: Mapping[str, Sequence[Frame]], result: CalibrationResult
+) -> dict[str, list[Frame]]:
+    """Return the frames that an adjustment used, in the order of their numbers."""
+    out = {}
+    for name, of_fluoroscope in frames.items():
+        used = {e.exposure for e in result.fluoroscopes[name].exposures}
+        out[name] = sorted((f for f in of_fluoroscope if f.number in used), key=lambda f: f.number)
+    return out
+
+
+def validate_or_report(
+    request: CalibrationRequest,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    progress: Callable[[str, int, int], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Validation:
+    """Validate, and give the verdict 'cannot tell' with its cause where that raises DataError."""
     try:
-        return validate(frames, phantom, calibrations, *how)
+        return validate(request, calibrations, progress, raise_if_cancelled)
     except DataError as error:
-        checks = (
-            Check(
-                'validation',
-                '',
-                np.nan,
-                np.nan,
-                '',
-                None,
-                f'the validation could not be made: {error}',
-            ),
-        )
-        return Validation(
-            'cannot tell', checks, {n: c.calibration_id for n, c in calibrations.items()}, 0.0
-        )
+        sentence = f'the validation could not be made: {error}'
+        check = Check('validation', '', np.nan, np.nan, '', None, sentence)
+        identities = {n: c.calibration_id for n, c in calibrations.items()}
+        return Validation('cannot tell', (check,), identities, 0.0)
 
 
 def verdict_of(checks):
@@ -343,7 +370,7 @@ def _trend_checks(scene, name, residuals):
         np.hypot(common.limit, everywhere),
         'px',
         f'fluoroscope {name}: the residuals keep a trend of {common.size:.2f} px, most at {where}',
-        _advice_on_trend(scene.options.model, model.kind, count),
+        _advice_on_trend(scene.request.options.model, model.kind, count),
         common.place,
     )
     area = _judged(
@@ -552,4 +579,4 @@ def _distances_check(beads, suspect):
     )
 
 
-__all__ = ['Check', 'Validation', 'validate', 'validate_or_tell', 'verdict_of']
+__all__ = ['Check', 'Validation', 'validate', 'validate_or_report', 'verdict_of']

@@ -1,0 +1,39 @@
+"""What a calibration is made from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
+from .options import CalibrationOptions
+
+
+@dataclass(frozen=True)
+class CalibrationRequest:
+    """Observations and options of a calibration.
+
+    Attributes
+    ----------
+    frames : mapping of str to sequence of Frame
+        Exposures of the phantom by fluoroscope.
+    phantom : Phantom
+        Its survey.
+    options : CalibrationOptions
+    joint : bool
+        Whether all fluoroscopes are adjusted together; else one after the other.
+    principal_distance : float or None
+        Start value, or with interior 'fixed' the held value [px]; None: from the observations.
+    """
+
+    frames: Mapping[str, Sequence[Frame]]
+    phantom: Phantom
+    options: CalibrationOptions = field(default_factory=CalibrationOptions)
+    joint: bool = False
+    principal_distance: float | None = None
+
+    @property
+    def groups(self) -> list[tuple[str, ...]]:
+        """Names of the fluoroscopes that are adjusted together, group by group."""
+        return [tuple(self.frames)] if self.joint else [(name,) for name in self.frames]

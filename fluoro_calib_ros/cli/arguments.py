@@ -1,0 +1,148 @@
+"""Types and groups of arguments that several commands share."""
+
+from __future__ import annotations
+
+import argparse
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ..options import Option
+
+
+def image_size(text: str) -> tuple[int, int]:
+    """Parse WxH as (width, height) [px]."""
+    try:
+        width, height = (int(part) for part in text.lower().split('x'))
+        if width > 0 and height > 0:
+            return width, height
+    except ValueError:
+        pass
+    raise argparse.ArgumentTypeError(f'{text!r} is not WIDTHxHEIGHT, such as 1024x1024')
+
+
+def number_in(low: float, high: float, kind: type = float) -> Callable[[str], Any]:
+    """Return an argument type: a number from low to high."""
+
+    def convert(text: str) -> Any:
+        try:
+            value = kind(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f'{text!r} is not a number') from None
+        if not low <= value <= high:
+            raise argparse.ArgumentTypeError(f'{text} is not between {low:g} and {high:g}')
+        return value
+
+    return convert
+
+
+def numbers_of(count: int) -> Callable[[str], tuple[float, ...]]:
+    """Return an argument type: count numbers above 0, separated by commas."""
+
+    def convert(text: str) -> tuple[float, ...]:
+        try:
+            values = tuple(float(part) for part in text.split(','))
+        except ValueError:
+            values = ()
+        if len(values) != count or not all(0 < v < math.inf for v in values):
+            raise argparse.ArgumentTypeError(
+                f'{text!r} is not {count} numbers above 0, separated by commas'
+            )
+        return values
+
+    return convert
+
+
+def names(text: str) -> list[str]:
+    """Parse A,B as a list of names."""
+    return text.split(',')
+
+
+def add_option(
+    parser: argparse.ArgumentParser | argparse._ArgumentGroup, option: Option, **changes: Any
+) -> None:
+    """Add the argument of a declared option: --name with its choices, default and description.
+
+    changes replace keyword arguments of `add_argument`.
+    """
+    settings: dict[str, Any] = {'default': option.default}
+    unit = f' [{option.unit}]' if option.unit else ''
+    default = '' if option.default is None else f' (default: {_text(option.default)})'
+    settings['help'] = f'{option.description}{unit}{default}'
+    if option.choices:
+        settings['choices'] = option.choices
+    elif option.length is not None:
+        settings['type'] = numbers_of(option.length)
+    elif isinstance(option.default, float):
+        settings['type'] = _number(option, float)
+    elif isinstance(option.default, int) or option.default is None:
+        settings['type'] = _number(option, int)
+    settings.update(changes)
+    parser.add_argument('--' + option.name.replace('_', '-'), **settings)
+
+
+def _number(option: Option, kind: type) -> Callable[[str], Any]:
+    low = -math.inf if option.minimum is None else option.minimum
+    high = math.inf if option.maximum is None else option.maximum
+    return number_in(low, high, kind)
+
+
+def _text(default: Any) -> str:
+    return ','.join(f'{v:g}' for v in default) if isinstance(default, tuple) else str(default)
+
+
+def add_source(parser: argparse.ArgumentParser, image_size_help: str) -> None:
+    """Add SOURCE, --image-size and --fluoroscopes."""
+    parser.add_argument(
+        'source',
+        type=Path,
+        metavar='SOURCE',
+        help='bag (file or folder), or CSV file fluoroscope,exposure,target_id,u,v[,sigma]',
+    )
+    parser.add_argument('--image-size', type=image_size, metavar='WxH', help=image_size_help)
+    add_fluoroscopes(parser)
+
+
+def add_fluoroscopes(parser: argparse.ArgumentParser, use: str = 'use') -> None:
+    """Add --fluoroscopes."""
+    parser.add_argument(
+        '--fluoroscopes',
+        type=names,
+        metavar='A,B',
+        help=f'names of the fluoroscopes to {use} (default: all)',
+    )
+
+
+def add_phantom(parser: argparse.ArgumentParser, **changes: Any) -> None:
+    """Add --phantom; changes replace keyword arguments of `add_argument`."""
+    settings: dict[str, Any] = {
+        'required': True,
+        'type': Path,
+        'help': 'surveyed coordinates target_id,x,y,z,sd [mm]',
+    }
+    settings.update(changes)
+    parser.add_argument('--phantom', **settings)
+
+
+def add_calibration(parser: argparse.ArgumentParser) -> None:
+    """Add --calibration."""
+    parser.add_argument(
+        '--calibration',
+        required=True,
+        type=Path,
+        metavar='DIR',
+        help='result folder of calibrate',
+    )
+
+
+def add_collect(parser: argparse.ArgumentParser, source: str = 'a bag') -> None:
+    """Add --collect."""
+    parser.add_argument(
+        '--collect',
+        choices=('auto', 'all', 'still'),
+        default='auto',
+        help=f'which exposures of {source}: all frames, or those in which the phantom stands '
+        'still in a new pose; auto: still for a stream of more than 10 frames a second '
+        '(default: auto)',
+    )

@@ -1,0 +1,91 @@
+"""What the commands print: results on standard output, progress and notes on standard error."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Mapping
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from ..calibration.self_calibration import Round
+
+
+def print_result(arguments: Any, document: Mapping[str, Any], text: str) -> None:
+    """Print a result: as JSON with --json, else as text for people."""
+    if arguments.json:
+        from ..files.json_file import result_text
+
+        text = result_text(document)
+    print(text.rstrip('\n'))
+
+
+def print_note(text: str) -> None:
+    """Print a note on standard error."""
+    print(text, file=sys.stderr)
+
+
+def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:
+    """Print how many frames have no partner, if any have none."""
+    lost = {name: count for name, count in unpaired.items() if count}
+    if lost:
+        print_note(
+            f'{source}: frames without partner of the other fluoroscopes, not used: {lost}'
+        )
+
+
+def print_round(label: str, this: Round) -> None:
+    """Print a round of a self-calibration on a terminal."""
+    if sys.stderr.isatty():
+        rmse = '  '.join(f'{n}: {r[0]:.3f} {r[1]:.3f} px' for n, r in this.rmse.items())
+        print_note(
+            f'{label}: round {this.iteration:2d}  F {this.F:12.2f}  G {this.G:12.2f}  '
+            f'k {max(this.k.values()):3d}  RMSE {rmse}'
+        )
+
+
+def print_step(step: str, done: int, total: int) -> None:
+    """Print a step of a validation on a terminal."""
+    if sys.stderr.isatty():
+        print_note(f'{100 * done // total:3d} %  {step}')
+
+
+class ProgressBar:
+    """A progress bar on a terminal, nothing elsewhere; a context manager.
+
+    Called with the number of images done and their total, 0 where that is unknown.
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._bar: Any = None
+
+    def __call__(self, done: int, total: int) -> None:
+        if self._bar is None:
+            from tqdm import tqdm
+
+            # tqdm shows nothing on a terminal that does not tell its width.
+            self._bar = tqdm(
+                desc=self._name,
+                total=total or None,
+                unit=' images',
+                disable=None,
+                leave=False,
+                ncols=shutil.get_terminal_size().columns,
+            )
+        self._bar.update(done - self._bar.n)
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._bar is not None:
+            self._bar.close()

@@ -1,0 +1,148 @@
+"""The calibration job: self-calibrate, orient the rig, validate.
+
+The command line, the calibration node, its worker process and Python users all call `run`;
+`result_folder.save_outcome` writes what it returns.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+from ..calibration.calibrate import CalibrationResult, calibrate
+from ..calibration.request import CalibrationRequest
+from ..calibration.result import FluoroscopeCalibration
+from ..calibration.rig_orientation import orientation_of_exposures
+from ..calibration.self_calibration import Round
+from ..errors import DataError
+from ..exposures.frame import Frame
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..validation.verdict import Validation, validate_or_report
+
+Progress = Callable[[str, Round], None]
+Cancellation = Callable[[], None]
+
+
+@dataclass(frozen=True)
+class Rig:
+    """Fluoroscopes that belong to the rig but are not calibrated by this job.
+
+    Attributes
+    ----------
+    fluoroscopes : sequence of str
+        Names of all fluoroscopes of the rig in their order; empty: those of the request.
+    frames : mapping of str to sequence of Frame
+        Exposures of the other fluoroscopes.
+    calibrations : mapping of str to FluoroscopeCalibration
+        Present calibrations of the other fluoroscopes.
+    """
+
+    fluoroscopes: Sequence[str] = ()
+    frames: Mapping[str, Sequence[Frame]] = field(default_factory=dict)
+    calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CalibrationOutcome:
+    """Everything that a calibration job found.
+
+    Attributes
+    ----------
+    request : CalibrationRequest
+    result : CalibrationResult
+    rig : Rig
+        The fluoroscopes that were not calibrated.
+    orientation : RigOrientation or None
+        None where the exposures give none; orientation_note says why.
+    orientation_note : str
+    validation : Validation or None
+        None where no validation was requested.
+    """
+
+    request: CalibrationRequest
+    result: CalibrationResult
+    rig: Rig = field(default_factory=Rig)
+    orientation: RigOrientation | None = None
+    orientation_note: str = ''
+    validation: Validation | None = None
+
+    @property
+    def calibrations(self) -> dict[str, FluoroscopeCalibration]:
+        """Calibrations of all fluoroscopes of the rig, the new ones among them."""
+        return {**self.rig.calibrations, **self.result.calibrations}
+
+    def without_runs(self) -> CalibrationOutcome:
+        """Return the outcome without the networks behind it, which only the figures need."""
+        return replace(self, result=replace(self.result, runs={}))
+
+
+def run(
+    request: CalibrationRequest,
+    *,
+    validate: bool = False,
+    rig: Rig | None = None,
+    progress: Progress | None = None,
+    raise_if_cancelled: Cancellation | None = None,
+) -> CalibrationOutcome:
+    """Self-calibrate the fluoroscopes of a request, and orient the rig.
+
+    Parameters
+    ----------
+    request : CalibrationRequest
+    validate : bool
+        Whether the calibration is validated with its own exposures.
+    rig : Rig, optional
+        Further fluoroscopes of the rig.
+    progress : callable, optional
+        Called with the names of the fluoroscopes and the Round after every round.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop the job.
+
+    Returns
+    -------
+    CalibrationOutcome
+
+    Raises
+    ------
+    DataError
+        For observations that do not suffice.
+    ValueError
+        For options that contradict each other.
+    """
+    result = calibrate(
+        request.frames,
+        request.phantom,
+        request.options,
+        request.joint,
+        request.principal_distance,
+        progress,
+        raise_if_cancelled,
+    )
+    rig = rig or Rig()
+    orientation, note = _orientation(request, result, rig)
+    validation = None
+    if validate:
+        validation = validate_or_report(
+            request, result.calibrations, raise_if_cancelled=raise_if_cancelled
+        )
+    return CalibrationOutcome(request, result, rig, orientation, note, validation)
+
+
+def _orientation(
+    request: CalibrationRequest, result: CalibrationResult, rig: Rig
+) -> tuple[RigOrientation | None, str]:
+    """Return the orientation of the rig, or None and the reason."""
+    frames = {**rig.frames, **request.frames}
+    calibrations = {**rig.calibrations, **result.calibrations}
+    names = [name for name in rig.fluoroscopes or calibrations if name in calibrations]
+    if len(names) < 2:
+        return None, 'a single fluoroscope is calibrated'
+    try:
+        orientation = orientation_of_exposures(
+            {name: frames[name] for name in names},
+            request.phantom,
+            {name: calibrations[name] for name in names},
+        )
+    except DataError as error:
+        return None, str(error)
+    return orientation, ''

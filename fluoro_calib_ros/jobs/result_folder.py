@@ -1,0 +1,102 @@
+"""The result folder of a calibration; its layout is described in docs/result_folder.md."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+from ..calibration.calibrate import CalibrationResult
+from ..calibration.result import FluoroscopeCalibration
+from ..errors import DataError
+from ..files.calibration import save_calibration
+from ..files.calibration_sources import write_sources, write_validation
+from ..files.json_file import write_result
+from ..files.result_document import result_document
+from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
+from ..photogrammetry.rig_orientation import RigOrientation
+from .calibration import CalibrationOutcome
+
+RESULT = 'result.json'
+
+
+def save_outcome(
+    directory: str | os.PathLike[str],
+    outcome: CalibrationOutcome,
+    present: RigOrientation | None = None,
+) -> RigOrientation | None:
+    """Write the outcome of a calibration job into a folder, which is made where it is missing.
+
+    Writes the calibrations, result.json, the sources (observations, phantom, options), the
+    orientation of the rig and, where there is one, the validation.
+
+    Parameters
+    ----------
+    directory : path-like
+    outcome : CalibrationOutcome
+    present : RigOrientation, optional
+        Orientation in use; by default that in the folder.
+
+    Returns
+    -------
+    RigOrientation or None
+        The orientation to use with the new calibrations: the new one, or the present one where it
+        is kept.
+
+    Raises
+    ------
+    DataError
+        Where a file cannot be written.
+    """
+    directory = Path(directory)
+    save_result(directory, outcome.result)
+    write_sources(directory, outcome.request)
+    saved = saved_orientation(directory)
+    orientation = kept_orientation(present or saved, outcome.orientation, outcome.calibrations)
+    if orientation is not None and orientation is not saved:
+        save_orientation(directory, orientation)
+    if outcome.validation is not None:
+        write_validation(directory, outcome.validation)
+    return orientation
+
+
+def save_result(directory: str | os.PathLike[str], result: CalibrationResult) -> None:
+    """Write calibrations and result.json of a calibration or adjustment. Raises DataError."""
+    directory = Path(directory)
+    for calibration in result.calibrations.values():
+        save_calibration(directory, calibration)
+    write_result(directory / RESULT, result_document(result))
+
+
+def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | None:
+    """Return the orientation in a folder, None where there is none that can be read."""
+    try:
+        return load_orientation(orientation_path(directory))
+    except DataError:
+        return None
+
+
+def belongs_to(
+    orientation: RigOrientation, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> bool:
+    """Return whether an orientation was determined with these calibrations."""
+    return orientation.calibration_ids == tuple(
+        calibrations[name].calibration_id if name in calibrations else ''
+        for name in orientation.fluoroscopes
+    )
+
+
+def kept_orientation(
+    present: RigOrientation | None,
+    new: RigOrientation | None,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+) -> RigOrientation | None:
+    """Choose between the present orientation of a rig and that of new calibrations.
+
+    The present one is kept while it belongs to the calibrations and either was captured in the
+    frame of the lab, which exposures of a calibration do not know, or there is no new one.
+    """
+    if present is not None and belongs_to(present, calibrations):
+        if new is None or present.source == 'capture':
+            return present
+    return new

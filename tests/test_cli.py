@@ -16,7 +16,7 @@ import pytest
 from rigs import run
 
 from fluoro_calib_ros.calibration.result import OUTSIDE
-from fluoro_calib_ros.cli import EXAMPLES, main
+from fluoro_calib_ros.cli import COMMANDS, main
 from fluoro_calib_ros.files.calibration import load_calibration
 from fluoro_calib_ros.jobs.dataset import write_bag
 
@@ -399,14 +399,14 @@ def test_wrong_usage_ends_with_status_2_and_the_usage(arguments, capsys, tmp_pat
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize('name', sorted(EXAMPLES))
-def test_every_command_has_help_with_an_example_that_parses(name, capsys):
+@pytest.mark.parametrize('command', COMMANDS, ids=lambda command: command.NAME)
+def test_every_command_has_help_with_an_example_that_parses(command, capsys):
     from fluoro_calib_ros.cli import make_parser
 
-    assert run(name, '--help') == 0
+    assert run(command.NAME, '--help') == 0
     text = ' '.join(capsys.readouterr().out.split())
-    assert f'example: {EXAMPLES[name]}' in text
-    assert make_parser().parse_args(EXAMPLES[name].split()[1:]).command == name
+    assert f'example: {command.EXAMPLE}' in text
+    assert make_parser().parse_args(command.EXAMPLE.split()[1:]).command == command.NAME
 
 
 def test_missing_files_are_named(rig, tmp_path, capsys):
@@ -535,7 +535,7 @@ def test_a_fluoroscope_without_calibration_is_told(rig, result, tmp_path, capsys
         (result / 'b.calibration.npz').read_bytes()
     )
     more = ('--calibration', tmp_path / 'only', '--out', tmp_path / 'x')
-    assert 'no calibration of fluoroscope a, only of b' in said(
+    assert "no calibration of fluoroscope 'a', only of b" in said(
         capsys, ('adjust', rig / 'test', '--phantom', rig / 'phantom.csv', *more)
     )
     assert "row 2: there is no calibration of fluoroscope 'a'" in said(

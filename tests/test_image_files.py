@@ -317,7 +317,7 @@ COLOUR = cv2.imencode('.png', np.stack([image_of(), image_of(1), image_of(2)], a
     1
 ].tobytes()
 BAD = {  # file: content, what is said
-    'no.xyz': (b'x', 'what a file with the ending .xyz has is not known'),
+    'no.xyz': (b'x', 'files with the ending .xyz cannot be read'),
     'text.png': (b'this is text', 'no image that can be decoded, or it is damaged'),
     'empty.png': (b'', 'the file is empty'),
     'cut.png': (PNG[:-30], 'the PNG image is cut off'),
@@ -409,7 +409,7 @@ def test_outputs_that_cannot_be(one, both, tmp_path, capfd):
         (tmp_path / 'nothing.avi', 'x.avi', 'there is no such file'),
     ):
         assert sentence in said(capfd, source, one, tmp_path / out)
-    assert 'calibrations of a, b: say which with --fluoroscope' in said(
+    assert 'calibrations of a, b: choose one with --fluoroscope' in said(
         capfd, eight, both, tmp_path / 'x.png'
     )
     assert "there is no calibration of fluoroscope 'c', only of a, b" in said(

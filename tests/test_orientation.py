@@ -715,7 +715,9 @@ def test_reconstruct_refuses_in_a_sentence(folder, tmp_path, capsys):
     table.write_text('fluoroscope,exposure,target_id,u,v\na,1,1,500,500\nb,2,1,500,500\n')
     source = ('reconstruct', table, '--calibration', result, '--out', out)
     assert 'no frames of a and b belong together by frame_number' in said(capsys, *source)
-    assert 'a CSV file does not tell the time' in said(capsys, *source, '--pair-by', 'stamp')
+    assert 'the recording does not hold the times of its exposures' in said(
+        capsys, *source, '--pair-by', 'stamp'
+    )
     assert not out.exists()
     table.write_text('fluoroscope,exposure,target_id,u,v\na,1,1,500,500\nb,1,1,500,500\n')
     assert 'the image is 800 x 800 px, but the calibration is for 1024 x 1024 px' in said(

@@ -441,7 +441,7 @@ def test_reconstruct_says_where_no_drift_can_be_told(folder, capsys):
         (
             'short.csv',
             ['--cluster', 'tibia: 1 2'],
-            'a CSV file, does not tell the time of its exposures',
+            'a CSV file, does not hold the times of its exposures',
         ),
     ],
 )

@@ -32,9 +32,7 @@ def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:
     """Print how many frames have no partner, if any have none."""
     lost = {name: count for name, count in unpaired.items() if count}
     if lost:
-        print_note(
-            f'{source}: frames without partner of the other fluoroscopes, not used: {lost}'
-        )
+        print_note(f'{source}: frames without partner of the other fluoroscopes, not used: {lost}')
 
 
 def print_round(label: str, this: Round) -> None:

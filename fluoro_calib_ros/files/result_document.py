@@ -1,13 +1,23 @@
-"""The result of a job as the document result.json (DESIGN, section 6)."""
+"""Results as JSON documents, among them result.json."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
+from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
+from ..calibration.self_calibration import Round
+from ..drift.rig_watch import DriftVerdict
+from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
 
 
-def result_document(job):
-    """Dict of a CalibrationResult: lengths in mm, pixels in px, angles in rad, each with the unit in its
-    name.
+def result_document(job: CalibrationResult) -> dict[str, Any]:
+    """Return a CalibrationResult as the dict of result.json.
+
+    Lengths are in mm, pixels in px and angles in rad, each with the unit in its name.
     """
     return {
         'fluoroscopes': {
@@ -33,7 +43,7 @@ def result_document(job):
     }
 
 
-def _relative(orientations):
+def _relative(orientations: Sequence[Any]) -> Any:
     """The relative orientation of two fluoroscopes, a list where there are more, None where there
     is none.
     """
@@ -54,7 +64,7 @@ def _relative(orientations):
     return out if len(out) > 1 else (out[0] if out else None)
 
 
-def _fluoroscope(figures):
+def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
     xp, yp, c = figures.interior
     return {
         'interior': {'xp': xp, 'yp': yp, 'c': c, 'sd': figures.interior_sd},
@@ -76,7 +86,7 @@ def _fluoroscope(figures):
     }
 
 
-def _history(history):
+def _history(history: Mapping[str, Sequence[Round]]) -> list[dict[str, Any]]:
     """Rounds in order, those of fluoroscopes that were calibrated one after the other likewise."""
     return [
         {
@@ -91,3 +101,66 @@ def _history(history):
         for label, rounds in history.items()
         for r in rounds
     ]
+
+
+def orientation_document(orientation: RigOrientation) -> dict[str, Any]:
+    """Return a RigOrientation as a dict: lengths in mm, pixels in px, angles in rad."""
+    return {
+        'orientation_id': orientation.orientation_id,
+        'frame_id': orientation.frame_id,
+        'source': orientation.source,
+        'exposures': orientation.exposures,
+        'fluoroscopes': {
+            name: {
+                'calibration_id': identity,
+                'position_mm': position,
+                'quaternion_wxyz': quaternion_from_matrix(rotation),
+                'sd_mm': sd_mm,
+                'sd_rad': sd_rad,
+            }
+            for name, identity, position, rotation, sd_mm, sd_rad in zip(
+                orientation.fluoroscopes,
+                orientation.calibration_ids,
+                orientation.position_mm,
+                orientation.rotation,
+                orientation.sd_mm,
+                orientation.sd_rad,
+            )
+        },
+    }
+
+
+def drift_document(verdict: DriftVerdict | None, begin_ns: int) -> dict[str, Any] | None:
+    """Return a DriftVerdict as a dict; times [s] count from the exposure at begin_ns."""
+    if verdict is None:
+        return None
+    out = {
+        'level': verdict.level,
+        'message': verdict.message,
+        'level_at_end': verdict.level_at_end,
+        'watched_s': verdict.watched_s,
+    }
+    names = {
+        'fluoroscope': 'fluoroscope',
+        'place': 'place',
+        'area_px': 'area',
+        'size_px': 'size',
+        'sd_px': 'sd',
+        'direction': 'direction',
+        'against': 'against',
+        'source': 'source',
+        'evidence': 'evidence',
+        'threshold_warn': 'threshold_warn',
+        'threshold_error': 'threshold_error',
+        'observations': 'observations',
+    }
+    out.update(
+        {
+            key: getattr(verdict.state, name) if verdict.state else None
+            for key, name in names.items()
+        }
+    )
+    for key, stamp_ns in (('found', verdict.found_ns), ('began', verdict.began_ns)):
+        out[f'{key}_stamp_ns'] = stamp_ns
+        out[f'{key}_s'] = None if stamp_ns is None else (stamp_ns - begin_ns) / 1e9
+    return out

@@ -1,16 +1,18 @@
-"""Read the frames of a source: a bag, or a CSV file of observations."""
+"""Read what jobs need: the frames of a bag or a CSV file, and calibrations."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..bags.reader import read_frames
+from ..calibration.result import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
+from ..files.calibration import load_calibrations
 from ..files.observations import read_observations_csv
 
 COLLECT_MODES = ('auto', 'all', 'still')
@@ -74,3 +76,78 @@ def read_source(
     if collect is None or is_csv(path):
         return Recording(frames)
     return Recording(*collect_recorded(frames, collect))
+
+
+def select_calibrations(
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    fluoroscopes: Iterable[str],
+    where: str | os.PathLike[str] = '',
+) -> dict[str, FluoroscopeCalibration]:
+    """Return the calibrations of some fluoroscopes.
+
+    where begins the sentence of the DataError that a missing calibration raises.
+    """
+    place = f'{where}: ' if where else ''
+    if not calibrations:
+        raise DataError(f'{place}there is no calibration')
+    for name in fluoroscopes:
+        if name not in calibrations:
+            raise DataError(
+                f'{place}there is no calibration of fluoroscope {name!r}, '
+                f'only of {", ".join(calibrations)}'
+            )
+    return {name: calibrations[name] for name in fluoroscopes}
+
+
+def read_calibrations(
+    directory: str | os.PathLike[str], fluoroscopes: Sequence[str] | None = None
+) -> dict[str, FluoroscopeCalibration]:
+    """Read the calibrations in a result folder, by default all.
+
+    Raises DataError where there is none, where one is missing, and for a damaged file.
+    """
+    found = load_calibrations(directory)
+    if not found:
+        raise DataError(f'{directory}: there is no calibration in this folder')
+    return select_calibrations(found, found if fluoroscopes is None else fluoroscopes, directory)
+
+
+def read_calibrated_source(
+    path: str | os.PathLike[str],
+    directory: str | os.PathLike[str],
+    *,
+    image_size: tuple[int, int] | None = None,
+    fluoroscopes: Sequence[str] | None = None,
+    validate: bool = True,
+) -> tuple[dict[str, list[Frame]], dict[str, FluoroscopeCalibration]]:
+    """Read all frames of a source whose fluoroscopes are calibrated, and all calibrations.
+
+    Parameters
+    ----------
+    path : path-like
+        A bag or a CSV file.
+    directory : path-like
+        The result folder with the calibrations.
+    image_size : (int, int), optional
+        Of a CSV file; by default that of the calibration.
+    fluoroscopes, validate
+        As in `read_source`.
+
+    Returns
+    -------
+    frames : dict of str to list of Frame
+    calibrations : dict of str to FluoroscopeCalibration
+
+    Raises
+    ------
+    DataError
+        Also for a fluoroscope of the source without calibration.
+    """
+    calibrations = read_calibrations(directory)
+    if image_size is None:
+        image_size = next(iter(calibrations.values())).image_size
+    frames = read_source(
+        path, image_size=image_size, fluoroscopes=fluoroscopes, validate=validate
+    ).frames
+    select_calibrations(calibrations, frames, directory)
+    return frames, calibrations

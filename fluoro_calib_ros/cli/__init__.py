@@ -1,0 +1,56 @@
+"""The command fluoro-calib, one module a command; ROS need not run."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+
+from ..errors import DataError
+from . import adjust, calibrate, correct, orient, reconstruct, simulate, validate
+
+# A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, where
+# arguments depend on each other, check(arguments, error).
+COMMANDS = (simulate, calibrate, adjust, correct, validate, orient, reconstruct)
+
+
+def make_parser(command: str | None = None) -> argparse.ArgumentParser:
+    """Return the parser of the command line.
+
+    command names the one that is to be parsed: the arguments of the others, which import what they
+    are declared in, are left out.
+    """
+    parser = argparse.ArgumentParser(
+        prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.'
+    )
+    commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
+    for module in COMMANDS:
+        sub = commands.add_parser(
+            module.NAME,
+            help=module.HELP,
+            description=module.HELP,
+            epilog=f'example: {module.EXAMPLE}',
+        )
+        sub.set_defaults(module=module)
+        if command in (None, module.NAME):
+            sub.add_argument(
+                '--json', action='store_true', help='print the result as JSON on standard output'
+            )
+            module.add_arguments(sub)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command line; exit status 0 done, 1 failed for a reason in the data, 2 wrong usage."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    parser = make_parser(next((word for word in words if not word.startswith('-')), ''))
+    options = parser.parse_args(words)
+    if hasattr(options.module, 'check'):
+        options.module.check(options, parser.error)
+    try:
+        options.module.run(options)
+    except (DataError, OSError) as error:
+        print(f'fluoro-calib {options.command}: {error}', file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)

@@ -1,0 +1,5 @@
+"""`python -m fluoro_calib_ros.cli`."""
+
+from . import main
+
+main()

@@ -1,0 +1,51 @@
+"""fluoro-calib adjust."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from ..options import declared
+from .arguments import add_calibration, add_option, add_phantom, add_source
+from .output import print_note, print_result
+
+NAME = 'adjust'
+HELP = 'Adjust a bag or CSV file with the calibration held (an out-of-sample test).'
+EXAMPLE = 'fluoro-calib adjust test --phantom phantom.csv --calibration result --out check'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..calibration.options import CalibrationOptions
+
+    add_source(parser, 'image size of a CSV file, which does not hold it [px]')
+    add_phantom(parser)
+    parser.add_argument(
+        '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
+    )
+    add_calibration(parser)
+    add_option(parser, declared(CalibrationOptions)['loss'])
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Adjust and write the result folder. Raises DataError."""
+    from ..files.phantom import read_phantom
+    from ..files.result_document import result_document
+    from ..jobs.adjustment import adjust
+    from ..jobs.result_folder import save_result
+    from ..jobs.sources import read_calibrations, read_source, select_calibrations
+    from ..report.tables import summary_table
+
+    phantom = read_phantom(arguments.phantom)
+    calibrations = read_calibrations(arguments.calibration)
+    frames = read_source(
+        arguments.source,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+    ).frames
+    calibrations = select_calibrations(calibrations, frames, arguments.calibration)
+    result = adjust(frames, phantom, calibrations, arguments.loss)
+    save_result(arguments.out, result)
+    for sentence in result.left_out:
+        print_note(f'not used: {sentence}')
+    print_result(arguments, result_document(result), summary_table(result))

@@ -1,0 +1,118 @@
+"""fluoro-calib calibrate."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from ..options import declared
+from .arguments import (
+    add_collect,
+    add_option,
+    add_phantom,
+    add_source,
+    number_in,
+)
+from .output import print_note, print_result, print_round, print_unpaired
+
+NAME = 'calibrate'
+HELP = 'Self-calibrate the fluoroscopes of a bag or CSV file.'
+EXAMPLE = 'fluoro-calib calibrate bags/calibration --phantom bags/phantom.csv --out result'
+INTERNAL = ('tolerance',)  # options that the command does not offer
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..calibration.options import CalibrationOptions
+
+    add_source(parser, 'image size of a CSV file, which does not hold it [px]')
+    add_phantom(parser)
+    parser.add_argument(
+        '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
+    )
+    for name, option in declared(CalibrationOptions).items():
+        if name not in INTERNAL:
+            add_option(parser, option, **_METAVARS.get(name, {}))
+    together = parser.add_mutually_exclusive_group()
+    together.add_argument(
+        '--joint', action='store_true', help='all fluoroscopes in one adjustment'
+    )
+    together.add_argument(
+        '--separate', action='store_true', help='one fluoroscope after the other (the default)'
+    )
+    parser.add_argument(
+        '--principal-distance',
+        type=number_in(1, 1e7),
+        metavar='PX',
+        help='start value, or with --interior fixed the held value '
+        '(default: from the observations)',
+    )
+    add_collect(parser)
+    parser.add_argument(
+        '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
+    )
+
+
+_METAVARS = {
+    'relative_sd': {'metavar': 'MM,RAD'},
+    'interior_sd': {'metavar': 'XP,YP,C'},
+    'k': {'metavar': 'K'},
+    'max_iterations': {'metavar': 'N'},
+}
+
+
+def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+    """Call error with a sentence where arguments do not go together."""
+    from ..distortion.smoothers import SMOOTHERS
+
+    if arguments.k and arguments.model not in SMOOTHERS:
+        error(f'--k is a number of neighbours, it needs --model {", ".join(SMOOTHERS)}')
+    if arguments.relative_orientation != 'none' and not arguments.joint:
+        error('--relative-orientation needs --joint: the fluoroscopes in one adjustment')
+    if arguments.interior_sd and (
+        arguments.interior == 'fixed' or arguments.principal_distance is None
+    ):
+        error('--interior-sd needs --principal-distance and --interior estimated')
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Self-calibrate and write the result folder. Raises DataError."""
+    from ..calibration.options import CalibrationOptions
+    from ..calibration.request import CalibrationRequest
+    from ..files.phantom import read_phantom
+    from ..files.result_document import result_document
+    from ..jobs import calibration
+    from ..jobs.result_folder import save_outcome
+    from ..jobs.sources import read_source
+    from ..report.tables import summary_table
+
+    phantom = read_phantom(arguments.phantom)
+    recording = read_source(
+        arguments.source,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+        collect=arguments.collect,
+    )
+    print_unpaired(arguments.source, recording.unpaired)
+    options = CalibrationOptions(
+        **{
+            name: getattr(arguments, name)
+            for name in declared(CalibrationOptions)
+            if name not in INTERNAL
+        }
+    )
+    request = CalibrationRequest(
+        recording.frames, phantom, options, arguments.joint, arguments.principal_distance
+    )
+    outcome = calibration.run(request, progress=print_round)
+    save_outcome(arguments.out, outcome)
+    if arguments.figures:
+        from ..report.figures import write_figures
+
+        write_figures(outcome.result, arguments.out / 'figures')
+    if outcome.orientation is None and len(recording.frames) > 1:
+        print_note(f'no orientation of the rig: {outcome.orientation_note}')
+    for sentence in outcome.result.left_out:
+        print_note(f'not used: {sentence}')
+    print_result(arguments, result_document(outcome.result), summary_table(outcome.result))

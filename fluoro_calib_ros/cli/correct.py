@@ -1,0 +1,137 @@
+"""fluoro-calib correct."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import DataError
+from .arguments import add_calibration
+from .output import ProgressBar, print_note, print_result
+
+if TYPE_CHECKING:
+    from ..calibration.result import FluoroscopeCalibration
+
+NAME = 'correct'
+HELP = (
+    'Correct image points (a CSV file), or images: a file, a TIFF stack, a folder or a video '
+    '(correct recording.avi --calibration result --fluoroscope a --out corrected.avi).'
+)
+EXAMPLE = 'fluoro-calib correct points.csv --calibration result --out corrected.csv'
+POINTS = ('.csv', '.txt', '')  # endings of files with image points
+MAX_NAMES = 5  # files named in a note
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument(
+        'source',
+        type=Path,
+        metavar='SOURCE',
+        help='CSV file with columns u, v [px] and optionally fluoroscope, sigma; or a grey image '
+        '(png, tif, jpg, bmp, pgm), a folder of images, or a video (avi, mkv, mp4)',
+    )
+    add_calibration(parser)
+    parser.add_argument(
+        '--out',
+        required=True,
+        type=Path,
+        metavar='OUT',
+        help='file to write, for a folder the folder; its ending is the format',
+    )
+    parser.add_argument(
+        '--fluoroscope', metavar='NAME', help='fluoroscope of the source, where there are several'
+    )
+    parser.add_argument(
+        '--interpolation',
+        choices=('linear', 'cubic'),
+        default='linear',
+        help='interpolation between the pixels of an image (default: linear)',
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Correct image points or images. Raises DataError."""
+    from ..files.image_files import IMAGES, VIDEOS, ending_of, is_images
+    from ..jobs.sources import read_calibrations
+
+    names = None if arguments.fluoroscope is None else [arguments.fluoroscope]
+    calibrations = read_calibrations(arguments.calibration, names)
+    if is_images(arguments.source):
+        _correct_images(arguments, calibrations)
+    elif ending_of(arguments.source) in POINTS or not arguments.source.exists():
+        _correct_points(arguments, calibrations)  # reports a missing file
+    else:
+        known = ', '.join(ending[1:] for ending in ('.csv', *IMAGES, *VIDEOS))
+        raise DataError(
+            f'{arguments.source}: files with the ending {ending_of(arguments.source)} cannot be '
+            f'read, only {known} and folders of images'
+        )
+
+
+def _correct_points(
+    arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> None:
+    from ..files.image_points import correct_points, read_points, write_points
+
+    points = read_points(arguments.source)
+    corrected = correct_points(points, calibrations)
+    write_points(arguments.out, points, corrected)
+    counts = {
+        name: int((corrected.status == status).sum())
+        for status, name in enumerate(('OK', 'OUTSIDE', 'INVALID'))
+    }
+    total = len(corrected.uv)
+    by_status = ', '.join(f'{count} {name}' for name, count in counts.items())
+    print_result(
+        arguments,
+        {'out': str(arguments.out), 'points': total, 'status': counts},
+        f'{total} points written to {arguments.out}: {by_status}',
+    )
+
+
+def _correct_images(
+    arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> None:
+    from ..files.image_files import correct_images
+    from ..images.corrector import ImageCorrector
+
+    source = arguments.source
+    if not source.exists():
+        raise DataError(f'{source}: there is no such file')
+    if len(calibrations) > 1:
+        raise DataError(
+            f'{source}: images do not name their fluoroscope, and there are calibrations of '
+            f'{", ".join(calibrations)}: choose one with --fluoroscope'
+        )
+    (calibration,) = calibrations.values()
+    corrector = ImageCorrector(calibration, arguments.interpolation)
+    with ProgressBar(source.name) as progress:
+        done = correct_images(source, arguments.out, corrector, progress)
+    if done.passed_over:
+        names = ', '.join(done.passed_over[:MAX_NAMES])
+        further = len(done.passed_over) - MAX_NAMES
+        names += f' and {further} more' if further > 0 else ''
+        print_note(f'{source}: files that are no images were passed over: {names}')
+    size = 'x'.join(map(str, calibration.image_size))
+    empty = int((~corrector.mask).sum())
+    document = {
+        'out': str(arguments.out),
+        'kind': done.kind,
+        'images': done.images,
+        'fluoroscope': calibration.fluoroscope,
+        'calibration_id': calibration.calibration_id,
+        'image_size': list(calibration.image_size),
+        'interpolation': arguments.interpolation,
+        'empty_pixels': empty,
+        'passed_over': list(done.passed_over),
+    }
+    noun = 'image' if done.images == 1 else 'images'
+    print_result(
+        arguments,
+        document,
+        f'{done.images} {noun} of {size} px corrected with {calibration.calibration_id}, written '
+        f'to {arguments.out}; {empty} pixels of each are empty, nothing was seen there',
+    )

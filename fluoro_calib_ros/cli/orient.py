@@ -1,0 +1,92 @@
+"""fluoro-calib orient."""
+
+from __future__ import annotations
+
+import argparse
+
+from ..errors import DataError
+from .arguments import add_calibration, add_phantom, add_source
+from .output import print_result
+
+NAME = 'orient'
+HELP = 'Orientation of the rig from a capture of the phantom standing still in the rig frame.'
+EXAMPLE = 'fluoro-calib orient capture --phantom phantom.csv --calibration result'
+MAX_EXPOSURES = 10**6
+
+
+def exposure_numbers(text: str) -> set[int]:
+    """Parse 1,4-6 as a set of numbers."""
+    out: set[int] = set()
+    try:
+        for part in text.split(','):
+            low, _, high = part.partition('-')
+            numbers = range(int(low), int(high or low) + 1)
+            if not numbers or numbers[0] < 0 or len(numbers) > MAX_EXPOSURES:
+                raise ValueError
+            out.update(numbers)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f'{text!r} is not a list of exposures, such as 1,4-6'
+        ) from None
+    return out
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_source(parser, 'image size of a CSV file [px] (default: that of the calibration)')
+    add_calibration(parser)
+    add_phantom(parser)
+    parser.add_argument(
+        '--frame-id',
+        default='rig',
+        metavar='NAME',
+        help='name of the rig frame, which is that of the standing phantom (default: rig)',
+    )
+    parser.add_argument(
+        '--exposures',
+        type=exposure_numbers,
+        metavar='N,N-M',
+        help='numbers of the frames in which the phantom stands in the rig frame (default: all)',
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Write DIR/rig_orientation.npz. Raises DataError."""
+    from ..files.phantom import read_phantom
+    from ..files.result_document import orientation_document
+    from ..files.rig_orientation import save_orientation
+    from ..jobs.orientation import orient
+    from ..jobs.sources import read_calibrated_source
+    from ..report.orientation import orientation_text
+
+    phantom = read_phantom(arguments.phantom)
+    frames, calibrations = read_calibrated_source(
+        arguments.source,
+        arguments.calibration,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+    )
+    if arguments.exposures is not None:
+        frames = {
+            name: [frame for frame in of_fluoroscope if frame.number in arguments.exposures]
+            for name, of_fluoroscope in frames.items()
+        }
+    try:
+        outcome = orient(frames, phantom, calibrations, arguments.frame_id)
+    except DataError as error:
+        raise DataError(f'{arguments.source}: {error}') from None
+    path = save_orientation(arguments.calibration, outcome.orientation)
+    document = {
+        'out': path,
+        **orientation_document(outcome.orientation),
+        'targets': outcome.targets,
+        'rms_mm': outcome.rms_mm,
+    }
+    lines = [orientation_text(outcome.orientation)]
+    if outcome.targets:
+        lines.append(
+            f'{outcome.targets} targets intersected again lie {outcome.rms_mm:.3f} mm from '
+            'their survey (RMS)'
+        )
+    lines.append(f'written to {path}')
+    print_result(arguments, document, '\n'.join(lines))

@@ -1,0 +1,137 @@
+"""fluoro-calib reconstruct."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from ..errors import DataError
+from ..options import declared
+from .arguments import add_calibration, add_option, add_source
+from .output import print_result, print_unpaired
+
+if TYPE_CHECKING:
+    from ..jobs.reconstruction import ReconstructionOutcome
+
+NAME = 'reconstruct'
+HELP = 'Points in space from the observed image points of two or more fluoroscopes.'
+EXAMPLE = 'fluoro-calib reconstruct bags/tracking --calibration result --out points.csv'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..jobs.reconstruction import ReconstructionOptions
+
+    add_source(parser, 'image size of a CSV file [px] (default: that of the calibration)')
+    add_calibration(parser)
+    parser.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
+    parser.add_argument(
+        '--orientation',
+        type=Path,
+        metavar='FILE',
+        help='orientation of the rig (default: rig_orientation.npz in the result folder)',
+    )
+    options = declared(ReconstructionOptions)
+    add_option(parser, options['pair_by'])
+    add_option(parser, options['reject'], metavar='S')
+    parser.add_argument(
+        '--cluster',
+        action='append',
+        default=[],
+        metavar="'NAME: ID ID ...'",
+        help="rigid cluster of targets, such as 'tibia: 1001 1002 1003', whose distances the "
+        'drift watch looks at too; may be given again',
+    )
+    parser.add_argument(
+        '--no-drift-watch',
+        action='store_true',
+        help='do not look for a drift of the calibration; takes less time',
+    )
+
+
+def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+    """Read the clusters; call error with a sentence where arguments do not go together."""
+    from ..drift.rig_watch import clusters_of
+    from ..jobs.sources import is_csv
+
+    try:
+        arguments.clusters = clusters_of(arguments.cluster)
+    except ValueError as fault:
+        error(f'--cluster: {fault}')
+    if arguments.clusters and arguments.no_drift_watch:
+        error('--cluster is for the drift watch, it does not go with --no-drift-watch')
+    if arguments.clusters and is_csv(arguments.source):
+        error(
+            f'--cluster is for the drift watch, but {arguments.source}, a CSV file, does not hold '
+            'the times of its exposures'
+        )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Write the points of a recording. Raises DataError."""
+    from ..files.reconstructed_points import write_reconstruction
+    from ..files.rig_orientation import load_orientation, orientation_path
+    from ..jobs.reconstruction import ReconstructionOptions, check_orientation, reconstruct
+    from ..jobs.sources import is_csv, read_calibrated_source
+
+    path = arguments.orientation or orientation_path(arguments.calibration)
+    frames, calibrations = read_calibrated_source(
+        arguments.source,
+        arguments.calibration,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+        # A frame without points, or with a lost one, is no reason to refuse a recording.
+        validate=False,
+    )
+    orientation = load_orientation(path)
+    options = ReconstructionOptions(
+        arguments.pair_by,
+        arguments.reject,
+        not arguments.no_drift_watch,
+        arguments.clusters,
+        not is_csv(arguments.source),
+    )
+    names = [name for name in orientation.fluoroscopes if name in frames]
+    try:
+        check_orientation(orientation.subset(names) if names else orientation, calibrations)
+    except DataError as error:
+        raise DataError(f'{path}: {error}') from None
+    try:
+        outcome = reconstruct(frames, calibrations, orientation, options)
+    except DataError as error:
+        raise DataError(f'{arguments.source}: {error}') from None
+    write_reconstruction(arguments.out, outcome.frames)
+    print_unpaired(arguments.source, outcome.unpaired)
+    _print(arguments, outcome)
+
+
+def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> None:
+    """Print what was reconstructed."""
+    from ..files.result_document import drift_document, orientation_document
+
+    counts = outcome.status_counts
+    total = sum(counts.values())
+    names = outcome.orientation.fluoroscopes
+    document = {
+        'out': str(arguments.out),
+        'frames': len(outcome.frames),
+        'incomplete': outcome.incomplete,
+        'points': total,
+        'status': counts,
+        'unpaired': outcome.unpaired,
+        'drift': drift_document(outcome.drift, outcome.frames[0].stamp_ns),
+        'orientation': orientation_document(outcome.orientation),
+    }
+    by_status = ', '.join(f'{count} {name}' for name, count in counts.items() if count)
+    lines = [
+        f'{total} points of {len(outcome.frames)} frames written to {arguments.out}: {by_status}'
+    ]
+    if outcome.incomplete:
+        lines.append(
+            f'{outcome.incomplete} of the frames without all fluoroscopes ({", ".join(names)})'
+        )
+    if outcome.drift:
+        lines.append(f'drift watch: {outcome.drift.message}')
+    print_result(arguments, document, '\n'.join(lines))

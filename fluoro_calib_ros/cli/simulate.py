@@ -1,0 +1,35 @@
+"""fluoro-calib simulate."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+from pathlib import Path
+
+from ..options import declared
+from .arguments import add_option
+from .output import print_result
+
+NAME = 'simulate'
+HELP = 'Write bags, CSV, phantom and truth of a virtual rig.'
+EXAMPLE = 'fluoro-calib simulate --out rig --seed 1 --exposures 15'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..jobs.simulation import SimulationOptions
+
+    parser.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder to write')
+    for option in declared(SimulationOptions).values():
+        add_option(parser, option)
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Write the data set. Raises DataError."""
+    from ..jobs.simulation import SimulationOptions, simulate
+
+    values = {name: getattr(arguments, name) for name in declared(SimulationOptions)}
+    options = SimulationOptions(**values)
+    simulate(arguments.out, options)
+    document = {'out': str(arguments.out), **dataclasses.asdict(options)}
+    print_result(arguments, document, f'written to {arguments.out}')

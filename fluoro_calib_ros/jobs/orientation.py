@@ -1,0 +1,75 @@
+"""The orientation job: orient the rig from a capture of the phantom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.result import FluoroscopeCalibration
+from ..calibration.rig_orientation import orientation_of_capture, standing_frames
+from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.intersection import Intersector
+from ..reconstruction.reconstruct import reconstruct_frame
+
+
+@dataclass(frozen=True)
+class OrientationOutcome:
+    """Orientation of the rig, and a check of it for people.
+
+    Attributes
+    ----------
+    orientation : RigOrientation
+    targets : int
+        Number of targets of the capture that were intersected again.
+    rms_mm : float
+        Root mean square of their distances from the survey, NaN without targets.
+    """
+
+    orientation: RigOrientation
+    targets: int
+    rms_mm: float
+
+
+def orient(
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    frame_id: str = 'rig',
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> OrientationOutcome:
+    """Orient the rig in the frame of a phantom that stands still.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        One or more frames of every fluoroscope.
+    phantom : Phantom
+    calibrations : mapping of str to FluoroscopeCalibration
+    frame_id : str
+        Name of the rig frame.
+    raise_if_cancelled : callable, optional
+        Called during the adjustment; may raise to stop it.
+
+    Returns
+    -------
+    OrientationOutcome
+
+    Raises
+    ------
+    DataError
+        For fewer than two fluoroscopes, missing calibrations, and frames that do not suffice.
+    """
+    orientation = orientation_of_capture(
+        frames, phantom, calibrations, frame_id, raise_if_cancelled=raise_if_cancelled
+    )
+    found = reconstruct_frame(
+        standing_frames(frames, calibrations), calibrations, Intersector(orientation)
+    )
+    offset = found.points.xyz_mm - phantom.xyz_mm[phantom.index(found.target_id)]
+    offset = offset[np.isfinite(offset).all(axis=1)]
+    rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1)))) if len(offset) else float('nan')
+    return OrientationOutcome(orientation, len(offset), rms)

@@ -1,0 +1,156 @@
+"""The reconstruction job: points in space from a recording, and whether the calibration drifted."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.result import FluoroscopeCalibration
+from ..drift.clusters import Cluster
+from ..drift.rig_watch import DriftVerdict, RecordingWatch
+from ..errors import DataError
+from ..exposures.frame import Frame
+from ..options import option, validate_options
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.intersection import STATUS, Intersector
+from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
+
+PAIR_BY = ('frame_number', 'stamp')
+
+
+@dataclass(frozen=True)
+class ReconstructionOptions:
+    """Options of a reconstruction.
+
+    clusters are the rigid clusters of targets whose distances the drift watch looks at too. A
+    recording without time stamps (has_stamps False) is paired by frame number, and no drift can
+    be found in it. Raises ValueError for a value that an option cannot have.
+    """
+
+    pair_by: str = option(
+        'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
+    )
+    reject: float = option(
+        4.0,
+        'epipolar distance above which a match is false',
+        minimum=0.1,
+        maximum=1e6,
+        unit='standard deviations',
+    )
+    drift_watch: bool = True
+    clusters: tuple[Cluster, ...] = ()
+    has_stamps: bool = True
+
+    def __post_init__(self) -> None:
+        validate_options(self)
+
+
+@dataclass(frozen=True)
+class ReconstructionOutcome:
+    """Points of a recording.
+
+    Attributes
+    ----------
+    frames : list of ReconstructedFrame
+        In the order of time.
+    unpaired : mapping of str to int
+        Frames without partner, by fluoroscope.
+    orientation : RigOrientation
+        That of the fluoroscopes that were used.
+    drift : DriftVerdict or None
+        None where no drift watch was wanted.
+    """
+
+    frames: list[ReconstructedFrame]
+    unpaired: Mapping[str, int]
+    orientation: RigOrientation
+    drift: DriftVerdict | None
+
+    @property
+    def incomplete(self) -> int:
+        """Number of frames that some fluoroscope did not see."""
+        count = len(self.orientation.fluoroscopes)
+        return sum(len(frame.fluoroscopes) < count for frame in self.frames)
+
+    @property
+    def status_counts(self) -> dict[str, int]:
+        """Number of points by status."""
+        status = np.concatenate([frame.points.status for frame in self.frames])
+        return dict(zip(STATUS, np.bincount(status, minlength=len(STATUS)).tolist()))
+
+
+def reconstruct(
+    frames: Mapping[str, Sequence[Frame]],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation,
+    options: ReconstructionOptions | None = None,
+) -> ReconstructionOutcome:
+    """Correct and intersect the observed image points of a recording.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        By fluoroscope; two or more fluoroscopes of the orientation.
+    calibrations : mapping of str to FluoroscopeCalibration
+    orientation : RigOrientation
+    options : ReconstructionOptions, optional
+
+    Returns
+    -------
+    ReconstructionOutcome
+
+    Raises
+    ------
+    DataError
+        For calibrations that the orientation does not belong to, and for frames that cannot be
+        paired or corrected.
+    """
+    options = options or ReconstructionOptions()
+    if options.pair_by == 'stamp' and not options.has_stamps:
+        raise DataError(
+            'the recording does not hold the times of its exposures, pair them by frame_number'
+        )
+    names = [name for name in orientation.fluoroscopes if name in frames]
+    if len(names) < 2:
+        raise DataError(
+            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
+            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
+        )
+    orientation = orientation.subset(names)
+    watch, drift = _drift_watch(orientation, calibrations, options)
+    found, unpaired = reconstruct_recording(
+        frames, calibrations, Intersector(orientation, options.reject), options.pair_by, watch
+    )
+    if not found:
+        raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
+    return ReconstructionOutcome(found, unpaired, orientation, watch.verdict() if watch else drift)
+
+
+def check_orientation(
+    orientation: RigOrientation, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> None:
+    """Raise DataError unless an orientation was determined with these calibrations."""
+    orientation.check_calibrations(
+        {name: calibration.calibration_id for name, calibration in calibrations.items()}
+    )
+
+
+def _drift_watch(
+    orientation: RigOrientation,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    options: ReconstructionOptions,
+) -> tuple[RecordingWatch | None, DriftVerdict | None]:
+    """Return the drift watch of a recording, or None and the reason, or twice None."""
+    if not options.drift_watch:
+        return None, None
+    if not options.has_stamps:
+        return None, DriftVerdict(
+            'unknown', 'a CSV file does not tell the time of its exposures, no drift can be told'
+        )
+    sizes = {name: calibrations[name].image_size for name in orientation.fluoroscopes}
+    try:
+        return RecordingWatch(orientation, sizes, clusters=options.clusters), None
+    except DataError as error:
+        return None, DriftVerdict('unknown', f'no drift can be told: {error}')

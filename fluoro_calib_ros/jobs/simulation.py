@@ -1,0 +1,76 @@
+"""The simulation job: a data set of the virtual rig on disk."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+
+from ..options import option, validate_options
+from ..simulation.rig import START_NS, simulate_exposures, simulate_tracking, virtual_rig
+from .dataset import write_exposures, write_rig, write_tracking
+
+HOUR_NS = 3600 * 10**9
+
+
+@dataclasses.dataclass(frozen=True)
+class SimulationOptions:
+    """Options of a data set. Raises ValueError for a value that an option cannot have."""
+
+    seed: int = option(1, 'number of the rig', minimum=0, maximum=2**31)
+    exposures: int = option(
+        15, 'exposures of the phantom for the calibration', minimum=1, maximum=100000
+    )
+    test_exposures: int = option(
+        0,
+        'further exposures, written as a bag and CSV of their own',
+        minimum=0,
+        maximum=100000,
+    )
+    seconds: float = option(3.0, 'markers in motion', minimum=0, maximum=86400, unit='s')
+    rate: float = option(
+        120.0, 'frame rate of the markers in motion', minimum=1, maximum=2000, unit='Hz'
+    )
+    noise: float = option(0.25, 'image noise', minimum=0, maximum=100, unit='px')
+    false_matches: float = option(
+        0.01, 'part of the targets with a wrong id', minimum=0, maximum=0.5
+    )
+    strength: float = option(1.0, 'strength of the distortion', minimum=0, maximum=10)
+
+    def __post_init__(self) -> None:
+        validate_options(self)
+
+
+def simulate(directory: str | os.PathLike[str], options: SimulationOptions | None = None) -> None:
+    """Write bags, CSV files, phantom and truth of a virtual rig into a folder.
+
+    Raises DataError where a file cannot be written.
+    """
+    options = options or SimulationOptions()
+    directory = Path(directory)
+    rig = virtual_rig(options.seed, options.strength)
+    write_rig(directory, rig, **dataclasses.asdict(options))
+    image = {'noise_px': options.noise, 'false_matches': options.false_matches}
+    calibration = simulate_exposures(rig, options.exposures, options.seed, **image)
+    write_exposures(directory, 'calibration', rig, calibration)
+    # The parts have seeds of their own, so that the size of one does not change another.
+    if options.test_exposures:
+        test = simulate_exposures(
+            rig,
+            options.test_exposures,
+            options.seed + 1_000_000,
+            start_ns=START_NS + HOUR_NS,
+            first_number=options.exposures + 1,
+            **image,
+        )
+        write_exposures(directory, 'test', rig, test)
+    if options.seconds:
+        tracking = simulate_tracking(
+            rig,
+            options.seconds,
+            options.rate,
+            options.seed,
+            options.noise,
+            START_NS + 2 * HOUR_NS,
+        )
+        write_tracking(directory, tracking)

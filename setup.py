@@ -26,6 +26,7 @@ setup(
         'zstandard',
         'rosbags',
         'threadpoolctl',
+        'tifffile',
         'PyYAML',
         'opencv-python-headless',
         'tqdm',

@@ -117,7 +117,7 @@ def scaling_section():
     """Time and memory by the number of exposures."""
     return section(
         'Many exposures',
-        'One adjustment with surveyed coordinates and estimated noise, each size in a '
+        'One adjustment with surveyed coordinates and a given noise model, each size in a '
         'fresh process.',
         scaling.HEADER,
         list(scaling.rows()),

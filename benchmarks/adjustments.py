@@ -4,10 +4,12 @@ cost.
 
 import numpy as np
 
-from fluoro_calib_ros.photogrammetry.adjustment import Network, Parameters, adjust
+from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.collinearity import project
+from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 from fluoro_calib_ros.simulation.rig import phantom_poses, virtual_rig
 
 from .peers import ColmapAdjustment, with_datum
@@ -66,7 +68,7 @@ def beside_colmap(exposures, repeats=3):
     network, start = large_network(exposures)
     held = np.arange(len(network.survey_mm)) % HELD_EVERY == 0
     network = with_datum(network, held)
-    ours, seconds = timed(lambda: adjust(network, start, None, NOISE, noise_held=True), repeats)
+    ours, seconds = timed(lambda: adjust(network, start, None, NOISE), repeats)
 
     def colmap():
         peer = ColmapAdjustment(network, start, NOISE, held, STOP)

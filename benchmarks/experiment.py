@@ -20,7 +20,7 @@ from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.self_calibration import start_noise
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import points_on_image
-from fluoro_calib_ros.photogrammetry.adjustment import adjust
+from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy
@@ -352,11 +352,11 @@ def errors_of_test(scene, case, calibrations):
         nu=float(np.median([c.nu for c in calibrations.values()])),
     )
     if len(network.uv) < SEEN_FOR_NOISE * len(network.survey_mm):
-        after = adjust(
-            network, start, correction, noise, tolerance=TEST_TOLERANCE, noise_held=True
-        )
+        after = adjust(network, start, correction, noise, SolverOptions(TEST_TOLERANCE))
     else:
-        after = adjust_and_estimate_noise(network, start, correction, noise, TEST_TOLERANCE)
+        after = adjust_and_estimate_noise(
+            network, start, correction, noise, SolverOptions(TEST_TOLERANCE)
+        )
     exposures = [
         (frame.fluoroscope, frame.number, after.parameters.position_mm[j])
         for j, frame in enumerate(measured.frames)

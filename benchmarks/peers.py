@@ -14,9 +14,9 @@ from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
 from fluoro_calib_ros.distortion.gauge import gauge_basis
-from fluoro_calib_ros.photogrammetry.adjustment import Parameters
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.noise import INLIER_Q, Noise
+from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 
 from .timing import timed
 
@@ -80,7 +80,11 @@ class ColmapAdjustment:
     """
 
     def __init__(self, network, start, noise, held, tolerances=None):
-        if network.shape[3] != 1 or noise.loss != 'student_t' or not np.all(network.sigma == 1):
+        if (
+            network.n_fluoroscopes != 1
+            or noise.loss != 'student_t'
+            or not np.all(network.sigma == 1)
+        ):
             raise ValueError('one fluoroscope, Student-t and the same sigma for all image points')
         self._network = network
         self._noise = noise

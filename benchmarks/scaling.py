@@ -40,7 +40,7 @@ def peak_gib():
 
 
 def measure(exposures):
-    """Figures of one adjustment from disturbed start values, its noise estimated, in this process."""
+    """Figures of one adjustment from disturbed start values in this process."""
     network, start = large_network(exposures)
     before = peak_gib()
     with threadpool_limits(1):
@@ -49,7 +49,7 @@ def measure(exposures):
         'exposures': exposures,
         'targets': len(network.survey_mm),
         'image_points': len(network.uv),
-        'unknowns': network.unknowns,
+        'unknowns': network.n_unknowns,
         'steps': result.steps,
         'converged': bool(result.converged),
         'seconds': seconds,

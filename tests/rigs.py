@@ -7,9 +7,10 @@ import numpy as np
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.cli import main
-from fluoro_calib_ros.photogrammetry.adjustment import Network, Parameters
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
+from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 from fluoro_calib_ros.simulation.rig import (
     looking_at_origin,
     phantom_poses,
@@ -101,7 +102,7 @@ def moved(network, parameters, x):
     """Parameters moved by a flat vector of all unknowns: T and w of the exposures, points, free
     interiors.
     """
-    _, m, n, _ = network.shape
+    m, n = network.n_exposures, network.n_points
     exterior = x[: 6 * m].reshape(m, 6)
     points = x[6 * m : 6 * m + 3 * n].reshape(n, 3)
     interior = parameters.interior.copy()
@@ -116,9 +117,10 @@ def moved(network, parameters, x):
 
 def design_matrix(network, parameters):
     """Dense derivatives (2N, u) of the image points, in the order of `moved`."""
-    count, m, n, _ = network.shape
+    count = network.n_image_points
+    m, n = network.n_exposures, network.n_points
     _, d_e, d_p, d_i = project_with_jacobian(*parameters.per_image_point(network))
-    out = np.zeros((count, 2, network.unknowns))
+    out = np.zeros((count, 2, network.n_unknowns))
     column = 6 * m + 3 * n + 3 * (np.cumsum(network.interior_free) - 1)
     for row, (e, p) in enumerate(zip(network.exposure, network.point)):
         out[row, :, 6 * e : 6 * e + 6] = d_e[row]
@@ -138,7 +140,7 @@ def dense_normal_matrix(network, adjustment, factor=1.0):
         / (adjustment.noise.scale * network.sigma) ** 2
     )
     normal = a.T @ (np.repeat(weight, 2)[:, None] * a)
-    m, n = network.shape[1:3]
+    m, n = network.n_exposures, network.n_points
     points = np.arange(6 * m, 6 * m + 3 * n)
     normal[points, points] += np.repeat(1 / network.survey_sd_mm**2, 3)
     return normal

@@ -10,17 +10,20 @@ from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.calibration.self_calibration import adjusted_with_precision
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
-from fluoro_calib_ros.photogrammetry import normal_equations as normal_module
-from fluoro_calib_ros.photogrammetry import precision as precision_module
 from fluoro_calib_ros.photogrammetry.adjustment import (
+    SolverOptions,
     adjust,
-    eliminates_points,
     residuals_and_q,
     total_cost,
 )
 from fluoro_calib_ros.photogrammetry.collinearity import project
+from fluoro_calib_ros.photogrammetry.elimination import (
+    EliminateExposures,
+    EliminatePoints,
+    choose_elimination,
+)
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
+from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy, precision
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 
@@ -72,7 +75,7 @@ def test_gradient_of_the_cost_is_zero_at_the_solution(loss, shape):
     deviation.
     """
     network, truth = rigs.small_network(**shape, nu=4.0)
-    result = adjust(network, rigs.disturbed(truth), noise=Noise(loss))
+    result = adjust_and_estimate_noise(network, rigs.disturbed(truth), noise=Noise(loss))
     assert result.converged
     directions = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, result))).T
     step = 1e-3
@@ -86,7 +89,12 @@ def test_gradient_of_the_cost_is_zero_at_the_solution(loss, shape):
 
 def test_gaussian_adjustment_equals_scipy_least_squares():
     network, truth = rigs.small_network(**MANY_TARGETS)
-    result = adjust(network, rigs.disturbed(truth), noise=Noise('gaussian'), tolerance=1e-12)
+    result = adjust_and_estimate_noise(
+        network,
+        rigs.disturbed(truth),
+        noise=Noise('gaussian'),
+        options=SolverOptions(tolerance=1e-12),
+    )
     assert len(set(network.sigma)) > 1
 
     def residuals(x):
@@ -100,7 +108,7 @@ def test_gaussian_adjustment_equals_scipy_least_squares():
     sd = standard_deviations(network, result)
     theirs = optimize.least_squares(
         residuals,
-        np.zeros(network.unknowns),
+        np.zeros(network.n_unknowns),
         x_scale=sd,
         xtol=1e-13,
         ftol=1e-15,
@@ -120,12 +128,14 @@ def test_no_better_solution_is_found_by_direct_minimisation(loss):
     back to it.
     """
     network, truth = rigs.small_network(exposures=3, targets=14, nu=4.0)
-    result = adjust(network, rigs.disturbed(truth), noise=Noise(loss), tolerance=1e-12)
+    result = adjust_and_estimate_noise(
+        network, rigs.disturbed(truth), noise=Noise(loss), options=SolverOptions(tolerance=1e-12)
+    )
     root = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, result)))
     ours = cost_at(network, result)
     for start in (
-        np.zeros(network.unknowns),
-        np.random.default_rng(1).normal(0, 0.5, network.unknowns),
+        np.zeros(network.n_unknowns),
+        np.random.default_rng(1).normal(0, 0.5, network.n_unknowns),
     ):
         theirs = optimize.minimize(
             lambda z: cost_at(network, result, root @ z),
@@ -141,15 +151,17 @@ def test_no_better_solution_is_found_by_direct_minimisation(loss):
 @pytest.mark.parametrize(
     'shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)]
 )
-def test_both_eliminations_give_the_same_solution_and_covariances(monkeypatch, shape, loss):
+def test_both_eliminations_give_the_same_solution_and_covariances(shape, loss):
     network, truth = rigs.small_network(**shape, nu=5.0)
-    assert eliminates_points(network) == (shape is not MANY_EXPOSURES)
+    smaller = EliminateExposures if shape is MANY_EXPOSURES else EliminatePoints
+    assert choose_elimination(network) is smaller
     found = []
-    for points in (True, False):
-        for module in (adjustment_module, normal_module, precision_module):
-            monkeypatch.setattr(module, 'eliminates_points', lambda network, points=points: points)
-        result = adjust(network, rigs.disturbed(truth), noise=Noise(loss))
-        found.append((result, precision(network, result)))
+    for elimination in (EliminatePoints, EliminateExposures):
+        options = SolverOptions(elimination=elimination)
+        result = adjust_and_estimate_noise(
+            network, rigs.disturbed(truth), noise=Noise(loss), options=options
+        )
+        found.append((result, precision(network, result, elimination=elimination)))
     (one, one_precise), (other, other_precise) = found
     assert one.steps == other.steps
     assert one.cost == pytest.approx(other.cost, rel=1e-10)
@@ -170,9 +182,9 @@ def test_covariances_equal_the_dense_inverse(shape, loss, free):
     weighted problem.
     """
     network, truth = rigs.small_network(**shape, nu=5.0, free=free)
-    result = adjust(network, truth, noise=Noise(loss))
+    result = adjust_and_estimate_noise(network, truth, noise=Noise(loss))
     precise = precision(network, result)
-    _, m, n, _ = network.shape
+    m, n = network.n_exposures, network.n_points
     honest = np.linalg.inv(
         rigs.dense_normal_matrix(network, result, result.noise.information_factor(result.q))
     )
@@ -211,12 +223,12 @@ def test_covariances_equal_the_dense_inverse(shape, loss, free):
 )
 def test_redundancy_numbers_sum_to_observations_less_unknowns(shape, loss, free):
     network, truth = rigs.small_network(**shape, nu=4.0, free=free)
-    m, n, fluoroscopes = network.shape[1:]
-    assert network.unknowns == 6 * m + 3 * n + 3 * free * fluoroscopes
-    result = adjust(network, truth, noise=Noise(loss))
+    m, n, fluoroscopes = network.n_exposures, network.n_points, network.n_fluoroscopes
+    assert network.n_unknowns == 6 * m + 3 * n + 3 * free * fluoroscopes
+    result = adjust_and_estimate_noise(network, truth, noise=Noise(loss))
     precise = precision(network, result)
     total = precise.redundancy.sum() + precise.survey_redundancy.sum()
-    assert total == pytest.approx(2 * len(network.uv) + 3 * n - network.unknowns, rel=1e-8)
+    assert total == pytest.approx(2 * len(network.uv) + 3 * n - network.n_unknowns, rel=1e-8)
     for numbers in (precise.redundancy, precise.survey_redundancy):
         assert numbers.min() > -1e-9 and numbers.max() < 1 + 1e-9
 
@@ -226,7 +238,7 @@ def test_geometric_redundancy_is_that_of_equal_weights():
     adjustment.
     """
     network, truth = rigs.small_network(**MANY_TARGETS)
-    result = adjust(network, truth, noise=Noise('gaussian'))
+    result = adjust_and_estimate_noise(network, truth, noise=Noise('gaussian'))
     numbers = precision(network, result).redundancy.mean(axis=1)
     noise = Noise('student_t', result.noise.scale, 3.0)
     np.testing.assert_allclose(
@@ -314,11 +326,13 @@ def test_false_matches_do_not_move_the_solution():
         exposure=network.exposure[keep],
         point=network.point[keep],
     )
-    wanted = adjust(clean, truth)
+    wanted = adjust_and_estimate_noise(clean, truth)
     sd = np.sqrt(np.diagonal(precision(clean, wanted).exterior, axis1=1, axis2=2)[:, :3])
 
     def shift(loss):
-        found = adjust(replace(network, uv=uv), rigs.disturbed(truth), noise=Noise(loss))
+        found = adjust_and_estimate_noise(
+            replace(network, uv=uv), rigs.disturbed(truth), noise=Noise(loss)
+        )
         assert found.converged
         return np.max(
             np.abs(found.parameters.position_mm - wanted.parameters.position_mm) / sd
@@ -336,8 +350,8 @@ def test_the_order_of_image_points_does_not_matter():
     shuffled = replace(
         network, uv=network.uv[order], sigma=network.sigma[order], point=network.point[order]
     )
-    one = adjust(network, rigs.disturbed(truth))
-    other = adjust(shuffled, rigs.disturbed(truth))
+    one = adjust_and_estimate_noise(network, rigs.disturbed(truth))
+    other = adjust_and_estimate_noise(shuffled, rigs.disturbed(truth))
     assert_same_solution(one, other)
     np.testing.assert_allclose(one.residuals[order], other.residuals, atol=1e-6)
 
@@ -345,8 +359,8 @@ def test_the_order_of_image_points_does_not_matter():
 def test_sigma_has_a_unit_of_its_own():
     """Ten times the sigma gives a tenth of the scale, and nothing else changes."""
     network, truth = rigs.small_network(**MANY_TARGETS)
-    one = adjust(network, rigs.disturbed(truth))
-    other = adjust(
+    one = adjust_and_estimate_noise(network, rigs.disturbed(truth))
+    other = adjust_and_estimate_noise(
         replace(network, sigma=10 * network.sigma), rigs.disturbed(truth), noise=Noise(scale=0.1)
     )
     assert other.noise.scale == pytest.approx(one.noise.scale / 10, rel=1e-6)
@@ -376,7 +390,9 @@ def test_image_points_of_small_sigma_decide():
         np.sqrt(
             np.mean(
                 (
-                    adjust(replace(interior_held, sigma=s), truth).parameters.points_mm
+                    adjust_and_estimate_noise(
+                        replace(interior_held, sigma=s), truth
+                    ).parameters.points_mm
                     - truth.points_mm
                 )
                 ** 2
@@ -392,7 +408,7 @@ def test_a_held_interior_orientation_stays_to_the_last_bit():
     network, truth = rigs.small_network(exposures=4, targets=30, fluoroscopes=2)
     network = replace(network, interior_free=np.array([False, True]))
     start = rigs.disturbed(truth)
-    result = adjust(network, start)
+    result = adjust_and_estimate_noise(network, start)
     assert result.converged
     np.testing.assert_array_equal(result.parameters.interior[0], start.interior[0])
     assert np.all(result.parameters.interior[1] != start.interior[1])
@@ -406,9 +422,9 @@ def test_a_correction_is_taken_off_the_observed_points():
     """
     network, truth = rigs.small_network(**MANY_TARGETS)
     correction = np.random.default_rng(1).normal(0, 5, network.uv.shape)
-    one = adjust(network, rigs.disturbed(truth))
+    one = adjust_and_estimate_noise(network, rigs.disturbed(truth))
     distorted = replace(network, uv=network.uv + correction)
-    other = adjust(distorted, rigs.disturbed(truth), correction)
+    other = adjust_and_estimate_noise(distorted, rigs.disturbed(truth), correction)
     assert_same_solution(one, other)
     np.testing.assert_allclose(one.residuals, other.residuals, atol=1e-6)
     np.testing.assert_allclose(
@@ -421,8 +437,9 @@ def test_a_correction_is_taken_off_the_observed_points():
 
 def test_a_far_start_ends_in_the_same_place():
     network, truth = rigs.small_network(exposures=6, targets=40, nu=5.0)
-    near = adjust(network, truth)
-    far = adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0))
+    noise = Noise(scale=0.3)
+    near = adjust(network, truth, noise=noise)
+    far = adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0), noise=noise)
     assert near.converged and far.converged
     assert near.cost == pytest.approx(far.cost, abs=1e-3)
     sd = standard_deviations(network, near)[:3]
@@ -433,7 +450,9 @@ def test_a_far_start_ends_in_the_same_place():
 
 def test_steps_that_run_out_are_told():
     network, truth = rigs.small_network(**MANY_TARGETS)
-    result = adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0), max_steps=2)
+    result = adjust(
+        network, rigs.disturbed(truth, degrees=3.0, mm=40.0), options=SolverOptions(max_steps=2)
+    )
     assert not result.converged and result.steps == 2
 
 
@@ -447,7 +466,9 @@ def test_check_stops_an_adjustment_before_its_next_step():
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        adjust(network, rigs.disturbed(truth, degrees=3.0, mm=40.0), raise_if_cancelled=check)
+        adjust_and_estimate_noise(
+            network, rigs.disturbed(truth, degrees=3.0, mm=40.0), raise_if_cancelled=check
+        )
     assert len(calls) == 3
 
 
@@ -473,8 +494,7 @@ def test_a_held_noise_model_stays():
         network,
         rigs.disturbed(truth),
         noise=Noise(scale=0.7, nu=9.0),
-        noise_held=True,
-        tolerance=1e-12,
+        options=SolverOptions(tolerance=1e-12),
     )
     assert (held.noise.scale, held.noise.nu) == (0.7, 9.0) and held.converged
     directions = np.linalg.cholesky(np.linalg.inv(rigs.dense_normal_matrix(network, held))).T
@@ -482,14 +502,14 @@ def test_a_held_noise_model_stays():
         cost_at(network, held, 1e-3 * d) - cost_at(network, held, -1e-3 * d) for d in directions
     ]
     assert np.linalg.norm(slope) / 2e-3 < 1e-5
-    assert adjust(network, truth).noise.scale == pytest.approx(0.3, rel=0.3)
+    assert adjust_and_estimate_noise(network, truth).noise.scale == pytest.approx(0.3, rel=0.3)
 
 
 def test_exact_observations_give_the_exact_solution():
     """The noise scale stops at a hundredth of a pixel instead of vanishing."""
     network, truth = rigs.small_network(**MANY_TARGETS, noise_px=0.0, survey_sd_mm=1e-9)
     network = replace(network, survey_sd_mm=np.full(30, 0.1))
-    result = adjust(network, rigs.disturbed(truth))
+    result = adjust_and_estimate_noise(network, rigs.disturbed(truth))
     assert result.converged and result.noise.scale * np.median(network.sigma) == pytest.approx(
         0.01
     )

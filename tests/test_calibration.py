@@ -190,12 +190,8 @@ def test_both_fluoroscopes_share_their_object_points_in_a_joint_adjustment():
         assert [len(figures.exposures) for figures in job.fluoroscopes.values()] == [6, 6]
     assert set(joint.history['a+b'][0].k) == {'a', 'b'}
     network = joint.runs['a+b'].measured.network
-    assert network.shape == (
-        sum(len(f.target_id) for fs in frames.values() for f in fs),
-        12,
-        len(ids),
-        2,
-    )
+    assert network.n_image_points == sum(len(f.target_id) for fs in frames.values() for f in fs)
+    assert (network.n_exposures, network.n_points, network.n_fluoroscopes) == (12, len(ids), 2)
     assert not np.array_equal(joint.fluoroscopes['a'].interior, apart.fluoroscopes['a'].interior)
 
 

@@ -46,11 +46,18 @@ from fluoro_calib_ros.distortion.terms import (
     expert_terms,
     trend_transformation,
 )
-from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
-from fluoro_calib_ros.photogrammetry import normal_equations as normal_module
-from fluoro_calib_ros.photogrammetry import precision as precision_module
-from fluoro_calib_ros.photogrammetry.additional_parameters import Additional
-from fluoro_calib_ros.photogrammetry.adjustment import adjust, residuals_and_q, total_cost
+from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
+from fluoro_calib_ros.photogrammetry.adjustment import (
+    SolverOptions,
+    adjust,
+    residuals_and_q,
+    total_cost,
+)
+from fluoro_calib_ros.photogrammetry.elimination import (
+    EliminateExposures,
+    EliminatePoints,
+    factorize,
+)
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.normal_equations import normal_equations
 from fluoro_calib_ros.photogrammetry.precision import (
@@ -58,7 +65,6 @@ from fluoro_calib_ros.photogrammetry.precision import (
     covariance_of_projection,
     information_of_additional,
     precision,
-    solved,
 )
 from fluoro_calib_ros.simulation.distortion import DistortionField
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
@@ -256,21 +262,21 @@ def network_with_additional(scalar, seed=0, **shape):
         values = Functions((1024, 1024), 2, 2)(uv)[:, 3:]
         if not scalar:
             values = np.einsum('nm,amt->nat', values, rng.normal(size=(2, values.shape[1], 5)))
-        made = Additional(values, np.zeros((1, 1)))
+        made = AdditionalParameters(values, np.zeros((1, 1)))
         root = rng.normal(size=(made.count, made.count))
         additional.append(replace(made, prior=root @ root.T / made.count + np.eye(made.count)))
         coefficients.append(rng.normal(size=made.count))
     network = replace(network, additional=tuple(additional))
     truth = replace(truth, additional=tuple(coefficients))
-    return replace(network, uv=network.uv + network.added(truth)), truth
+    return replace(network, uv=network.uv + network.additional_correction(truth)), truth
 
 
 def dense_normal(network, result):
     """Dense normal matrix of all unknowns, additional parameters last, by central differences of
     the residuals.
     """
-    m, n = network.shape[1:3]
-    count = len(network.global_free) - 3 * network.shape[3]
+    m, n = network.n_exposures, network.n_points
+    count = network.layout.n_globals - 3 * network.n_fluoroscopes
     u = 6 * m + 3 * n + 3 * int(network.interior_free.sum())
 
     def moved(x):
@@ -325,14 +331,13 @@ def test_covariances_with_additional_parameters_equal_the_dense_inverse(scalar, 
             }
         ),
         noise=Noise('student_t', 0.3, 8.0),
-        noise_held=True,
     )
     assert result.converged
-    matrix = solved(
+    matrix = factorize(
         network,
         normal_equations(network, result.parameters, np.zeros_like(network.uv), result.noise),
     )
-    blocks = covariance_blocks(network, matrix)
+    blocks = covariance_blocks(matrix)
     normal, u, a = dense_normal(network, result)
     inverse = np.linalg.inv(normal)
     count = network.additional[0].count
@@ -340,7 +345,7 @@ def test_covariances_with_additional_parameters_equal_the_dense_inverse(scalar, 
     for f in range(2):
         own = slice(u + f * count, u + (f + 1) * count)
         np.testing.assert_allclose(
-            np.linalg.inv(information_of_additional(network, matrix, f)),
+            np.linalg.inv(information_of_additional(matrix, f)),
             inverse[own, own],
             rtol=2e-4,
             atol=1e-6,
@@ -358,16 +363,17 @@ def test_covariances_with_additional_parameters_equal_the_dense_inverse(scalar, 
     assert [len(c) for c in precise.additional] == [count, count]
 
 
-@pytest.mark.parametrize('points', [True, False])
-def test_both_eliminations_agree_with_additional_parameters(monkeypatch, points):
+@pytest.mark.parametrize('elimination', [EliminatePoints, EliminateExposures])
+def test_both_eliminations_agree_with_additional_parameters(elimination):
     network, truth = network_with_additional(True, exposures=4, targets=25)
     expected = adjust(
-        network, truth, noise=Noise('student_t', 0.3, 8.0), noise_held=True, tolerance=1e-12
+        network, truth, noise=Noise('student_t', 0.3, 8.0), options=SolverOptions(tolerance=1e-12)
     )
-    for module in (adjustment_module, normal_module, precision_module):
-        monkeypatch.setattr(module, 'eliminates_points', lambda network: points)
     found = adjust(
-        network, truth, noise=Noise('student_t', 0.3, 8.0), noise_held=True, tolerance=1e-12
+        network,
+        truth,
+        noise=Noise('student_t', 0.3, 8.0),
+        options=SolverOptions(tolerance=1e-12, elimination=elimination),
     )
     assert found.cost == pytest.approx(expected.cost, abs=1e-7)
     for one, other in zip(found.parameters.additional, expected.parameters.additional):
@@ -377,7 +383,7 @@ def test_both_eliminations_agree_with_additional_parameters(monkeypatch, points)
 def test_gradient_is_zero_at_the_solution_with_additional_parameters():
     network, truth = network_with_additional(True, exposures=4, targets=25)
     result = adjust(
-        network, truth, noise=Noise('student_t', 0.3, 8.0), noise_held=True, tolerance=1e-12
+        network, truth, noise=Noise('student_t', 0.3, 8.0), options=SolverOptions(tolerance=1e-12)
     )
 
     def cost(f, move):

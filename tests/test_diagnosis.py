@@ -18,13 +18,14 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.diagnosis import (
+    describe_directions,
     high_correlations,
-    open_directions,
     reduced_normal_matrix,
-    sentence_of,
-    undetermined,
+    undetermined_directions,
+    undetermined_interiors,
 )
 from fluoro_calib_ros.photogrammetry.noise import Noise
+from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.rig import looking_at_origin, simulate_exposures, virtual_rig
@@ -140,19 +141,19 @@ def test_an_exposure_of_two_targets_is_named():
         exposure=network.exposure[keep],
         point=network.point[keep],
     )
-    found = open_directions(network, truth, ('a',), [11, 12, 13, 14])
+    found = undetermined_directions(network, truth, ('a',), [11, 12, 13, 14])
     assert len(found) == 2 and all(
         name.startswith('exposure 12 of a') for names in found for name in names
     )
-    assert sentence_of(found) == 'the orientation of exposure 12 of a is left open'
-    assert not open_directions(
+    assert describe_directions(found) == 'the orientation of exposure 12 of a is left open'
+    assert not undetermined_directions(
         rigs.small_network()[0], rigs.small_network()[1], ('a',), [1, 2, 3, 4]
     )
 
 
 def test_the_datum_of_a_free_network_is_not_called_open():
     network, truth = rigs.small_network(exposures=5, targets=30, seen=1.0)
-    assert not open_directions(replace(network, datum='inner'), truth, ('a',), range(5))
+    assert not undetermined_directions(replace(network, datum='inner'), truth, ('a',), range(5))
 
 
 def test_the_reduced_normal_matrix_is_the_schur_complement_of_the_dense_one():
@@ -161,10 +162,9 @@ def test_the_reduced_normal_matrix_is_the_schur_complement_of_the_dense_one():
         network,
         disturbed(truth),
         noise=Noise('gaussian', 1 / np.median(network.sigma)),
-        noise_held=True,
     )
     full = dense(network, result)[0]
-    _, m, n, _ = network.shape
+    m, n = network.n_exposures, network.n_points
     points = np.arange(6 * m, 6 * m + 3 * n)
     rest = np.r_[0 : 6 * m, 6 * m + 3 * n : len(full)]
     schur = full[np.ix_(rest, rest)] - full[np.ix_(rest, points)] @ np.linalg.solve(
@@ -183,7 +183,7 @@ def test_the_reduced_normal_matrix_is_the_schur_complement_of_the_dense_one():
 
 def test_correlations_are_those_of_the_dense_inverse():
     network, truth = rigid_network(5, 40)
-    result = adjust(network, disturbed(truth), noise=Noise('gaussian'))
+    result = adjust_and_estimate_noise(network, disturbed(truth), noise=Noise('gaussian'))
     numbers = [1, 2, 3, 4, 5] * 2
     found = high_correlations(
         network, result.parameters, precision(network, result), ('a', 'b'), numbers
@@ -192,7 +192,7 @@ def test_correlations_are_those_of_the_dense_inverse():
     assert all(abs(v) > 0.95 for _, _, v in found)
     assert list(found) == sorted(found, key=lambda c: -abs(c[2]))
     covariance = np.linalg.inv(dense(network, result)[0])
-    _, m, n, _ = network.shape
+    m, n = network.n_exposures, network.n_points
     turn = np.eye(len(covariance))
     for j, rotation in enumerate(result.parameters.rotation):
         turn[6 * j : 6 * j + 3, 6 * j : 6 * j + 3] = rotation
@@ -225,14 +225,14 @@ def test_a_principal_point_that_is_left_open_is_named():
     not count.
     """
     network, truth = rigs.small_network()
-    precise = precision(network, adjust(network, truth))
-    assert not undetermined(network, truth, precise, ('a',), 0.3)
+    precise = precision(network, adjust_and_estimate_noise(network, truth))
+    assert not undetermined_interiors(network, truth, precise, ('a',), 0.3)
     worse = replace(precise, interior=precise.interior + np.diag([300.0**2, 0, 0]))
-    (sentence,) = undetermined(network, truth, worse, ('a',), 0.3)
+    (sentence,) = undetermined_interiors(network, truth, worse, ('a',), 0.3)
     assert sentence.startswith(
         'fluoroscope a: the principal point cannot be separated from the position of the source'
     )
-    assert not undetermined(network, truth, worse, ('a',), 5.0)
-    assert not undetermined(
+    assert not undetermined_interiors(network, truth, worse, ('a',), 5.0)
+    assert not undetermined_interiors(
         replace(network, interior_free=np.array([False])), truth, worse, ('a',), 0.3
     )

@@ -17,7 +17,7 @@ from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.initial_network import measured_network
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.distortion.cross_validation import CrossValidation, exposure_folds
-from fluoro_calib_ros.photogrammetry.adjustment import adjust
+from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
@@ -74,7 +74,7 @@ def test_adjustment_is_that_of_colmap(problem, held_points):
     held = held_points(network)
     assert held.sum() >= 3 and (held.all() or (~held).sum() > len(held) / 2)
     network = with_datum(network, held)
-    ours = adjust(network, start, None, noise, tolerance=1e-10, noise_held=True)
+    ours = adjust(network, start, None, noise, SolverOptions(tolerance=1e-10))
     assert ours.converged and ours.noise == noise
     assert np.any(~ours.inliers) or problem is small_problem
 

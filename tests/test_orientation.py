@@ -28,9 +28,11 @@ from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.rig_orientation import FIELDS, load_orientation, save_orientation
 from fluoro_calib_ros.jobs.dataset import write_bag
 from fluoro_calib_ros.photogrammetry.collinearity import project
-from fluoro_calib_ros.photogrammetry.relative_orientation import vector_of
-from fluoro_calib_ros.photogrammetry.rig_orientation import datum_map, held_to
-from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.photogrammetry.rig_orientation import (
+    datum_transformation,
+    with_datum_of_points,
+)
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from fluoro_calib_ros.reconstruction.intersection import OK, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.simulation.rig import (
@@ -153,7 +155,7 @@ def test_covariance_of_a_capture_against_monte_carlo():
             np.concatenate(
                 [
                     position - f.position_mm,
-                    vector_of(rotation @ f.rotation.T),
+                    vector_from_matrix(rotation @ f.rotation.T),
                     interior - f.interior,
                 ]
             )
@@ -280,12 +282,12 @@ def test_covariance_of_a_relative_orientation_against_monte_carlo():
                 np.zeros(6),
                 found.interior[0] - a.interior,
                 found.position_mm[1] - a.rotation @ (b.position_mm - a.position_mm),
-                vector_of(found.rotation[1] @ (b.rotation @ a.rotation.T).T),
+                vector_from_matrix(found.rotation[1] @ (b.rotation @ a.rotation.T).T),
                 found.interior[1] - b.interior,
             ]
         )
         assert not found.position_mm[0].any() and np.array_equal(found.rotation[0], np.eye(3))
-        s = datum_map(found, points)
+        s = datum_transformation(found, points)
         left = s @ step
         squares.append(
             left
@@ -303,10 +305,10 @@ def test_the_datum_takes_out_what_moves_points_together_and_nothing_else():
     found = orientation_of_exposures(exposures(), rig().phantom, calibrations())
     rng = np.random.default_rng(1)
     points = rng.uniform(-80, 80, (40, 3)) + [0, 0, 1500]
-    s = datum_map(found, points)
+    s = datum_transformation(found, points)
     np.testing.assert_allclose(s @ s, s, atol=1e-6)
-    again = held_to(held_to(found, points), points).covariance
-    np.testing.assert_allclose(again, held_to(found, points).covariance, atol=1e-9)
+    again = with_datum_of_points(with_datum_of_points(found, points), points).covariance
+    np.testing.assert_allclose(again, with_datum_of_points(found, points).covariance, atol=1e-9)
     uv = np.stack(
         [
             project(np.broadcast_to(r, (40, 3, 3)), np.broadcast_to(t, (40, 3)), points, i)

@@ -7,9 +7,9 @@ import pytest
 import rigs
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.noise import Noise
+from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.outliers import (
     find_outliers,
     image_statistics,
@@ -27,7 +27,7 @@ def one_thread():
 
 
 def adjusted(network, truth, loss='student_t'):
-    result = adjust(network, truth, noise=Noise(loss))
+    result = adjust_and_estimate_noise(network, truth, noise=Noise(loss))
     return result, precision(network, result)
 
 
@@ -48,10 +48,8 @@ def test_false_alarms_on_clean_data(loss):
             network, result, precise, 0.05 * np.isfinite(result.q).sum()
         )
         image.append(np.mean(value > critical))
-        (value, _, _), critical = target_statistics(
-            network, result, precise, 0.05 * len(network.survey_mm)
-        )
-        target.append(np.mean(value > critical))
+        targets = target_statistics(network, result, precise, 0.05 * len(network.survey_mm))
+        target.append(np.mean(targets.value > targets.critical))
     assert alarms <= 2
     assert np.mean(image) == pytest.approx(0.05, abs=0.02)
     assert np.mean(target) == pytest.approx(0.05, abs=0.025)

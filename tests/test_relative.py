@@ -9,27 +9,34 @@ import pytest
 import rigs
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.photogrammetry import adjustment as adjustment_module
-from fluoro_calib_ros.photogrammetry import normal_equations as normal_module
-from fluoro_calib_ros.photogrammetry import precision as precision_module
-from fluoro_calib_ros.photogrammetry.additional_parameters import Additional
-from fluoro_calib_ros.photogrammetry.adjustment import adjust
+from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
+from fluoro_calib_ros.photogrammetry.adjustment import (
+    SolverOptions,
+    adjust,
+    residuals_and_q,
+    total_cost,
+)
 from fluoro_calib_ros.photogrammetry.collinearity import project
+from fluoro_calib_ros.photogrammetry.elimination import EliminateExposures, EliminatePoints
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
+from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.photogrammetry.relative_orientation import (
     RIGID_SD_MM,
     RIGID_SD_RAD,
-    Relative,
+    RelativeConstraint,
     RelativePose,
     discrepancies,
     discrepancies_with_jacobian,
+    exposures_from_pose,
     mean_pose,
-    on_constraint,
-    poses_of_pairs,
-    vector_of,
+    relative_poses,
 )
-from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, rotation_angle
+from fluoro_calib_ros.photogrammetry.rotations import (
+    matrix_from_vector,
+    rotation_angle,
+    vector_from_matrix,
+)
 
 POSE = RelativePose(matrix_from_vector([0.03, -1.19, -0.02]), np.array([-1300.0, 30.0, 980.0]))
 SHAPES = [
@@ -52,11 +59,13 @@ def rigid_network(exposures=4, targets=30, sd=SOFT, seed=0, alone=1, nu=np.inf, 
     network, truth = rigs.small_network(exposures, targets, 2, seed=seed, nu=nu, seen=0.9)
     a = np.arange(exposures)
     pairs = np.stack([a, a + exposures], axis=1)[: exposures - alone]
-    constraint = Relative((0, 1), pairs, *sd, length_mm)
+    constraint = RelativeConstraint((0, 1), pairs, *sd, length_mm)
     rotation = truth.rotation.copy()
     position = truth.position_mm.copy()
-    every = Relative((0, 1), np.stack([a, a + exposures], axis=1), 1.0, 1.0)
-    rotation[every.pairs[:, 1]], position[every.pairs[:, 1]] = on_constraint(truth, every, POSE)
+    every = RelativeConstraint((0, 1), np.stack([a, a + exposures], axis=1), 1.0, 1.0)
+    rotation[every.pairs[:, 1]], position[every.pairs[:, 1]] = exposures_from_pose(
+        truth, every, POSE
+    )
     truth = replace(truth, rotation=rotation, position_mm=position, relative=(POSE,))
     noise = network.sigma[:, None] * np.random.default_rng(seed + 1).normal(
         0, 0.3, network.uv.shape
@@ -69,7 +78,7 @@ def disturbed(truth, seed=0):
     return replace(
         rigs.disturbed(truth, seed),
         relative=tuple(
-            p.moved(np.random.default_rng(seed).normal(0, [3.0] * 3 + [1e-3] * 3))
+            p.updated(np.random.default_rng(seed).normal(0, [3.0] * 3 + [1e-3] * 3))
             for p in truth.relative
         ),
     )
@@ -92,10 +101,10 @@ def dense(network, result, factor=1.0):
         x[column] = step
         rows[:, column] = (
             discrepancies(
-                constraint, pose.moved(x[u:]), rigs.moved(plain_network, parameters, x[:u])
+                constraint, pose.updated(x[u:]), rigs.moved(plain_network, parameters, x[:u])
             )
             - discrepancies(
-                constraint, pose.moved(-x[u:]), rigs.moved(plain_network, parameters, -x[:u])
+                constraint, pose.updated(-x[u:]), rigs.moved(plain_network, parameters, -x[:u])
             )
         ).ravel() / (2 * step)
     normal = np.zeros((u + 6, u + 6))
@@ -109,7 +118,7 @@ def test_derivatives_equal_finite_differences(length_mm):
     network, truth = rigid_network(alone=0)
     constraint = replace(network.relative[0], length_mm=length_mm)
     parameters = disturbed(truth, 1)
-    pose = POSE.moved([2, -5, 8, 0.2, -0.1, 0.15])
+    pose = POSE.updated([2, -5, 8, 0.2, -0.1, 0.15])
     off, d_a, d_b, d_pose = discrepancies_with_jacobian(constraint, pose, parameters)
     np.testing.assert_allclose(off, discrepancies(constraint, pose, parameters))
     (a, b) = constraint.pairs.T
@@ -133,8 +142,8 @@ def test_derivatives_equal_finite_differences(length_mm):
         np.testing.assert_allclose(d_b[:, :, axis], by(b, axis), atol=2e-6 * 1500)
         x = step * np.eye(6)[axis]
         slope = (
-            discrepancies(constraint, pose.moved(x), parameters)
-            - discrepancies(constraint, pose.moved(-x), parameters)
+            discrepancies(constraint, pose.updated(x), parameters)
+            - discrepancies(constraint, pose.updated(-x), parameters)
         ) / (2 * step)
         np.testing.assert_allclose(d_pose[:, :, axis], slope, atol=1e-6)
 
@@ -142,17 +151,19 @@ def test_derivatives_equal_finite_differences(length_mm):
 @pytest.mark.parametrize('angle', [0.0, 1e-9, 1e-3, 1.0, 3.0])
 def test_rotation_vector_of_a_matrix(angle):
     w = angle * np.array([0.6, -0.64, 0.48])
-    np.testing.assert_allclose(vector_of(matrix_from_vector(w)), w, rtol=1e-12, atol=1e-18)
+    np.testing.assert_allclose(
+        vector_from_matrix(matrix_from_vector(w)), w, rtol=1e-12, atol=1e-18
+    )
 
 
 @pytest.mark.parametrize('loss', LOSSES)
 @pytest.mark.parametrize('shape', SHAPES)
 def test_covariances_equal_the_dense_inverse(shape, loss):
     network, truth = rigid_network(**shape, nu=5.0)
-    result = adjust(network, disturbed(truth), noise=Noise(loss))
+    result = adjust(network, disturbed(truth), noise=Noise(loss, 0.3))
     assert result.converged
     precise = precision(network, result)
-    _, m, n, _ = network.shape
+    m, n = network.n_exposures, network.n_points
     honest = np.linalg.inv(dense(network, result, result.noise.information_factor(result.q))[0])
     for j in range(m):
         np.testing.assert_allclose(
@@ -175,26 +186,28 @@ def test_covariances_equal_the_dense_inverse(shape, loss):
         + precise.survey_redundancy.sum()
         + precise.relative_redundancy[0].sum()
     )
-    assert total == pytest.approx(network.observations - network.unknowns, rel=1e-7)
+    assert total == pytest.approx(network.n_observations - network.n_unknowns, rel=1e-7)
 
 
 @pytest.mark.parametrize('shape', SHAPES)
 @pytest.mark.parametrize('sd', [SOFT, (RIGID_SD_MM, RIGID_SD_RAD)])
-def test_both_eliminations_give_the_same_solution_and_covariances(monkeypatch, shape, sd):
+def test_both_eliminations_give_the_same_solution_and_covariances(shape, sd):
     network, truth = rigid_network(**shape, sd=sd)
     rng = np.random.default_rng(5)
     network = replace(
         network,
-        additional=(Additional(rng.normal(0, 1, (len(network.rows(0)), 3)), np.eye(6)), None),
+        additional=(
+            AdditionalParameters(rng.normal(0, 1, (len(network.rows(0)), 3)), np.eye(6)),
+            None,
+        ),
     )
     start = replace(disturbed(truth), additional=(np.zeros(6), None))
     found = []
-    for points in (True, False):
-        for module in (adjustment_module, normal_module, precision_module):
-            monkeypatch.setattr(module, 'eliminates_points', lambda network, points=points: points)
-        result = adjust(network, start)
+    for elimination in (EliminatePoints, EliminateExposures):
+        options = SolverOptions(elimination=elimination)
+        result = adjust_and_estimate_noise(network, start, options=options)
         assert result.converged
-        found.append((result, precision(network, result)))
+        found.append((result, precision(network, result, elimination=elimination)))
     (one, one_precise), (other, other_precise) = found
     sd = np.sqrt(np.diagonal(one_precise.exterior, axis1=1, axis2=2)[:, :3])
     assert np.max(np.abs(one.parameters.position_mm - other.parameters.position_mm) / sd) < 1e-4
@@ -215,17 +228,19 @@ def test_both_eliminations_give_the_same_solution_and_covariances(monkeypatch, s
 @pytest.mark.parametrize('shape', SHAPES)
 def test_gradient_of_the_cost_is_zero_at_the_solution(shape):
     network, truth = rigid_network(**shape)
-    result = adjust(network, disturbed(truth), tolerance=1e-12)
+    result = adjust_and_estimate_noise(
+        network, disturbed(truth), options=SolverOptions(tolerance=1e-12)
+    )
     root = np.linalg.cholesky(np.linalg.inv(dense(network, result)[0]))
     plain = replace(network, relative=())
 
     def cost(x):
         moved = replace(
             rigs.moved(plain, result.parameters, x[:-6]),
-            relative=(result.parameters.relative[0].moved(x[-6:]),),
+            relative=(result.parameters.relative[0].updated(x[-6:]),),
         )
-        _, q = adjustment_module.residuals_and_q(network, moved, 0.0, result.noise)
-        return adjustment_module.total_cost(network, moved, q, result.noise)
+        _, q = residuals_and_q(network, moved, 0.0, result.noise)
+        return total_cost(network, moved, q, result.noise)
 
     slope = [(cost(1e-3 * d) - cost(-1e-3 * d)) / 2e-3 for d in root.T]
     assert np.linalg.norm(slope) < 2e-4
@@ -238,7 +253,7 @@ def test_rigid_is_the_limit_that_a_reparametrisation_gives(shape):
     """
     network, truth = rigid_network(**shape, sd=(RIGID_SD_MM, RIGID_SD_RAD))
     noise = Noise('gaussian', 0.3)
-    result = adjust(network, disturbed(truth), noise=noise, noise_held=True)
+    result = adjust(network, disturbed(truth), noise=noise)
     assert result.converged
     precise = precision(network, result)
     parameters = result.parameters
@@ -246,7 +261,7 @@ def test_rigid_is_the_limit_that_a_reparametrisation_gives(shape):
     constraint = network.relative[0]
     rotation = parameters.rotation.copy()
     position = parameters.position_mm.copy()
-    rotation[constraint.pairs[:, 1]], position[constraint.pairs[:, 1]] = on_constraint(
+    rotation[constraint.pairs[:, 1]], position[constraint.pairs[:, 1]] = exposures_from_pose(
         parameters, constraint, parameters.relative[0]
     )
     on = replace(parameters, rotation=rotation, position_mm=position)
@@ -256,7 +271,7 @@ def test_rigid_is_the_limit_that_a_reparametrisation_gives(shape):
     weight = np.repeat((0.3 * network.sigma) ** -2.0, 2)
     a = rigs.design_matrix(plain, on)
     gradient = a.T @ (weight * r.ravel())
-    _, m, n, _ = network.shape
+    m, n = network.n_exposures, network.n_points
     gradient[6 * m : 6 * m + 3 * n] += (
         (network.survey_mm - on.points_mm) / network.survey_sd_mm[:, None] ** 2
     ).ravel()
@@ -278,8 +293,7 @@ def test_rigid_is_the_limit_that_a_reparametrisation_gives(shape):
 
 def reparametrisation(plain, parameters, constraint):
     """Derivatives of all unknowns of a network by those of a rigid one, by finite differences."""
-    _, m, n, _ = plain.shape
-    u = plain.unknowns
+    u = plain.n_unknowns
     pairs = constraint.pairs
     step = 1e-6
     keep = np.setdiff1d(np.arange(u), (6 * pairs[:, 1:] + np.arange(6)).ravel())
@@ -294,13 +308,13 @@ def reparametrisation(plain, parameters, constraint):
             if a is not None:
                 x[6 * a + i] = sign * step
             shifted = rigs.moved(plain, parameters, x)
-            own = pose if a is not None else pose.moved(sign * step * np.eye(6)[i])
-            ends.append(on_constraint(shifted, constraint, own))
+            own = pose if a is not None else pose.updated(sign * step * np.eye(6)[i])
+            ends.append(exposures_from_pose(shifted, constraint, own))
         turn = ends[0][0] @ ends[1][0].transpose(0, 2, 1)
         rows = 6 * pairs[:, 1:] + np.arange(6)
-        out[rows, column] = np.concatenate([ends[0][1] - ends[1][1], vector_of(turn)], axis=1) / (
-            2 * step
-        )
+        out[rows, column] = np.concatenate(
+            [ends[0][1] - ends[1][1], vector_from_matrix(turn)], axis=1
+        ) / (2 * step)
     return out
 
 
@@ -312,8 +326,8 @@ def test_the_constraint_pulls_exposures_together_and_reduces_errors():
     error = []
     for sd in ((1e3, 1.0), SOFT, (RIGID_SD_MM, RIGID_SD_RAD)):
         network, truth = rigid_network(8, 40, sd, alone=0)
-        result = adjust(network, disturbed(truth))
-        _, shift = poses_of_pairs(result.parameters, network.relative[0].pairs)
+        result = adjust_and_estimate_noise(network, disturbed(truth))
+        _, shift = relative_poses(result.parameters, network.relative[0].pairs)
         scatter.append(np.linalg.norm(np.std(shift, axis=0)))
         error.append(np.linalg.norm(result.parameters.position_mm - truth.position_mm))
     assert scatter[0] > scatter[1] > scatter[2] and scatter[2] < 1e-3
@@ -325,10 +339,13 @@ def test_standard_deviations_against_monte_carlo():
     squares = []
     for seed in range(40):
         network, truth = rigid_network(5, 40, (RIGID_SD_MM, RIGID_SD_RAD), seed)
-        result = adjust(network, truth, noise=Noise('gaussian'))
+        result = adjust_and_estimate_noise(network, truth, noise=Noise('gaussian'))
         pose = result.parameters.relative[0]
         error = np.concatenate(
-            [pose.translation_mm - POSE.translation_mm, vector_of(pose.rotation @ POSE.rotation.T)]
+            [
+                pose.translation_mm - POSE.translation_mm,
+                vector_from_matrix(pose.rotation @ POSE.rotation.T),
+            ]
         )
         squares.append(error @ np.linalg.solve(precision(network, result).relative[0], error) / 6)
     assert np.mean(squares) == pytest.approx(1, abs=0.35)
@@ -351,7 +368,7 @@ def test_mean_pose_is_not_steered_by_one_pair():
     )
 
 
-def test_three_fluoroscopes_share_the_first(monkeypatch):
+def test_three_fluoroscopes_share_the_first():
     """Two constraints, one with fewer pairs than the other: both eliminations agree, and all pairs
     keep to it.
     """
@@ -359,14 +376,14 @@ def test_three_fluoroscopes_share_the_first(monkeypatch):
     a = np.arange(5)
     other = RelativePose(matrix_from_vector([0.02, 0.6, 0.01]), np.array([800.0, -20.0, 250.0]))
     every = [
-        Relative((0, f), np.stack([a, a + 5 * f], axis=1), RIGID_SD_MM, RIGID_SD_RAD)
+        RelativeConstraint((0, f), np.stack([a, a + 5 * f], axis=1), RIGID_SD_MM, RIGID_SD_RAD)
         for f in (1, 2)
     ]
     rotation = truth.rotation.copy()
     position = truth.position_mm.copy()
     for constraint, pose in zip(every, (POSE, other)):
         b = constraint.pairs[:, 1]
-        rotation[b], position[b] = on_constraint(truth, constraint, pose)
+        rotation[b], position[b] = exposures_from_pose(truth, constraint, pose)
     truth = replace(truth, rotation=rotation, position_mm=position, relative=(POSE, other))
     uv = project(*truth.per_image_point(network)) + np.random.default_rng(1).normal(
         0, 0.3, network.uv.shape
@@ -375,12 +392,11 @@ def test_three_fluoroscopes_share_the_first(monkeypatch):
         network, uv=uv, relative=(every[0], replace(every[1], pairs=every[1].pairs[1:4]))
     )
     found = []
-    for points in (True, False):
-        for module in (adjustment_module, normal_module, precision_module):
-            monkeypatch.setattr(module, 'eliminates_points', lambda network, points=points: points)
-        result = adjust(network, disturbed(truth))
+    for elimination in (EliminatePoints, EliminateExposures):
+        options = SolverOptions(elimination=elimination)
+        result = adjust_and_estimate_noise(network, disturbed(truth), options=options)
         assert result.converged
-        found.append((result, precision(network, result)))
+        found.append((result, precision(network, result, elimination=elimination)))
     (one, one_precise), (two, two_precise) = found
     np.testing.assert_allclose(one.residuals, two.residuals, atol=1e-4)
     for name in ('interior', 'exterior', 'points', 'all_global', 'exterior_global'):
@@ -394,4 +410,4 @@ def test_three_fluoroscopes_share_the_first(monkeypatch):
         + one_precise.survey_redundancy.sum()
         + sum(r.sum() for r in one_precise.relative_redundancy)
     )
-    assert redundancy == pytest.approx(network.observations - network.unknowns, rel=1e-6)
+    assert redundancy == pytest.approx(network.n_observations - network.n_unknowns, rel=1e-6)

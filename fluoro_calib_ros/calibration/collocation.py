@@ -8,7 +8,7 @@ import numpy as np
 
 from ..distortion.priors import gauge_precision, most_likely_prior, prior_precision, starting_prior
 from ..distortion.series import MARGIN, Functions, Series, sd_over_image
-from ..photogrammetry.additional_parameters import Additional
+from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
 
 DEGREE = (
@@ -60,7 +60,7 @@ class Collocation:
         return replace(
             network,
             additional=tuple(
-                Additional(values, prior_precision(functions, prior) + gauge)
+                AdditionalParameters(values, prior_precision(functions, prior) + gauge)
                 for values, functions, prior, gauge in zip(
                     self.values, self.functions, self.priors, self.gauges
                 )
@@ -90,7 +90,7 @@ class Collocation:
         for f, functions in enumerate(self.functions):
             last = self.priors[f]
             present = network.additional[f].prior
-            information = information_of_additional(network, matrix, f) - present
+            information = information_of_additional(matrix, f) - present
             right = (information + present) @ coefficients[f]
             now = most_likely_prior(functions, information, right, self.gauges[f], last)
             self.priors[f] = now

@@ -6,9 +6,10 @@ import numpy as np
 
 from ..errors import DataError
 from ..exposures.frame import validate_frame
-from ..photogrammetry.adjustment import Network, Parameters
+from ..photogrammetry.network import Network
 from ..photogrammetry.resection import principal_distance_of, resect, robust_dlt
 from ..photogrammetry.rotations import rotation_angle
+from ..photogrammetry.unknowns import Parameters
 
 MIN_EXPOSURES = 3
 MIN_TARGETS_OF_EXPOSURE = 12

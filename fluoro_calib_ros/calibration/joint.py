@@ -9,18 +9,19 @@ import numpy as np
 
 from ..errors import DataError
 from ..photogrammetry.diagnosis import (
+    describe_directions,
     high_correlations,
-    open_directions,
-    sentence_of,
-    undetermined,
+    undetermined_directions,
+    undetermined_interiors,
 )
+from ..photogrammetry.elimination import factorize
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.outliers import find_outliers
-from ..photogrammetry.precision import covariance_blocks, solved
+from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.relative_orientation import (
     RIGID_SD_MM,
     RIGID_SD_RAD,
-    Relative,
+    RelativeConstraint,
     RelativePose,
     discrepancies,
     discrepancies_with_jacobian,
@@ -101,7 +102,7 @@ def constrained(measured, options):
 
 
 def _constraints(measured, options):
-    """A Relative constraint of every further fluoroscope with the first. Raises DataError."""
+    """A RelativeConstraint of every further fluoroscope with the first. Raises DataError."""
     if len(measured.fluoroscopes) < 2:
         raise DataError(
             'a relative orientation needs two fluoroscopes in one adjustment, there is only '
@@ -120,14 +121,14 @@ def _constraints(measured, options):
                 f'fluoroscopes {measured.fluoroscopes[0]} and {measured.fluoroscopes[b]}: {len(pairs)} '
                 'exposures have the same number, 2 are needed for a relative orientation constraint'
             )
-        out.append(Relative((0, b), pairs, *sd))
+        out.append(RelativeConstraint((0, b), pairs, *sd))
     return tuple(out)
 
 
 def _without_few_rays(measured):
     """The Measured network without targets that fewer than three image points show."""
     network = measured.network
-    rays = np.bincount(network.point, minlength=network.shape[2])
+    rays = np.bincount(network.point, minlength=network.n_points)
     few = rays < MIN_RAYS
     if not few.any():
         return measured
@@ -181,7 +182,7 @@ def relative_orientations(run, constraint):
             pairs = measured.network.relative[b - 1].pairs
             pose = parameters.relative[b - 1]
             covariance = run.precision.relative[b - 1]
-        off = discrepancies(Relative((0, b), pairs, 1.0, 1.0), pose, parameters)
+        off = discrepancies(RelativeConstraint((0, b), pairs, 1.0, 1.0), pose, parameters)
         scatter = np.sqrt(np.sum(off**2, axis=0) / max(len(off) - 1, 1))
         out.append(
             RelativeOrientation(
@@ -203,14 +204,14 @@ def _mean_of_pairs(run, pairs):
     equations = normal_equations(
         network,
         after.parameters,
-        run.correction - network.added(after.parameters),
+        run.correction - network.additional_correction(after.parameters),
         after.noise,
         after.noise.information_factor(after.q),
     )
-    blocks = covariance_blocks(network, solved(network, equations))
+    blocks = covariance_blocks(factorize(network, equations))
     pose = mean_pose(after.parameters, pairs)
     _, d_a, d_b, _ = discrepancies_with_jacobian(
-        Relative((0, 1), pairs, 1.0, 1.0), pose, after.parameters
+        RelativeConstraint((0, 1), pairs, 1.0, 1.0), pose, after.parameters
     )
     one, other = (a.ravel() for a in np.indices((len(pairs), len(pairs))))
     mixed = 0
@@ -230,13 +231,13 @@ def what_is_open(measured):
     """A sentence on the unknowns that a network leaves open at its start values; empty where there
     are none.
     """
-    found = open_directions(
+    found = undetermined_directions(
         measured.network, measured.start, measured.fluoroscopes, _numbers(measured)
     )
     if not found:
         return ''
     return (
-        f'the exposures do not determine the unknowns: {sentence_of(found)}; '
+        f'the exposures do not determine the unknowns: {describe_directions(found)}; '
         'add exposures with the phantom turned and moved, with more targets'
     )
 
@@ -246,7 +247,7 @@ def refuse_undetermined(measured, adjustment, precise):
     orientations open.
     """
     scale = adjustment.noise.scale
-    found = undetermined(
+    found = undetermined_interiors(
         measured.network, adjustment.parameters, precise, measured.fluoroscopes, scale
     )
     if found:

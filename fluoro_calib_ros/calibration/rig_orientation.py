@@ -26,15 +26,16 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
+from ..photogrammetry.elimination import factorize
 from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.precision import covariance_blocks, solved
+from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.relative_orientation import (
-    Relative,
+    RelativeConstraint,
     discrepancies,
     discrepancies_with_jacobian,
     mean_pose,
 )
-from ..photogrammetry.rig_orientation import UNKNOWNS, RigOrientation, held_to
+from ..photogrammetry.rig_orientation import UNKNOWNS, RigOrientation, with_datum_of_points
 from .calibrate import SEEN_FOR_NOISE, held_corrections
 from .initial_network import MIN_TARGETS_OF_EXPOSURE, Measured, measured_network
 from .joint import pairs_of
@@ -122,7 +123,7 @@ def orientation_of_exposures(
     took of the phantom.
 
     The frame is the sensor's as it was estimated, and its covariance is held to where the phantom
-    stood (held_to).
+    stood (with_datum_of_points).
 
     frames {fluoroscope: [Frame, ...]}, those of the same number belong together; calibrations
     {fluoroscope: FluoroscopeCalibration}, held. The relative orientation is the weighted mean of
@@ -164,7 +165,7 @@ def orientation_of_exposures(
         _last_stamp(paired),
         min(used),
     )
-    return held_to(found, _seen_by_first(held))
+    return with_datum_of_points(found, _seen_by_first(held))
 
 
 def _seen_by_first(held):
@@ -337,8 +338,7 @@ def _adjusted(frames, phantom, calibrations, loss, noise_held, raise_if_cancelle
         interior_sd=np.full((len(names), 3), ASSUMED_SD_PX),
     )
     blocks = covariance_blocks(
-        free,
-        solved(
+        factorize(
             free,
             normal_equations(
                 free,
@@ -380,7 +380,7 @@ def _mean_of_pairs(held, pairs):
     """
     parameters = held.after.parameters
     (a, b) = pairs.T
-    constraint = Relative((0, 1), pairs, 1.0, 1.0)
+    constraint = RelativeConstraint((0, 1), pairs, 1.0, 1.0)
     _, d_a, d_b, _ = discrepancies_with_jacobian(
         constraint, mean_pose(parameters, pairs), parameters
     )

@@ -16,16 +16,16 @@ import numpy as np
 from ..distortion.models import CorrectionModel
 from ..distortion.regressor import MIN_TRAINING, Regressor
 from ..errors import DataError
-from ..photogrammetry.adjustment import Adjustment, adjust
+from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.elimination import factorize
 from ..photogrammetry.noise import Noise
-from ..photogrammetry.noise_estimation import SETTLED, adjust_and_estimate_noise, renewed_noise
+from ..photogrammetry.noise_estimation import SETTLED, adjust_and_estimate_noise, estimate_noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import (
     Precision,
     covariance_blocks,
     precision,
     residual_covariance,
-    solved,
 )
 from .anderson import Anderson
 from .collocation import Collocation
@@ -157,17 +157,11 @@ def adjusted_with_precision(
     try:
         if noise_held:
             result = adjust(
-                network,
-                start,
-                correction,
-                noise,
-                tolerance=tolerance,
-                raise_if_cancelled=raise_if_cancelled,
-                noise_held=True,
+                network, start, correction, noise, SolverOptions(tolerance), raise_if_cancelled
             )
         else:
             result = adjust_and_estimate_noise(
-                network, start, correction, noise, tolerance, raise_if_cancelled
+                network, start, correction, noise, SolverOptions(tolerance), raise_if_cancelled
             )
         return result, precision(network, result, correction)
     except np.linalg.LinAlgError:
@@ -255,7 +249,7 @@ def _adjust_as_a_whole(measured, before, options, progress, raise_if_cancelled):
     network, after, converged = adjust_in_turns(
         measured, before, state, options.max_iterations, report, raise_if_cancelled
     )
-    correction = network.added(after.parameters)
+    correction = network.additional_correction(after.parameters)
     precise = precision(network, after)
     measured = replace(measured, network=network)
     inliers = after.inliers
@@ -304,9 +298,8 @@ def _alternate(measured, before, options, progress, raise_if_cancelled):
             after.parameters,
             correction,
             noise,
-            tolerance=ROUND_TOLERANCE,
-            raise_if_cancelled=raise_if_cancelled,
-            noise_held=True,
+            SolverOptions(ROUND_TOLERANCE),
+            raise_if_cancelled,
         )
         information, noise = _information(network, after, correction)
         image = state.without_gauge(after.residuals + correction, after.parameters.interior)
@@ -334,7 +327,7 @@ def _alternate(measured, before, options, progress, raise_if_cancelled):
         raise_if_cancelled=raise_if_cancelled,
         noise_held=True,
     )
-    added = network.added(after.parameters)
+    added = network.additional_correction(after.parameters)
     models = {
         name: state.regressors[name].model(
             values[rows],
@@ -362,7 +355,7 @@ def _information(network, adjustment, correction):
     DataError.
     """
     try:
-        matrix = solved(
+        matrix = factorize(
             network, normal_equations(network, adjustment.parameters, correction, adjustment.noise)
         )
     except np.linalg.LinAlgError:
@@ -370,8 +363,8 @@ def _information(network, adjustment, correction):
             'the exposures do not determine the unknowns: the normal matrix is singular; '
             'add exposures with the phantom turned and moved'
         ) from None
-    blocks = covariance_blocks(network, matrix)
-    return np.linalg.inv(residual_covariance(network, adjustment, blocks)), renewed_noise(
+    blocks = covariance_blocks(matrix)
+    return np.linalg.inv(residual_covariance(network, adjustment, blocks)), estimate_noise(
         network, adjustment, blocks
     )
 

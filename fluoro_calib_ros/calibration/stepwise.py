@@ -16,7 +16,7 @@ from scipy.spatial import cKDTree
 from ..distortion.gauge import gauge_basis
 from ..distortion.series import Functions, Series, sd_over_image
 from ..distortion.terms import HIGHEST, expert_terms
-from ..photogrammetry.additional_parameters import Additional
+from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.noise_estimation import LOOSE
 from ..photogrammetry.precision import information_of_additional
 
@@ -58,7 +58,7 @@ class Terms:
         return replace(
             network,
             additional=tuple(
-                Additional(values, np.diag(np.where(chosen, 0.0, HELD)))
+                AdditionalParameters(values, np.diag(np.where(chosen, 0.0, HELD)))
                 for values, chosen in zip(self._values, self.chosen)
             ),
         )
@@ -89,11 +89,11 @@ class Terms:
         whether one was.
         """
         present = network.additional[f].prior
-        information = information_of_additional(network, matrix, f) - present
+        information = information_of_additional(matrix, f) - present
         coefficients = result.parameters.additional[f]
         chosen = self.chosen[f]
         rows = network.rows(f)
-        dof = 2 * len(rows) - network.unknowns + len(self.names) * len(self.chosen)
+        dof = 2 * len(rows) - network.n_unknowns + len(self.names) * len(self.chosen)
         limit = stats.t.ppf(1 - SIGNIFICANCE / (2 * len(self.names)), max(dof, 1))
         if self._take_out(f, information, coefficients, limit):
             return True

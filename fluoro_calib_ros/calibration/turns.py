@@ -11,10 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..photogrammetry.adjustment import adjust
-from ..photogrammetry.noise_estimation import SETTLED, renewed_noise
+from ..photogrammetry.adjustment import SolverOptions, adjust
+from ..photogrammetry.elimination import factorize
+from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
 from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.precision import covariance_blocks, solved
+from ..photogrammetry.precision import covariance_blocks
 
 TOLERANCE = 1e-5  # decrease of F that the last adjustment may leave
 
@@ -43,22 +44,21 @@ def adjust_in_turns(measured, before, model, max_rounds, report, raise_if_cancel
             parameters,
             zero,
             noise,
-            tolerance=TOLERANCE if final else model.on_the_way,
-            raise_if_cancelled=raise_if_cancelled,
-            noise_held=True,
+            SolverOptions(TOLERANCE if final else model.on_the_way),
+            raise_if_cancelled,
         )
         last = correction
-        correction = network.added(result.parameters)
+        correction = network.additional_correction(result.parameters)
         report(result, float(np.sqrt(np.mean((correction - last) ** 2))))
         if final:
             break
-        matrix = solved(
+        matrix = factorize(
             network,
             normal_equations(
                 network, result.parameters, zero, noise, noise.information_factor(result.q)
             ),
         )
-        now = renewed_noise(network, result, covariance_blocks(network, matrix))
+        now = estimate_noise(network, result, covariance_blocks(matrix))
         converged, coefficients = model.renew(network, matrix, result)
         converged &= abs(now.scale - noise.scale) <= SETTLED * noise.scale
         parameters = replace(result.parameters, additional=coefficients)

@@ -1,100 +1,113 @@
 """Datum of a free network: inner constraints over the object points.
 
 Without surveyed coordinates the images leave seven directions open: the network can be shifted,
-turned and scaled. The datum is chosen so that the similarity transformation between object points
-and surveyed coordinates, fitted by least squares, is the identity: B^T (P - P0) = 0, B being the
-seven directions at the surveyed coordinates. An adjustment holds any seven directions instead,
-which changes neither residuals nor estimable quantities; parameters and covariances are
-transformed into the datum afterwards (S-transformation: Baarda, "S-transformations and criterion
-matrices", Netherlands Geodetic Commission 1973; inner constraints in photogrammetry: Granshaw,
-"Bundle adjustment methods in engineering photogrammetry", Photogrammetric Record 10, 1980).
+turned and scaled. The datum makes the least-squares similarity transformation between object
+points and surveyed coordinates the identity: B^T (P - P0) = 0, where B holds the seven directions
+at the surveyed coordinates. The adjustment itself fixes other seven directions, which changes
+neither residuals nor estimable quantities; parameters and covariances are transformed into the
+datum afterwards (S-transformation: Baarda, "S-transformations and criterion matrices", Netherlands
+Geodetic Commission 1973; inner constraints in photogrammetry: Granshaw, "Bundle adjustment methods
+in engineering photogrammetry", Photogrammetric Record 10, 1980).
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .relative_orientation import RelativePose
 from .rotations import cross_matrix
 
+if TYPE_CHECKING:
+    from .network import Network
+    from .unknowns import ByKind, Parameters
+
 DATUMS = ('survey', 'inner')
-DEFECT = 7  # shift, turn and scale
+DATUM_DEFECT = 7  # shift, turn and scale
 
 
 @dataclass(frozen=True)
 class Gauge:
-    """Directions that the images leave open: exposures e (m, 6, 7), points p (n, 3, 7) and global
-    unknowns g (G, 7); constraint (n, 3, 7): B of the object points at the surveyed coordinates.
+    """Directions that the images leave open.
+
+    Attributes
+    ----------
+    exteriors : (m, 6, 7) ndarray
+    points : (n, 3, 7) ndarray
+    globals : (G, 7) ndarray
+        Changes of the unknowns along the directions.
+    constraint : (n, 3, 7) ndarray
+        B: the directions of the object points at the surveyed coordinates.
     """
 
-    e: np.ndarray
-    p: np.ndarray
-    g: np.ndarray
+    exteriors: np.ndarray
+    points: np.ndarray
+    globals: np.ndarray
     constraint: np.ndarray
 
 
-def directions(points, centre):
-    """Change (n, 3, 7) of points (n, 3) [mm] by a shift, a turn and a scale about a centre (3,)."""
-    off = points - centre
-    return np.concatenate(
-        [np.broadcast_to(np.eye(3), (len(points), 3, 3)), -cross_matrix(off), off[:, :, None]],
-        axis=2,
-    )
+def similarity_directions(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
+    """Changes (n, 3, 7) of points (n, 3) [mm] by a shift, a turn and a scale about a centre (3,)."""
+    offset = points - centre
+    shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
+    return np.concatenate([shift, -cross_matrix(offset), offset[:, :, None]], axis=2)
 
 
-def gauge_of(network, parameters):
-    """The Gauge of a network at some parameters; None where surveyed coordinates give the datum."""
+def open_gauge(network: Network, parameters: Parameters) -> Gauge | None:
+    """Gauge of a network at some parameters; None where the survey defines the datum."""
     if network.datum == 'survey':
         return None
     centre = network.survey_mm.mean(axis=0)
-    m = network.shape[1]
-    e = np.zeros((m, 6, DEFECT))
-    e[:, :3] = directions(parameters.position_mm, centre)
+    e = np.zeros((network.n_exposures, 6, DATUM_DEFECT))
+    e[:, :3] = similarity_directions(parameters.position_mm, centre)
     e[:, 3:, 3:6] = -parameters.rotation
-    g = np.zeros((len(network.global_free), DEFECT))
-    for columns, pose in zip(network.relative_columns, parameters.relative):
-        g[columns.start : columns.start + 3, 6] = pose.translation_mm
+    g = np.zeros((network.layout.n_globals, DATUM_DEFECT))
+    for columns, pose in zip(network.layout.relative, parameters.relative):
+        g[columns][:3, 6] = pose.translation_mm
     return Gauge(
-        e, directions(parameters.points_mm, centre), g, directions(network.survey_mm, centre)
+        e,
+        similarity_directions(parameters.points_mm, centre),
+        g,
+        similarity_directions(network.survey_mm, centre),
     )
 
 
-def held_directions(open_directions, diagonal):
-    """D (q, 7) so that adding D D^T to a normal matrix holds its open directions (q, 7); diagonal
-    (q,) of the matrix.
+def stabilising_factor(directions: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
+    """Matrix D (q, 7) such that adding D D^T to a normal matrix fixes its open directions.
 
-    D D^T is a projector in the unknowns scaled by the diagonal: it is as large as the matrix
-    itself.
+    directions (q, 7) are open; diagonal (q,) is that of the normal matrix. D D^T is a projector in
+    the unknowns scaled by the diagonal, so that it is as large as the matrix itself.
     """
-    scaled = diagonal[:, None] * open_directions
-    return np.linalg.solve(np.linalg.cholesky(open_directions.T @ scaled), scaled.T).T
+    scaled = diagonal[:, None] * directions
+    return np.linalg.solve(np.linalg.cholesky(directions.T @ scaled), scaled.T).T
 
 
-def in_datum(network, parameters):
-    """Parameters of a free network transformed into its datum; the same ones where the survey
-    gives it.
+def transform_to_datum(network: Network, parameters: Parameters) -> Parameters:
+    """Parameters of a free network in its datum; unchanged where the survey defines the datum.
 
-    The turn is that of least squares (Horn, Hilden and Negahdaripour, JOSA A 5, 1988), the scale
-    that at which the survey fits the points.
+    Least-squares rotation: Horn, Hilden and Negahdaripour, JOSA A 5, 1988. The scale is the one at
+    which the survey fits the points.
     """
     if network.datum == 'survey':
         return parameters
     centre = parameters.points_mm.mean(axis=0)
-    survey = network.survey_mm.mean(axis=0)
-    off = parameters.points_mm - centre
-    wanted = network.survey_mm - survey
-    u, _, vt = np.linalg.svd(wanted.T @ off)
+    survey_centre = network.survey_mm.mean(axis=0)
+    found = parameters.points_mm - centre
+    wanted = network.survey_mm - survey_centre
+    u, _, vt = np.linalg.svd(wanted.T @ found)
     turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
-    scale = np.sum(wanted**2) / np.sum(wanted * (off @ turn.T))
+    scale = np.sum(wanted**2) / np.sum(wanted * (found @ turn.T))
 
-    def there(points):
-        return survey + scale * (points - centre) @ turn.T
+    def transform(points: np.ndarray) -> np.ndarray:
+        return survey_centre + scale * (points - centre) @ turn.T
 
     return replace(
         parameters,
         rotation=parameters.rotation @ turn.T,
-        position_mm=there(parameters.position_mm),
-        points_mm=there(parameters.points_mm),
+        position_mm=transform(parameters.position_mm),
+        points_mm=transform(parameters.points_mm),
         relative=tuple(
             RelativePose(p.rotation, scale * p.translation_mm) for p in parameters.relative
         ),
@@ -102,24 +115,34 @@ def in_datum(network, parameters):
 
 
 class STransformation:
-    """Covariances in another datum: S C S^T with S = 1 - E (B^T E)^-1 B^T, block by block.
+    """Covariances in the datum of a free network: S C S^T with S = 1 - E (B^T E)^-1 B^T.
 
-    gauge: directions E and constraint B; v_e (m, 6, 7), v_p (n, 3, 7) and v_g (G, 7): C B of the
-    covariance C that is at hand.
+    gauge: directions E and constraint B; covariance_times_b: the products C B of the covariance C
+    at hand. Blocks are transformed one by one: each side of a block is a pair (H, V) of rows of
+    E (B^T E)^-1 and of C B, from `exteriors`, `points` or `globals`.
     """
 
-    def __init__(self, gauge, v_e, v_p, v_g):
-        inverse = np.linalg.inv(np.einsum('nia,nib->ab', gauge.constraint, gauge.p))
-        self.e, self.p, self.g = (
-            (h @ inverse, v) for h, v in ((gauge.e, v_e), (gauge.p, v_p), (gauge.g, v_g))
-        )
-        self._middle = np.einsum('nia,nib->ab', gauge.constraint, v_p)
+    def __init__(self, gauge: Gauge, covariance_times_b: ByKind) -> None:
+        inverse = np.linalg.inv(np.einsum('nia,nib->ab', gauge.constraint, gauge.points))
+        self.exteriors = (gauge.exteriors @ inverse, covariance_times_b.exteriors)
+        self.points = (gauge.points @ inverse, covariance_times_b.points)
+        self.globals = (gauge.globals @ inverse, covariance_times_b.globals)
+        self._middle = np.einsum('nia,nib->ab', gauge.constraint, covariance_times_b.points)
 
-    def block(self, covariance, one, other):
-        """Covariances (..., i, j) in the new datum; one and other: (H, V) of the two sides, from
-        e, p or g.
-        """
-        (h, v) = one
-        (k, w) = other
-        t = np.swapaxes
-        return covariance - h @ t(w, -1, -2) - v @ t(k, -1, -2) + h @ self._middle @ t(k, -1, -2)
+    def transform(
+        self,
+        covariance: np.ndarray,
+        left: tuple[np.ndarray, np.ndarray],
+        right: tuple[np.ndarray, np.ndarray],
+    ) -> np.ndarray:
+        """Covariances (..., i, j) in the new datum; left and right are the sides of the block."""
+        h_left, v_left = left
+        h_right, v_right = right
+        h_right_t = np.swapaxes(h_right, -1, -2)
+        v_right_t = np.swapaxes(v_right, -1, -2)
+        return (
+            covariance
+            - h_left @ v_right_t
+            - v_left @ h_right_t
+            + h_left @ self._middle @ h_right_t
+        )

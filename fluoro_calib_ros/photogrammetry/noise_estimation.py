@@ -1,87 +1,101 @@
-"""Adjustment and noise model in turn: the scale of the noise is that of its marginal likelihood.
+"""Estimation of the noise model around the adjustment, from the marginal likelihood of its scale.
 
-The residuals of an adjustment are smaller than the noise, as the unknowns follow it; and how far
-they follow depends on the scale, for the survey holds the object points the more the less the
-image points weigh. So adjustment and expected squared errors are renewed in turn until the scale
-no longer changes: the EM algorithm with the unknowns as missing data (Dempster, Laird and Rubin,
-JRSS B 39, 1977; for variance components in photogrammetry Foerstner and Wrobel, "Photogrammetric
-Computer Vision", Springer 2016, 4.2.4).
+Residuals are smaller than the noise, because the unknowns follow it. How much smaller depends on
+the scale itself: the less the image points weigh, the more the survey holds the object points.
+Adjustment and expected squared errors are therefore updated in turn until the scale settles: the
+EM algorithm with the unknowns as missing data (Dempster, Laird and Rubin, JRSS B 39, 1977; for
+variance components in photogrammetry Foerstner and Wrobel, "Photogrammetric Computer Vision",
+Springer 2016, 4.2.4).
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from .adjustment import adjust, residuals_and_q
+from .adjustment import Adjustment, SolverOptions, adjust, residuals_and_q
+from .elimination import CovarianceBlocks, factorize
+from .network import Network
+from .noise import Noise
 from .normal_equations import normal_equations
-from .precision import covariance_blocks, covariance_of_projection, solved
+from .precision import covariance_blocks, covariance_of_projection
+from .unknowns import Parameters
 
-ROUNDS = 40
-# relative change of the scale at which the turns end: a hundredth of its standard deviation
+MAX_ROUNDS = 40
+# Relative change of the scale at which the rounds end: a hundredth of its standard deviation.
 SETTLED = 2e-3
-LOOSE = 0.1  # decrease of F that an adjustment may leave while the scale is still on its way
-MIN_NOISE_PX = 0.01  # no target is measured better than this
+# Tolerance of the adjustments before the last one.
+LOOSE = 0.1
+# No target is measured better than this. Where redundancy is scarce, the scale could vanish.
+MIN_NOISE_PX = 0.01
 
 
 def adjust_and_estimate_noise(
-    network, start, correction, noise, tolerance=1e-8, raise_if_cancelled=None
-):
+    network: Network,
+    start: Parameters,
+    correction: np.ndarray | None = None,
+    noise: Noise = Noise(),
+    options: SolverOptions = SolverOptions(),
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Adjustment:
     """Adjust a network and estimate its noise model.
 
-    start: Parameters; correction (N, 2) [px]; noise: loss and start values. Returns Adjustment,
-    converged False where scale and adjustment did not settle. Raises numpy.linalg.LinAlgError
-    where the network does not determine the unknowns.
+    Parameters
+    ----------
+    network : Network
+    start : Parameters
+        Start values.
+    correction : (N, 2) ndarray, optional
+        Correction of the image points [px], without that of the additional parameters.
+    noise : Noise
+        Loss and start values of the noise model.
+    options : SolverOptions
+        Options of the last adjustment; those before it have a looser tolerance.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop.
+
+    Returns
+    -------
+    Adjustment
+        `converged` is False where adjustment or scale did not settle. `steps` are those of the
+        last adjustment.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where the network does not determine the unknowns.
     """
+    correction = np.zeros_like(network.uv) if correction is None else correction
     _, q = residuals_and_q(network, start, correction, noise)
     if np.isfinite(q).all():
-        # From afar whole exposures may look like gross errors: these are told from the rest after
-        # the first adjustment.
-        noise = replace(replace(noise, gross=0.0).estimated(q * noise.scale**2), gross=noise.gross)
+        # Far from the solution, whole exposures may look like gross errors: these are told apart
+        # only after the first adjustment.
+        plain = replace(noise, gross=0.0).estimated(q * noise.scale**2)
+        noise = replace(plain, gross=noise.gross)
+    loose = replace(options, tolerance=LOOSE)
     parameters = start
     settled = False
-    for _ in range(ROUNDS):
-        result = adjust(
-            network,
-            parameters,
-            correction,
-            noise,
-            tolerance=LOOSE,
-            raise_if_cancelled=raise_if_cancelled,
-            noise_held=True,
-        )
-        blocks = covariance_blocks(
-            network,
-            solved(network, normal_equations(network, result.parameters, correction, noise)),
-        )
-        noise, last = renewed_noise(network, result, blocks), noise
+    for _ in range(MAX_ROUNDS):
+        result = adjust(network, parameters, correction, noise, loose, raise_if_cancelled)
         parameters = result.parameters
-        if abs(noise.scale - last.scale) <= SETTLED * last.scale:
+        equations = normal_equations(network, parameters, correction, noise)
+        blocks = covariance_blocks(factorize(network, equations, options.elimination))
+        last_scale = noise.scale
+        noise = estimate_noise(network, result, blocks)
+        if abs(noise.scale - last_scale) <= SETTLED * last_scale:
             settled = True
             break
-    result = adjust(
-        network,
-        parameters,
-        correction,
-        noise,
-        tolerance=tolerance,
-        raise_if_cancelled=raise_if_cancelled,
-        noise_held=True,
-    )
+    result = adjust(network, parameters, correction, noise, options, raise_if_cancelled)
     return replace(result, converged=result.converged and settled)
 
 
-def renewed_noise(network, adjustment, blocks):
-    """The noise model that the residuals of an Adjustment and the CovarianceBlocks of its unknowns
-    show.
-    """
+def estimate_noise(network: Network, adjustment: Adjustment, blocks: CovarianceBlocks) -> Noise:
+    """Noise model estimated from the residuals of an adjustment and the covariance of its unknowns."""
     noise = adjustment.noise
-    left_open = np.trace(
-        covariance_of_projection(network, adjustment.parameters, blocks), axis1=1, axis2=2
-    )
-    new = noise.estimated(
-        adjustment.q * noise.scale**2, left_open / (noise.scale * network.sigma) ** 2
-    )
+    projected = covariance_of_projection(network, adjustment.parameters, blocks)
+    variance = (noise.scale * network.sigma) ** 2
+    unresolved = np.trace(projected, axis1=1, axis2=2) / variance
+    new = noise.estimated(adjustment.q * noise.scale**2, unresolved)
     return replace(new, scale=max(new.scale, MIN_NOISE_PX / float(np.median(network.sigma))))
-
-
-__all__ = ['adjust_and_estimate_noise', 'renewed_noise']

@@ -1,34 +1,57 @@
-"""Normal equations of a bundle adjustment and their solution by the Schur complement.
+"""Normal equations of a bundle adjustment.
 
 Triggs, McLauchlan, Hartley and Fitzgibbon, "Bundle Adjustment - A Modern Synthesis", 2000, section
-6. Object points or exposures are eliminated, whichever leaves the smaller system; exposures that a
-relative orientation couples are eliminated together. Interior orientations, relative orientations
-and additional parameters, which touch everything, come last.
+6. They are built in blocks by exposure, object point and global unknowns, in chunks of image points
+that stay in the cache; `elimination` solves them.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import blas, cho_factor, cho_solve
 
-from .datum import Gauge, gauge_of, held_directions
-from .relative_orientation import discrepancies_with_jacobian
+from .datum import Gauge, open_gauge
+from .network import Network
+from .noise import Noise
+from .relative_orientation import POSE_SIZE, discrepancies_with_jacobian
+from .unknowns import EXTERIOR_SIZE, Parameters
 
-CHUNK = 8_000  # image points linearised at once: what belongs to them stays in the cache
-# Of a gross error in a free network, where no survey holds a point that is left with one ray: it
-# moves nothing, and the point is found to be undetermined instead of the whole network.
-MIN_WEIGHT = 1e-8
+# Image points that are linearised at once: their arrays stay in the cache.
+CHUNK = 8_000
+# Smallest weight of a gross error in a free network, where no survey holds a point that is left
+# with one ray. It moves nothing, and only that point, not the whole network, is found to be
+# undetermined.
+MIN_FREE_WEIGHT = 1e-8
 
 
 @dataclass(frozen=True)
 class NormalEquations:
     """Blocks of the normal matrix and of its right side.
 
-    Exposures ee (m, 6, 6), points pp (n, 3, 3) and global unknowns gg (G, G): interior
-    orientations (3F), relative orientations, then the additional parameters of each fluoroscope;
-    mixed eg (m, 6, G), pg (n, 3, G) and pe (N, 3, 6); right sides e, p and g. coupled: ((k, 2),
-    (k, 6, 6)) pairs of exposures and their mixed blocks; gauge: the directions that a free network
-    leaves open, None where there are none.
+    e stands for exposures, p for object points and g for the global unknowns (see unknowns).
+
+    Attributes
+    ----------
+    ee : (m, 6, 6) ndarray
+    pp : (n, 3, 3) ndarray
+    gg : (G, G) ndarray
+        Diagonal blocks.
+    eg : (m, 6, G) ndarray
+    pg : (n, 3, G) ndarray
+        Mixed blocks with the global unknowns.
+    pe : (N, 3, 6) ndarray
+        Mixed block of object point and exposure of each image point.
+    e : (m, 6) ndarray
+    p : (n, 3) ndarray
+    g : (G,) ndarray
+        Right sides.
+    coupled_pairs : (k, 2) ndarray of int
+    coupled : (k, 6, 6) ndarray
+        Pairs of exposures coupled by a relative orientation, and their mixed blocks.
+    gauge : Gauge, optional
+        Directions that a free network leaves open.
     """
 
     ee: np.ndarray
@@ -40,24 +63,38 @@ class NormalEquations:
     e: np.ndarray
     p: np.ndarray
     g: np.ndarray
-    coupled: tuple = ()
+    coupled_pairs: np.ndarray
+    coupled: np.ndarray
     gauge: Gauge | None = None
 
 
-def _by_component(values, index=None):
-    """Components of values (n, ...) as rows (c, N), taken at index (N,)."""
+def _by_component(values: np.ndarray, index: np.ndarray | None = None) -> np.ndarray:
+    """Components of values (n, ...) as rows (c, n), or (c, N) taken at index (N,)."""
     rows = values.reshape(len(values), -1).T
     return np.ascontiguousarray(rows) if index is None else np.take(rows, index, axis=1)
 
 
-def _in_sensor(network, parameters, rows):
-    """X/Z, Y/Z, 1/Z (N,) of the image points rows (a slice), interior orientation (3, N) and
-    rotation (9, N).
+@dataclass(frozen=True)
+class _SensorPoints:
+    """Object points of k image points in the sensor frame, by component.
+
+    x and y (k,) are X/Z and Y/Z; inverse_depth (k,) is 1/Z [1/mm], NaN for a point that is not in
+    front of the source; interior (3, k) and rotation (9, k) belong to the image points.
     """
-    e = network.exposure[rows]
-    rotation = _by_component(parameters.rotation, e)
+
+    x: np.ndarray
+    y: np.ndarray
+    inverse_depth: np.ndarray
+    interior: np.ndarray
+    rotation: np.ndarray
+
+
+def _to_sensor(network: Network, parameters: Parameters, rows: slice) -> _SensorPoints:
+    """Object points of the image points `rows` in the sensor frame."""
+    exposure = network.exposure[rows]
+    rotation = _by_component(parameters.rotation, exposure)
     offset = _by_component(parameters.points_mm, network.point[rows]) - _by_component(
-        parameters.position_mm, e
+        parameters.position_mm, exposure
     )
     x, y, z = (
         rotation[3 * i] * offset[0]
@@ -66,32 +103,36 @@ def _in_sensor(network, parameters, rows):
         for i in range(3)
     )
     with np.errstate(divide='ignore', invalid='ignore'):
-        depth = np.where(z > 0, 1 / z, np.nan)
-    return (
-        x * depth,
-        y * depth,
-        depth,
-        _by_component(parameters.interior, network.fluoroscope[e]),
-        rotation,
-    )
+        inverse_depth = np.where(z > 0, 1 / z, np.nan)
+    interior = _by_component(parameters.interior, network.fluoroscope[exposure])
+    return _SensorPoints(x * inverse_depth, y * inverse_depth, inverse_depth, interior, rotation)
 
 
-def projected(network, parameters):
+def project_network(network: Network, parameters: Parameters) -> np.ndarray:
     """Image points (N, 2) [px] of a network; NaN where a point is behind the source."""
     out = np.empty_like(network.uv)
     for start in range(0, len(out), CHUNK):
         rows = slice(start, start + CHUNK)
-        x, y, _, (xp, yp, c), _ = _in_sensor(network, parameters, rows)
-        out[rows, 0] = xp + c * x
-        out[rows, 1] = yp + c * y
+        sensor = _to_sensor(network, parameters, rows)
+        xp, yp, c = sensor.interior
+        out[rows, 0] = xp + c * sensor.x
+        out[rows, 1] = yp + c * sensor.y
     return out
 
 
 @dataclass(frozen=True)
 class _Linearised:
-    """Weighted derivatives of some image points, by component: root (k,) of the weights; u and v
-    (10, k): by T in the sensor frame, w, interior orientation and residual; pu and pv (3, k): by
-    the object point.
+    """Weighted derivatives of k image points, by component.
+
+    Attributes
+    ----------
+    root : (k,) ndarray
+        Square roots of the weights.
+    u, v : (10, k) ndarray
+        Derivatives of u and v by T in the sensor frame (3), w (3) and the interior orientation
+        (3), and the residual.
+    pu, pv : (3, k) ndarray
+        Derivatives of u and v by the object point.
     """
 
     root: np.ndarray
@@ -100,53 +141,78 @@ class _Linearised:
     pu: np.ndarray
     pv: np.ndarray
 
-    def by_image_point(self):
-        """Derivatives by exterior orientation, object point and interior orientation, and
-        residuals (k, 2, ...).
+    def by_image_point(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Arrays (k, 2, ...) with one image point a row.
+
+        Derivatives by exterior orientation, object point and interior orientation, and residuals.
         """
         a = np.stack([self.u.T, self.v.T], axis=1)
         a_p = np.stack([self.pu.T, self.pv.T], axis=1)
         return np.concatenate([-a_p, a[:, :, 3:6]], axis=2), a_p, a[:, :, 6:9], a[:, :, 9]
 
 
-def _linearised(network, parameters, correction, noise, image_factor, rows):
-    """_Linearised image points rows (a slice).
+@dataclass(frozen=True)
+class _Linearisation:
+    """The weighted problem: correction (N, 2) [px] by models and additional parameters."""
 
-    With s the derivative of the image point by the point X in the sensor frame, those by P, T and
-    w are s R, -s R and -s [X]x. T is turned into the sensor frame here: the same turn for a whole
-    exposure is made after the sums.
-    """
-    x, y, depth, (xp, yp, c), rotation = _in_sensor(network, parameters, rows)
-    observed = network.uv[rows] - correction[rows]
-    ru = observed[:, 0] - xp - c * x
-    rv = observed[:, 1] - yp - c * y
-    variance = (noise.scale * network.sigma[rows]) ** 2
-    weight = noise.weight((ru * ru + rv * rv) / variance)
-    if network.datum == 'inner':
-        weight = np.maximum(weight, MIN_WEIGHT)
-    root = np.sqrt(image_factor * weight / variance)
-    b = c * root
-    a = b * depth
-    bx = b * x
-    by = b * y
-    zero = np.zeros_like(b)
-    ax = a * x
-    ay = a * y
-    bxy = bx * y
-    u = np.stack([-a, zero, ax, -bxy, b + bx * x, -by, root, zero, root * x, root * ru])
-    v = np.stack([zero, -a, ay, -b - by * y, bxy, bx, zero, root, root * y, root * rv])
-    return _Linearised(
-        root, u, v, a * rotation[0:3] - ax * rotation[6:9], a * rotation[3:6] - ay * rotation[6:9]
-    )
+    network: Network
+    parameters: Parameters
+    correction: np.ndarray
+    noise: Noise
+    image_factor: float
+
+    def at(self, rows: slice) -> _Linearised:
+        """Derivatives of the image points `rows`.
+
+        With s the derivative of the image point by the point X in the sensor frame, those by P, T
+        and w are s R, -s R and -s [X]x. T is turned into the sensor frame here; turning it back is
+        the same for a whole exposure, and is done after summation.
+        """
+        network = self.network
+        sensor = _to_sensor(network, self.parameters, rows)
+        x = sensor.x
+        y = sensor.y
+        rotation = sensor.rotation
+        xp, yp, c = sensor.interior
+        observed = network.uv[rows] - self.correction[rows]
+        ru = observed[:, 0] - xp - c * x
+        rv = observed[:, 1] - yp - c * y
+        variance = (self.noise.scale * network.sigma[rows]) ** 2
+        weight = self.noise.weight((ru * ru + rv * rv) / variance)
+        if network.datum == 'inner':
+            weight = np.maximum(weight, MIN_FREE_WEIGHT)
+        root = np.sqrt(self.image_factor * weight / variance)
+        b = c * root
+        a = b * sensor.inverse_depth
+        bx = b * x
+        by = b * y
+        zero = np.zeros_like(b)
+        ax = a * x
+        ay = a * y
+        bxy = bx * y
+        u = np.stack([-a, zero, ax, -bxy, b + bx * x, -by, root, zero, root * x, root * ru])
+        v = np.stack([zero, -a, ay, -b - by * y, bxy, bx, zero, root, root * y, root * rv])
+        return _Linearised(
+            root,
+            u,
+            v,
+            a * rotation[0:3] - ax * rotation[6:9],
+            a * rotation[3:6] - ay * rotation[6:9],
+        )
 
 
-def _add_by_point(lin, point, sums, pe):
-    """Add to the sums (18, n) by object point, and fill in pe (k, 18), for some image points of
-    the points (k,).
+# The 18 sums by object point: six products of its coordinates, three with the residual, and nine
+# with the interior orientation.
+POINT_PRODUCTS = slice(0, 9)
+INTERIOR_PRODUCTS = slice(9, 18)
 
-    The sums are the nine products with P and the residual - xx, xy, xz, yy, yz, zz, rx, ry, rz -
-    and by component of P those with xp, yp and c. A product with T is one with P, its sign
-    changed.
+
+def _add_by_point(lin: _Linearised, point: np.ndarray, sums: np.ndarray, pe: np.ndarray) -> None:
+    """Add products of k image points to the sums by object point, and fill in pe (k, 18).
+
+    point (k,) are their object points. The sums (18, n) are the products with P and the residual -
+    xx, xy, xz, yy, yz, zz, rx, ry, rz - and by component of P those with xp, yp and c. A product
+    with T is one with P with the opposite sign.
     """
     n = sums.shape[1]
     number = 0
@@ -167,247 +233,216 @@ def _add_by_point(lin, point, sums, pe):
     pe[:] = mixed.T
 
 
-def _chunks(network):
-    """Ranges of exposures, of one fluoroscope each, with about CHUNK image points."""
-    starts = np.searchsorted(network.exposure, np.arange(network.shape[1] + 1))
-    first = 0
-    while first < network.shape[1]:
-        others = np.flatnonzero(network.fluoroscope[first:] != network.fluoroscope[first])
-        end = first + (others[0] if len(others) else network.shape[1] - first)
-        last = max(
-            first + 1,
-            min(end, int(np.searchsorted(starts, starts[first] + CHUNK, side='right')) - 1),
-        )
-        yield first, last, starts[first : last + 1]
-        first = last
+def _chunks(network: Network) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Ranges of exposures of one fluoroscope with about CHUNK image points.
 
-
-def normal_equations(network, parameters, correction, noise, image_factor=1.0):
-    """Normal equations of the weighted linearised problem; image_factor multiplies the image
-    weights.
+    Yields the first exposure, the one after the last, and the rows (k + 1,) at which the image
+    points of the k exposures start and end.
     """
-    n_image, m, n, n_fluoro = network.shape
-    correction = np.broadcast_to(correction + network.added(parameters), network.uv.shape)
-    by_exposure = np.zeros((m, 10, 10))
-    by_point = np.zeros((n_fluoro, 18, n))
-    pe = np.empty((n_image, 18))
-    kept = []
-    for first, last, starts in _chunks(network):
+    m = network.n_exposures
+    starts = np.searchsorted(network.exposure, np.arange(m + 1))
+    first = 0
+    while first < m:
+        others = np.flatnonzero(network.fluoroscope[first:] != network.fluoroscope[first])
+        end = first + (others[0] if len(others) else m - first)
+        full = int(np.searchsorted(starts, starts[first] + CHUNK, side='right')) - 1
+        stop = max(first + 1, min(end, full))
+        yield first, stop, starts[first : stop + 1]
+        first = stop
+
+
+@dataclass(frozen=True)
+class _ImageSums:
+    """Products of the linearised image points.
+
+    by_exposure (m, 10, 10) with the rows of _Linearised.u; by_point (F, 18, n) of _add_by_point;
+    pe (N, 3, 6); linearised: the chunks, where additional parameters need them.
+    """
+
+    by_exposure: np.ndarray
+    by_point: np.ndarray
+    pe: np.ndarray
+    linearised: list[_Linearised]
+
+
+def _image_sums(problem: _Linearisation) -> _ImageSums:
+    """Sum the products of the image points by exposure and by object point."""
+    network = problem.network
+    by_exposure = np.zeros((network.n_exposures, 10, 10))
+    by_point = np.zeros((network.n_fluoroscopes, 18, network.n_points))
+    pe = np.empty((network.n_image_points, 18))
+    has_additional = any(a is not None for a in network.additional)
+    linearised = []
+    for first, stop, starts in _chunks(network):
         rows = slice(starts[0], starts[-1])
-        lin = _linearised(network, parameters, correction, noise, image_factor, rows)
-        for e, start, end in zip(range(first, last), starts - starts[0], starts[1:] - starts[0]):
+        lin = problem.at(rows)
+        local = starts - starts[0]
+        for e, start, end in zip(range(first, stop), local, local[1:]):
             u = lin.u[:, start:end]
             v = lin.v[:, start:end]
             by_exposure[e] = u @ u.T + v @ v.T
         _add_by_point(lin, network.point[rows], by_point[network.fluoroscope[first]], pe[rows])
-        if any(a is not None for a in network.additional):
-            kept.append(lin)
-    turn = np.tile(np.eye(10), (m, 1, 1))
-    turn[:, :3, :3] = parameters.rotation
+        if has_additional:
+            linearised.append(lin)
+    turn = np.tile(np.eye(10), (network.n_exposures, 1, 1))
+    turn[:, :3, :3] = problem.parameters.rotation
     by_exposure = turn.transpose(0, 2, 1) @ by_exposure @ turn
+    return _ImageSums(by_exposure, by_point, pe.reshape(-1, 3, 6), linearised)
 
-    survey = 1 / network.survey_sd_mm**2 if network.datum == 'survey' else np.zeros(n)
-    both = by_point[:, :9].sum(axis=0)
-    pp = both[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(n, 3, 3) + survey[:, None, None] * np.eye(3)
-    p = both[6:].T + survey[:, None] * (network.survey_mm - parameters.points_mm)
-    ee = by_exposure[:, :6, :6]
-    e = by_exposure[:, :6, 9]
-    gg, eg, pg, g = _global_blocks(network, parameters, by_exposure, by_point)
-    coupled = _add_relative(network, parameters, (ee, eg, gg, e, g))
-    if kept:
-        root = np.concatenate([lin.root for lin in kept])
-        weighted = [
-            np.concatenate(parts) for parts in zip(*(lin.by_image_point() for lin in kept))
-        ]
-        _add_additional(network, parameters, root, weighted, (gg, eg, pg, g))
+
+def normal_equations(
+    network: Network,
+    parameters: Parameters,
+    correction: np.ndarray | float,
+    noise: Noise,
+    image_factor: float = 1.0,
+) -> NormalEquations:
+    """Normal equations of the weighted linearised problem.
+
+    Parameters
+    ----------
+    network : Network
+    parameters : Parameters
+        Values at which the problem is linearised.
+    correction : (N, 2) ndarray or float
+        Correction of the image points [px], without that of the additional parameters.
+    noise : Noise
+        Noise model; its weights are those at the residuals.
+    image_factor : float
+        Factor of all image weights, see Noise.information_factor.
+    """
+    correction = correction + network.additional_correction(parameters)
+    correction = np.broadcast_to(correction, network.uv.shape)
+    sums = _image_sums(_Linearisation(network, parameters, correction, noise, image_factor))
+    pp, p = _point_blocks(network, parameters, sums)
+    ee = sums.by_exposure[:, :6, :6]
+    e = sums.by_exposure[:, :6, 9]
+    blocks = _GlobalBlocks.zeros(network)
+    blocks.add_interiors(parameters, sums)
+    coupled_pairs, coupled = _add_relative(parameters, ee, e, blocks)
+    if sums.linearised:
+        _add_additional(parameters, sums.linearised, blocks)
     return NormalEquations(
-        ee, pp, gg, eg, pg, pe.reshape(-1, 3, 6), e, p, g, coupled, gauge_of(network, parameters)
+        ee,
+        pp,
+        blocks.gg,
+        blocks.eg,
+        blocks.pg,
+        sums.pe,
+        e,
+        p,
+        blocks.g,
+        coupled_pairs,
+        coupled,
+        open_gauge(network, parameters),
     )
 
 
-def _global_blocks(network, parameters, by_exposure, by_point):
-    """Blocks gg, eg, pg and right side g with the interior orientations filled in, from the sums
-    by exposure (m, 10, 10) and by fluoroscope and point (F, 18, n).
-    """
-    _, m, n, n_fluoro = network.shape
-    size = len(network.global_free)
-    gg = np.zeros((size, size))
-    g = np.zeros(size)
-    eg = np.zeros((m, 6, size))
-    pg = np.zeros((n, 3, size))
-    for f in range(n_fluoro):
-        cols = slice(3 * f, 3 * f + 3)
-        mine = network.fluoroscope == f
-        gg[cols, cols] = by_exposure[mine, 6:9, 6:9].sum(axis=0)
-        g[cols] = by_exposure[mine, 6:9, 9].sum(axis=0)
-        eg[mine, :, cols] = by_exposure[mine, :6, 6:9]
-        pg[:, :, cols] = by_point[f, 9:].T.reshape(n, 3, 3)
-    if network.interior_sd is not None:
-        diagonal = np.arange(3 * n_fluoro)
-        weight = network.interior_weight
-        gg[diagonal, diagonal] += weight.ravel()
-        g[diagonal] += (weight * (network.interior_mean - parameters.interior)).ravel()
-    return gg, eg, pg, g
+def _point_blocks(
+    network: Network, parameters: Parameters, sums: _ImageSums
+) -> tuple[np.ndarray, np.ndarray]:
+    """Blocks pp (n, 3, 3) and right side p (n, 3), with the survey."""
+    n = network.n_points
+    survey = 1 / network.survey_sd_mm**2 if network.datum == 'survey' else np.zeros(n)
+    products = sums.by_point[:, POINT_PRODUCTS].sum(axis=0)
+    symmetric = products[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(n, 3, 3)
+    pp = symmetric + survey[:, None, None] * np.eye(3)
+    return pp, products[6:].T + survey[:, None] * (network.survey_mm - parameters.points_mm)
 
 
-def _add_relative(network, parameters, blocks):
-    """Add the relative orientation constraints to ee, eg, gg, e and g; returns pairs (k, 2) and
-    mixed blocks (k, 6, 6).
+@dataclass(frozen=True)
+class _GlobalBlocks:
+    """Blocks with the global unknowns, as in NormalEquations, while they are filled in."""
+
+    network: Network
+    gg: np.ndarray
+    eg: np.ndarray
+    pg: np.ndarray
+    g: np.ndarray
+
+    @classmethod
+    def zeros(cls, network: Network) -> _GlobalBlocks:
+        """Blocks of zeros."""
+        size = network.layout.n_globals
+        return cls(
+            network,
+            np.zeros((size, size)),
+            np.zeros((network.n_exposures, EXTERIOR_SIZE, size)),
+            np.zeros((network.n_points, 3, size)),
+            np.zeros(size),
+        )
+
+    def add_interiors(self, parameters: Parameters, sums: _ImageSums) -> None:
+        """Fill in the interior orientations and their prior."""
+        network = self.network
+        for f, columns in enumerate(network.layout.interiors):
+            own = network.fluoroscope == f
+            self.gg[columns, columns] = sums.by_exposure[own, 6:9, 6:9].sum(axis=0)
+            self.g[columns] = sums.by_exposure[own, 6:9, 9].sum(axis=0)
+            self.eg[own, :, columns] = sums.by_exposure[own, :6, 6:9]
+            by_point = sums.by_point[f, INTERIOR_PRODUCTS]
+            self.pg[:, :, columns] = by_point.T.reshape(network.n_points, 3, 3)
+        if network.interior_sd is not None:
+            columns = network.layout.all_interiors
+            weight = network.interior_weight
+            diagonal = np.einsum('ii->i', self.gg[columns, columns])  # a view
+            diagonal += weight.ravel()
+            self.g[columns] += (weight * (network.interior_mean - parameters.interior)).ravel()
+
+
+def _add_relative(
+    parameters: Parameters, ee: np.ndarray, e: np.ndarray, blocks: _GlobalBlocks
+) -> tuple[np.ndarray, np.ndarray]:
+    """Add the relative orientation constraints to ee, e and the global blocks.
+
+    Returns the coupled pairs (k, 2) of exposures and their mixed blocks (k, 6, 6).
     """
-    ee, eg, gg, e, g = blocks
+    network = blocks.network
     pairs = [np.zeros((0, 2), dtype=int)]
-    mixed = [np.zeros((0, 6, 6))]
-    for constraint, pose, cols in zip(
-        network.relative, parameters.relative, network.relative_columns
+    coupled = [np.zeros((0, POSE_SIZE, POSE_SIZE))]
+    for constraint, pose, columns in zip(
+        network.relative, parameters.relative, network.layout.relative
     ):
-        off, d_a, d_b, d_pose = discrepancies_with_jacobian(constraint, pose, parameters)
-        (a, b) = constraint.pairs.T
+        offset, d_a, d_b, d_pose = discrepancies_with_jacobian(constraint, pose, parameters)
+        a, b = constraint.pairs.T
         w = constraint.weights[:, None]
-        for rows, d in ((a, d_a), (b, d_b)):
-            back = d.transpose(0, 2, 1)
-            ee[rows] += back @ (w * d)
-            eg[rows, :, cols] += back @ (w * d_pose)
-            e[rows] -= (back @ (w * off[:, :, None]))[..., 0]
-        gg[cols, cols] += np.einsum('kia,i,kib->ab', d_pose, w[:, 0], d_pose)
-        g[cols] -= np.einsum('kia,i,ki->a', d_pose, w[:, 0], off)
+        for rows, derivative in ((a, d_a), (b, d_b)):
+            transposed = derivative.transpose(0, 2, 1)
+            ee[rows] += transposed @ (w * derivative)
+            blocks.eg[rows, :, columns] += transposed @ (w * d_pose)
+            e[rows] -= (transposed @ (w * offset[:, :, None]))[..., 0]
+        blocks.gg[columns, columns] += np.einsum('kia,i,kib->ab', d_pose, w[:, 0], d_pose)
+        blocks.g[columns] -= np.einsum('kia,i,ki->a', d_pose, w[:, 0], offset)
         pairs.append(constraint.pairs)
-        mixed.append(d_a.transpose(0, 2, 1) @ (w * d_b))
-    return np.concatenate(pairs), np.concatenate(mixed)
+        coupled.append(d_a.transpose(0, 2, 1) @ (w * d_b))
+    return np.concatenate(pairs), np.concatenate(coupled)
 
 
-def _add_additional(network, parameters, root, weighted, blocks):
-    """Fill in the rows and columns of the additional parameters; root (N,) of the weights."""
-    a_e, a_p, a_i, r = weighted
-    gg, eg, pg, g = blocks
-    _, m, n, _ = network.shape
-    for f, (additional, cols) in enumerate(zip(network.additional, network.additional_columns)):
+def _add_additional(
+    parameters: Parameters, linearised: list[_Linearised], blocks: _GlobalBlocks
+) -> None:
+    """Fill in the rows and columns of the additional parameters."""
+    network = blocks.network
+    root = np.concatenate([lin.root for lin in linearised])
+    parts = [lin.by_image_point() for lin in linearised]
+    a_e, a_p, a_i, r = (np.concatenate(arrays) for arrays in zip(*parts))
+    layout = network.layout
+    for f, (additional, columns) in enumerate(zip(network.additional, layout.additional)):
         if additional is None:
             continue
         rows = network.rows(f)
         w = root[rows, None, None]
-        eg[:, :, cols] = additional.sums(network.exposure[rows], m, w * a_e[rows])
-        pg[:, :, cols] = additional.sums(network.point[rows], n, w * a_p[rows])
-        mixed = additional.sums(np.zeros(len(rows), dtype=int), 1, w * a_i[rows])[0]
-        gg[3 * f : 3 * f + 3, cols] = mixed
-        gg[cols, 3 * f : 3 * f + 3] = mixed.T
-        gg[cols, cols] = additional.gram(root[rows] ** 2) + additional.prior
-        g[cols] = (
-            additional.transposed(w[:, 0] * r[rows]) - additional.prior @ parameters.additional[f]
+        exposure = network.exposure[rows]
+        blocks.eg[:, :, columns] = additional.grouped_products(
+            exposure, network.n_exposures, w * a_e[rows]
         )
-
-
-def eliminates_points(network):
-    """Whether the object points are eliminated (else the exposures): what leaves the smaller
-    system.
-    """
-    _, m, n, _ = network.shape
-    return 6 * m < 3 * n
-
-
-def bordered_blocks(network, equations):
-    """The normal equations as a block-diagonal part and the rest.
-
-    Returns bb (k, b, b), br (k, b, q), rr (q, q), right sides (k, b) and (q,). The rest ends with
-    the global unknowns, of which only the free ones are kept. The directions that a free network
-    leaves open are held in the rest.
-    """
-    _, m, n, _ = network.shape
-    free = network.global_free
-    if eliminates_points(network):
-        br = np.zeros((n, 3, 6 * m + int(free.sum())))
-        br[:, :, : 6 * m].reshape(n, 3, m, 6)[network.point, :, network.exposure, :] = equations.pe
-        br[:, :, 6 * m :] = equations.pg[:, :, free]
-        bb = equations.pp
-        b = equations.p
-        rest = equations.ee
-        rest_g = equations.eg
-        r = equations.e
-    else:
-        bb, br, b = _by_cell(network, equations)
-        rest = equations.pp
-        rest_g = equations.pg
-        r = equations.p
-    count, size = rest.shape[:2]
-    rr = np.zeros((br.shape[2], br.shape[2]))
-    diagonal = np.arange(count * size).reshape(count, size)
-    rr[diagonal[:, :, None], diagonal[:, None, :]] = rest
-    rr[: count * size, count * size :] = rest_g.reshape(count * size, -1)[:, free]
-    rr[count * size :, : count * size] = rr[: count * size, count * size :].T
-    rr[count * size :, count * size :] = equations.gg[np.ix_(free, free)]
-    if eliminates_points(network) and len(network.relative):
-        (one, other) = equations.coupled[0].T
-        mixed = equations.coupled[1]
-        rr[diagonal[one][:, :, None], diagonal[other][:, None, :]] = mixed
-        rr[diagonal[other][:, :, None], diagonal[one][:, None, :]] = mixed.transpose(0, 2, 1)
-    if equations.gauge is not None:
-        gauge = equations.gauge
-        part = slice(0, count * size)
-        held = held_directions(
-            (gauge.e if eliminates_points(network) else gauge.p).reshape(count * size, -1),
-            np.diagonal(rr)[part],
+        blocks.pg[:, :, columns] = additional.grouped_products(
+            network.point[rows], network.n_points, w * a_p[rows]
         )
-        rr[part, part] += held @ held.T
-    return bb, br, rr, b, np.concatenate([r.ravel(), equations.g[free]])
-
-
-def _by_cell(network, equations):
-    """Bb (k, b, b), br (k, b, q) and right side (k, b) of the exposures, those that are coupled
-    side by side.
-
-    A place that no exposure takes has a one in the diagonal and zeros elsewhere.
-    """
-    _, m, n, _ = network.shape
-    free = network.global_free
-    cell, place, places = network.cells
-    count = int(cell.max()) + 1
-    br = np.zeros((count, places, 6, 3 * n + int(free.sum())))
-    br[..., : 3 * n].reshape(count, places, 6, n, 3)[
-        cell[network.exposure], place[network.exposure], :, network.point, :
-    ] = equations.pe.transpose(0, 2, 1)
-    br[cell, place, :, 3 * n :] = equations.eg[:, :, free]
-    bb = np.zeros((count, places, 6, places, 6))
-    b = np.zeros((count, places, 6))
-    diagonal = np.einsum('kiaia->kia', bb)  # a view
-    diagonal[...] = 1
-    bb[cell, place, :, place, :] = equations.ee
-    b[cell, place] = equations.e
-    if len(network.relative):
-        (one, other) = equations.coupled[0].T
-        mixed = equations.coupled[1]
-        bb[cell[one], place[one], :, place[other], :] = mixed
-        bb[cell[one], place[other], :, place[one], :] = mixed.transpose(0, 2, 1)
-    width = 6 * places
-    return bb.reshape(count, width, width), br.reshape(count, width, -1), b.reshape(count, width)
-
-
-def reduce_blocks(bb, br, rr, overwrite=False):
-    """Inverse Cholesky factors (k, b, b) of bb, H = L^-1 br as (k b, q), and the Schur complement
-    (q, q).
-
-    Only the lower triangle of the Schur complement is set. Raises numpy.linalg.LinAlgError where
-    bb is not positive definite.
-    """
-    inverse = np.linalg.inv(np.linalg.cholesky(bb))
-    h = (inverse @ br).reshape(-1, br.shape[2])
-    # In BLAS's order of storage h is its transpose: half the operations of a full product, and no
-    # copy.
-    schur = blas.dsyrk(-1.0, h.T, beta=1.0, c=rr.T, trans=0, lower=1, overwrite_c=overwrite)
-    return inverse, h, schur
-
-
-def damped_step(blocks, mu):
-    """Solution of (H + mu diag H) x = b for the bordered blocks: x_b (k, b) and x_r (q,).
-
-    Raises numpy.linalg.LinAlgError where the damped matrix is not positive definite.
-    """
-    bb, br, rr, b, r = blocks
-    bb = bb + mu * bb * np.eye(bb.shape[1])
-    rr = rr.copy()
-    rr.ravel()[:: len(rr) + 1] *= 1 + mu
-    inverse, h, schur = reduce_blocks(bb, br, rr, overwrite=True)
-    half = (inverse @ b[..., None]).ravel()
-    x_r = cho_solve(
-        cho_factor(schur, lower=True, overwrite_a=True, check_finite=True), r - h.T @ half
-    )
-    x_b = inverse.transpose(0, 2, 1) @ (half - h @ x_r).reshape(b.shape)[..., None]
-    return x_b[..., 0], x_r
+        mixed = additional.grouped_products(np.zeros_like(exposure), 1, w * a_i[rows])[0]
+        interior = layout.interiors[f]
+        blocks.gg[interior, columns] = mixed
+        blocks.gg[columns, interior] = mixed.T
+        blocks.gg[columns, columns] = additional.normal_matrix(root[rows] ** 2) + additional.prior
+        prior_pull = additional.prior @ parameters.additional[f]
+        blocks.g[columns] = additional.right_side(w[:, 0] * r[rows]) - prior_pull

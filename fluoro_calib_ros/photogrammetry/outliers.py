@@ -1,37 +1,63 @@
-"""Tests of single observations for gross errors: image points, and surveyed coordinates of object
-points.
+"""Tests of single image points and surveyed coordinates for gross errors.
 
 Data snooping (Baarda, "A testing procedure for use in geodetic networks", Netherlands Geodetic
 Commission 1968) for observations of two and three coordinates: each is compared with what all
-others say of it. Under robust weights the residual of a gross error is tested by its covariance at
-full weight, as the adjustment has hardly listened to it: with P = A C_x A^T and weight w the
-residual without the observation is (1 - w P / s^2)^-1 r, with covariance s^2 + P (1 - w P /
-s^2)^-1 (Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6). Where the
-scale was estimated along, Pope's test takes the place of chi-square (NOAA TR NOS 65 NGS 1, 1976).
+other observations predict. Under robust weights an adjustment hardly follows a gross error, so its
+residual is tested by its covariance at full weight. With P = A C_x A^T and weight w, the residual
+without the observation is (1 - w P / s^2)^-1 r, with covariance s^2 + P (1 - w P / s^2)^-1
+(Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6). Where the scale is
+estimated from the same residuals, Pope's test replaces chi-square (NOAA TR NOS 65 NGS 1, 1976).
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
 from scipy import stats
 
+from .adjustment import Adjustment
 from .collinearity import project_with_jacobian
-from .precision import MIN_WEIGHT
+from .network import Network
+from .noise import Noise
+from .precision import MIN_WEIGHT, Precision
 
-SIGNIFICANCE = 0.01  # chance of any false alarm among all image points, and among all targets
-CONTROLLED = 0.02  # smallest redundancy of an observation that is tested
+# Probability of any false alarm among all image points, and among all targets.
+SIGNIFICANCE = 0.01
+# Smallest redundancy of an image point that is tested.
+MIN_TESTED_REDUNDANCY = 0.02
+# Sum of the weights of the rays that intersect a target.
 MIN_RAYS = 2
-ROUNDS = 15  # of the weights of a target's rays
+# Iterations of the weights of a target's rays.
+INTERSECTION_ITERATIONS = 15
+# Smallest eigenvalue of the scaled normal matrix of an intersection.
+MIN_INTERSECTION_EIGENVALUE = 1e-4
+# Significance at which the rays of a target contradict each other.
+CONTRADICTION_SIGNIFICANCE = 1e-3
 
 
 @dataclass(frozen=True)
 class Outliers:
     """Observations that fail the test.
 
-    image_point (k,): rows; value (k,) of the statistic and critical_image, above which it lies;
-    target (l,): rows of object points; target_value (l,), critical_target; offset_mm (l, 3): where
-    the images see it, less the survey; tested: numbers of image points and of targets that could
-    be tested.
+    Attributes
+    ----------
+    image_point : (k,) ndarray of int
+        Rows of image points.
+    value : (k,) ndarray
+        Their statistics.
+    critical_image : float
+        Critical value of the image points.
+    target : (l,) ndarray of int
+        Rows of object points.
+    target_value : (l,) ndarray
+        Their statistics.
+    critical_target : float
+        Critical value of the targets.
+    offset_mm : (l, 3) ndarray
+        Position of the targets in the images minus their survey.
+    tested : (int, int)
+        Numbers of image points and of targets that could be tested.
     """
 
     image_point: np.ndarray
@@ -41,139 +67,188 @@ class Outliers:
     target_value: np.ndarray
     critical_target: float
     offset_mm: np.ndarray
-    tested: tuple
+    tested: tuple[int, int]
 
 
-def find_outliers(network, adjustment, precise, significance=SIGNIFICANCE):
-    """Outliers of an Adjustment with its Precision; significance: chance of any false alarm of
-    each test.
+@dataclass(frozen=True)
+class TargetTest:
+    """Test of the surveyed coordinates of all targets.
+
+    Attributes
+    ----------
+    value : (n,) ndarray
+        Statistics; NaN where a target cannot be tested.
+    critical : float
+        Critical value.
+    offset_mm : (n, 3) ndarray
+        Position of the targets in the images minus their survey; zeros where not tested.
+    ray_square : (N,) ndarray
+        Statistics of the image points at the intersected targets.
     """
-    target, critical_target = target_statistics(network, adjustment, precise, significance)
-    value, offset, seen = target
-    wrong = np.flatnonzero(value > critical_target)
-    image, critical_image = image_statistics(network, adjustment, precise, significance)
-    # What fits a bead where the images see it is no fault of the images.
-    explained = np.isin(network.point, wrong) & (seen <= critical_image)
+
+    value: np.ndarray
+    critical: float
+    offset_mm: np.ndarray
+    ray_square: np.ndarray
+
+
+def find_outliers(
+    network: Network,
+    adjustment: Adjustment,
+    precision: Precision,
+    significance: float = SIGNIFICANCE,
+) -> Outliers:
+    """Image points and targets that fail the test.
+
+    significance: probability of any false alarm of each of the two tests.
+    """
+    targets = target_statistics(network, adjustment, precision, significance)
+    wrong = np.flatnonzero(targets.value > targets.critical)
+    image, critical_image = image_statistics(network, adjustment, precision, significance)
+    # An image point that fits its target where the images see it is not at fault.
+    explained = np.isin(network.point, wrong) & (targets.ray_square <= critical_image)
     found = np.flatnonzero((image > critical_image) & ~explained)
     return Outliers(
         found,
         image[found],
         critical_image,
         wrong,
-        value[wrong],
-        critical_target,
-        offset[wrong],
-        (int(np.isfinite(image).sum()), int(np.isfinite(value).sum())),
+        targets.value[wrong],
+        targets.critical,
+        targets.offset_mm[wrong],
+        (int(np.isfinite(image).sum()), int(np.isfinite(targets.value).sum())),
     )
 
 
-def image_statistics(network, adjustment, precise, significance=SIGNIFICANCE):
-    """Statistics (N,) of the image points, NaN where the redundancy is too small, and their
-    critical value.
+def image_statistics(
+    network: Network,
+    adjustment: Adjustment,
+    precision: Precision,
+    significance: float = SIGNIFICANCE,
+) -> tuple[np.ndarray, float]:
+    """Statistics (N,) of the image points and their critical value.
+
+    A statistic is NaN where the redundancy is too small.
     """
     noise = adjustment.noise
-    weight = np.maximum(adjustment.noise.weight(adjustment.q), MIN_WEIGHT)
+    weight = np.maximum(noise.weight(adjustment.q), MIN_WEIGHT)
     variance = (noise.scale * network.sigma) ** 2
     unit = np.eye(2)
-    # C_r = s^2 / w - P, so that this is 1 - w P / s^2.
-    part = precise.residual * (weight / variance)[:, None, None]
-    tested = np.linalg.eigvalsh(part)[:, 0] > CONTROLLED
+    # C_r = s^2 / w - P, so this is 1 - w P / s^2.
+    part = precision.residual * (weight / variance)[:, None, None]
+    tested = np.linalg.eigvalsh(part)[:, 0] > MIN_TESTED_REDUNDANCY
     inverse = np.linalg.inv(np.where(tested[:, None, None], part, unit))
     fitted = (unit - part) * (variance / weight)[:, None, None]
-    covariance = variance[:, None, None] * unit + fitted @ inverse / noise.information_factor(
-        adjustment.q
-    )
+    factor = noise.information_factor(adjustment.q)
+    covariance = variance[:, None, None] * unit + fitted @ inverse / factor
     without = (inverse @ adjustment.residuals[..., None])[..., 0]
-    value = np.einsum('ni,ni->n', without, np.linalg.solve(covariance, without[..., None])[..., 0])
+    standardised = np.linalg.solve(covariance, without[..., None])[..., 0]
+    value = np.einsum('ni,ni->n', without, standardised)
     count = max(int(tested.sum()), 1)
-    redundancy = float(precise.redundancy.sum())
+    redundancy = float(precision.redundancy.sum())
     if noise.loss == 'gaussian':
-        # The estimated variance without the image point, which has a share of value in it.
+        # Refer to the variance estimated without the image point, which contributes to it.
         value = value * (redundancy - 2) / np.maximum(redundancy - value, 1e-3 * redundancy)
     critical = 2 * stats.f.isf(significance / count, 2, min(noise.nu, redundancy - 2))
     return np.where(tested, value, np.nan), float(critical)
 
 
-def target_statistics(network, adjustment, precise, significance=SIGNIFICANCE):
-    """Statistics of the targets' surveyed coordinates, and their critical value.
+def target_statistics(
+    network: Network,
+    adjustment: Adjustment,
+    precision: Precision,
+    significance: float = SIGNIFICANCE,
+) -> TargetTest:
+    """Test the surveyed coordinates of the targets.
 
-    Each target is intersected from its rays without its survey, with orientations held and their
-    uncertainty added to that of the rays. Returns ((n,) values, NaN where there is nothing to
-    test, (n, 3) offsets [mm], (N,) statistics of the image points at the intersected targets),
-    critical value.
+    Each target is intersected from its rays without its survey. The orientations are held, and
+    their uncertainty is added to that of the rays.
     """
-    n = network.shape[2]
-    nothing = (np.full(n, np.nan), np.zeros((n, 3)), np.full(len(network.uv), np.inf))
+    n = network.n_points
     if network.datum != 'survey':
-        return nothing, np.inf
-    a, information, r = _rays(network, adjustment, precise)
-    offset, covariance, square = _intersected(network, a, information, r, adjustment.noise)
+        untested = np.full(n, np.nan)
+        return TargetTest(
+            untested, np.inf, np.zeros((n, 3)), np.full(network.n_image_points, np.inf)
+        )
+    rays = _rays_of(network, adjustment, precision)
+    offset, covariance, square = _intersect(network, rays, adjustment.noise)
     covariance = covariance + (network.survey_sd_mm**2)[:, None, None] * np.eye(3)
     testable = np.isfinite(offset).all(axis=1)
+    tested = offset[testable]
+    standardised = np.linalg.solve(covariance[testable], tested[..., None])[..., 0]
     value = np.full(n, np.nan)
-    value[testable] = np.einsum(
-        'ni,ni->n',
-        offset[testable],
-        np.linalg.solve(covariance[testable], offset[testable][..., None])[..., 0],
-    )
+    value[testable] = np.einsum('ni,ni->n', tested, standardised)
     critical = stats.chi2.isf(significance / max(int(testable.sum()), 1), 3)
-    return (value, np.where(testable[:, None], offset, 0.0), square), float(critical)
+    return TargetTest(value, float(critical), np.where(testable[:, None], offset, 0.0), square)
 
 
-def _rays(network, adjustment, precise):
-    """Derivatives (N, 2, 3) by the object points, inverse covariances (N, 2, 2) of the rays with
-    their orientations, and residuals (N, 2) at the surveyed coordinates.
+@dataclass(frozen=True)
+class _Rays:
+    """Rays of the image points with the uncertainty of their orientations.
+
+    derivative (N, 2, 3) by the object points; information (N, 2, 2) inverse covariances [1/px^2];
+    residual (N, 2) [px] at the surveyed coordinates.
     """
+
+    derivative: np.ndarray
+    information: np.ndarray
+    residual: np.ndarray
+
+
+def _rays_of(network: Network, adjustment: Adjustment, precision: Precision) -> _Rays:
+    """Rays of all image points."""
     parameters = adjustment.parameters
     e = network.exposure
-    _, d_e, a, d_i = project_with_jacobian(*parameters.per_image_point(network))
-    r = (
-        adjustment.residuals
-        - (a @ (network.survey_mm - parameters.points_mm)[network.point][..., None])[..., 0]
+    f = network.fluoroscope[e]
+    _, d_e, d_p, d_i = project_with_jacobian(*parameters.per_image_point(network))
+    shift = (network.survey_mm - parameters.points_mm)[network.point]
+    residual = adjustment.residuals - (d_p @ shift[..., None])[..., 0]
+    by_interior = np.stack(
+        [precision.exterior_global[:, :, columns] for columns in network.layout.interiors]
     )
-    columns = 3 * network.fluoroscope[e][:, None] + np.arange(3)
-    mixed = np.take_along_axis(precise.exterior_global[e], columns[:, None, :], axis=2)
-    own = precise.interior[network.fluoroscope[e]]
-    across = d_e @ mixed @ d_i.transpose(0, 2, 1)
+    across = d_e @ by_interior[f, e] @ d_i.transpose(0, 2, 1)
     covariance = (
-        d_e @ precise.exterior[e] @ d_e.transpose(0, 2, 1)
+        d_e @ precision.exterior[e] @ d_e.transpose(0, 2, 1)
         + across
         + across.transpose(0, 2, 1)
-        + d_i @ own @ d_i.transpose(0, 2, 1)
+        + d_i @ precision.interior[f] @ d_i.transpose(0, 2, 1)
     )
-    covariance += ((adjustment.noise.scale * network.sigma) ** 2)[:, None, None] * np.eye(2)
-    return a, np.linalg.inv(covariance), r
+    variance = (adjustment.noise.scale * network.sigma) ** 2
+    covariance += variance[:, None, None] * np.eye(2)
+    return _Rays(d_p, np.linalg.inv(covariance), residual)
 
 
-def _intersected(network, a, information, r, noise):
-    """Offsets (n, 3) [mm] of the targets by their rays, covariances (n, 3, 3), and squares (N,) of
-    the rays' residuals.
+def _intersect(
+    network: Network, rays: _Rays, noise: Noise
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Intersect the targets from their rays.
 
-    Rays of one target that contradict each other are weighed down; NaN where fewer than two are
-    left.
+    Returns offsets (n, 3) [mm], their covariances (n, 3, 3) and squares (N,) of the rays'
+    residuals. Rays of one target that contradict each other are downweighted; offsets are NaN
+    where fewer than two are left.
     """
-    n = network.shape[2]
+    n = network.n_points
     p = network.point
+    a = rays.derivative
     weight = np.ones(len(p))
     offset = np.zeros((n, 3))
     covariance = np.tile(np.eye(3), (n, 1, 1))
-    for _ in range(ROUNDS):
-        weighted = (weight[:, None, None] * a.transpose(0, 2, 1)) @ information
+    for _ in range(INTERSECTION_ITERATIONS):
+        weighted = (weight[:, None, None] * a.transpose(0, 2, 1)) @ rays.information
         normal = np.zeros((n, 3, 3))
         right = np.zeros((n, 3))
         np.add.at(normal, p, weighted @ a)
-        np.add.at(right, p, (weighted @ r[..., None])[..., 0])
-        rays = np.bincount(p, weight, n)
+        np.add.at(right, p, (weighted @ rays.residual[..., None])[..., 0])
+        count = np.bincount(p, weight, n)
         scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
         smallest = np.linalg.eigvalsh(normal / scale[:, :, None] / scale[:, None, :])[:, 0]
-        good = (rays > MIN_RAYS - 0.5) & (smallest > 1e-4)
+        good = (count > MIN_RAYS - 0.5) & (smallest > MIN_INTERSECTION_EIGENVALUE)
         covariance[good] = np.linalg.inv(normal[good])
         offset[good] = (covariance[good] @ right[good][..., None])[..., 0]
-        off = r - (a @ offset[p][..., None])[..., 0]
-        square = np.einsum('ni,nij,nj->n', off, information, off)
+        residual = rays.residual - (a @ offset[p][..., None])[..., 0]
+        square = np.einsum('ni,nij,nj->n', residual, rays.information, residual)
         weight = noise.weight(square) if noise.loss != 'gaussian' else weight
-    contradicting = np.bincount(p, square * weight, n) > stats.chi2.isf(
-        1e-3, np.maximum(2 * rays, 1)
-    )
+    limit = stats.chi2.isf(CONTRADICTION_SIGNIFICANCE, np.maximum(2 * count, 1))
+    contradicting = np.bincount(p, square * weight, n) > limit
     offset[~good | contradicting] = np.nan
     return offset, covariance, square

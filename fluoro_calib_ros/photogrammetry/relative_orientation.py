@@ -1,88 +1,103 @@
-"""Relative orientation of two fluoroscopes, the same in every exposure that both took.
+"""Relative orientation of two fluoroscopes that is the same in every common exposure.
 
 Q = R_b R_a^T and t = R_a (T_b - T_a) [mm, sensor frame of a] are unknowns of the adjustment, six
-for a pair of fluoroscopes. An exposure of both observes them: R_a (T_b - T_a) - t = 0 and log(R_b
-R_a^T Q^T) = 0, with standard deviations. A rigid mounting is the limit of small ones. Relative
-orientation constraints: Lerma, Navarro, Cabrelles and Seguí, "Camera calibration with baseline
-distance constraints", Photogrammetric Record 25, 2010; derivatives of rotations: Barfoot, "State
-Estimation for Robotics", Cambridge 2017, 7.1.
+for each pair of fluoroscopes. Each common exposure observes them: R_a (T_b - T_a) - t = 0 and
+log(R_b R_a^T Q^T) = 0, with standard deviations. A rigid mounting is the limit of small standard
+deviations. Relative orientation constraints: Lerma, Navarro, Cabrelles and Seguí, "Camera
+calibration with baseline distance constraints", Photogrammetric Record 25, 2010. Derivatives of
+rotations: Barfoot, "State Estimation for Robotics", Cambridge 2017, 7.1.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .rotations import cross_matrix, matrix_from_vector, quaternion_from_matrix
+from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
 
-UNKNOWNS = 6
-# As good as rigid: a thousandth of what images of 0.25 px noise tell of a pair of exposures, so
-# that the solution is that of the limit to some 1e-5 standard deviations, and far from where
-# rounding errors begin.
+if TYPE_CHECKING:
+    from .network import Network
+    from .unknowns import ByKind, Parameters
+
+POSE_SIZE = 6  # translation [mm], rotation vector [rad]
+# Standard deviations that stand for a rigid mounting: a thousandth of what one pair of exposures
+# determines from images of 0.25 px noise. The solution is that of the limit within some 1e-5
+# standard deviations, and rounding errors are still far away.
 RIGID_SD_MM = 3e-4
 RIGID_SD_RAD = 1e-7
+# Iterations of the mean pose, and the step [mm, rad] at which they end.
+MEAN_ITERATIONS = 10
+MEAN_TOLERANCE = 1e-12
 
 
 @dataclass(frozen=True)
-class Relative:
-    """Constraint between two fluoroscopes.
+class RelativeConstraint:
+    """Constraint that the relative orientation of two fluoroscopes is the same in all pairs.
 
-    fluoroscopes (a, b): their numbers; pairs (k, 2): rows of the exposures of a and of b taken
-    together; sd_mm and sd_rad of each component; length_mm: distance of the sources at which sd_mm
-    holds; it follows the scale of a free network, None: the network is not free.
+    Attributes
+    ----------
+    fluoroscopes : (int, int)
+        Numbers of the fluoroscopes a and b.
+    pairs : (k, 2) ndarray of int
+        Rows of the common exposures of a and of b.
+    sd_mm, sd_rad : float
+        Standard deviations of each component of translation and rotation.
+    length_mm : float, optional
+        Distance of the sources at which `sd_mm` holds. It makes the constraint follow the scale of
+        a free network; None where the scale is fixed.
     """
 
-    fluoroscopes: tuple
+    fluoroscopes: tuple[int, int]
     pairs: np.ndarray
     sd_mm: float
     sd_rad: float
     length_mm: float | None = None
 
     @property
-    def weights(self):
+    def weights(self) -> np.ndarray:
         """Weights (6,) of the components of the constraint."""
         return np.repeat([self.sd_mm**-2.0, self.sd_rad**-2.0], 3)
 
 
 @dataclass(frozen=True)
 class RelativePose:
-    """A relative orientation: rotation (3, 3) from the sensor frame of a to that of b;
-    translation_mm (3,) of the source of b in the sensor frame of a.
+    """Relative orientation of fluoroscope b with respect to a.
+
+    rotation (3, 3) from the sensor frame of a to that of b; translation_mm (3,) of the source of b
+    in the sensor frame of a.
     """
 
     rotation: np.ndarray
     translation_mm: np.ndarray
 
-    def moved(self, step):
+    def updated(self, step: np.ndarray) -> RelativePose:
         """The pose after a step (6,): translation [mm], rotation [rad] on the left."""
+        step = np.asarray(step)
         return RelativePose(
             matrix_from_vector(step[3:]) @ self.rotation, self.translation_mm + step[:3]
         )
 
 
-def vector_of(rotation):
-    """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3), of angles below pi."""
-    q = quaternion_from_matrix(rotation)
-    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
-    angle = 2 * np.arctan2(sine, q[..., :1])
-    return q[..., 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-300), 2.0)
+def inverse_left_jacobian(w: np.ndarray) -> np.ndarray:
+    """Derivatives (..., 3, 3) of log(exp(v) exp(w)) with respect to v at v = 0.
 
-
-def inverse_left_jacobian(w):
-    """Derivatives (..., 3, 3) of log(exp(v) exp(w)) by v at v = 0, of rotation vectors w (..., 3)
-    (Barfoot 7.1.3).
+    w (..., 3) are rotation vectors [rad] (Barfoot 7.1.3).
     """
     half = np.linalg.norm(w, axis=-1)[..., None, None] / 2
     k = cross_matrix(w)
-    # (1 - h cot h) / (4 h^2), which is 1/12 at zero where it would be 0/0.
+    # (1 - h cot h) / (4 h^2) is 0/0 at zero, where its limit is 1/12.
     small = half < 1e-3
     safe = np.where(small, 1.0, half)
     factor = np.where(small, 1 / 12 + half**2 / 180, (1 - safe / np.tan(safe)) / (4 * safe**2))
     return np.eye(3) - k / 2 + factor * (k @ k)
 
 
-def poses_of_pairs(parameters, pairs):
-    """Rotations (k, 3, 3) and translations (k, 3) [mm] of b against a in pairs (k, 2) of
-    exposures.
+def relative_poses(parameters: Parameters, pairs: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (k, 3, 3) and translations (k, 3) [mm] of b relative to a in pairs of exposures.
+
+    pairs (k, 2) are rows of exposures.
     """
     a, b = pairs.T
     r_a = parameters.rotation[a]
@@ -90,35 +105,44 @@ def poses_of_pairs(parameters, pairs):
     return parameters.rotation[b] @ r_a.transpose(0, 2, 1), (r_a @ shift[..., None])[..., 0]
 
 
-def discrepancies(constraint, pose, parameters):
-    """Discrepancies (k, 6) of the pairs from a RelativePose: translation [mm], rotation [rad]."""
-    turn, shift = poses_of_pairs(parameters, constraint.pairs)
-    scale, _ = _scale(constraint, pose)
+def discrepancies(
+    constraint: RelativeConstraint, pose: RelativePose, parameters: Parameters
+) -> np.ndarray:
+    """Discrepancies (k, 6) of the pairs from a pose: translation [mm], rotation [rad]."""
+    turn, shift = relative_poses(parameters, constraint.pairs)
+    scale, _ = _translation_scale(constraint, pose)
     return np.concatenate(
-        [scale * (shift - pose.translation_mm), vector_of(turn @ pose.rotation.T)], axis=1
+        [scale * (shift - pose.translation_mm), vector_from_matrix(turn @ pose.rotation.T)], axis=1
     )
 
 
-def _scale(constraint, pose):
-    """Factor of the translations and its derivative (3,) by the translation of the pose."""
+def _translation_scale(
+    constraint: RelativeConstraint, pose: RelativePose
+) -> tuple[float, np.ndarray]:
+    """Factor of the translations, and its derivative (3,) by the translation of the pose."""
     if constraint.length_mm is None:
         return 1.0, np.zeros(3)
     length = np.linalg.norm(pose.translation_mm)
-    return constraint.length_mm / length, -constraint.length_mm / length**3 * pose.translation_mm
+    derivative = -constraint.length_mm / length**3 * pose.translation_mm
+    return constraint.length_mm / length, derivative
 
 
-def discrepancies_with_jacobian(constraint, pose, parameters):
-    """Discrepancies (k, 6) and their derivatives (k, 6, 6) by the exposures of a and of b, and by
-    the pose.
+def discrepancies_with_jacobian(
+    constraint: RelativeConstraint, pose: RelativePose, parameters: Parameters
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Discrepancies (k, 6) and their derivatives.
 
-    Exposures by T [mm] and w [rad], as everywhere; the pose as in RelativePose.moved.
+    Returns the discrepancies and their derivatives (k, 6, 6) by the exposure of a, by the exposure
+    of b (T [mm] and w [rad] each), and by the pose (as in RelativePose.updated).
     """
-    a, b = constraint.pairs.T
-    turn, shift = poses_of_pairs(parameters, constraint.pairs)
-    scale, d_scale = _scale(constraint, pose)
-    w = vector_of(turn @ pose.rotation.T)
+    a, _ = constraint.pairs.T
+    turn, shift = relative_poses(parameters, constraint.pairs)
+    scale, d_scale = _translation_scale(constraint, pose)
+    w = vector_from_matrix(turn @ pose.rotation.T)
     back = inverse_left_jacobian(w)
-    d_a, d_b, d_pose = (np.zeros((len(a), 6, 6)) for _ in range(3))
+    d_a = np.zeros((len(a), POSE_SIZE, POSE_SIZE))
+    d_b = np.zeros_like(d_a)
+    d_pose = np.zeros_like(d_a)
     d_a[:, :3, :3] = -scale * parameters.rotation[a]
     d_b[:, :3, :3] = scale * parameters.rotation[a]
     d_a[:, :3, 3:] = -scale * cross_matrix(shift)
@@ -129,66 +153,88 @@ def discrepancies_with_jacobian(constraint, pose, parameters):
     return np.concatenate([scale * (shift - pose.translation_mm), w], axis=1), d_a, d_b, d_pose
 
 
-def mean_pose(parameters, pairs, weights=None):
-    """RelativePose of pairs (k, 2) of exposures; weights (k, 6, 6) of each (pose's translation and
-    rotation).
+def mean_pose(
+    parameters: Parameters, pairs: np.ndarray, weights: np.ndarray | None = None
+) -> RelativePose:
+    """Mean relative orientation of pairs (k, 2) of exposures.
 
-    Without weights the component-wise median about the pair in the middle: a start value that no
-    single pair steers. With them the weighted mean.
+    With weights (k, 6, 6) of translation and rotation of each pair, the weighted mean. Without
+    them the component-wise median: a start value that is robust to single pairs.
     """
-    turn, shift = poses_of_pairs(parameters, pairs)
-    middle = shift - np.median(shift, axis=0)
-    start = int(np.argmin(np.sum(middle**2, axis=1)))
-    pose = RelativePose(turn[start], np.median(shift, axis=0))
-    for _ in range(10):
-        off = np.concatenate(
-            [shift - pose.translation_mm, vector_of(turn @ pose.rotation.T)], axis=1
+    turn, shift = relative_poses(parameters, pairs)
+    median = np.median(shift, axis=0)
+    start = int(np.argmin(np.sum((shift - median) ** 2, axis=1)))
+    pose = RelativePose(turn[start], median)
+    for _ in range(MEAN_ITERATIONS):
+        difference = np.concatenate(
+            [shift - pose.translation_mm, vector_from_matrix(turn @ pose.rotation.T)], axis=1
         )
         if weights is None:
-            step = np.median(off, axis=0)
+            step = np.median(difference, axis=0)
         else:
             step = np.linalg.solve(
-                weights.sum(axis=0), (weights @ off[..., None]).sum(axis=0)[:, 0]
+                weights.sum(axis=0), (weights @ difference[..., None]).sum(axis=0)[:, 0]
             )
-        pose = pose.moved(step)
-        if np.max(np.abs(step)) < 1e-12:
+        pose = pose.updated(step)
+        if np.max(np.abs(step)) < MEAN_TOLERANCE:
             break
     return pose
 
 
-def on_constraint(parameters, constraint, pose, off=None):
-    """Rotations (k, 3, 3) and positions (k, 3) [mm] of b's exposures where the pose puts them
-    beside a's, or where their discrepancies from it are off (k, 6).
+def exposures_from_pose(
+    parameters: Parameters,
+    constraint: RelativeConstraint,
+    pose: RelativePose,
+    offset: np.ndarray | None = None,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Exterior orientations of b's exposures from those of a and a relative orientation.
+
+    Parameters
+    ----------
+    parameters : Parameters
+        Exterior orientations of a's exposures.
+    constraint : RelativeConstraint
+        The pairs of exposures.
+    pose : RelativePose
+        Relative orientation of b with respect to a.
+    offset : (k, 6) ndarray, optional
+        Discrepancies from the pose that the result has; zeros by default.
+
+    Returns
+    -------
+    rotation : (k, 3, 3) ndarray
+    position_mm : (k, 3) ndarray
     """
-    off = np.zeros((len(constraint.pairs), 6)) if off is None else off
-    scale, _ = _scale(constraint, pose)
-    r_a = parameters.rotation[constraint.pairs[:, 0]]
-    shift = (r_a.transpose(0, 2, 1) @ (pose.translation_mm + off[:, :3] / scale)[..., None])[
-        ..., 0
-    ]
-    position = parameters.position_mm[constraint.pairs[:, 0]] + shift
-    return matrix_from_vector(off[:, 3:]) @ pose.rotation @ r_a, position
+    if offset is None:
+        offset = np.zeros((len(constraint.pairs), POSE_SIZE))
+    scale, _ = _translation_scale(constraint, pose)
+    a = constraint.pairs[:, 0]
+    r_a = parameters.rotation[a]
+    translation = pose.translation_mm + offset[:, :3] / scale
+    shift = (r_a.transpose(0, 2, 1) @ translation[..., None])[..., 0]
+    rotation = matrix_from_vector(offset[:, 3:]) @ pose.rotation @ r_a
+    return rotation, parameters.position_mm[a] + shift
 
 
-def moved_along(network, parameters, moved, step_e, step_g):
-    """Moved parameters with b's exposures put where the discrepancies are what the linearised
-    constraint says.
+def exposures_after_step(
+    network: Network, before: Parameters, after: Parameters, step: ByKind
+) -> Parameters:
+    """Parameters after a step, with b's exposures moved along their constraints.
 
-    To first order they are there already. The way of a step along a stiff constraint is curved,
-    and a straight one would leave it by more than its standard deviation. step_e (m, 6) and step_g
-    (G,): the step of the exposures and of the global unknowns.
+    Their discrepancies become what the linearised constraint predicts. To first order they are so
+    already, but a stiff constraint is curved, and a straight step would leave it by more than its
+    standard deviation.
     """
-    rotation = moved.rotation.copy()
-    position = moved.position_mm.copy()
-    for number, (constraint, cols) in enumerate(zip(network.relative, network.relative_columns)):
+    rotation = after.rotation.copy()
+    position = after.position_mm.copy()
+    for number, (constraint, columns) in enumerate(zip(network.relative, network.layout.relative)):
         a, b = constraint.pairs.T
-        off, d_a, d_b, d_pose = discrepancies_with_jacobian(
-            constraint, parameters.relative[number], parameters
+        offset, d_a, d_b, d_pose = discrepancies_with_jacobian(
+            constraint, before.relative[number], before
         )
-        off = (
-            off
-            + (d_a @ step_e[a][..., None] + d_b @ step_e[b][..., None])[..., 0]
-            + d_pose @ step_g[cols]
+        by_exposures = d_a @ step.exteriors[a][..., None] + d_b @ step.exteriors[b][..., None]
+        offset = offset + by_exposures[..., 0] + d_pose @ step.globals[columns]
+        rotation[b], position[b] = exposures_from_pose(
+            after, constraint, after.relative[number], offset
         )
-        rotation[b], position[b] = on_constraint(moved, constraint, moved.relative[number], off)
-    return replace(moved, rotation=rotation, position_mm=position)
+    return replace(after, rotation=rotation, position_mm=position)

@@ -178,7 +178,7 @@ class RigOrientation:
         return scale[:, None] * vectors * np.sqrt(np.maximum(values, 0))
 
 
-def held_to(orientation, points_mm):
+def with_datum_of_points(orientation, points_mm):
     """The RigOrientation with its covariance in the datum of points (n, 3) [mm]: their centre and
     attitude are what the rig frame is fixed to.
 
@@ -189,14 +189,14 @@ def held_to(orientation, points_mm):
     what errors of the orientation move the points together, as a rigid body. Nothing else changes:
     distances and angles have the variances that they had.
     """
-    s = datum_map(orientation, points_mm)
+    s = datum_transformation(orientation, points_mm)
     covariance = s @ orientation.covariance @ s.T
     return replace(orientation, covariance=(covariance + covariance.T) / 2)
 
 
-def datum_map(orientation, points_mm):
+def datum_transformation(orientation, points_mm):
     """Matrix S (9F, 9F) that takes errors of an orientation into the datum of points (n, 3) [mm],
-    see held_to.
+    see with_datum_of_points.
     """
     points = np.asarray(points_mm, dtype=float)
     count = len(orientation.fluoroscopes)

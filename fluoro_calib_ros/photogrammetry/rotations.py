@@ -86,3 +86,11 @@ def rotation_angle(rotation):
     )
     cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1) - 1)
     return np.arctan2(sine, cosine)
+
+
+def vector_from_matrix(rotation):
+    """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) with angles below pi."""
+    q = quaternion_from_matrix(rotation)
+    sine = np.linalg.norm(q[..., 1:], axis=-1, keepdims=True)
+    angle = 2 * np.arctan2(sine, q[..., :1])
+    return q[..., 1:] * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-300), 2.0)

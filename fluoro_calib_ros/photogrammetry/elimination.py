@@ -1,0 +1,456 @@
+"""Solution of the normal equations: object points or exposures are eliminated first.
+
+Schur complement: Triggs, McLauchlan, Hartley and Fitzgibbon, "Bundle Adjustment - A Modern
+Synthesis", 2000, section 6. Eliminating the object points leaves a system of exposures, and
+eliminating the exposures one of object points, each bordered by the global unknowns. Exposures that
+a relative orientation couples are eliminated together. Everything that depends on this choice is
+behind the interface `Elimination`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.linalg import blas, cho_factor, cho_solve
+
+from .datum import Gauge, stabilising_factor
+from .network import Network
+from .normal_equations import NormalEquations
+from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ByKind, ReducedLayout
+
+
+@dataclass(frozen=True)
+class BorderedSystem:
+    """Normal equations [B C; C^T D] (x_b, x_r) = (b, r) with a block-diagonal part B.
+
+    Attributes
+    ----------
+    blocks : (k, s, s) ndarray
+        B: blocks of the unknowns that are eliminated.
+    border : (k, s, q) ndarray
+        C: their mixed blocks with the remaining unknowns.
+    rest : (q, q) ndarray
+        D: normal matrix of the remaining unknowns.
+    block_right : (k, s) ndarray
+    rest_right : (q,) ndarray
+        Right sides b and r.
+    """
+
+    blocks: np.ndarray
+    border: np.ndarray
+    rest: np.ndarray
+    block_right: np.ndarray
+    rest_right: np.ndarray
+
+    def damped(self, mu: float) -> BorderedSystem:
+        """A copy with the diagonal multiplied by 1 + mu."""
+        blocks = self.blocks + mu * self.blocks * np.eye(self.blocks.shape[1])
+        rest = self.rest.copy()
+        rest.ravel()[:: len(rest) + 1] *= 1 + mu
+        return replace(self, blocks=blocks, rest=rest)
+
+    def predicted_decrease(self, x_blocks: np.ndarray, x_rest: np.ndarray, mu: float) -> float:
+        """Decrease of the cost that a step damped by mu makes in the linearised problem."""
+        undamped = np.sum(x_blocks * self.block_right) + np.sum(x_rest * self.rest_right)
+        damping = mu * (
+            np.einsum('ki,kii,ki', x_blocks, self.blocks, x_blocks)
+            + np.sum(x_rest * x_rest * np.diag(self.rest))
+        )
+        return float((undamped + damping) / 2)
+
+    def singular_schur_complement(self) -> np.ndarray:
+        """Schur complement (q, q) of the rest by pseudo-inverses: the blocks may be singular."""
+        inverse = np.linalg.pinv(self.blocks, hermitian=True)
+        size = len(self.rest)
+        flat = self.border.reshape(-1, size)
+        return self.rest - flat.T @ (inverse @ self.border).reshape(-1, size)
+
+    def factorize(self) -> BorderedFactor:
+        """Cholesky factors of the system; the rest is overwritten.
+
+        Raises numpy.linalg.LinAlgError where the matrix is not positive definite, and ValueError
+        where it is not finite.
+        """
+        inverse = np.linalg.inv(np.linalg.cholesky(self.blocks))
+        half = (inverse @ self.border).reshape(-1, self.border.shape[2])
+        # BLAS stores by columns, where `half` is its own transpose: no copy is made, and dsyrk
+        # takes half the operations of a full product.
+        schur = blas.dsyrk(-1.0, half.T, beta=1.0, c=self.rest.T, trans=0, lower=1, overwrite_c=1)
+        return BorderedFactor(inverse, half, cho_factor(schur, lower=True, overwrite_a=True)[0])
+
+
+@dataclass(frozen=True)
+class BorderedFactor:
+    """Cholesky factors of a BorderedSystem.
+
+    Attributes
+    ----------
+    inverse : (k, s, s) ndarray
+        Inverse Cholesky factors L^-1 of the blocks.
+    half_border : (k s, q) ndarray
+        H = L^-1 C.
+    schur : (q, q) ndarray
+        Lower Cholesky factor of the Schur complement D - H^T H; its upper triangle is undefined.
+    """
+
+    inverse: np.ndarray
+    half_border: np.ndarray
+    schur: np.ndarray
+
+    def solve(
+        self, block_right: np.ndarray, rest_right: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Solutions x_b (k, s, d) and x_r (q, d) for right sides (k, s, d) and (q, d)."""
+        columns = block_right.shape[2]
+        half = (self.inverse @ block_right).reshape(-1, columns)
+        x_rest = cho_solve((self.schur, True), rest_right - self.half_border.T @ half)
+        remaining = (half - self.half_border @ x_rest).reshape(block_right.shape)
+        return self.inverse.transpose(0, 2, 1) @ remaining, x_rest
+
+    def covariance(self) -> BorderedCovariance:
+        """Blocks of the inverse of the matrix."""
+        k, size = self.inverse.shape[:2]
+        q = len(self.schur)
+        rest = cho_solve((self.schur, True), np.eye(q))
+        transposed = self.inverse.transpose(0, 2, 1)
+        gain = transposed @ self.half_border.reshape(k, size, q)
+        border = -(gain.reshape(-1, q) @ rest).reshape(k, size, q)
+        conditional = transposed @ self.inverse
+        blocks = conditional - border @ gain.transpose(0, 2, 1)
+        return BorderedCovariance(blocks, border, rest, conditional, gain)
+
+
+@dataclass(frozen=True)
+class BorderedCovariance:
+    """Blocks of the inverse of a bordered matrix.
+
+    Attributes
+    ----------
+    blocks : (k, s, s) ndarray
+    border : (k, s, q) ndarray
+    rest : (q, q) ndarray
+        The inverse; of the part between two different blocks, see `conditional` and `gain`.
+    conditional : (k, s, s) ndarray
+        B^-1: covariances of the blocks with the rest held.
+    gain : (k, s, q) ndarray
+        B^-1 C. The inverse between blocks i and j is (i = j) B^-1 - border[i] gain[j]^T.
+    """
+
+    blocks: np.ndarray
+    border: np.ndarray
+    rest: np.ndarray
+    conditional: np.ndarray
+    gain: np.ndarray
+
+
+@dataclass(frozen=True)
+class CovarianceBlocks:
+    """Blocks of the inverse normal matrix; zeros where a global unknown is held.
+
+    Attributes
+    ----------
+    ee : (m, 6, 6) ndarray
+    pp : (n, 3, 3) ndarray
+    gg : (G, G) ndarray
+    eg : (m, 6, G) ndarray
+    pg : (n, 3, G) ndarray
+        Exposures e, object points p and global unknowns g.
+    pe : callable
+        pe(e, p): blocks (k, 3, 6) of object points p (k,) with exposures e (k,).
+    between : callable
+        between(e, f): blocks (k, 6, 6) of exposures e (k,) with exposures f (k,).
+    """
+
+    ee: np.ndarray
+    pp: np.ndarray
+    gg: np.ndarray
+    eg: np.ndarray
+    pg: np.ndarray
+    pe: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    between: Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+class Elimination(ABC):
+    """How the unknowns of a network are ordered for the solution of its normal equations.
+
+    `layout` is the order of the unknowns that remain after the elimination.
+    """
+
+    layout: ReducedLayout
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+
+    @abstractmethod
+    def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
+        """Normal equations in the order of this elimination.
+
+        Held global unknowns are left out. The open directions of a free network are fixed in the
+        part that remains.
+        """
+
+    @abstractmethod
+    def by_kind(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> ByKind:
+        """Values (k, s, ...) of the eliminated and (q, ...) of the remaining unknowns, by kind."""
+
+    @abstractmethod
+    def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Right sides (k, s, d) and (q, d) with values (n, 3, d) of the points, else zeros."""
+
+    @abstractmethod
+    def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
+        """Covariances by kind of unknown."""
+
+    def _globals_of(self, x_rest: np.ndarray) -> np.ndarray:
+        return self.network.layout.expand_globals(x_rest[self.layout.globals])
+
+    def _rest_matrix(
+        self, own: np.ndarray, own_globals: np.ndarray, equations: NormalEquations
+    ) -> np.ndarray:
+        """Matrix (q, q) of the remaining blocks (c, s, s), their mixed ones (c, s, G), and gg."""
+        rows = self.layout.block_rows
+        blocks = self.layout.blocks
+        border = self.layout.globals
+        free = self.network.layout.free
+        out = np.zeros((self.layout.size, self.layout.size))
+        out[rows[:, :, None], rows[:, None, :]] = own
+        out[blocks, border] = own_globals.reshape(rows.size, -1)[:, free]
+        out[border, blocks] = out[blocks, border].T
+        out[border, border] = equations.gg[np.ix_(free, free)]
+        return out
+
+    def _fix_gauge(self, rest: np.ndarray, directions: np.ndarray) -> None:
+        """Fix the open directions (c, s, 7) of the remaining blocks in their matrix."""
+        blocks = self.layout.blocks
+        directions = directions.reshape(blocks.stop, -1)
+        factor = stabilising_factor(directions, np.diagonal(rest)[blocks])
+        rest[blocks, blocks] += factor @ factor.T
+
+    def _split_rest(
+        self, covariance: BorderedCovariance
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Covariances of the rest: its blocks (c, s, s), gg (G, G) and mixed ones (c, s, G)."""
+        rest = covariance.rest
+        rows = self.layout.block_rows
+        free = self.network.layout.free
+        size = self.network.layout.n_globals
+        gg = np.zeros((size, size))
+        gg[np.ix_(free, free)] = rest[self.layout.globals, self.layout.globals]
+        mixed = np.zeros((*rows.shape, size))
+        mixed[:, :, free] = rest[self.layout.blocks, self.layout.globals].reshape(*rows.shape, -1)
+        return rest[rows[:, :, None], rows[:, None, :]], gg, mixed
+
+    def _split_border(self, border: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Covariances (k, t, q) of other unknowns with the rest, split.
+
+        Returns those with its blocks (k, t, c, s) and with all global unknowns (k, t, G).
+        """
+        shape = border.shape[:2]
+        with_globals = np.zeros((*shape, self.network.layout.n_globals))
+        with_globals[:, :, self.network.layout.free] = border[:, :, self.layout.globals]
+        with_blocks = border[:, :, self.layout.blocks]
+        return with_blocks.reshape(*shape, *self.layout.block_rows.shape), with_globals
+
+
+class EliminatePoints(Elimination):
+    """Object points are eliminated; exposures and global unknowns remain."""
+
+    def __init__(self, network: Network) -> None:
+        super().__init__(network)
+        self.layout = network.layout.without_points
+
+    def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
+        """See Elimination."""
+        network = self.network
+        m = network.n_exposures
+        n = network.n_points
+        free = network.layout.free
+        border = np.zeros((n, POINT_SIZE, self.layout.size))
+        by_exposure = border[:, :, self.layout.blocks].reshape(n, POINT_SIZE, m, EXTERIOR_SIZE)
+        by_exposure[network.point, :, network.exposure, :] = equations.pe
+        border[:, :, self.layout.globals] = equations.pg[:, :, free]
+        rest = self._rest_matrix(equations.ee, equations.eg, equations)
+        rows = self.layout.block_rows
+        a, b = equations.coupled_pairs.T
+        rest[rows[a][:, :, None], rows[b][:, None, :]] = equations.coupled
+        rest[rows[b][:, :, None], rows[a][:, None, :]] = equations.coupled.transpose(0, 2, 1)
+        if equations.gauge is not None:
+            self._fix_gauge(rest, equations.gauge.exteriors)
+        rest_right = np.concatenate([equations.e.ravel(), equations.g[free]])
+        return BorderedSystem(equations.pp, border, rest, equations.p, rest_right)
+
+    def by_kind(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> ByKind:
+        """See Elimination."""
+        exteriors = x_rest[self.layout.blocks].reshape(-1, EXTERIOR_SIZE, *x_rest.shape[1:])
+        return ByKind(exteriors, x_blocks, self._globals_of(x_rest))
+
+    def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See Elimination."""
+        return values, np.zeros((self.layout.size, values.shape[2]))
+
+    def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
+        """See Elimination."""
+        rows = self.layout.block_rows
+        ee, gg, eg = self._split_rest(covariance)
+        pairs, pg = self._split_border(covariance.border)
+        return CovarianceBlocks(
+            ee,
+            covariance.blocks,
+            gg,
+            eg,
+            pg,
+            lambda e, p: pairs[p, :, e, :],
+            lambda e, f: covariance.rest[rows[e][:, :, None], rows[f][:, None, :]],
+        )
+
+
+class EliminateExposures(Elimination):
+    """Exposures are eliminated; object points and global unknowns remain.
+
+    Exposures coupled by a constraint share a cell: that of the exposure of their first
+    fluoroscope. The normal matrix of the exposures is block-diagonal by cells. `cell` and `place`
+    (m,) locate each exposure; every cell has `n_places`.
+    """
+
+    def __init__(self, network: Network) -> None:
+        super().__init__(network)
+        self.layout = network.layout.without_exposures
+        head = np.arange(network.n_exposures)
+        place = np.zeros(network.n_exposures, dtype=int)
+        for number, constraint in enumerate(network.relative):
+            a, b = constraint.pairs.T
+            head[b] = a
+            place[b] = number + 1
+        self.cell = np.unique(head, return_inverse=True)[1]
+        self.place = place
+        self.n_cells = int(self.cell.max()) + 1
+        self.n_places = len(network.relative) + 1
+
+    def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
+        """See Elimination."""
+        rest = self._rest_matrix(equations.pp, equations.pg, equations)
+        if equations.gauge is not None:
+            self._fix_gauge(rest, equations.gauge.points)
+        width = EXTERIOR_SIZE * self.n_places
+        right = np.zeros((self.n_cells, self.n_places, EXTERIOR_SIZE))
+        right[self.cell, self.place] = equations.e
+        free = self.network.layout.free
+        return BorderedSystem(
+            self._cell_blocks(equations),
+            self._cell_border(equations),
+            rest,
+            right.reshape(self.n_cells, width),
+            np.concatenate([equations.p.ravel(), equations.g[free]]),
+        )
+
+    def _cell_blocks(self, equations: NormalEquations) -> np.ndarray:
+        """Blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""
+        cell = self.cell
+        place = self.place
+        shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
+        blocks = np.zeros((*shape, *shape[1:]))
+        diagonal = np.einsum('kiaia->kia', blocks)  # a view
+        diagonal[...] = 1
+        blocks[cell, place, :, place, :] = equations.ee
+        a, b = equations.coupled_pairs.T
+        blocks[cell[a], place[a], :, place[b], :] = equations.coupled
+        blocks[cell[a], place[b], :, place[a], :] = equations.coupled.transpose(0, 2, 1)
+        width = EXTERIOR_SIZE * self.n_places
+        return blocks.reshape(self.n_cells, width, width)
+
+    def _cell_border(self, equations: NormalEquations) -> np.ndarray:
+        """Mixed blocks (k, s, q) of the cells with object points and global unknowns."""
+        network = self.network
+        shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
+        border = np.zeros((*shape, self.layout.size))
+        by_point = border[..., self.layout.blocks].reshape(*shape, network.n_points, POINT_SIZE)
+        cell = self.cell[network.exposure]
+        place = self.place[network.exposure]
+        by_point[cell, place, :, network.point, :] = equations.pe.transpose(0, 2, 1)
+        free = network.layout.free
+        border[self.cell, self.place, :, self.layout.globals] = equations.eg[:, :, free]
+        return border.reshape(self.n_cells, EXTERIOR_SIZE * self.n_places, -1)
+
+    def by_kind(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> ByKind:
+        """See Elimination."""
+        points = x_rest[self.layout.blocks].reshape(-1, POINT_SIZE, *x_rest.shape[1:])
+        return ByKind(self._of_exposures(x_blocks), points, self._globals_of(x_rest))
+
+    def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """See Elimination."""
+        columns = values.shape[2]
+        rest = np.zeros((self.layout.size, columns))
+        rest[self.layout.blocks] = values.reshape(-1, columns)
+        return np.zeros((self.n_cells, EXTERIOR_SIZE * self.n_places, columns)), rest
+
+    def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
+        """See Elimination."""
+        pp, gg, pg = self._split_rest(covariance)
+        border = self._of_exposures(covariance.border)
+        pairs, eg = self._split_border(border)
+        cell = self.cell
+        place = self.place
+        shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
+        blocks = covariance.blocks.reshape(*shape, *shape[1:])
+        conditional = covariance.conditional.reshape(*shape, *shape[1:])
+        gain = covariance.gain.reshape(*shape, self.layout.size)
+
+        def between(e: np.ndarray, f: np.ndarray) -> np.ndarray:
+            same_cell = (cell[e] == cell[f])[:, None, None]
+            held = np.where(same_cell, conditional[cell[e], place[e], :, place[f], :], 0.0)
+            return held - border[e] @ gain[cell[f], place[f]].transpose(0, 2, 1)
+
+        return CovarianceBlocks(
+            blocks[cell, place, :, place, :],
+            pp,
+            gg,
+            eg,
+            pg,
+            lambda e, p: pairs[e, :, p, :].transpose(0, 2, 1),
+            between,
+        )
+
+    def _of_exposures(self, values: np.ndarray) -> np.ndarray:
+        """Values (m, 6, ...) of the exposures from those (k, s, ...) of their cells."""
+        shape = (self.n_cells, self.n_places, EXTERIOR_SIZE, *values.shape[2:])
+        return values.reshape(shape)[self.cell, self.place]
+
+
+def choose_elimination(network: Network) -> type[Elimination]:
+    """The elimination that leaves the smaller system."""
+    layout = network.layout
+    if layout.without_points.blocks.stop < layout.without_exposures.blocks.stop:
+        return EliminatePoints
+    return EliminateExposures
+
+
+@dataclass(frozen=True)
+class FactorizedNormalMatrix:
+    """A normal matrix after elimination and Cholesky factorization.
+
+    gauge: the directions that the network leaves open, None where there are none.
+    """
+
+    elimination: Elimination
+    factor: BorderedFactor
+    gauge: Gauge | None = None
+
+    @property
+    def network(self) -> Network:
+        """The network that the matrix belongs to."""
+        return self.elimination.network
+
+
+def factorize(
+    network: Network, equations: NormalEquations, elimination: type[Elimination] | None = None
+) -> FactorizedNormalMatrix:
+    """Factorize normal equations; by default the elimination that leaves the smaller system.
+
+    Raises numpy.linalg.LinAlgError where the matrix is singular.
+    """
+    strategy = (elimination or choose_elimination(network))(network)
+    factor = strategy.bordered_system(equations).factorize()
+    return FactorizedNormalMatrix(strategy, factor, equations.gauge)

@@ -1,0 +1,246 @@
+"""The unknowns of a bundle adjustment: their layout, their values and a step of the values.
+
+Unknowns that belong to one exposure or to one object point form small blocks. All others are
+global, as they touch many image points: interior orientations, relative orientations, additional
+parameters, in this order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .datum import DATUM_DEFECT
+from .relative_orientation import POSE_SIZE, RelativePose, exposures_after_step
+from .rotations import matrix_from_vector
+
+if TYPE_CHECKING:
+    from .network import Network
+
+EXTERIOR_SIZE = 6  # source T [mm], rotation vector w [rad]
+POINT_SIZE = 3
+INTERIOR_SIZE = 3  # xp, yp, c [px]
+
+
+@dataclass(frozen=True)
+class ReducedLayout:
+    """Order of the unknowns after an elimination: blocks of one kind, then the free globals.
+
+    Attributes
+    ----------
+    n_blocks, block_size : int
+        Number and size of the blocks: exposures or object points.
+    n_globals : int
+        Number of free global unknowns.
+    """
+
+    n_blocks: int
+    block_size: int
+    n_globals: int
+
+    @property
+    def blocks(self) -> slice:
+        """Rows of all blocks."""
+        return slice(0, self.n_blocks * self.block_size)
+
+    @property
+    def globals(self) -> slice:
+        """Rows of the free global unknowns."""
+        return slice(self.blocks.stop, self.size)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns."""
+        return self.blocks.stop + self.n_globals
+
+    @property
+    def block_rows(self) -> np.ndarray:
+        """Rows (n_blocks, block_size) of each block."""
+        return np.arange(self.blocks.stop).reshape(self.n_blocks, self.block_size)
+
+
+@dataclass(frozen=True)
+class UnknownLayout:
+    """Where the unknowns of a network stand.
+
+    Attributes
+    ----------
+    n_exposures, n_points : int
+        Numbers of the block unknowns.
+    interiors : tuple of slice
+        Columns of the interior orientation of each fluoroscope among the global unknowns.
+    relative : tuple of slice
+        Columns of each constrained relative orientation among the global unknowns.
+    additional : tuple of slice
+        Columns of the additional parameters of each fluoroscope among the global unknowns, empty
+        where there are none.
+    free : (G,) ndarray of bool
+        Which global unknowns are estimated.
+    datum_defect : int
+        Number of unknowns that the datum of a free network fixes.
+    """
+
+    n_exposures: int
+    n_points: int
+    interiors: tuple[slice, ...]
+    relative: tuple[slice, ...]
+    additional: tuple[slice, ...]
+    free: np.ndarray
+    datum_defect: int
+
+    @classmethod
+    def of(cls, network: Network) -> UnknownLayout:
+        """Layout of the unknowns of a network."""
+        sizes = [INTERIOR_SIZE] * network.n_fluoroscopes
+        sizes += [POSE_SIZE] * len(network.relative)
+        sizes += [0 if a is None else a.count for a in network.additional]
+        stops = np.cumsum(sizes, dtype=int)
+        columns = [slice(int(stop - size), int(stop)) for stop, size in zip(stops, sizes)]
+        first_additional = network.n_fluoroscopes + len(network.relative)
+        free = np.ones(sum(sizes), dtype=bool)
+        interior_free = np.asarray(network.interior_free, dtype=bool)
+        free[: INTERIOR_SIZE * network.n_fluoroscopes] = np.repeat(interior_free, INTERIOR_SIZE)
+        return cls(
+            network.n_exposures,
+            network.n_points,
+            tuple(columns[: network.n_fluoroscopes]),
+            tuple(columns[network.n_fluoroscopes : first_additional]),
+            tuple(columns[first_additional:]),
+            free,
+            DATUM_DEFECT if network.datum == 'inner' else 0,
+        )
+
+    @property
+    def n_globals(self) -> int:
+        """Number G of global unknowns, free or held."""
+        return len(self.free)
+
+    @cached_property
+    def n_free_globals(self) -> int:
+        """Number of estimated global unknowns."""
+        return int(self.free.sum())
+
+    @property
+    def n_unknowns(self) -> int:
+        """Number of scalar unknowns, less those that the datum of a free network fixes."""
+        blocks = EXTERIOR_SIZE * self.n_exposures + POINT_SIZE * self.n_points
+        return blocks + self.n_free_globals - self.datum_defect
+
+    @property
+    def all_interiors(self) -> slice:
+        """Columns of all interior orientations among the global unknowns."""
+        return slice(0, INTERIOR_SIZE * len(self.interiors))
+
+    @property
+    def all_orientations(self) -> slice:
+        """Columns of all interior and relative orientations among the global unknowns."""
+        return slice(0, self.all_interiors.stop + POSE_SIZE * len(self.relative))
+
+    @property
+    def all_additional(self) -> slice:
+        """Columns of the additional parameters of all fluoroscopes among the global unknowns."""
+        return slice(self.all_orientations.stop, self.n_globals)
+
+    @cached_property
+    def without_points(self) -> ReducedLayout:
+        """Order of the unknowns after the elimination of the object points."""
+        return ReducedLayout(self.n_exposures, EXTERIOR_SIZE, self.n_free_globals)
+
+    @cached_property
+    def without_exposures(self) -> ReducedLayout:
+        """Order of the unknowns after the elimination of the exposures."""
+        return ReducedLayout(self.n_points, POINT_SIZE, self.n_free_globals)
+
+    def expand_globals(self, free_values: np.ndarray) -> np.ndarray:
+        """Values (G, ...) of all global unknowns, zeros where held, from those of the free ones."""
+        out = np.zeros((self.n_globals, *free_values.shape[1:]))
+        out[self.free] = free_values
+        return out
+
+
+@dataclass(frozen=True)
+class ByKind:
+    """One value, or one row of values, per scalar unknown, sorted by kind.
+
+    Attributes
+    ----------
+    exteriors : (m, 6, ...) ndarray
+        Of T [mm] and w [rad] of the exposures.
+    points : (n, 3, ...) ndarray
+        Of the object points [mm].
+    globals : (G, ...) ndarray
+        Of the global unknowns; zeros where held.
+    """
+
+    exteriors: np.ndarray
+    points: np.ndarray
+    globals: np.ndarray
+
+
+@dataclass(frozen=True)
+class Parameters:
+    """Values of the unknowns of a network.
+
+    Attributes
+    ----------
+    interior : (F, 3) ndarray
+        xp, yp, c of the fluoroscopes [px].
+    rotation : (m, 3, 3) ndarray
+        Rotations phantom -> sensor of the exposures.
+    position_mm : (m, 3) ndarray
+        Positions of the source.
+    points_mm : (n, 3) ndarray
+        Object points.
+    additional : tuple of (p,) ndarray or None
+        Coefficients of the additional parameters of each fluoroscope.
+    relative : tuple of RelativePose
+        Relative orientation of each constraint of the network.
+    """
+
+    interior: np.ndarray
+    rotation: np.ndarray
+    position_mm: np.ndarray
+    points_mm: np.ndarray
+    additional: tuple[np.ndarray | None, ...] = ()
+    relative: tuple[RelativePose, ...] = ()
+
+    def per_image_point(
+        self, network: Network
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Rotation, position, object point and interior orientation of every image point."""
+        exposure = network.exposure
+        return (
+            self.rotation[exposure],
+            self.position_mm[exposure],
+            self.points_mm[network.point],
+            self.interior[network.fluoroscope[exposure]],
+        )
+
+    def updated(self, network: Network, step: ByKind) -> Parameters:
+        """Parameters after a step; rotations are varied on the left, R -> exp([w]x) R.
+
+        The second exposures of constrained pairs follow their constraint (see
+        relative_orientation.exposures_after_step).
+        """
+        layout = network.layout
+        interior_step = step.globals[layout.all_interiors].reshape(-1, INTERIOR_SIZE)
+        additional = tuple(
+            a if a is None or network.additional[f] is None else a + step.globals[columns]
+            for f, (a, columns) in enumerate(zip(self.additional, layout.additional))
+        )
+        relative = tuple(
+            pose.updated(step.globals[columns])
+            for pose, columns in zip(self.relative, layout.relative)
+        )
+        moved = Parameters(
+            self.interior + interior_step,
+            matrix_from_vector(step.exteriors[:, 3:]) @ self.rotation,
+            self.position_mm + step.exteriors[:, :3],
+            self.points_mm + step.points,
+            additional,
+            relative,
+        )
+        return exposures_after_step(network, self, moved, step)

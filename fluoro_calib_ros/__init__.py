@@ -1,1 +1,64 @@
-"""Self-calibration of X-ray fluoroscopes and live correction of their image coordinates in ROS 2."""
+"""Self-calibration of X-ray fluoroscopes and live correction of their image coordinates in ROS 2.
+
+The public interface is that of `fluoro_calib_ros.api`; it needs no ROS:
+
+>>> import fluoro_calib_ros as fc
+>>> phantom = fc.read_phantom('bags/phantom.csv')
+>>> frames = fc.read_source('bags/calibration', collect='auto').frames
+>>> outcome = fc.calibrate(frames, phantom)
+>>> fc.save_outcome('result', outcome)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .api import *  # noqa: F403
+
+__all__ = [
+    'CalibrationOptions',
+    'CalibrationOutcome',
+    'CalibrationRequest',
+    'CalibrationResult',
+    'CorrectedPoints',
+    'DataError',
+    'FluoroscopeCalibration',
+    'Frame',
+    'OrientationOutcome',
+    'Phantom',
+    'ReconstructionOptions',
+    'ReconstructionOutcome',
+    'Recording',
+    'RigOrientation',
+    'SimulationOptions',
+    'Validation',
+    'adjust',
+    'calibrate',
+    'correct',
+    'load_orientation',
+    'orient',
+    'read_calibrations',
+    'read_phantom',
+    'read_request',
+    'read_source',
+    'reconstruct',
+    'save_orientation',
+    'save_outcome',
+    'save_result',
+    'simulate',
+    'validate',
+    'write_reconstruction',
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the public interface when it is first used: a node needs only a part of it."""
+    if name in __all__:
+        return getattr(import_module('.api', __name__), name)
+    raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

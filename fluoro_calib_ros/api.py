@@ -1,0 +1,129 @@
+"""The public Python interface; `import fluoro_calib_ros as fc` offers the same names.
+
+Nothing here needs ROS. Frames are passed as {fluoroscope: [Frame, ...]}, calibrations as
+{fluoroscope: FluoroscopeCalibration}.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .calibration.calibrate import CalibrationResult
+from .calibration.options import CalibrationOptions
+from .calibration.request import CalibrationRequest
+from .calibration.result import CorrectedPoints, FluoroscopeCalibration
+from .errors import DataError
+from .exposures.frame import Frame
+from .exposures.phantom import Phantom
+from .files.calibration_sources import read_sources as read_request
+from .files.phantom import read_phantom
+from .files.reconstructed_points import write_reconstruction
+from .files.rig_orientation import load_orientation, save_orientation
+from .jobs import calibration as _calibration
+from .jobs.adjustment import adjust
+from .jobs.calibration import CalibrationOutcome, Progress
+from .jobs.orientation import OrientationOutcome, orient
+from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
+from .jobs.result_folder import save_outcome, save_result
+from .jobs.simulation import SimulationOptions, simulate
+from .jobs.sources import Recording, read_calibrations, read_source
+from .photogrammetry.rig_orientation import RigOrientation
+from .validation.verdict import Validation, validate
+
+__all__ = [
+    'CalibrationOptions',
+    'CalibrationOutcome',
+    'CalibrationRequest',
+    'CalibrationResult',
+    'CorrectedPoints',
+    'DataError',
+    'FluoroscopeCalibration',
+    'Frame',
+    'OrientationOutcome',
+    'Phantom',
+    'ReconstructionOptions',
+    'ReconstructionOutcome',
+    'Recording',
+    'RigOrientation',
+    'SimulationOptions',
+    'Validation',
+    'adjust',
+    'calibrate',
+    'correct',
+    'load_orientation',
+    'orient',
+    'read_calibrations',
+    'read_phantom',
+    'read_request',
+    'read_source',
+    'reconstruct',
+    'save_orientation',
+    'save_outcome',
+    'save_result',
+    'simulate',
+    'validate',
+    'write_reconstruction',
+]
+
+
+def calibrate(
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    options: CalibrationOptions | None = None,
+    *,
+    joint: bool = False,
+    principal_distance: float | None = None,
+    validated: bool = False,
+    progress: Progress | None = None,
+) -> CalibrationOutcome:
+    """Self-calibrate fluoroscopes, and orient the rig.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        Exposures of the phantom by fluoroscope.
+    phantom : Phantom
+        Its survey.
+    options : CalibrationOptions, optional
+    joint : bool
+        Whether all fluoroscopes are adjusted together; else one after the other.
+    principal_distance : float, optional
+        Start value, or with interior 'fixed' the held value [px].
+    validated : bool
+        Whether the calibration is validated with its own exposures, which takes some six times as
+        long.
+    progress : callable, optional
+        Called with the names of the fluoroscopes and the Round after every round.
+
+    Returns
+    -------
+    CalibrationOutcome
+        `save_outcome` writes it into a result folder.
+
+    Raises
+    ------
+    DataError
+        For observations that do not suffice: one sentence with place and cause.
+    ValueError
+        For options that contradict each other.
+    """
+    request = CalibrationRequest(
+        frames, phantom, options or CalibrationOptions(), joint, principal_distance
+    )
+    return _calibration.run(request, validate=validated, progress=progress)
+
+
+def correct(
+    calibration: FluoroscopeCalibration, uv: ArrayLike, sigma: ArrayLike | None = None
+) -> CorrectedPoints:
+    """Remove the distortion from observed image points.
+
+    uv (n, 2) are observed pixels, sigma (n,) their standard deviations [px], by default that of
+    the calibration.
+    """
+    return calibration.correct(
+        np.asarray(uv, dtype=float), None if sigma is None else np.asarray(sigma, dtype=float)
+    )

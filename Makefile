@@ -14,7 +14,7 @@ help:
 	@echo 'make bench   run the benchmarks'
 	@echo 'make online  the nodes at lab rates beside relays that do nothing, points in space, images (10 minutes)'
 	@echo 'make endurance   an hour of the stream, faster than real time: counts and memory (15 minutes)'
-	@echo 'make validation  the experiment of the paper, and more, against the truth: docs/validation.md (10 minutes)'
+	@echo 'make validation  the experiment of the paper, and more, against the truth: docs/accuracy.md (10 minutes)'
 	@echo 'make precision   errors of 200 simulated calibrations over what is claimed: docs/precision.md (5 minutes)'
 	@echo 'make convergence 200 random rigs with bad start values: docs/convergence.md (15 minutes)'
 	@echo 'make bags    write the bags in bags/ anew'

@@ -150,7 +150,7 @@ class Plan:
 
 
 def full_plan():
-    """The experiment of docs/validation.md."""
+    """The experiment of docs/accuracy.md."""
     return Plan(
         available_models(),
         CalibrationOptions().model,

@@ -1,4 +1,4 @@
-"""Text of docs/validation.md: what was done, the figures, and what falls short, computed from
+"""Text of docs/accuracy.md: what was done, the figures, and what falls short, computed from
 them.
 """
 
@@ -379,7 +379,7 @@ def _named(case):
 
 
 def document_text(plan, outcomes, paths, document):
-    """The whole text of docs/validation.md."""
+    """The whole text of docs/accuracy.md."""
     comparisons = [Comparison(plan, outcomes, setting) for setting in plan.settings]
     models = ''.join(
         f'| `{m}` | {ABOUT.get(m, "a model of this package")} |\n'

@@ -1,6 +1,6 @@
 """The experiment of Chow et al. on the virtual rig, and what goes beyond it: `make validation`.
 
-Writes docs/validation.md and its pictures. What is done is in experiment_plan, what is written in
+Writes docs/accuracy.md and its pictures. What is done is in experiment_plan, what is written in
 experiment_text.
 """
 
@@ -35,8 +35,8 @@ def main(arguments=None):
     parser.add_argument(
         '--out',
         type=Path,
-        default=Path('docs/validation.md'),
-        help='file to write, pictures go into images/ beside it (default: docs/validation.md)',
+        default=Path('docs/accuracy.md'),
+        help='file to write, pictures go into images/ beside it (default: docs/accuracy.md)',
     )
     options = parser.parse_args(arguments)
     outcomes = make(quick_plan() if options.quick else full_plan(), options.out)

@@ -3,7 +3,7 @@ given size found.
 
 Every case draws virtual rigs with one fluoroscope, calibrates it and validates the calibration.
 The rows are kept in a file, so that a run that was stopped goes on where it ended. Prints the
-tables of docs/validate.md.
+tables of docs/verdict.md.
 """
 
 import argparse

@@ -48,7 +48,7 @@ SMALL = {'exposures': 30, 'every': 5, 'rounds': 3}
 @pytest.fixture(scope='module')
 def experiment(tmp_path_factory):
     """Plan, outcomes and document of the small experiment."""
-    document = tmp_path_factory.mktemp('docs') / 'validation.md'
+    document = tmp_path_factory.mktemp('docs') / 'accuracy.md'
     plan = quick_plan()
     return plan, validation.make(plan, document), document
 
@@ -159,7 +159,7 @@ def test_failed_case_is_told(experiment, tmp_path):
                 broken[case] = Outcome(failed='DataError: no such luck')
     comparisons = [Comparison(plan, broken, s) for s in plan.settings]
     assert any('no such luck' in sentence for sentence in shortcomings(plan, broken, comparisons))
-    text = document_text(plan, broken, {}, tmp_path / 'validation.md')
+    text = document_text(plan, broken, {}, tmp_path / 'accuracy.md')
     assert 'failed on every rig' in text and text.count('no such luck') >= 3
 
 

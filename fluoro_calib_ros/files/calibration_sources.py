@@ -1,5 +1,5 @@
 """What a validation needs beside the calibration, and its result: observations.csv, phantom.csv,
-options.json and validation.json in the folder of a calibration (docs/validate.md).
+options.json and validation.json in the folder of a calibration (docs/verdict.md).
 """
 
 import dataclasses

@@ -1,7 +1,7 @@
 """A verdict on a calibration from the exposures it was made of: pass, fail, or cannot tell.
 
 Seven checks, each a number with a limit. How the limits were found, how often they are exceeded
-without cause and what size of fault they find is in docs/validate.md. `validate` recalibrates
+without cause and what size of fault they find is in docs/verdict.md. `validate` recalibrates
 parts of the exposures: two halves and FOLDS folds, so it takes some six times as long as the
 calibration.
 """
@@ -32,7 +32,7 @@ MAX_ROUNDS = 25
 GOOD_EXPOSURES = 15  # with fewer, more of them are the first advice
 MIN_BEADS = 10  # for distances
 NAMED = 5  # beads named at most
-# Limits of what has no null distribution of its own, from simulated rigs: docs/validate.md,
+# Limits of what has no null distribution of its own, from simulated rigs: docs/verdict.md,
 # benchmarks/verdict.py.
 HALVES_LIMIT = 1.9
 HELD_OUT_MARGIN = (

@@ -2,7 +2,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test bench online endurance validation precision convergence bags clean
+.PHONY: help setup demo test lint docs bench online endurance validation precision convergence bags clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
@@ -10,6 +10,8 @@ RUN := .venv/bin/python
 help:
 	@echo 'make demo    calibrate the recorded rig in bags/, with real ROS 2 nodes (sets up first)'
 	@echo 'make test    run all tests (sets up first)'
+	@echo 'make lint    ruff, mypy and the import contracts (the tests run them too)'
+	@echo 'make docs    the documentation with the API reference, into docs/_build/html'
 	@echo 'make setup   make or refresh .venv: packages, ROS 2, messages; nothing is done twice'
 	@echo 'make bench   run the benchmarks'
 	@echo 'make online  the nodes at lab rates beside relays that do nothing, points in space, images (10 minutes)'
@@ -31,6 +33,16 @@ demo: setup
 
 test: setup
 	@$(RUN) -m pytest tests $(ARGS)
+
+lint: setup
+	@.venv/bin/ruff check .
+	@.venv/bin/ruff format --check .
+	@.venv/bin/mypy
+	@.venv/bin/lint-imports
+
+docs: setup
+	@$(RUN) -m sphinx -W --keep-going -q -b html docs docs/_build/html
+	@echo 'docs/_build/html/index.html'
 
 bench: setup
 	@$(RUN) -m benchmarks $(ARGS)
@@ -56,5 +68,5 @@ bags: setup
 	@.venv/bin/fluoro-calib simulate --out bags $(ARGS)
 
 clean:
-	rm -rf .venv .build demo_result .pytest_cache *.egg-info
+	rm -rf .venv .build demo_result .pytest_cache .mypy_cache .ruff_cache docs/_build *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,0 +1,68 @@
+"""The examples run, and the public interface is what they import."""
+
+import pathlib
+import subprocess
+import sys
+
+import pytest
+
+import fluoro_calib_ros as fc
+from fluoro_calib_ros import api
+
+ROOT = pathlib.Path(__file__).resolve().parent.parent
+EXAMPLES = ROOT / 'examples'
+
+
+def example(name, *arguments):
+    """Run an example as a user would; returns what it prints."""
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / name, *map(str, arguments)],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=280,
+    )
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_public_names_are_those_of_the_api():
+    assert sorted(fc.__all__) == sorted(api.__all__)
+    for name in fc.__all__:
+        assert getattr(fc, name) is getattr(api, name)
+    with pytest.raises(AttributeError, match='no attribute'):
+        fc.no_such_name  # noqa: B018
+
+
+def test_public_interface_needs_no_ros():
+    code = (
+        'import sys; import fluoro_calib_ros.api; '
+        'print([m for m in sys.modules if m.split(".")[0] in ("rclpy", "fluoro_calib_msgs")])'
+    )
+    done = subprocess.run([sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True)
+    assert done.stdout.strip() == '[]', done.stderr
+
+
+def test_every_example_is_listed_and_tested():
+    scripts = {path.name for path in EXAMPLES.glob('*.py')}
+    readme = (EXAMPLES / 'README.md').read_text()
+    assert scripts == {name for name in scripts if f'`{name}`' in readme}
+    tests = pathlib.Path(__file__).read_text()
+    assert all(f"example('{name}'" in tests for name in scripts)
+
+
+@pytest.mark.long
+def test_calibrate_a_bag_then_reconstruct(tmp_path):
+    said = example('calibrate_bag.py', tmp_path / 'result')
+    assert 'verdict: pass' in said
+    assert (tmp_path / 'result' / 'validation.json').is_file()
+    said = example('points_in_space.py', tmp_path / 'result')
+    assert '360 exposures' in said
+    assert 'target 1001: ' in said
+
+
+@pytest.mark.long
+def test_out_of_sample_test_of_a_calibration(tmp_path):
+    said = example('test_a_calibration.py', tmp_path / 'rig').splitlines()
+    beads, survey = (float(line.split()[-2]) for line in said)
+    assert beads < 0.6 * survey

@@ -604,7 +604,7 @@ WRONG = [
     (dict(u=np.full(30, np.nan)), 'is not a number'),
     (dict(u=np.full(30, 5000.0)), 'is off the image'),
     (dict(sigma=np.zeros(30)), 'is not a positive number'),
-    (dict(target_id=np.full(30, 7, dtype=np.uint32)), 'target 7 is there 30 times'),
+    (dict(target_id=np.full(30, 7, dtype=np.uint32)), 'target 7 occurs 30 times'),
     (dict(image_width=0), 'the image size is 0 x 960 px'),
     (
         dict(target_id=np.zeros(0, np.uint32), u=np.zeros(0), v=np.zeros(0), sigma=np.zeros(0)),

@@ -137,7 +137,7 @@ def test_the_phantom_is_taken_where_it_stands_still_in_a_new_pose():
     # already.
     assert taken == [1, 45], said
     assert [e['a'].number for e in collector.exposures] == taken
-    assert said[10] == 'the phantom stands in a pose that is collected already'
+    assert said[10] == 'this pose of the phantom is already collected'
     assert said[30] == 'the phantom moves' and said[-1] == said[10]
 
 
@@ -156,10 +156,7 @@ def test_single_shots_count_each_in_a_new_pose():
     """
     collector = ExposureCollector('ab', StillOptions(still_time_s=0.1, new_px=10))
     assert collector.offer(pair(1, 0, 0)) == ''
-    assert (
-        collector.offer(pair(2, 500, 9.9))
-        == 'the phantom stands in a pose that is collected already'
-    )
+    assert collector.offer(pair(2, 500, 9.9)) == 'this pose of the phantom is already collected'
     assert collector.offer(pair(3, 1000, 10.1)) == ''
 
 

@@ -1,1 +1,1 @@
-"""Frames of image points and the phantom: validation, pairing and collecting."""
+"""Frames of image points and the phantom: validation, pairing and collection of exposures."""

@@ -1,115 +1,160 @@
-"""Collecting exposures from streams of frames: pairing, and waiting for the phantom to stand
+"""Collect exposures from streams of frames: pair the frames, and wait until the phantom stands
 still.
 """
 
+from __future__ import annotations
+
 from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..errors import DataError
+from ..options import option
 from .coverage import Coverage
+from .frame import Frame
 from .pairing import FramePairer
 
-COMMON_TARGETS = 8  # fewer targets in common, and two frames cannot be compared
+MIN_COMMON_TARGETS = 8  # with fewer targets in common two frames cannot be compared
+MAX_RECENT = 1000  # pairs that are remembered
+MAX_GAP = 10  # a gap in a stream is at most this many times the still time
+
+Pair = Mapping[str, Frame]
 
 
-def displacement(a, b):
-    """Median displacement [px] of the targets that two frames of a fluoroscope have in common;
-    infinite where they have too few in common.
+def displacement(one: Frame, other: Frame) -> float:
+    """Return the median displacement [px] of the targets that two frames have in common.
+
+    Infinite for fewer than MIN_COMMON_TARGETS common targets.
     """
-    _, in_a, in_b = np.intersect1d(
-        a.target_id, b.target_id, assume_unique=True, return_indices=True
+    _, in_one, in_other = np.intersect1d(
+        one.target_id, other.target_id, assume_unique=True, return_indices=True
     )
-    if len(in_a) < COMMON_TARGETS:
+    if len(in_one) < MIN_COMMON_TARGETS:
         return np.inf
-    return float(np.median(np.linalg.norm(a.uv[in_a] - b.uv[in_b], axis=1)))
+    return float(np.median(np.linalg.norm(one.uv[in_one] - other.uv[in_other], axis=1)))
 
 
 @dataclass(frozen=True)
 class StillOptions:
     """When the phantom counts as standing still in a new pose.
 
-    still_time_s: no frame of that time before may show it displaced by more than still_px, and
-    those there are have to go back half of it; new_px: median displacement from every collected
-    exposure. Frames further apart than still_time_s are single shots, each of which counts; but
-    not after a gap in a stream, up to ten times as long.
+    Frames further apart than still_time_s are single shots, each of which counts; but not after a
+    gap in a stream, up to ten times as long.
     """
 
-    still_time_s: float = 0.1
-    still_px: float = 1.0
-    new_px: float = 10.0
+    still_time_s: float = option(
+        0.1,
+        'time for which the phantom has to stand still; frames have to cover half of it',
+        minimum=0.0,
+        maximum=60.0,
+        unit='s',
+    )
+    still_px: float = option(
+        1.0,
+        'median displacement of the targets that counts as still',
+        minimum=0.0,
+        maximum=100.0,
+        unit='px',
+    )
+    new_px: float = option(
+        10.0,
+        'median displacement of the targets from every collected exposure that makes a new pose',
+        minimum=0.0,
+        maximum=1000.0,
+        unit='px',
+    )
 
 
 class ExposureCollector:
     """Exposures collected from paired frames.
 
-    exposures: list of {fluoroscope: Frame}; offer() takes a pair where the phantom stands still in
-    a new pose, take() takes it as it is. coverage: by fluoroscope, grows with the exposures.
+    Attributes
+    ----------
+    fluoroscopes : tuple of str
+    still : StillOptions
+    exposures : list of dict of str to Frame
+        The collected pairs.
+    coverage : dict of str to Coverage
+        Coverage of the image by fluoroscope; it grows with the exposures.
     """
 
-    def __init__(self, fluoroscopes, still=StillOptions()):
+    def __init__(self, fluoroscopes: Iterable[str], still: StillOptions | None = None) -> None:
         self.fluoroscopes = tuple(fluoroscopes)
-        self.still = still
-        self.exposures = []
-        self.coverage = {}
-        self._recent = deque(maxlen=1000)
+        self.still = still or StillOptions()
+        self.exposures: list[Pair] = []
+        self.coverage: dict[str, Coverage] = {}
+        self._recent: deque[Pair] = deque(maxlen=MAX_RECENT)
         self._streaming = False
 
-    def offer(self, pair):
-        """Take the pair if the phantom stands still in a new pose; returns '' if taken, else why
-        not.
+    def offer(self, pair: Pair) -> str:
+        """Collect a pair if the phantom stands still in a new pose.
+
+        Returns '' if the pair was collected, else the reason why not.
         """
         first = self.fluoroscopes[0]
         now = pair[first].stamp_ns
         still_ns = self.still.still_time_s * 1e9
         window = [p for p in self._recent if 0 <= now - p[first].stamp_ns <= still_ns]
-        moved = max(
-            (displacement(pair[n], p[n]) for p in window for n in self.fluoroscopes), default=0.0
-        )
+        moved = max((self._displacement(pair, p) for p in window), default=0.0)
         span = max((now - p[first].stamp_ns for p in window), default=0)
-        self._notice_stream(now, bool(window), still_ns)
+        self._update_streaming(now, bool(window), still_ns)
         self._recent.append(pair)
         if moved > self.still.still_px:
             return 'the phantom moves'
         if self._streaming and span < still_ns / 2:
-            return 'too few frames tell whether the phantom stands still'
+            return 'too few frames to tell whether the phantom stands still'
         for known in self.exposures:
-            if max(displacement(pair[n], known[n]) for n in self.fluoroscopes) < self.still.new_px:
-                return 'the phantom stands in a pose that is collected already'
+            if self._displacement(pair, known) < self.still.new_px:
+                return 'this pose of the phantom is already collected'
         return self.take(pair)
 
-    def _notice_stream(self, now, follows, still_ns):
-        """Note whether frames come as a stream: since one has followed another, until a long gap."""
+    def _displacement(self, one: Pair, other: Pair) -> float:
+        """Return the largest displacement [px] that a fluoroscope sees between two pairs."""
+        return max(displacement(one[name], other[name]) for name in self.fluoroscopes)
+
+    def _update_streaming(self, now: int, follows: bool, still_ns: float) -> None:
+        """Update whether frames arrive as a stream.
+
+        They do from the first frame that follows another one, until a long gap.
+        """
         before = self._recent[-1][self.fluoroscopes[0]].stamp_ns if self._recent else None
         if follows:
             self._streaming = True
-        elif before is None or not 0 <= now - before <= 10 * still_ns:
+        elif before is None or not 0 <= now - before <= MAX_GAP * still_ns:
             self._streaming = False
 
-    def take(self, pair):
-        """Take the pair as an exposure; returns '' if taken, else why not."""
-        numbers = {pair[n].number for n in self.fluoroscopes}
+    def take(self, pair: Pair) -> str:
+        """Collect a pair as it is, unless one of its frame numbers is already collected.
+
+        Returns '' if the pair was collected, else the reason why not.
+        """
+        numbers = {pair[name].number for name in self.fluoroscopes}
         for known in self.exposures:
-            if any(known[n].number == pair[n].number for n in self.fluoroscopes):
+            if any(known[name].number == pair[name].number for name in self.fluoroscopes):
                 return f'frame {min(numbers)} is collected already'
         self.exposures.append(pair)
         for name in self.fluoroscopes:
-            self.coverage.setdefault(name, Coverage(pair[name].image_size)).add(pair[name].uv)
+            frame = pair[name]
+            self.coverage.setdefault(name, Coverage(frame.image_size)).add(frame.uv)
         return ''
 
-    def reset(self):
-        """Forget the exposures."""
+    def reset(self) -> None:
+        """Discard all exposures."""
         self.exposures = []
         self.coverage = {}
         self._recent.clear()
         self._streaming = False
 
-    def frames(self, fluoroscopes=None):
-        """{fluoroscope: [Frame, ...]} of the exposures. Raises DataError for an unknown
-        fluoroscope.
+    def frames(self, fluoroscopes: Iterable[str] | None = None) -> dict[str, list[Frame]]:
+        """Return the collected frames by fluoroscope.
+
+        fluoroscopes are the names of those to return, by default all. Raises DataError for an
+        unknown name.
         """
-        for name in fluoroscopes or ():
+        wanted = tuple(fluoroscopes or ())
+        for name in wanted:
             if name not in self.fluoroscopes:
                 raise DataError(
                     f'fluoroscope {name} is unknown, there are {", ".join(self.fluoroscopes)}'
@@ -117,32 +162,53 @@ class ExposureCollector:
         return {
             name: [pair[name] for pair in self.exposures]
             for name in self.fluoroscopes
-            if not fluoroscopes or name in fluoroscopes
+            if not wanted or name in wanted
         }
 
 
-def collect_recorded(frames, mode='auto', pair_by='frame_number', still=StillOptions()):
-    """Exposures of a recording, as the calibration node would collect them: ({fluoroscope:
-    [Frame]}, unpaired).
+def collect_recorded(
+    frames: Mapping[str, Sequence[Frame]],
+    mode: str = 'auto',
+    pair_by: str = 'frame_number',
+    still: StillOptions | None = None,
+) -> tuple[dict[str, list[Frame]], dict[str, int]]:
+    """Collect the exposures of a recording, as the calibration node would.
 
-    frames {fluoroscope: [Frame, ...]}; mode 'all': every paired frame; 'still': as the node does
-    by itself; 'auto': 'still' for a stream, 'all' for single shots.
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        All frames by fluoroscope.
+    mode : {'auto', 'all', 'still'}
+        'all' collects every pair, 'still' those in which the phantom stands still in a new pose;
+        'auto' is 'still' for a stream and 'all' for single shots.
+    pair_by : {'frame_number', 'stamp'}
+    still : StillOptions, optional
+
+    Returns
+    -------
+    frames : dict of str to list of Frame
+        Collected frames by fluoroscope.
+    unpaired : dict of str to int
+        Number of frames without partner by fluoroscope.
     """
+    still = still or StillOptions()
     pairer = FramePairer(frames, pair_by, waiting=10**9)
     collector = ExposureCollector(frames, still)
     if mode == 'auto':
         mode = 'still' if any(_is_stream(f, still) for f in frames.values()) else 'all'
-    everything = sorted(
-        (f for of_one in frames.values() for f in of_one), key=lambda f: (f.stamp_ns, f.number)
-    )
-    for frame in everything:
+    collect = collector.offer if mode == 'still' else collector.take
+    recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
+    for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):
         pair = pairer.add(frame)
         if pair is not None:
-            (collector.offer if mode == 'still' else collector.take)(pair)
+            collect(pair)
     pairer.flush()
     return collector.frames(), dict(pairer.unpaired)
 
 
-def _is_stream(frames, still):
-    gaps = np.diff(sorted(f.stamp_ns for f in frames)) if len(frames) > 1 else np.array([0])
-    return 0 < np.median(gaps) <= still.still_time_s * 1e9
+def _is_stream(frames: Sequence[Frame], still: StillOptions) -> bool:
+    """Return whether frames follow each other within the still time."""
+    if len(frames) < 2:
+        return False
+    gaps = np.diff(sorted(f.stamp_ns for f in frames))
+    return bool(0 < np.median(gaps) <= still.still_time_s * 1e9)

@@ -1,29 +1,32 @@
-"""How much of the image the collected image points cover."""
+"""Coverage of the image by the collected image points."""
+
+from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import binary_dilation
 
-CELLS = (
-    32  # across the image: at 1024 px a cell is 32 px, about the spacing of 15 exposures' points
-)
+# Across the image: at 1024 px a cell is 32 px, about the spacing of the points of 15 exposures.
+CELLS = 32
 
 
 class Coverage:
-    """Part of the image area within reach of an image point: its cell of a 32 x 32 grid and the
-    eight around it.
+    """Fraction of the image that is close to an image point.
+
+    A point covers its cell in a grid of 32 x 32 and the eight cells around it.
     """
 
-    def __init__(self, image_size):
+    def __init__(self, image_size: tuple[int, int]) -> None:
         self._size = np.asarray(image_size, dtype=float)
-        self._hit = np.zeros((CELLS, CELLS), dtype=bool)
+        self._occupied = np.zeros((CELLS, CELLS), dtype=bool)
 
-    def add(self, uv):
-        """Count image points (n, 2) [px]."""
+    def add(self, uv: ArrayLike) -> None:
+        """Add image points (n, 2) [px]."""
         cell = np.floor((np.asarray(uv) + 0.5) / self._size * CELLS).astype(int)
         cell = np.clip(cell, 0, CELLS - 1)
-        self._hit[cell[:, 1], cell[:, 0]] = True
+        self._occupied[cell[:, 1], cell[:, 0]] = True
 
     @property
-    def fraction(self):
-        """Covered part of the image area, 0 to 1."""
-        return float(np.mean(binary_dilation(self._hit, np.ones((3, 3), dtype=bool))))
+    def fraction(self) -> float:
+        """Covered fraction of the image, 0 to 1."""
+        return float(np.mean(binary_dilation(self._occupied, np.ones((3, 3), dtype=bool))))

@@ -1,94 +1,222 @@
-"""Frames of image points and their validation."""
+"""Frames of image points, and the rules that every frame must meet.
 
+All inputs apply the same rules: the CSV and bag readers, the nodes and the calculations. The
+functions `..._error` state one rule each. They return '' where it is met, else the sentence that
+says what is wrong, so that a caller puts its own place in front: a row of a file, a message of a
+bag, a frame of a stream.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sized
 from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
+
+if TYPE_CHECKING:
+    from .phantom import Phantom
 
 
 @dataclass(frozen=True)
 class Frame:
     """Image points of identified targets in one exposure of one fluoroscope.
 
-    target_id (n,); uv (n, 2) observed column and row [px]; sigma (n,) standard deviation [px] or
-    None; image_size (width, height) [px]; stamp_ns time of the exposure [ns].
+    Attributes
+    ----------
+    fluoroscope : str
+    number : int
+        Frame number; frames of one exposure have the same.
+    target_id : (n,) ndarray of int
+    uv : (n, 2) ndarray
+        Observed column and row [px].
+    image_size : (int, int)
+        Width and height [px].
+    sigma : (n,) ndarray or None
+        Standard deviation of a coordinate [px], None where it is unknown.
+    stamp_ns : int
+        Time of the exposure [ns].
+    frame_id : str
+        Name of the optical frame.
     """
 
     fluoroscope: str
     number: int
     target_id: np.ndarray
     uv: np.ndarray
-    image_size: tuple
+    image_size: tuple[int, int]
     sigma: np.ndarray | None = None
     stamp_ns: int = 0
     frame_id: str = field(default='', compare=False)
 
-    def sorted(self):
-        """The same frame with its targets in ascending order: results do not depend on the input's
-        order.
+    def sorted(self) -> Frame:
+        """Return the frame with its targets in ascending order.
+
+        Results must not depend on the order of the input.
         """
         order = np.argsort(self.target_id, kind='stable')
+        width, height = self.image_size
         return Frame(
             self.fluoroscope,
             int(self.number),
             np.asarray(self.target_id, dtype=np.int64)[order],
             np.asarray(self.uv, dtype=float)[order],
-            tuple(int(s) for s in self.image_size),
+            (int(width), int(height)),
             None if self.sigma is None else np.asarray(self.sigma, dtype=float)[order],
             int(self.stamp_ns),
             self.frame_id,
         )
 
 
-def validate_frame(frame, phantom=None, image_size=None):
-    """Check a frame for everything that would spoil a calculation.
+def validate_frame(
+    frame: Frame, phantom: Phantom | None = None, image_size: tuple[int, int] | None = None
+) -> None:
+    """Validate a frame before it is used in a calculation.
 
-    Raises DataError in one sentence: lengths that differ, an empty frame, NaN or infinite numbers,
-    a point off the image, a duplicate id, with phantom an id it does not have, with image_size
-    another size.
+    Parameters
+    ----------
+    frame : Frame
+    phantom : Phantom, optional
+        The frame may only contain its targets.
+    image_size : (int, int), optional
+        Image size of the calibration [px], which the frame must have.
+
+    Raises
+    ------
+    DataError
+        For an empty frame, arrays of different lengths, values that are not finite, a sigma that
+        is not positive, a point off the image, a repeated or unknown target, or another image
+        size. The message names the fluoroscope, the frame and the first wrong target.
     """
-    where = f'fluoroscope {frame.fluoroscope}, frame {frame.number}'
+    error = _frame_error(frame, phantom, image_size)
+    if error:
+        raise DataError(f'fluoroscope {frame.fluoroscope}, frame {frame.number}: {error}')
+
+
+def _frame_error(frame: Frame, phantom: Phantom | None, image_size: tuple[int, int] | None) -> str:
+    """Return the first rule that a frame breaks, '' for a valid frame."""
     ids = np.asarray(frame.target_id)
     uv = np.asarray(frame.uv)
     width, height = frame.image_size
     if width <= 0 or height <= 0:
-        raise DataError(f'{where}: the image size is {width} x {height} px')
-    if image_size is not None and (width, height) != tuple(image_size):
-        raise DataError(
-            f'{where}: the image is {width} x {height} px, '
-            f'but the calibration is for {image_size[0]} x {image_size[1]} px'
-        )
+        return f'the image size is {width} x {height} px'
+    if image_size is not None:
+        error = image_size_error(frame.image_size, image_size)
+        if error:
+            return error
     if len(ids) == 0:
-        raise DataError(f'{where}: the frame is empty, it has no targets')
+        return 'the frame is empty, it has no targets'
     if uv.shape != (len(ids), 2):
-        raise DataError(f'{where}: {len(ids)} target ids, but image points of shape {uv.shape}')
+        return f'{len(ids)} target ids, but image points of shape {uv.shape}'
     if frame.sigma is not None and len(frame.sigma) != len(ids):
-        raise DataError(f'{where}: {len(ids)} target ids, but {len(frame.sigma)} values of sigma')
-    bad = ~np.isfinite(uv).all(axis=1)
-    if bad.any():
-        raise DataError(f'{where}: the image point of target {ids[bad][0]} is not a number')
-    if frame.sigma is not None:
-        bad = ~(np.isfinite(frame.sigma) & (np.asarray(frame.sigma) > 0))
-        if bad.any():
-            raise DataError(f'{where}: sigma of target {ids[bad][0]} is not a positive number')
-    bad = ~points_on_image(uv, frame.image_size)
-    if bad.any():
-        raise DataError(f'{where}: target {ids[bad][0]} is off the image of {width} x {height} px')
-    values, counts = np.unique(ids, return_counts=True)
-    if (counts > 1).any():
-        raise DataError(
-            f'{where}: target {values[counts > 1][0]} is there {counts[counts > 1][0]} times'
-        )
-    if phantom is not None:
-        unknown = phantom.index(ids) < 0
-        if unknown.any():
-            raise DataError(f'{where}: target {ids[unknown][0]} is not on the phantom')
+        return length_error(ids, sigma=frame.sigma)
+    return (
+        _finite_error(ids, uv)
+        or ('' if frame.sigma is None else sigma_error(ids, frame.sigma))
+        or _image_error(ids, uv, frame.image_size)
+        or repeated_target_error(ids)
+        or ('' if phantom is None else _phantom_error(ids, phantom))
+    )
 
 
-def points_on_image(uv, image_size):
-    """True (n,) where a pixel (n, 2) is a point of the image; pixel centres are at integers, NaN
-    is off.
+def points_on_image(uv: ArrayLike, image_size: tuple[int, int]) -> NDArray[np.bool_]:
+    """Return (n,) whether pixels (n, 2) lie on the image.
+
+    Pixel centres are at integers; NaN is off the image.
     """
     uv = np.asarray(uv)
     return ((uv >= -0.5) & (uv <= np.asarray(image_size) - 0.5)).all(axis=1)
+
+
+def is_positive(sigma: ArrayLike) -> NDArray[np.bool_]:
+    """Return (n,) whether values are finite and above 0, as a standard deviation must be."""
+    sigma = np.asarray(sigma)
+    return np.isfinite(sigma) & (sigma > 0)
+
+
+def first_repeated(target_id: ArrayLike) -> tuple[int, int] | None:
+    """Return the first two positions of the smallest id that occurs more than once, else None."""
+    ids = np.asarray(target_id)
+    order = np.argsort(ids, kind='stable')
+    ordered = ids[order]
+    repeated = np.flatnonzero(ordered[1:] == ordered[:-1])
+    if not len(repeated):
+        return None
+    return int(order[repeated[0]]), int(order[repeated[0] + 1])
+
+
+def length_error(target_id: Sized, **arrays: Sized) -> str:
+    """Return the error of the first array, by name, that is not as long as target_id."""
+    for name, values in arrays.items():
+        if len(values) != len(target_id):
+            return f'{len(target_id)} target ids, but {len(values)} values of {name}'
+    return ''
+
+
+def image_size_error(image_size: tuple[int, int], expected: tuple[int, int]) -> str:
+    """Return the error of an image size (width, height) that is not that of the calibration."""
+    if tuple(image_size) == tuple(expected):
+        return ''
+    return (
+        f'the image is {image_size[0]} x {image_size[1]} px, '
+        f'but the calibration is for {expected[0]} x {expected[1]} px'
+    )
+
+
+def sigma_error(target_id: ArrayLike, sigma: ArrayLike) -> str:
+    """Return the error of the first target whose sigma is not a positive number."""
+    valid = is_positive(sigma)
+    if valid.all():
+        return ''
+    return f'sigma of target {np.asarray(target_id)[valid.argmin()]} is not a positive number'
+
+
+def repeated_target_error(target_id: ArrayLike) -> str:
+    """Return the error of the smallest id that occurs more than once."""
+    repeated = first_repeated(target_id)
+    if repeated is None:
+        return ''
+    ids = np.asarray(target_id)
+    target = ids[repeated[0]]
+    return f'target {target} occurs {np.count_nonzero(ids == target)} times'
+
+
+def stack_image_points(
+    target_id: ArrayLike, u: ArrayLike, v: ArrayLike, sigma: ArrayLike
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64] | None]:
+    """Return ids (n,), uv (n, 2) and sigma (n,) of a Frame from the flat arrays of a message.
+
+    An empty sigma is unknown, None. Raises DataError for arrays of different lengths.
+    """
+    ids = np.array(target_id)
+    columns = {'u': np.array(u), 'v': np.array(v)}
+    deviations = np.array(sigma)
+    if len(deviations):
+        error = length_error(ids, **columns, sigma=deviations)
+    else:
+        error = length_error(ids, **columns)
+    if error:
+        raise DataError(error)
+    uv = np.column_stack([columns['u'], columns['v']]).astype(float)
+    return ids.astype(np.int64), uv, deviations.astype(float) if len(deviations) else None
+
+
+def _finite_error(ids: np.ndarray, uv: np.ndarray) -> str:
+    finite = np.isfinite(uv).all(axis=1)
+    return '' if finite.all() else f'the image point of target {ids[~finite][0]} is not a number'
+
+
+def _image_error(ids: np.ndarray, uv: np.ndarray, image_size: tuple[int, int]) -> str:
+    inside = points_on_image(uv, image_size)
+    if inside.all():
+        return ''
+    width, height = image_size
+    return f'target {ids[~inside][0]} is off the image of {width} x {height} px'
+
+
+def _phantom_error(ids: np.ndarray, phantom: Phantom) -> str:
+    known = phantom.index(ids) >= 0
+    return '' if known.all() else f'target {ids[~known][0]} is not on the phantom'

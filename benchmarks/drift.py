@@ -24,7 +24,10 @@ from fluoro_calib_ros.calibration.rig_orientation import (
 )
 from fluoro_calib_ros.distortion.grid import OUTSIDE
 from fluoro_calib_ros.drift.clusters import Cluster
-from fluoro_calib_ros.drift.watch import ERROR, OK, WARN, DriftOptions, DriftWatch
+from fluoro_calib_ros.drift.observations import EpipolarObservations, PointObservations
+from fluoro_calib_ros.drift.options import DriftOptions
+from fluoro_calib_ros.drift.state import ERROR, OK, WARN
+from fluoro_calib_ros.drift.watch import DriftWatch
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
 from fluoro_calib_ros.reconstruction.intersection import Intersector
@@ -74,14 +77,13 @@ class Scene:
             Cluster(f'bone {i + 1}', IDS[BEADS * i : BEADS * (i + 1)]) for i in range(CLUSTERS)
         )
 
-    def watch(self, options=DriftOptions(), clusters=True):
+    def watch(self, options=None, clusters=True):
         """A DriftWatch of the scene."""
-        o = self.orientation
         return DriftWatch(
             dict.fromkeys(self.names, (SIZE, SIZE)),
             options,
             self.clusters if clusters else (),
-            (o.interior, o.rotation, o.position_mm),
+            self.orientation,
         )
 
 
@@ -193,10 +195,7 @@ def feed(scene_, watch, block, clusters=True):
     found = scene_.geometry.residuals(corrected[a], corrected[b], systematic[a], systematic[b])
     sd_noise = np.hypot(found.factor_a * noise[0], found.factor_b * noise[1])
     good = np.abs(found.residual) <= REJECT * np.hypot(sd_noise, found.sd_total)
-    state = watch.add(
-        stamps[0],
-        a,
-        b,
+    residuals = EpipolarObservations(
         np.tile(IDS, FRAMES),
         seen[a],
         seen[b],
@@ -208,6 +207,7 @@ def feed(scene_, watch, block, clusters=True):
         found.factor_a,
         found.factor_b,
     )
+    state = watch.add_residuals(stamps[0], a, b, residuals)
     if clusters:
         uv = np.stack([corrected[a], corrected[b]])
         uv[:, ~good] = np.nan
@@ -218,14 +218,14 @@ def feed(scene_, watch, block, clusters=True):
         sd = np.stack([systematic[a], systematic[b]])
         for k, stamp in enumerate(stamps):
             rows = slice(k * len(IDS), (k + 1) * len(IDS))
-            state = watch.add_points(
-                stamp,
+            bead_points = PointObservations(
                 IDS,
                 points.xyz_mm[rows],
                 points.covariance_noise[rows],
                 where[:, rows],
                 sd[:, rows],
             )
+            state = watch.add_points(stamp, bead_points)
     return state
 
 
@@ -249,7 +249,7 @@ def step_of(fluoroscope, quarter, size, direction, begin, ramp_s=0.0):
     return drift
 
 
-def false_alarms(seed, hours=0.5, source='exposures', options=DriftOptions(), clusters=True):
+def false_alarms(seed, hours=0.5, source='exposures', options=None, clusters=True):
     """Alarms of a stream without drift: dict of hours, the number of WARNs and ERRORs that began,
     the largest evidence over the threshold of WARN, and the sentences of the alarms.
     """
@@ -544,16 +544,18 @@ def measure(rigs=3, alarm_rigs=10, hours=0.5, processes=1, chosen=None):
     return {'alarms': [r for t, r in zip(tasks, results) if t[0] == 'alarms'], 'cases': cases}
 
 
-def report(figures, options=DriftOptions()):
+def report(figures):
     """The figures of `measure` as text."""
+    options = DriftOptions()
     alarms = figures['alarms']
     hours = sum(a['hours'] for a in alarms)
     lines = []
     if alarms:
         lines += [
             f'{hours:g} h of stream without drift on {len(alarms)} rigs, 120 Hz, 30 markers: '
-            f'{sum(a["error"] for a in alarms)} false ERRORs (stated: {hours / options.error_interval_h:.2g} at '
-            f'most on average), {sum(a["warn"] for a in alarms)} false WARNs (stated: '
+            f'{sum(a["error"] for a in alarms)} false ERRORs (stated: '
+            f'{hours / options.error_interval_h:.2g} at most on average), '
+            f'{sum(a["warn"] for a in alarms)} false WARNs (stated: '
             f'{hours / options.warn_interval_h:.2g}); largest evidence '
             f'{max(a["largest"] for a in alarms):.2f} of the threshold of WARN.'
         ]

@@ -10,7 +10,7 @@ import pytest
 from rigs import calibrated
 from scipy.optimize import least_squares
 
-from fluoro_calib_ros.drift.rig_watch import clusters_of
+from fluoro_calib_ros.drift.clusters import parse_clusters
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
@@ -580,18 +580,18 @@ def test_wrong_recordings_are_refused_in_a_sentence():
         (['1001 1002'], "does not declare a cluster, as 'tibia: 1001 1002 1003' does"),
         (['tibia:'], 'does not declare a cluster'),
         (['tibia: 1 x'], 'does not declare a cluster'),
-        (['tibia: 1'], 'cluster tibia: it is two beads or more'),
+        (['tibia: 1'], 'cluster tibia: needs two beads or more'),
         (['tibia: 1 2', 'tibia: 3 4'], 'two clusters have the same name'),
         (['tibia: 1 2', 'femur: 2 3'], 'target 2 is in two clusters'),
     ],
 )
 def test_declared_clusters_that_are_none(texts, sentence):
     with pytest.raises(ValueError, match=sentence):
-        clusters_of(texts)
+        parse_clusters(texts)
 
 
 def test_declared_clusters():
-    assert [(c.name, c.target_id) for c in clusters_of(['tibia: 1 2,3', 'my femur :4 5'])] == [
+    assert [(c.name, c.target_id) for c in parse_clusters(['tibia: 1 2,3', 'my femur :4 5'])] == [
         ('tibia', (1, 2, 3)),
         ('my femur', (4, 5)),
     ]

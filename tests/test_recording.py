@@ -10,8 +10,11 @@ import pytest
 from rigs import calibrated, run
 
 from fluoro_calib_ros.distortion.models import no_correction
-from fluoro_calib_ros.drift.rig_watch import RecordingWatch, RigWatch, clusters_of
-from fluoro_calib_ros.drift.watch import ERROR, DriftOptions
+from fluoro_calib_ros.drift.clusters import parse_clusters
+from fluoro_calib_ros.drift.options import DriftOptions
+from fluoro_calib_ros.drift.recording_watch import RecordingDriftWatch
+from fluoro_calib_ros.drift.rig_watch import RigDriftWatch
+from fluoro_calib_ros.drift.state import ERROR
 from fluoro_calib_ros.files.calibration import save_calibration
 from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.rig_orientation import save_orientation
@@ -93,13 +96,13 @@ def shifted(frames, name, begin_s, end_s=np.inf, size_px=1.0):
 
 
 def watched(frames, names, clusters=(), options=DriftOptions()):
-    """RecordingWatch after a recording."""
+    """RecordingDriftWatch after a recording."""
     calibrations, orientation = known(names)
-    watch = RecordingWatch(
+    watch = RecordingDriftWatch(
         orientation,
         {n: c.image_size for n, c in calibrations.items()},
         options,
-        clusters_of(clusters),
+        parse_clusters(clusters),
     )
     reconstruct_recording(frames, calibrations, Intersector(orientation), watch=watch)
     return watch
@@ -231,7 +234,7 @@ def test_what_lies_beyond_the_calibrated_area_is_no_drift(outside):
     elsewhere.
     """
     calibrations, orientation = known('ab')
-    watch = RecordingWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
+    watch = RecordingDriftWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
     frames = shifted(tracking(20, 120, 'ab').frames, 'a', 12.0)
     for exposure in zip(*(frames[name] for name in 'ab')):
         views = [
@@ -252,10 +255,10 @@ def test_what_lies_beyond_the_calibrated_area_is_no_drift(outside):
 
 @pytest.mark.long
 def test_the_state_is_that_of_a_watch_fed_frame_by_frame():
-    """A RecordingWatch does what the RigWatch of the node does."""
+    """A RecordingDriftWatch does what the RigDriftWatch of the node does."""
     calibrations, orientation = known('ab')
     frames = shifted(tracking(30.0, 30.0, 'ab').frames, 'b', 16.0)
-    live = RigWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
+    live = RigDriftWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
     reconstruct_recording(frames, calibrations, Intersector(orientation), watch=live)
     assert live.state == watched(frames, 'ab').state and live.state.level == ERROR
 
@@ -290,7 +293,7 @@ def test_what_cannot_be_told_is_not_called_ok():
     frames = tracking(30.0, 30.0, 'ab').frames
     short = watched({name: of_one[:320] for name, of_one in frames.items()}, 'ab').verdict()
     assert short.level == 'learning' and short.message == (
-        'the recording is too short to tell a drift: it has 10.6 s, of which the first 10 s are learned'
+        'the recording is too short to detect a drift: it has 10.6 s, of which the first 10 s are learned'
     )
     apart = {**frames, 'b': [replace(f, target_id=f.target_id + 100) for f in frames['b']]}
     few = {
@@ -300,7 +303,7 @@ def test_what_cannot_be_told_is_not_called_ok():
     for found in (watched(apart, 'ab').verdict(), watched(few, 'ab').verdict()):
         assert (
             found.level == 'unknown'
-            and found.message == 'there are too few markers in two views to tell a drift'
+            and found.message == 'there are too few markers in two views to detect a drift'
         )
     assert watched({'a': [], 'b': []}, 'ab').verdict().level == 'learning'
 
@@ -407,7 +410,7 @@ def test_reconstruct_tells_of_a_drift_and_of_missing_views(folder, capsys):
 def test_reconstruct_says_where_no_drift_can_be_told(folder, capsys):
     short = document(capsys, *command(folder, 'short'))['drift']
     assert short['level'] == 'learning' and short['size_px'] is None and short['found_s'] is None
-    assert 'too short to tell a drift: it has 1.3 s' in short['message']
+    assert 'too short to detect a drift: it has 1.3 s' in short['message']
     assert document(capsys, *command(folder, 'short', '--no-drift-watch'))['drift'] is None
     assert run(*command(folder, 'short', '--no-drift-watch')) == 0
     assert 'drift' not in capsys.readouterr().out
@@ -427,7 +430,7 @@ def test_reconstruct_says_where_no_drift_can_be_told(folder, capsys):
             ['--cluster', '1001 1002'],
             "--cluster: '1001 1002' does not declare a cluster, as 'tibia: 1001 1002",
         ),
-        ('short', ['--cluster', 'tibia: 1'], '--cluster: cluster tibia: it is two beads or more'),
+        ('short', ['--cluster', 'tibia: 1'], '--cluster: cluster tibia: needs two beads or more'),
         (
             'short',
             ['--cluster', 'tibia: 1 2', '--cluster', 'femur: 2 3'],

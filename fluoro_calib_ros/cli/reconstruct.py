@@ -53,11 +53,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
     """Read the clusters; call error with a sentence where arguments do not go together."""
-    from ..drift.rig_watch import clusters_of
+    from ..drift.clusters import parse_clusters
     from ..jobs.sources import is_csv
 
     try:
-        arguments.clusters = clusters_of(arguments.cluster)
+        arguments.clusters = parse_clusters(arguments.cluster)
     except ValueError as fault:
         error(f'--cluster: {fault}')
     if arguments.clusters and arguments.no_drift_watch:

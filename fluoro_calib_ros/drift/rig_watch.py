@@ -1,85 +1,122 @@
-"""What the drift watch is given of every exposure: epipolar residuals of all pairs of views, and
-points in space.
+"""The drift watch of an oriented rig: turns corrected views into its observations.
 
-The noise of an image point and the error of its correction are told apart: the one is another in
-every frame, the other the same every time at a place, and does not average out.
+It separates the noise of an image point from the error of its correction: the one is new in every
+frame, the other stays the same at a place and does not average out.
 """
 
-from collections import Counter
-from dataclasses import dataclass
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from itertools import combinations
 
 import numpy as np
 
+from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
-from ..reconstruction.intersection import OK as INTERSECTED
+from ..reconstruction.intersection import OK, IntersectedPoints
 from .clusters import Cluster
-from .watch import ERROR, LEVEL, OK, STEPS_TO_ALARM, DriftOptions, DriftState, DriftWatch
+from .observations import EpipolarObservations, PointObservations
+from .options import DriftOptions
+from .state import DriftState
+from .watch import DriftWatch
 
-# Beyond both together a residual is one of a false match; up to there it may be that of a drift,
-# rejected or not.
-FALSE_SD = 4.0
-FALSE_PX = 3.0
+# A residual above FALSE_MATCH_SD standard deviations and FALSE_MATCH_PX more is that of a false
+# match. Up to there it may be that of a drift, even if the intersection rejects it.
+FALSE_MATCH_SD = 4.0
+FALSE_MATCH_PX = 3.0
 
 
-class RigWatch:
-    """A DriftWatch for a RigOrientation, built anew with every orientation.
+class RigDriftWatch:
+    """Drift watch of one RigOrientation; a new orientation needs a new one.
 
-    image_sizes {fluoroscope: (width, height)} [px]; options: DriftOptions; clusters: Cluster, ...;
-    rate_hz: most exposures a second that are looked at. Raises ValueError as DriftWatch, DataError
-    for a rig of sources in one place.
+    Parameters
+    ----------
+    orientation : RigOrientation
+    image_sizes : mapping of str to tuple of int
+        Width and height of the images by fluoroscope [px].
+    options : DriftOptions, optional
+    clusters : sequence of Cluster
+    rate_hz : float
+        Largest number of exposures to examine per second.
+
+    Raises
+    ------
+    ValueError
+        As DriftWatch.
+    DataError
+        For a rig with two sources in one place.
     """
 
     def __init__(
-        self, orientation, image_sizes, options=DriftOptions(), clusters=(), rate_hz=120.0
-    ):
+        self,
+        orientation: RigOrientation,
+        image_sizes: Mapping[str, tuple[int, int]],
+        options: DriftOptions | None = None,
+        clusters: Sequence[Cluster] = (),
+        rate_hz: float = 120.0,
+    ) -> None:
         names = self._names = orientation.fluoroscopes
         self._pairs = [
             (i, j, EpipolarGeometry(orientation, names[i], names[j]))
             for i, j in combinations(range(len(names)), 2)
         ]
-        self._watch = DriftWatch(
-            {name: image_sizes[name] for name in names},
-            options,
-            clusters,
-            (orientation.interior, orientation.rotation, orientation.position_mm),
-        )
-        # Exposures come with some jitter: at the rate itself none is to be left out.
-        self._every_ns = round(0.9e9 / rate_hz)
-        self._last = None
-        self.clusters = bool(clusters)
+        sizes = {name: image_sizes[name] for name in names}
+        self._watch = DriftWatch(sizes, options, clusters, orientation)
+        # Stamps jitter: a stream at this very rate must not lose any exposure.
+        self._min_interval_ns = round(0.9e9 / rate_hz)
+        self._last_ns: int | None = None
+        self._has_clusters = bool(clusters)
 
     @property
-    def state(self):
-        """The DriftState."""
+    def options(self) -> DriftOptions:
+        """Options of the watch."""
+        return self._watch.options
+
+    @property
+    def state(self) -> DriftState:
+        """Present state."""
         return self._watch.state
 
     @property
-    def watched_s(self):
-        """Time after the start in which a drift could be told somewhere [s]."""
+    def watched_s(self) -> float:
+        """Time after the start in which a drift could have been detected somewhere [s]."""
         return self._watch.watched_s
 
-    def wants(self, stamp_ns):
-        """Whether an exposure is to be looked at."""
-        return self._last is None or not 0 <= stamp_ns - self._last < self._every_ns
+    def is_due(self, stamp_ns: int) -> bool:
+        """Whether an exposure with this stamp is to be examined."""
+        last = self._last_ns
+        return last is None or not 0 <= stamp_ns - last < self._min_interval_ns
 
-    def take(self, stamp_ns, target_id, uv, sigma, correction_sd, points):
-        """Take in an exposure; returns the DriftState.
+    def add_exposure(
+        self,
+        stamp_ns: int,
+        target_id: np.ndarray,
+        uv: np.ndarray,
+        sigma: np.ndarray,
+        correction_sd: np.ndarray,
+        points: IntersectedPoints,
+    ) -> DriftState:
+        """Add an exposure and return the state.
 
-        target_id (n,); uv (F, n, 2), sigma and correction_sd (F, n) [px], NaN where a fluoroscope
-        does not see a target; points: the IntersectedPoints of them.
+        Parameters
+        ----------
+        stamp_ns : int
+        target_id : ndarray
+            (n,)
+        uv : ndarray
+            (F, n, 2), corrected pixels, NaN where a fluoroscope does not see a target.
+        sigma, correction_sd : ndarray
+            (F, n), standard deviations of the corrected pixels, and of the correction alone [px].
+        points : IntersectedPoints
         """
-        self._last = stamp_ns
+        self._last_ns = stamp_ns
         noise2 = np.maximum(sigma * sigma - correction_sd * correction_sd, 0)
-        names = self._names
         for i, j, geometry in self._pairs:
             found = geometry.residuals(uv[i], uv[j], sigma[i], sigma[j])
             noise = found.factor_a**2 * noise2[i] + found.factor_b**2 * noise2[j]
-            good = np.flatnonzero(np.abs(found.residual) <= FALSE_SD * found.sd_total + FALSE_PX)
-            self._watch.add(
-                stamp_ns,
-                names[i],
-                names[j],
+            limit = FALSE_MATCH_SD * found.sd_total + FALSE_MATCH_PX
+            good = np.flatnonzero(np.abs(found.residual) <= limit)
+            observations = EpipolarObservations(
                 target_id[good],
                 uv[i][good],
                 uv[j][good],
@@ -91,143 +128,25 @@ class RigWatch:
                 found.factor_a[good],
                 found.factor_b[good],
             )
-        if self.clusters:
-            part = noise2 / (sigma * sigma)  # of the covariance that is noise
-            seen = np.isfinite(part)
-            part = np.where(seen, part, 0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
-            good = np.flatnonzero(points.status == INTERSECTED)
+            self._watch.add_residuals(stamp_ns, self._names[i], self._names[j], observations)
+        if self._has_clusters:
+            noise_fraction = _mean_where_finite(noise2 / (sigma * sigma))
+            covariance = points.covariance_noise * noise_fraction[:, None, None]
+            good = np.flatnonzero(points.status == OK)
             self._watch.add_points(
                 stamp_ns,
-                target_id[good],
-                points.xyz_mm[good],
-                (points.covariance_noise * part[:, None, None])[good],
-                uv[:, good],
-                correction_sd[:, good],
+                PointObservations(
+                    target_id[good],
+                    points.xyz_mm[good],
+                    covariance[good],
+                    uv[:, good],
+                    correction_sd[:, good],
+                ),
             )
         return self.state
 
 
-@dataclass(frozen=True)
-class DriftVerdict:
-    """What the drift watch says of a whole recording.
-
-    level: 'ok', 'warn' or 'error', the highest that there was; 'learning' where the recording is
-    too short to tell; 'unknown' where there is nothing to tell it from. message: one sentence. Of
-    a drift, else None: state, the DriftState with the largest evidence; found_ns: stamp of the
-    exposure by which its level was found first [ns], began_ns: of the begin of the drift, as
-    estimated at last [ns]. level_at_end: 'ok', 'warn' or 'error'; watched_s: time in which a drift
-    could be told [s].
-    """
-
-    level: str
-    message: str
-    state: DriftState | None = None
-    found_ns: int | None = None
-    began_ns: int | None = None
-    level_at_end: str | None = None
-    watched_s: float = 0.0
-
-
-class RecordingWatch(RigWatch):
-    """A RigWatch that remembers what it has told: an alarm in the middle of a recording may have
-    ended with it.
-    """
-
-    def __init__(
-        self, orientation, image_sizes, options=DriftOptions(), clusters=(), rate_hz=120.0
-    ):
-        super().__init__(orientation, image_sizes, options, clusters, rate_hz)
-        self._options = options
-        self._begin_ns = None
-        self._worst = self.state
-        self._worst_ns = None
-        self._found_ns = None
-
-    def take(self, stamp_ns, target_id, uv, sigma, correction_sd, points):
-        """Take in an exposure, as a RigWatch does; returns the DriftState."""
-        state = super().take(stamp_ns, target_id, uv, sigma, correction_sd, points)
-        if self._begin_ns is None:
-            self._begin_ns = stamp_ns
-        if state is not self._worst and (state.level, state.evidence) >= (
-            self._worst.level,
-            self._worst.evidence,
-        ):
-            if state.level > self._worst.level:
-                self._found_ns = stamp_ns
-            self._worst = state
-            self._worst_ns = stamp_ns
-        return state
-
-    def verdict(self):
-        """The DriftVerdict on what was taken in."""
-        worst = self._worst
-        watched = self.watched_s
-        length = 0.0 if self._last is None else (self._last - self._begin_ns) / 1e9
-        at_end = LEVEL[self.state.level].lower()
-        if worst.level > OK:
-            return DriftVerdict(
-                LEVEL[worst.level].lower(),
-                self._sentence(worst),
-                worst,
-                self._found_ns,
-                self._worst_ns - round(1e9 * worst.since_s),
-                at_end,
-                watched,
-            )
-        least = STEPS_TO_ALARM * self._options.block_s  # an alarm takes so long at least
-        if watched >= least:
-            return DriftVerdict(
-                'ok',
-                f'no drift is seen in {watched:.1f} s',
-                level_at_end=at_end,
-                watched_s=watched,
-            )
-        learn = self._options.learn_s
-        if length < learn + least:
-            return DriftVerdict(
-                'learning',
-                f'the recording is too short to tell a drift: it has {length:.1f} s, of '
-                f'which the first {learn:g} s are learned',
-                watched_s=watched,
-            )
-        return DriftVerdict(
-            'unknown', 'there are too few markers in two views to tell a drift', watched_s=watched
-        )
-
-    def _sentence(self, worst):
-        """What to say of a drift."""
-        holds = (
-            'the calibration no longer holds'
-            if worst.level == ERROR
-            else 'it may be that the calibration no longer holds'
-        )
-        ended = '; it was gone at the end' if self.state.level == OK else ''
-        return (
-            f'{worst.message}; found {(self._found_ns - self._begin_ns) / 1e9:.1f} s after the beginning{ended}: '
-            f'{holds}'
-        )
-
-
-def clusters_of(texts):
-    """Clusters of texts such as 'tibia: 1001 1002 1003'. Raises ValueError for a text that is
-    none.
-    """
-    out = []
-    for text in texts:
-        name, colon, ids = text.partition(':')
-        try:
-            numbers = tuple(int(i) for i in ids.replace(',', ' ').split())
-        except ValueError:
-            numbers = ()
-        if not colon or not name.strip() or not numbers:
-            raise ValueError(
-                f"{text!r} does not declare a cluster, as 'tibia: 1001 1002 1003' does"
-            )
-        out.append(Cluster(name.strip(), numbers))
-    if len({cluster.name for cluster in out}) < len(out):
-        raise ValueError('two clusters have the same name')
-    targets = Counter(i for cluster in out for i in cluster.target_id)
-    twice = [i for i, count in targets.items() if count > 1]
-    if twice:
-        raise ValueError(f'target {twice[0]} is in two clusters')
-    return tuple(out)
+def _mean_where_finite(values: np.ndarray) -> np.ndarray:
+    """Means (n,) of the finite values (F, n) of every column, 0 where there are none."""
+    finite = np.isfinite(values)
+    return np.where(finite, values, 0).sum(axis=0) / np.maximum(finite.sum(axis=0), 1)

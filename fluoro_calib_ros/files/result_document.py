@@ -9,7 +9,7 @@ import numpy as np
 
 from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
 from ..calibration.self_calibration import Round
-from ..drift.rig_watch import DriftVerdict
+from ..drift.recording_watch import DriftVerdict
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
 

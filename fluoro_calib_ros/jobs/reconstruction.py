@@ -9,7 +9,7 @@ import numpy as np
 
 from ..calibration.result import FluoroscopeCalibration
 from ..drift.clusters import Cluster
-from ..drift.rig_watch import DriftVerdict, RecordingWatch
+from ..drift.recording_watch import DriftVerdict, RecordingDriftWatch
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..options import option, validate_options
@@ -141,7 +141,7 @@ def _drift_watch(
     orientation: RigOrientation,
     calibrations: Mapping[str, FluoroscopeCalibration],
     options: ReconstructionOptions,
-) -> tuple[RecordingWatch | None, DriftVerdict | None]:
+) -> tuple[RecordingDriftWatch | None, DriftVerdict | None]:
     """Return the drift watch of a recording, or None and the reason, or twice None."""
     if not options.drift_watch:
         return None, None
@@ -151,6 +151,6 @@ def _drift_watch(
         )
     sizes = {name: calibrations[name].image_size for name in orientation.fluoroscopes}
     try:
-        return RecordingWatch(orientation, sizes, clusters=options.clusters), None
+        return RecordingDriftWatch(orientation, sizes, clusters=options.clusters), None
     except DataError as error:
         return None, DriftVerdict('unknown', f'no drift can be told: {error}')

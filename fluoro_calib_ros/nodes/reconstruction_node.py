@@ -19,8 +19,9 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from ..drift.rig_watch import RigWatch, clusters_of
-from ..drift.watch import DriftOptions
+from ..drift.clusters import parse_clusters
+from ..drift.options import DriftOptions
+from ..drift.rig_watch import RigDriftWatch
 from ..errors import DataError
 from ..exposures.pairing import PATIENCE, exposure_pairer
 from ..files.rig_orientation import load_orientation
@@ -59,14 +60,14 @@ class _View:
 
 
 class _Rig(NamedTuple):
-    """An orientation that arrived, and what is made of it once; watch: RigWatch, None while there
+    """An orientation that arrived, and what is made of it once; watch: RigDriftWatch, None while there
     is none.
     """
 
     orientation_id: str
     orientation: object
     intersector: Intersector
-    watch: RigWatch | None
+    watch: RigDriftWatch | None
 
 
 class ReconstructionNode(support.StreamNode):
@@ -180,7 +181,7 @@ class ReconstructionNode(support.StreamNode):
             'at a drift of level ERROR call the service collect_anew of the calibration node',
         )
         try:
-            self._clusters = clusters_of([text for text in clusters if text])
+            self._clusters = parse_clusters([text for text in clusters if text])
             self._watch_options = DriftOptions(warn_interval_h=hours[0], error_interval_h=hours[1])
         except ValueError as error:
             raise StartError(
@@ -287,12 +288,12 @@ class ReconstructionNode(support.StreamNode):
         )
 
     def _watch_of(self, orientation):
-        """RigWatch of an orientation, None where none is wanted or the sizes of the images are not
+        """RigDriftWatch of an orientation, None where none is wanted or the sizes of the images are not
         known yet.
         """
         if not self._watching or any(name not in self._sizes for name in self._names):
             return None
-        return RigWatch(
+        return RigDriftWatch(
             orientation, self._sizes, self._watch_options, self._clusters, self._watch_rate
         )
 

@@ -59,13 +59,13 @@ def intersect_views(views, intersector):
 
 
 def watch_views(watch, stamp_ns, views, found):
-    """Give a RigWatch the CorrectedViews of an exposure, None for a missing one, with their
+    """Give a RigDriftWatch the CorrectedViews of an exposure, None for a missing one, with their
     IntersectedViews, if it wants it.
 
     Image points beyond the calibrated area are left out: there the correction is extrapolated, and
     markers that come to other places there would look like a drift.
     """
-    if watch.wants(stamp_ns):
+    if watch.is_due(stamp_ns):
         correction_sd = matched(
             *(
                 [None if view is None else getattr(view, name) for view in views]
@@ -73,7 +73,7 @@ def watch_views(watch, stamp_ns, views, found):
             )
         )[2]
         inside = np.where(found.outside[:, :, None], np.nan, found.uv)
-        watch.take(stamp_ns, found.target_id, inside, found.sigma, correction_sd, found.points)
+        watch.add_exposure(stamp_ns, found.target_id, inside, found.sigma, correction_sd, found.points)
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ def reconstruct_frame(exposure, calibrations, intersector, watch=None):
     then intersected.
 
     Two fluoroscopes of the orientation or more have to be there. calibrations {fluoroscope:
-    FluoroscopeCalibration}; watch: RigWatch that looks at it, None: none does. Raises DataError
+    FluoroscopeCalibration}; watch: RigDriftWatch that looks at it, None: none does. Raises DataError
     for an image of another size than that of the calibration, and for a target that is there
     twice.
     """
@@ -140,7 +140,7 @@ def reconstruct_recording(frames, calibrations, intersector, pair_by='frame_numb
     """ReconstructedFrames of a recording in order of time, and the number of frames {fluoroscope:
     n} whose partners are missing.
 
-    frames {fluoroscope: [Frame, ...]}; pair_by 'frame_number' or 'stamp'; watch: RigWatch that
+    frames {fluoroscope: [Frame, ...]}; pair_by 'frame_number' or 'stamp'; watch: RigDriftWatch that
     looks at the exposures. Of three or more fluoroscopes views may be missing. Raises DataError as
     reconstruct_frame, and where a fluoroscope of the rig has no frames.
     """

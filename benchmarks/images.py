@@ -319,7 +319,7 @@ def text_of(core, cases):
         for f in core
     ]
     first = table(
-        ['1024 x 1024', 'median [ms]', 'CPU [ms]', 'images a second a core', 'as fast as scipy'],
+        ['1024 x 1024', 'median [ms]', 'CPU [ms]', 'images per second and core', 'speed-up over scipy'],
         rows,
     )
     rows = [
@@ -338,7 +338,7 @@ def text_of(core, cases):
         first
         + '\n\n'
         + table(
-            ['live', 'images', 'lost', 'p50 [ms]', 'p99 [ms]', 'max [ms]', 'CPU an image [ms]'],
+            ['live', 'images', 'lost', 'p50 [ms]', 'p99 [ms]', 'max [ms]', 'CPU per image [ms]'],
             rows,
         )
     )

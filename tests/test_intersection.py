@@ -206,7 +206,7 @@ def test_covariance_against_monte_carlo():
     orientation = orientation_of()
     xyz, uv, sigma = seen(orientation, 20, noise_px=0)
     rng = np.random.default_rng(5)
-    root = orientation.root()
+    root = orientation.covariance_root()
     squares = []
     noise_only = []
     tests = []
@@ -352,7 +352,7 @@ def test_points_that_few_fluoroscopes_see():
     assert found.rays.tolist() == [2, 2, 2, 1, 0, 3]
     assert found.status.tolist() == [OK, OK, OK, SINGLE_VIEW, SINGLE_VIEW, OK]
     for k, names in enumerate([('b', 'c'), ('a', 'b'), ('a', 'c')]):
-        rows = [orientation.number(name) for name in names]
+        rows = [orientation.index(name) for name in names]
         alone = Intersector(orientation.subset(names)).intersect(
             uv[rows][:, k : k + 1], sigma[rows][:, k : k + 1]
         )
@@ -419,7 +419,7 @@ def test_empty_frame_and_wrong_shapes():
     [
         (
             {'fluoroscopes': ('a', 'a')},
-            'the fluoroscopes are a, a, and each is to have a name of its own',
+            'the fluoroscopes are a, a, but each must have a name of its own',
         ),
         ({'calibration_ids': ('a',)}, '2 fluoroscopes, but 1 calibrations'),
         ({'optical_frame_ids': ('a',)}, '2 fluoroscopes, but 1 optical frames'),
@@ -436,11 +436,11 @@ def test_empty_frame_and_wrong_shapes():
         ),
         (
             {'rotation': np.tile(np.diag([1, 1, -1.0]), (2, 1, 1))},
-            'the rotation of fluoroscope a is no rotation matrix',
+            'the rotation of fluoroscope a is not a rotation matrix',
         ),
         (
             {'rotation': np.tile(1.01 * np.eye(3), (2, 1, 1))},
-            'the rotation of fluoroscope a is no rotation matrix',
+            'the rotation of fluoroscope a is not a rotation matrix',
         ),
         ({'covariance': np.eye(18) + np.eye(18, k=1)}, 'its covariance is not symmetric'),
         (
@@ -464,7 +464,9 @@ def test_orientation_by_name():
     np.testing.assert_array_equal(part.covariance[:9, 9:], orientation.covariance[18:, :9])
     np.testing.assert_array_equal(part.sd_mm, orientation.sd_mm[[2, 0]])
     np.testing.assert_allclose(
-        orientation.root() @ orientation.root().T, orientation.covariance, atol=1e-12
+        orientation.covariance_root() @ orientation.covariance_root().T,
+        orientation.covariance,
+        atol=1e-12,
     )
     with pytest.raises(DataError, match="there is no fluoroscope 'd', only a, b, c"):
         orientation.subset(['a', 'd'])
@@ -484,7 +486,7 @@ def test_orientation_by_name():
         orientation.check_calibrations({'a': 'a', 'b': 'b'})
     with pytest.raises(
         DataError,
-        match='it belongs to the calibration b of fluoroscope b, but that at hand is x; ',
+        match='it belongs to the calibration b of fluoroscope b, but the present one is x; ',
     ):
         orientation.check_calibrations({'a': 'a', 'b': 'x', 'c': 'c'})
 

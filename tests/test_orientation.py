@@ -315,7 +315,7 @@ def test_the_datum_takes_out_what_moves_points_together_and_nothing_else():
             for r, t, i in zip(found.rotation, found.position_mm, found.interior)
         ]
     )
-    step = 1e-3 * found.root() @ rng.normal(size=18)
+    step = 1e-3 * found.covariance_root() @ rng.normal(size=18)
     ways = [moved_orientation(found, change) for change in (step, s @ step)]
     sigma = np.full((2, 40), 0.1)
     moved = [Intersector(way, None).intersect(uv, sigma).xyz_mm for way in ways]
@@ -441,7 +441,10 @@ def test_file_gives_the_same_orientation(tmp_path, found):
             {'position_mm': np.zeros((3, 3))},
             r'rig orientation: position_mm has shape \(3, 3\), not \(2, 3\)',
         ),
-        ({'rotation': np.zeros((2, 3, 3))}, 'the rotation of fluoroscope a is no rotation matrix'),
+        (
+            {'rotation': np.zeros((2, 3, 3))},
+            'the rotation of fluoroscope a is not a rotation matrix',
+        ),
         ({'covariance': np.full((18, 18), np.nan)}, 'the array covariance holds nan'),
         ({'fluoroscope': np.array(['a', '../b'])}, "the fluoroscope is called '../b'"),
         ({'position_mm': np.zeros((2, 3))}, 'the content does not belong to its orientation_id'),
@@ -703,7 +706,7 @@ def test_reconstruct_refuses_in_a_sentence(folder, tmp_path, capsys):
     for calibration in calibrations().values():
         save_calibration(other, replace(calibration, source_digest='another'))
     source = ('reconstruct', folder / 'tracking', '--calibration')
-    assert 'the orientation has to be made anew' in said(
+    assert 'the orientation has to be determined again' in said(
         capsys, *source, other, '--out', out, '--orientation', result / 'rig_orientation.npz'
     )
     assert 'rig_orientation.npz: there is no such file' in said(

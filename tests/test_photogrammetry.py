@@ -354,7 +354,7 @@ def test_scale_and_degrees_of_freedom_equal_direct_maximum_likelihood(nu):
     best = optimize.minimize(
         cost, np.log([0.5, 6.0]), method='Nelder-Mead', options={'xatol': 1e-6, 'fatol': 1e-6}
     )
-    found = Noise('student_t', 1.0, 5.0).estimated(squared)
+    found = Noise('student_t', 1.0, 5.0).estimate_from(squared)
     assert cost(np.log([found.scale, found.nu])) - best.fun < 0.05
     assert found.scale == pytest.approx(np.exp(best.x[0]), rel=2e-3)
     assert found.nu == pytest.approx(np.exp(best.x[1]), rel=2e-2)
@@ -370,7 +370,7 @@ def test_scale_is_estimated_from_residuals_of_unequal_redundancy(loss):
     rng = np.random.default_rng(8)
     share = rng.choice([0.2, 0.9], 60_000)
     noise = rng.normal(0, 0.25, (len(share), 2))
-    found = Noise(loss).estimated(share * np.sum(noise**2, axis=1), 2 * (1 - share))
+    found = Noise(loss).estimate_from(share * np.sum(noise**2, axis=1), 2 * (1 - share))
     assert found.scale == pytest.approx(0.25, rel=0.015)
     if loss == 'student_t':
         assert found.nu > 60
@@ -384,13 +384,13 @@ def test_gross_errors_beside_the_student_t_leave_its_core_alone(nu):
     rng = np.random.default_rng(4)
     noise = bivariate_t(rng, 20_000, nu, 0.25)
     squared = np.sum(noise**2, axis=1)
-    clean = Noise().estimated(squared)
+    clean = Noise().estimate_from(squared)
     squared[:1000] = np.sum(rng.uniform(-300, 300, (1000, 2)) ** 2, axis=1)
-    found = Noise(gross=0.01).estimated(squared)
+    found = Noise(gross=0.01).estimate_from(squared)
     assert found.gross == pytest.approx(0.05, abs=0.003)
     assert found.scale == pytest.approx(clean.scale, rel=0.02)
     assert 1 / found.nu == pytest.approx(1 / clean.nu, abs=0.02)
-    assert Noise().estimated(squared).nu == pytest.approx(NU_RANGE[0], rel=1e-2)
+    assert Noise().estimate_from(squared).nu == pytest.approx(NU_RANGE[0], rel=1e-2)
     weight = found.weight(squared / found.scale**2)
     assert weight[:1000].max() < 0.2 and np.median(weight[:1000]) < 1e-6
 
@@ -402,18 +402,18 @@ def test_robust_scale_withstands_false_matches():
     rng = np.random.default_rng(9)
     squared = np.sum(rng.normal(0, 0.25, (5000, 2)) ** 2, axis=1)
     squared[:500] = 1e4
-    assert Noise('huber').estimated(squared).scale == pytest.approx(0.25, rel=0.15)
-    assert Noise('student_t').estimated(squared).scale == pytest.approx(0.25, rel=0.35)
-    assert Noise('gaussian').estimated(squared).scale > 10
+    assert Noise('huber').estimate_from(squared).scale == pytest.approx(0.25, rel=0.15)
+    assert Noise('student_t').estimate_from(squared).scale == pytest.approx(0.25, rel=0.35)
+    assert Noise('gaussian').estimate_from(squared).scale > 10
 
 
 def test_degrees_of_freedom_stay_within_their_range():
     rng = np.random.default_rng(10)
     gaussian = np.sum(rng.normal(size=(20_000, 2)) ** 2, axis=1)
-    assert 60 < Noise().estimated(gaussian).nu <= NU_RANGE[1]
+    assert 60 < Noise().estimate_from(gaussian).nu <= NU_RANGE[1]
     cauchy = np.sum(bivariate_t(rng, 20_000, 1.0, 1.0) ** 2, axis=1)
-    assert Noise().estimated(cauchy).nu == pytest.approx(NU_RANGE[0], rel=1e-2)
-    assert np.isfinite(Noise().estimated(np.zeros(100)).scale)
+    assert Noise().estimate_from(cauchy).nu == pytest.approx(NU_RANGE[0], rel=1e-2)
+    assert np.isfinite(Noise().estimate_from(np.zeros(100)).scale)
 
 
 def test_inliers_are_the_9999_of_10000_of_a_gaussian():

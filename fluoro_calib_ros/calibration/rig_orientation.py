@@ -35,7 +35,7 @@ from ..photogrammetry.relative_orientation import (
     discrepancies_with_jacobian,
     mean_pose,
 )
-from ..photogrammetry.rig_orientation import UNKNOWNS, RigOrientation, with_datum_of_points
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
 from .calibrate import SEEN_FOR_NOISE, held_corrections
 from .initial_network import MIN_TARGETS_OF_EXPOSURE, Measured, measured_network
 from .joint import pairs_of
@@ -426,7 +426,7 @@ def _orientation(
     order = np.concatenate(
         [np.r_[6 * f : 6 * f + 6, 6 * count + 3 * f : 6 * count + 3 * f + 3] for f in range(count)]
     )
-    covariance = every[np.ix_(order, order)].reshape(UNKNOWNS * count, -1)
+    covariance = every[np.ix_(order, order)].reshape(ORIENTATION_SIZE * count, -1)
     return RigOrientation(
         names,
         np.array([calibrations[n].interior for n in names]),

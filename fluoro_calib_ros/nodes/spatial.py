@@ -61,7 +61,7 @@ def orientation_from_message(message):
         for name in ('xp', 'yp', 'c', 'x', 'y', 'z', 'qw', 'qx', 'qy', 'qz')
     }
     wrong = [name for name, column in columns.items() if len(column) != count]
-    if wrong or len(message.covariance) != (rig.UNKNOWNS * count) ** 2:
+    if wrong or len(message.covariance) != (rig.ORIENTATION_SIZE * count) ** 2:
         raise DataError(
             f'rig orientation: {count} fluoroscopes, but the array {(wrong or ["covariance"])[0]} has '
             'another length'
@@ -231,7 +231,7 @@ def drift_message(state, stamp, orientation):
     message.header.stamp = stamp
     if state.fluoroscope in orientation.fluoroscopes:
         message.header.frame_id = orientation.optical_frame_ids[
-            orientation.number(state.fluoroscope)
+            orientation.index(state.fluoroscope)
         ]
     for name in ('size', 'sd', 'evidence', 'threshold_warn', 'threshold_error'):
         setattr(message, name, float(getattr(state, name)))

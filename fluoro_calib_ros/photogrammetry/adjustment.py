@@ -17,10 +17,10 @@ import numpy as np
 from .datum import transform_to_datum
 from .elimination import BorderedSystem, Elimination, choose_elimination
 from .network import Network
-from .noise import Noise
+from .noise import DEFAULT_NOISE, Noise
 from .normal_equations import normal_equations, project_network
 from .relative_orientation import discrepancies
-from .unknowns import ByKind, Parameters
+from .unknowns import Parameters
 
 # Relative increase of the cost that rounding errors can cause.
 ROUNDING = 1e-12
@@ -47,6 +47,9 @@ class SolverOptions:
     tolerance: float = 1e-8
     max_steps: int = 100
     elimination: type[Elimination] | None = None
+
+
+DEFAULT_OPTIONS = SolverOptions()
 
 
 @dataclass(frozen=True)
@@ -129,120 +132,41 @@ class _Iterate:
 
 @dataclass(frozen=True)
 class _Problem:
-    """What an adjustment minimises: the cost of a network under a correction and a noise model."""
+    """What an adjustment minimises: the cost of a network for a correction and a noise model."""
 
     network: Network
     correction: np.ndarray
     noise: Noise
+    elimination: Elimination
 
     def evaluate(self, parameters: Parameters) -> _Iterate:
         """Cost at some parameters."""
         r, q = residuals_and_q(self.network, parameters, self.correction, self.noise)
         return _Iterate(parameters, r, q, total_cost(self.network, parameters, q, self.noise))
 
-    def linearise(self, elimination: Elimination, parameters: Parameters) -> BorderedSystem:
+    def linearise(self, parameters: Parameters) -> BorderedSystem:
         """Normal equations at some parameters."""
         equations = normal_equations(self.network, parameters, self.correction, self.noise)
-        return elimination.bordered_system(equations)
+        return self.elimination.bordered_system(equations)
 
-    def stretch(self, q: np.ndarray) -> float:
-        """Factor of a step: weighted normal matrix over Fisher information.
+    def step(
+        self, iterate: _Iterate, system: BorderedSystem, mu: float
+    ) -> tuple[Parameters, float]:
+        """Parameters after a step damped by mu, and the decrease of F that it predicts.
 
-        The robustly weighted normal matrix is larger than the information. Where the tails are
-        heavy, stretched steps converge in a third of the iterations.
+        Raises numpy.linalg.LinAlgError where the damped matrix is singular, ValueError where it is
+        not finite.
         """
-        return 1 / self.noise.information_factor(q)
-
-
-def adjust(
-    network: Network,
-    start: Parameters,
-    correction: np.ndarray | None = None,
-    noise: Noise = Noise(),
-    options: SolverOptions = SolverOptions(),
-    raise_if_cancelled: Callable[[], None] | None = None,
-) -> Adjustment:
-    """Adjust a network under a given noise model.
-
-    Parameters
-    ----------
-    network : Network
-    start : Parameters
-        Start values.
-    correction : (N, 2) ndarray, optional
-        Correction of the image points [px], without that of the additional parameters.
-    noise : Noise
-        Noise model; it is not changed.
-    options : SolverOptions
-    raise_if_cancelled : callable, optional
-        Called before every step; may raise to stop the adjustment.
-
-    Returns
-    -------
-    Adjustment
-        `converged` is False where `max_steps` ended the iteration or no step was found.
-    """
-    correction = np.zeros_like(network.uv) if correction is None else correction
-    problem = _Problem(network, correction, noise)
-    elimination = (options.elimination or choose_elimination(network))(network)
-    current = problem.evaluate(start)
-    damping = _NielsenDamping()
-    system = None
-    converged = False
-    steps = 0
-    for steps in range(1, options.max_steps + 1):
-        if raise_if_cancelled is not None:
-            raise_if_cancelled()
-        if system is None:
-            system = problem.linearise(elimination, current.parameters)
-        try:
-            step, predicted = _damped_step(
-                elimination, system, damping.mu, problem.stretch(current.q)
-            )
-        except (np.linalg.LinAlgError, ValueError):
-            if damping.refuse():
-                break
-            continue
-        trial = problem.evaluate(current.parameters.updated(network, step))
-        if trial.cost > current.cost + ROUNDING * abs(current.cost):
-            converged = predicted <= NEGLIGIBLE * options.tolerance
-            if converged or damping.refuse():
-                break
-            continue
-        damping.accept((current.cost - trial.cost) / max(predicted, 1e-300))
-        current = trial
-        system = None
-        if predicted <= options.tolerance:
-            converged = True
-            break
-    return Adjustment(
-        transform_to_datum(network, current.parameters),
-        current.residuals,
-        current.q,
-        noise,
-        current.cost,
-        steps,
-        converged,
-    )
-
-
-def _damped_step(
-    elimination: Elimination, system: BorderedSystem, mu: float, stretch: float
-) -> tuple[ByKind, float]:
-    """Step damped by mu and stretched, and the decrease of F that the unstretched step predicts.
-
-    Raises numpy.linalg.LinAlgError where the damped matrix is singular, ValueError where it is not
-    finite.
-    """
-    x_blocks, x_rest = (
-        system.damped(mu)
-        .factorize()
-        .solve(system.block_right[..., None], system.rest_right[:, None])
-    )
-    x_blocks = x_blocks[..., 0]
-    x_rest = x_rest[:, 0]
-    step = elimination.by_kind(stretch * x_blocks, stretch * x_rest)
-    return step, system.predicted_decrease(x_blocks, x_rest, mu)
+        factor = system.damped(mu).factorize()
+        x_blocks, x_rest = factor.solve(system.block_right[..., None], system.rest_right[:, None])
+        x_blocks = x_blocks[..., 0]
+        x_rest = x_rest[:, 0]
+        predicted = system.predicted_decrease(x_blocks, x_rest, mu)
+        # The robustly weighted normal matrix is larger than the Fisher information. With heavy
+        # tails, stretched steps converge in a third of the iterations.
+        stretch = 1 / self.noise.information_factor(iterate.q)
+        step = self.elimination.by_kind(stretch * x_blocks, stretch * x_rest)
+        return iterate.parameters.updated(self.network, step), predicted
 
 
 class _NielsenDamping:
@@ -266,3 +190,90 @@ class _NielsenDamping:
         self.mu = max(self.mu, self.START) * self._growth
         self._growth = 2 * self._growth
         return self.mu > self.MAX
+
+
+class _LevenbergMarquardt:
+    """Levenberg-Marquardt iteration.
+
+    `current` is the best iterate so far, `steps` the number of steps, refused ones included.
+    `finished` ends the iteration, `converged` tells whether at a minimum.
+    """
+
+    def __init__(self, problem: _Problem, start: Parameters, tolerance: float) -> None:
+        self.current = problem.evaluate(start)
+        self.steps = 0
+        self.finished = False
+        self.converged = False
+        self._problem = problem
+        self._tolerance = tolerance
+        self._damping = _NielsenDamping()
+        self._system: BorderedSystem | None = None  # at the current parameters
+
+    def step(self) -> None:
+        """Take or refuse one damped step."""
+        self.steps += 1
+        if self._system is None:
+            self._system = self._problem.linearise(self.current.parameters)
+        try:
+            moved, predicted = self._problem.step(self.current, self._system, self._damping.mu)
+        except (np.linalg.LinAlgError, ValueError):
+            self.finished = self._damping.refuse()
+            return
+        trial = self._problem.evaluate(moved)
+        if trial.cost > self.current.cost + ROUNDING * abs(self.current.cost):
+            self.converged = predicted <= NEGLIGIBLE * self._tolerance
+            self.finished = self.converged or self._damping.refuse()
+            return
+        self._damping.accept((self.current.cost - trial.cost) / max(predicted, 1e-300))
+        self.current = trial
+        self._system = None
+        self.converged = predicted <= self._tolerance
+        self.finished = self.converged
+
+
+def adjust(
+    network: Network,
+    start: Parameters,
+    correction: np.ndarray | None = None,
+    noise: Noise = DEFAULT_NOISE,
+    options: SolverOptions = DEFAULT_OPTIONS,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Adjustment:
+    """Adjust a network for a given noise model.
+
+    Parameters
+    ----------
+    network : Network
+    start : Parameters
+        Start values.
+    correction : (N, 2) ndarray, optional
+        Correction of the image points [px], without that of the additional parameters.
+    noise : Noise
+        Noise model; it is not changed.
+    options : SolverOptions
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop the adjustment.
+
+    Returns
+    -------
+    Adjustment
+        `converged` is False where `max_steps` ended the iteration or no step was found.
+    """
+    correction = np.zeros_like(network.uv) if correction is None else correction
+    elimination = (options.elimination or choose_elimination(network))(network)
+    problem = _Problem(network, correction, noise, elimination)
+    iteration = _LevenbergMarquardt(problem, start, options.tolerance)
+    while not iteration.finished and iteration.steps < options.max_steps:
+        if raise_if_cancelled is not None:
+            raise_if_cancelled()
+        iteration.step()
+    found = iteration.current
+    return Adjustment(
+        transform_to_datum(network, found.parameters),
+        found.residuals,
+        found.q,
+        noise,
+        found.cost,
+        iteration.steps,
+        iteration.converged,
+    )

@@ -49,7 +49,7 @@ class Gauge:
 
 
 def similarity_directions(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
-    """Changes (n, 3, 7) of points (n, 3) [mm] by a shift, a turn and a scale about a centre (3,)."""
+    """Changes (n, 3, 7) of points (n, 3) [mm] by shift, turn and scale about a centre (3,)."""
     offset = points - centre
     shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
     return np.concatenate([shift, -cross_matrix(offset), offset[:, :, None]], axis=2)

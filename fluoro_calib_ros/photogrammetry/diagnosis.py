@@ -158,18 +158,20 @@ def undetermined_interiors(
         factor = min(NOMINAL_NOISE_PX / noise_px, 1.0)
         sd = np.sqrt(np.diagonal(precision.interior[f])) * factor
         c = parameters.interior[f, 2]
+        remark = _flatness_remark(network)
         if sd[2] > MAX_RELATIVE_SD * c or correlations[f] > MAX_DISTANCE_CORRELATION:
             out.append(
-                f'fluoroscope {name}: principal distance and distance to the phantom cannot be separated '
-                f'(standard deviation of c {100 * sd[2] / c:.0f} %, correlation {correlations[f]:.5f})'
-                f'{_flatness_remark(network)}; '
-                'add exposures with the phantom tilted towards the source, or hold the interior orientation'
+                f'fluoroscope {name}: principal distance and distance to the phantom cannot be '
+                f'separated (standard deviation of c {100 * sd[2] / c:.0f} %, '
+                f'correlation {correlations[f]:.5f}){remark}; add exposures with '
+                'the phantom tilted towards the source, or hold the interior orientation'
             )
         elif max(sd[:2]) > MAX_RELATIVE_SD * c:
             out.append(
-                f'fluoroscope {name}: the principal point cannot be separated from the position of the source '
-                f'(standard deviation {max(sd[:2]):.0f} px){_flatness_remark(network)}; add exposures with '
-                'the phantom turned about the axis of the image and tilted, or hold the interior orientation'
+                f'fluoroscope {name}: the principal point cannot be separated from the position '
+                f'of the source (standard deviation {max(sd[:2]):.0f} px){remark}; '
+                'add exposures with the phantom turned about the axis of the image and tilted, '
+                'or hold the interior orientation'
             )
     return tuple(out)
 

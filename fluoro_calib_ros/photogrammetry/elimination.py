@@ -2,9 +2,9 @@
 
 Schur complement: Triggs, McLauchlan, Hartley and Fitzgibbon, "Bundle Adjustment - A Modern
 Synthesis", 2000, section 6. Eliminating the object points leaves a system of exposures, and
-eliminating the exposures one of object points, each bordered by the global unknowns. Exposures that
-a relative orientation couples are eliminated together. Everything that depends on this choice is
-behind the interface `Elimination`.
+eliminating the exposures one of object points, each bordered by the global unknowns. Exposures
+that a relative orientation couples are eliminated together. Everything that depends on this choice
+is behind the interface `Elimination`.
 """
 
 from __future__ import annotations

@@ -1,42 +1,62 @@
-"""Noise models of image points: Student-t, Huber and Gaussian, with their scale estimated.
+"""Noise models of image points: Student-t, Huber and Gaussian, with estimation of their scale.
 
 An image point has D = 2 coordinates with one scale. q = |r|^2 / (scale * sigma)^2 is its
-normalised squared residual. Beside the core of the distribution a share of gross errors (false
-matches) can be estimated, spread evenly over a wide area: where they are left to the tails of the
-Student-t they make them heavy, and the efficient use of the good image points is lost. Sources:
-Lange, Little and Taylor, "Robust statistical modeling using the t distribution", JASA 1989
-(weights, information); Liu and Rubin, "ML estimation of the t distribution using EM and its
+normalised squared residual. Besides the core of the distribution, a share of gross errors (false
+matches) can be estimated, spread evenly over a wide area. If they are left to the tails of the
+Student-t, they make the tails heavy, and good image points are no longer used efficiently.
+Sources: Lange, Little and Taylor, "Robust statistical modeling using the t distribution", JASA
+1989 (weights, information); Liu and Rubin, "ML estimation of the t distribution using EM and its
 extensions, ECM and ECME", Statistica Sinica 1995 (scale and degrees of freedom); Fraley and
 Raftery, "Model-based clustering, discriminant analysis, and density estimation", JASA 2002, 3.1
-(even background); Huber, "Robust Statistics", Wiley 1981.
+(uniform background); Huber, "Robust Statistics", Wiley 1981.
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.optimize import minimize_scalar
 
 LOSSES = ('student_t', 'huber', 'gaussian')
 HUBER_DELTA = 1.345  # 95 % efficiency at the Gaussian (Huber 1981)
-# Below 3 the likelihood rewards fitting some image points exactly at the cost of the rest; beyond
-# 200 a t distribution cannot be told from a Gaussian.
+# Below 3, the likelihood rewards an exact fit of some image points at the expense of the others.
+# Above 200, a t distribution cannot be distinguished from a Gaussian.
 NU_RANGE = (3.0, 200.0)
-# of gross errors, in squares of scale * sigma; a factor of ten moves the border by 0.4 sigma
+# Area over which gross errors are spread, in squares of scale * sigma. A factor of ten moves the
+# border between core and gross errors by 0.4 sigma.
 GROSS_AREA = 1e6
+# Share of gross errors.
 GROSS_RANGE = (1e-5, 0.4)
-MIN_REDUNDANCY = 0.05  # below it a residual tells nothing of the noise
+# Smallest redundancy of an image point: with less, its residual says nothing about the noise.
+MIN_REDUNDANCY = 0.05
 # 0.9999 quantile of chi-square with two degrees of freedom: about four sigma of each coordinate.
 INLIER_Q = -2 * np.log(1e-4)
+# Iterations of the estimation of the Student-t, and relative changes at which they end. Steps of
+# the scale are cheap compared with the search for nu.
+MAX_NU_STEPS = 50
+MAX_SCALE_STEPS = 100
+NU_TOLERANCE = 1e-3
+SCALE_TOLERANCE = 1e-4
+SCALE_STEP_TOLERANCE = 1e-6
 
 
 @dataclass(frozen=True)
 class Noise:
     """Distribution of the image noise.
 
-    loss 'student_t', 'huber' or 'gaussian'; scale [px], or a factor of sigma where sigma is given;
-    nu degrees of freedom of the Student-t (infinite for the others); gross: share of gross errors
-    beside the Student-t, 0: there are none, and none are looked for. Raises ValueError for an
-    unknown loss.
+    Raises ValueError for an unknown loss.
+
+    Attributes
+    ----------
+    loss : {'student_t', 'huber', 'gaussian'}
+    scale : float
+        Scale [px], or a factor of sigma where sigma is given.
+    nu : float
+        Degrees of freedom of the Student-t; infinite for the others.
+    gross : float
+        Share of gross errors besides the Student-t. 0: there are none, and none are estimated.
     """
 
     loss: str = 'student_t'
@@ -44,41 +64,36 @@ class Noise:
     nu: float = 5.0
     gross: float = 0.0
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         if self.loss not in LOSSES:
             raise ValueError(f'loss is one of {", ".join(LOSSES)}, not {self.loss!r}')
         if self.loss != 'student_t':
             object.__setattr__(self, 'nu', np.inf)
             object.__setattr__(self, 'gross', 0.0)
-        elif not np.isfinite(self.nu):  # of a calibration with another loss
+        elif not np.isfinite(self.nu):  # from a calibration with another loss
             object.__setattr__(self, 'nu', NU_RANGE[1])
 
-    def weight(self, q):
-        """Weights (n,) of iteratively reweighted least squares at normalised squared residuals q
-        (n,).
-        """
+    def weight(self, q: np.ndarray) -> np.ndarray:
+        """Weights (n,) of iteratively reweighted least squares for normalised squares q (n,)."""
         if self.loss == 'student_t':
-            return self.core(q) * (self.nu + 2) / (self.nu + q)
+            return self.core_probability(q) * (self.nu + 2) / (self.nu + q)
         if self.loss == 'huber':
             return np.minimum(1.0, HUBER_DELTA / np.sqrt(np.maximum(q, 1e-300)))
         return np.ones_like(q)
 
-    def core(self, q):
-        """Probability (n,) that an image point is no gross error."""
+    def core_probability(self, q: np.ndarray) -> np.ndarray:
+        """Probability (n,) that an image point is not a gross error."""
         if not self.gross:
             return np.ones_like(q)
         background = self.gross / (1 - self.gross) * 2 * np.pi / GROSS_AREA
-        return 1 / (
-            1 + background * np.exp(np.minimum((self.nu + 2) / 2 * np.log1p(q / self.nu), 700.0))
-        )
+        exponent = np.minimum((self.nu + 2) / 2 * np.log1p(q / self.nu), 700.0)
+        return 1 / (1 + background * np.exp(exponent))
 
-    def cost(self, q, sigma):
-        """Negative log-likelihood of image points with normalised squared residuals q (n,) and
-        sigma (n,).
-        """
+    def cost(self, q: np.ndarray, sigma: np.ndarray) -> float:
+        """Negative log-likelihood of image points with normalised squares q (n,), sigma (n,)."""
         if self.loss == 'student_t':
-            # ln of the bivariate t density; its constant is Gamma(nu/2 + 1)/(Gamma(nu/2) nu pi) =
-            # 1/(2 pi).
+            # Logarithm of the bivariate t density; its constant is Gamma(nu/2 + 1)/(Gamma(nu/2) nu
+            # pi) = 1/(2 pi).
             value = (self.nu + 2) / 2 * np.log1p(q / self.nu)
             constant = 2 * np.pi
             if self.gross:
@@ -96,12 +111,12 @@ class Noise:
             np.sum(value) + len(q) * np.log(constant) + 2 * np.sum(np.log(self.scale * sigma))
         )
 
-    def information_factor(self, q):
+    def information_factor(self, q: np.ndarray) -> float:
         """Fisher information over the expected weighted normal matrix.
 
         The weighted normal matrix of a robust fit is optimistic. For the t with D = 2 the factor
-        is (nu+2)/(nu+4) (Lange et al. 1989); for Huber it is that of the sandwich covariance, from
-        q (n,).
+        is (nu+2)/(nu+4) (Lange et al. 1989). For Huber it is that of the sandwich covariance, from
+        the normalised squares q (n,).
         """
         if self.loss == 'student_t':
             return (self.nu + 2) / (self.nu + 4)
@@ -111,76 +126,86 @@ class Noise:
         slope = np.where(q <= HUBER_DELTA**2, 1.0, w / 2)  # w + q dw/dq
         return float(np.mean(slope) ** 2 / (np.mean(w * w * q) / 2 * np.mean(w)))
 
-    def inliers(self, q):
+    def inliers(self, q: np.ndarray) -> np.ndarray:
         """True (n,) where an image point belongs to the core of the distribution."""
         return q <= INLIER_Q
 
-    def estimated(self, squared, open_part=0.0):
-        """The noise model with scale and, for Student-t, nu and the share of gross errors
-        estimated (ECME).
+    def estimate_from(self, squared: ArrayLike, unresolved: ArrayLike = 0.0) -> Noise:
+        """Noise model with its scale and, for Student-t, nu and share of gross errors estimated.
 
-        squared (n,) squared residuals |r|^2 / sigma^2 of the image points. open_part (n,) or a
-        number: the unknowns of the adjustment are missing data, and the expected square of an
-        error is that of its residual and of what the unknowns leave open, tr(A C A^T) / sigma^2 =
-        open_part scale^2; for a point of weight one it is two less twice its redundancy number.
+        Method: ECME, started from this model. The unknowns of the adjustment are missing data, so
+        the expected squared error is that of the residual plus what the unknowns leave unresolved.
+
+        Parameters
+        ----------
+        squared : (n,) array_like
+            Squared residuals |r|^2 / sigma^2 of the image points.
+        unresolved : (n,) array_like or float
+            tr(A C A^T) / (scale * sigma)^2 of each image point. For a point of weight one it is
+            two minus twice its redundancy number.
         """
         squared = np.maximum(np.asarray(squared, dtype=float), 1e-300)
-        open_part = np.broadcast_to(open_part, squared.shape)
+        unresolved = np.broadcast_to(unresolved, squared.shape)
         if self.loss == 'student_t':
-            return self._most_likely(squared, open_part)
-        redundancy = np.maximum(1 - open_part / 2, MIN_REDUNDANCY)
+            return self._estimate_student_t(squared, unresolved)
+        redundancy = np.maximum(1 - unresolved / 2, MIN_REDUNDANCY)
         if self.loss == 'gaussian':
-            return replace(self, scale=float(np.sqrt(np.sum(squared) / (2 * np.sum(redundancy)))))
-        return replace(
-            self,
-            scale=float(
-                np.sqrt(_weighted_median(squared / redundancy, redundancy) / (2 * np.log(2)))
-            ),
-        )
+            variance = np.sum(squared) / (2 * np.sum(redundancy))
+        else:
+            median = _weighted_median(squared / redundancy, redundancy)
+            variance = median / (2 * np.log(2))  # median of chi-square, two degrees of freedom
+        return replace(self, scale=float(np.sqrt(variance)))
 
-    def _most_likely(self, squared, open_part):
-        """Student-t with scale, nu and share of gross errors; open_part (n,): expected q beside
-        the residual's.
-        """
-        now = self
-        scale2 = self.scale**2
-        for _ in range(50):
-            before = scale2
-            nu = now.nu
-            for _ in range(100):  # steps in the scale are cheap beside the search for nu
-                q = squared / scale2 + open_part
-                core = now.core(q)
-                if now.gross:
-                    now = replace(now, gross=float(np.clip(1 - np.mean(core), *GROSS_RANGE)))
-                w = core * (nu + 2) / (nu + q)
-                scale2, last = float(np.dot(w, q) / (2 * np.sum(core))) * scale2, scale2
-                if abs(scale2 - last) <= 1e-6 * last:
-                    break
-            now = replace(
-                now,
-                scale=float(np.sqrt(scale2)),
-                nu=_most_likely_nu(squared / scale2 + open_part, core),
-            )
-            if abs(scale2 - before) <= 1e-4 * before and abs(now.nu - nu) <= 1e-3 * nu:
+    def _estimate_student_t(self, squared: np.ndarray, unresolved: np.ndarray) -> Noise:
+        """Student-t with scale, nu and share of gross errors."""
+        noise = self
+        variance = self.scale**2
+        for _ in range(MAX_NU_STEPS):
+            nu = noise.nu
+            before = variance
+            noise, variance, core = noise._estimate_variance(variance, squared, unresolved)
+            q = squared / variance + unresolved
+            noise = replace(noise, scale=float(np.sqrt(variance)), nu=_estimate_nu(q, core))
+            settled = abs(variance - before) <= SCALE_TOLERANCE * before
+            if settled and abs(noise.nu - nu) <= NU_TOLERANCE * nu:
                 break
-        return now
+        return noise
+
+    def _estimate_variance(
+        self, variance: float, squared: np.ndarray, unresolved: np.ndarray
+    ) -> tuple[Noise, float, np.ndarray]:
+        """Share of gross errors, variance and core probabilities (n,) for the present nu."""
+        noise = self
+        nu = self.nu
+        for _ in range(MAX_SCALE_STEPS):
+            q = squared / variance + unresolved
+            core = noise.core_probability(q)
+            if noise.gross:
+                noise = replace(noise, gross=float(np.clip(1 - np.mean(core), *GROSS_RANGE)))
+            w = core * (nu + 2) / (nu + q)
+            last = variance
+            variance = float(np.dot(w, q) / (2 * np.sum(core))) * variance
+            if abs(variance - last) <= SCALE_STEP_TOLERANCE * last:
+                break
+        return noise, variance, core
 
 
-def _weighted_median(values, weights):
+DEFAULT_NOISE = Noise()
+
+
+def _weighted_median(values: np.ndarray, weights: np.ndarray) -> float:
     """Median of values (n,) with weights (n,)."""
     order = np.argsort(values)
     sums = np.cumsum(weights[order])
-    return values[order][np.searchsorted(sums, sums[-1] / 2)]
+    return float(values[order][np.searchsorted(sums, sums[-1] / 2)])
 
 
-def _most_likely_nu(q, share):
-    """Degrees of freedom that maximise the weighted likelihood of bivariate t variables with
-    squared norms q.
-    """
+def _estimate_nu(q: np.ndarray, share: np.ndarray) -> float:
+    """Degrees of freedom of bivariate t variables with squared norms q (n,) and weights (n,)."""
 
-    def cost(log_nu):
+    def cost(log_nu: float) -> float:
         nu = np.exp(log_nu)
-        return (nu + 2) / 2 * np.dot(share, np.log1p(q / nu))
+        return float((nu + 2) / 2 * np.dot(share, np.log1p(q / nu)))
 
     found = minimize_scalar(
         cost, bounds=np.log(NU_RANGE), method='bounded', options={'xatol': 1e-3}

@@ -15,10 +15,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from .adjustment import Adjustment, SolverOptions, adjust, residuals_and_q
+from .adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust, residuals_and_q
 from .elimination import CovarianceBlocks, factorize
 from .network import Network
-from .noise import Noise
+from .noise import DEFAULT_NOISE, Noise
 from .normal_equations import normal_equations
 from .precision import covariance_blocks, covariance_of_projection
 from .unknowns import Parameters
@@ -36,8 +36,8 @@ def adjust_and_estimate_noise(
     network: Network,
     start: Parameters,
     correction: np.ndarray | None = None,
-    noise: Noise = Noise(),
-    options: SolverOptions = SolverOptions(),
+    noise: Noise = DEFAULT_NOISE,
+    options: SolverOptions = DEFAULT_OPTIONS,
     raise_if_cancelled: Callable[[], None] | None = None,
 ) -> Adjustment:
     """Adjust a network and estimate its noise model.
@@ -72,7 +72,7 @@ def adjust_and_estimate_noise(
     if np.isfinite(q).all():
         # Far from the solution, whole exposures may look like gross errors: these are told apart
         # only after the first adjustment.
-        plain = replace(noise, gross=0.0).estimated(q * noise.scale**2)
+        plain = replace(noise, gross=0.0).estimate_from(q * noise.scale**2)
         noise = replace(plain, gross=noise.gross)
     loose = replace(options, tolerance=LOOSE)
     parameters = start
@@ -92,10 +92,10 @@ def adjust_and_estimate_noise(
 
 
 def estimate_noise(network: Network, adjustment: Adjustment, blocks: CovarianceBlocks) -> Noise:
-    """Noise model estimated from the residuals of an adjustment and the covariance of its unknowns."""
+    """Noise model from the residuals of an adjustment and the covariances of its unknowns."""
     noise = adjustment.noise
     projected = covariance_of_projection(network, adjustment.parameters, blocks)
     variance = (noise.scale * network.sigma) ** 2
     unresolved = np.trace(projected, axis1=1, axis2=2) / variance
-    new = noise.estimated(adjustment.q * noise.scale**2, unresolved)
+    new = noise.estimate_from(adjustment.q * noise.scale**2, unresolved)
     return replace(new, scale=max(new.scale, MIN_NOISE_PX / float(np.median(network.sigma))))

@@ -1,8 +1,8 @@
 """Normal equations of a bundle adjustment.
 
 Triggs, McLauchlan, Hartley and Fitzgibbon, "Bundle Adjustment - A Modern Synthesis", 2000, section
-6. They are built in blocks by exposure, object point and global unknowns, in chunks of image points
-that stay in the cache; `elimination` solves them.
+6. They are built in blocks by exposure, object point and global unknowns, from chunks of image
+points that stay in the cache; `elimination` solves them.
 """
 
 from __future__ import annotations

@@ -1,9 +1,12 @@
 """Resection: exterior orientation of one exposure from the phantom, without start values.
 
 The direct linear transformation (Abdel-Aziz and Karara 1971; Hartley and Zisserman, "Multiple View
-Geometry", 2nd ed., 2004, 7.1 and 6.2) on random samples, the one with the least median of squared
-residuals kept (Rousseeuw 1984), refined on all points with robust weights.
+Geometry", 2nd ed., 2004, 7.1 and 6.2) is computed from random samples. The one with the least
+median of squared residuals is selected (Rousseeuw 1984) and refined on all points with robust
+weights.
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 
@@ -16,16 +19,37 @@ from .noise import Noise
 from .rotations import matrix_from_vector
 
 MIN_TARGETS = 8
-SAMPLE_SIZE = 6  # the DLT has 11 unknowns, a target gives two equations
+SAMPLE_SIZE = 6  # the DLT has 11 unknowns, and a target gives two equations
 SAMPLES = 200  # with 20 % false matches 1 - (1 - 0.8^6)^200: a good sample is certain
-# smallest over largest extent of the targets below which they lie in one plane, but for the survey
-FLATNESS = 1e-2
+# Smallest over largest extent of the targets below which they lie in one plane.
+MIN_FLATNESS = 1e-2
+DLT_ITERATIONS = 10
+NU = 3.0  # of the Student-t of the robust weights: heavy tails
+MIN_VARIANCE = 1e-12  # [px^2], for exact observations
+# Damping of the refinement: start, minimum, maximum and factor.
+START_DAMPING = 1e-4
+MIN_DAMPING = 1e-12
+MAX_DAMPING = 1e10
+DAMPING_FACTOR = 10
+# Relative increase of the cost that rounding errors can cause.
+ROUNDING = 1e-9
+# Squared step at which the refinement ends, in the metric of its normal matrix and noise variance.
+TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
 class Resection:
-    """Exterior orientation: rotation (3, 3) phantom -> sensor, position_mm (3,) of the source,
-    scale [px] of the residuals, inliers (n,) True or False.
+    """Exterior orientation of one exposure.
+
+    Attributes
+    ----------
+    rotation : (3, 3) ndarray
+        Rotation phantom -> sensor.
+    position_mm : (3,) ndarray
+        Position of the source.
+    scale : float
+        Scale of the residuals [px].
+    inliers : (n,) ndarray of bool
     """
 
     rotation: np.ndarray
@@ -34,12 +58,13 @@ class Resection:
     inliers: np.ndarray
 
 
-def direct_linear_transformation(xyz, uv, weights=None):
-    """Projection matrices (..., 3, 4) with uv ~ P (xyz, 1), of xyz (..., n, 3), uv (..., n, 2), n
-    >= 6.
+def direct_linear_transformation(
+    xyz: np.ndarray, uv: np.ndarray, weights: np.ndarray | None = None
+) -> np.ndarray:
+    """Projection matrices (..., 3, 4) with uv ~ P (xyz, 1).
 
-    Coordinates are normalised (Hartley and Zisserman, algorithm 7.1); weights (..., n) of the
-    points.
+    xyz (..., n, 3), uv (..., n, 2) and weights (..., n) of n >= 6 points. Coordinates are
+    normalised (Hartley and Zisserman, algorithm 7.1).
     """
     mean_x = xyz.mean(axis=-2, keepdims=True)
     mean_u = uv.mean(axis=-2, keepdims=True)
@@ -71,8 +96,8 @@ def direct_linear_transformation(xyz, uv, weights=None):
     return from_u @ normalised @ to_x
 
 
-def decompose(projection):
-    """Calibration matrix (3, 3), rotation (3, 3) and source (3,) of one projection matrix (3, 4).
+def decompose(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Calibration matrix (3, 3), rotation (3, 3) and source (3,) of a projection matrix (3, 4).
 
     The calibration matrix has a positive diagonal and a one in the corner (Hartley and Zisserman
     6.2.4).
@@ -88,9 +113,10 @@ def decompose(projection):
     return k / k[2, 2], rotation, -np.linalg.solve(m, projection[:, 3])
 
 
-def _squared_residuals(projection, xyz, uv):
-    """Squared residuals (..., n) of projection matrices (..., 3, 4); infinite on the plane of the
-    source.
+def _squared_residuals(projection: np.ndarray, xyz: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Squared residuals (..., n) of projection matrices (..., 3, 4).
+
+    They are infinite for points in the plane of the source.
     """
     x = xyz @ np.swapaxes(projection[..., :3], -1, -2) + projection[..., None, :, 3]
     with np.errstate(divide='ignore', invalid='ignore'):
@@ -98,18 +124,24 @@ def _squared_residuals(projection, xyz, uv):
     return np.where(np.isfinite(r), r, np.inf)
 
 
-def robust_dlt(xyz, uv, seed=0):
-    """Projection matrix (3, 4) of n >= 8 targets xyz (n, 3) [mm] at uv (n, 2) [px], up to half
-    false.
+def _robust_variance(squared: np.ndarray) -> float:
+    """Variance [px^2] of each coordinate by the median of squared residuals (n,)."""
+    # The median of chi-square with two degrees of freedom is 2 ln 2.
+    return max(np.median(squared) / (2 * np.log(2)), MIN_VARIANCE)
 
-    Raises DataError where the targets are too few or lie in one plane.
+
+def robust_dlt(xyz: np.ndarray, uv: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Projection matrix (3, 4) of targets of which up to half may be falsely matched.
+
+    xyz (n, 3) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError where the targets are
+    too few or lie in one plane.
     """
     if len(xyz) < MIN_TARGETS:
         raise DataError(
             f'{len(xyz)} targets are too few for a resection, {MIN_TARGETS} are needed'
         )
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
-    if extent[2] < FLATNESS * extent[0]:
+    if extent[2] < MIN_FLATNESS * extent[0]:
         raise DataError(
             'all targets lie in one plane, from which the principal distance cannot be found'
         )
@@ -118,86 +150,150 @@ def robust_dlt(xyz, uv, seed=0):
     candidates = direct_linear_transformation(xyz[samples], uv[samples])
     squared = _squared_residuals(candidates, xyz, uv)
     best = squared[np.argmin(np.median(squared, axis=1))]
-    for _ in range(10):
-        scale2 = max(np.median(best) / (2 * np.log(2)), 1e-12)  # median of chi-square, two degrees
-        projection = direct_linear_transformation(xyz, uv, Noise(nu=3.0).weight(best / scale2))
+    for _ in range(DLT_ITERATIONS):
+        weights = Noise(nu=NU).weight(best / _robust_variance(best))
+        projection = direct_linear_transformation(xyz, uv, weights)
         best = _squared_residuals(projection, xyz, uv)
     return projection
 
 
-def principal_distance_of(projection):
+def principal_distance_of(projection: np.ndarray) -> float:
     """Principal distance [px] of a projection matrix (3, 4): mean of its two scale factors."""
     k, _, _ = decompose(projection)
     return float(np.sqrt(abs(k[0, 0] * k[1, 1])))
 
 
-def resect(xyz, uv, interior, projection=None, max_steps=100):
-    """Exterior orientation of one exposure under a given interior orientation, robust to false
-    matches.
+def resect(
+    xyz: np.ndarray,
+    uv: np.ndarray,
+    interior: np.ndarray,
+    projection: np.ndarray | None = None,
+    max_steps: int = 100,
+) -> Resection:
+    """Exterior orientation of one exposure for a given interior orientation.
 
-    xyz (n, 3) [mm], uv (n, 2) [px], interior (3,) xp, yp, c [px]; projection (3, 4) from
-    robust_dlt where it is known already. Returns Resection. Raises DataError as robust_dlt does,
-    and where no orientation with the targets in front of the source is found.
+    Robust to false matches.
+
+    Parameters
+    ----------
+    xyz : (n, 3) ndarray
+        Targets [mm].
+    uv : (n, 2) ndarray
+        Their image points [px].
+    interior : (3,) ndarray
+        xp, yp, c [px].
+    projection : (3, 4) ndarray, optional
+        Result of robust_dlt; computed by default.
+    max_steps : int
+        Largest number of steps of the refinement.
+
+    Raises
+    ------
+    DataError
+        As robust_dlt, and where no orientation with the targets before the source is found.
     """
     projection = robust_dlt(xyz, uv) if projection is None else projection
-    k, rotation, position = decompose(projection)
-    # The distance found goes with the principal distance found: keep the ratio, so the image scale
-    # stays.
-    centre = xyz.mean(axis=0)
-    position = centre + (position - centre) * interior[2] / np.sqrt(k[0, 0] * k[1, 1])
-    rotation, position = _pointed_at(rotation, position, centre, np.median(uv, axis=0), interior)
-    mu = 1e-4
+    problem = _Problem(xyz, uv, interior)
+    rotation, position = _start_orientation(projection, problem)
+    mu = START_DAMPING
     for _ in range(max_steps):
+        system = problem.linearise(rotation, position)
+        rotation, position, step, mu = _damped_step(problem, system, rotation, position, mu)
+        if step @ system.normal @ step <= TOLERANCE * system.noise.scale**2:
+            break
+    noise = system.noise
+    return Resection(
+        rotation, position, noise.scale, noise.inliers(system.squared / noise.scale**2)
+    )
+
+
+@dataclass(frozen=True)
+class _System:
+    """Normal equations of the exterior orientation, with the noise model of their weights."""
+
+    normal: np.ndarray
+    right: np.ndarray
+    squared: np.ndarray
+    noise: Noise
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Targets (n, 3) [mm] and image points (n, 2) [px] of one exposure, and xp, yp, c [px]."""
+
+    xyz: np.ndarray
+    uv: np.ndarray
+    interior: np.ndarray
+
+    def linearise(self, rotation: np.ndarray, position: np.ndarray) -> _System:
+        """Robustly weighted normal equations. Raises DataError for a target behind the source."""
+        n = len(self.xyz)
         predicted, jacobian, _, _ = project_with_jacobian(
-            np.broadcast_to(rotation, (len(xyz), 3, 3)),
-            np.broadcast_to(position, (len(xyz), 3)),
-            xyz,
-            interior,
+            np.broadcast_to(rotation, (n, 3, 3)),
+            np.broadcast_to(position, (n, 3)),
+            self.xyz,
+            self.interior,
         )
-        r = uv - predicted
+        r = self.uv - predicted
         if not np.isfinite(r).all():
             raise DataError(
                 'the image points do not fit the phantom: targets would lie behind the source'
             )
         squared = np.sum(r * r, axis=1)
-        noise = Noise(
-            nu=3.0, scale=float(np.sqrt(max(np.median(squared) / (2 * np.log(2)), 1e-12)))
-        )
+        noise = Noise(nu=NU, scale=float(np.sqrt(_robust_variance(squared))))
         w = noise.weight(squared / noise.scale**2)
-        weighted = (np.repeat(w, 2)[:, None] * jacobian.reshape(-1, 6)).T
-        h = weighted @ jacobian.reshape(-1, 6)
-        g = weighted @ r.ravel()
-        cost = noise.cost(squared / noise.scale**2, np.ones(len(xyz)))
-        while True:
-            step = np.linalg.solve(h + mu * np.diag(np.diag(h)), g)
-            moved = matrix_from_vector(step[3:]) @ rotation, position + step[:3]
-            squared_new = np.sum((uv - project(moved[0], moved[1], xyz, interior)) ** 2, axis=1)
-            if noise.cost(squared_new / noise.scale**2, np.ones(len(xyz))) <= cost + 1e-9 * abs(
-                cost
-            ):
-                mu = max(mu / 10, 1e-12)
-                break
-            mu *= 10
-            if mu > 1e10:
-                moved = (rotation, position)
-                step = np.zeros(6)
-                break
-        rotation, position = moved
-        if step @ h @ step <= 1e-4 * noise.scale**2:
-            break
-    return Resection(rotation, position, noise.scale, noise.inliers(squared / noise.scale**2))
+        jacobian = jacobian.reshape(-1, 6)
+        weighted = (np.repeat(w, 2)[:, None] * jacobian).T
+        return _System(weighted @ jacobian, weighted @ r.ravel(), squared, noise)
+
+    def squared_residuals(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+        """Squared residuals (n,) [px^2]; NaN behind the source."""
+        return np.sum(
+            (self.uv - project(rotation, position, self.xyz, self.interior)) ** 2, axis=1
+        )
 
 
-def _pointed_at(rotation, position, centre, pixel, interior):
-    """The orientation turned about the source until the centre of the targets falls on its pixel."""
-    there = rotation @ (centre - position)
-    wanted = np.array(
-        [(pixel[0] - interior[0]) / interior[2], (pixel[1] - interior[1]) / interior[2], 1.0]
-    )
-    there = there / np.linalg.norm(there)
+def _damped_step(
+    problem: _Problem, system: _System, rotation: np.ndarray, position: np.ndarray, mu: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Orientation after a step that does not increase the cost, the step (6,), and the damping.
+
+    The orientation is returned unchanged, with a step of zeros, where no such step is found.
+    """
+    noise = system.noise
+    sigma = np.ones(len(problem.xyz))
+    cost = noise.cost(system.squared / noise.scale**2, sigma)
+    while mu <= MAX_DAMPING:
+        damped = system.normal + mu * np.diag(np.diag(system.normal))
+        step = np.linalg.solve(damped, system.right)
+        new_rotation = matrix_from_vector(step[3:]) @ rotation
+        new_position = position + step[:3]
+        squared = problem.squared_residuals(new_rotation, new_position)
+        if noise.cost(squared / noise.scale**2, sigma) <= cost + ROUNDING * abs(cost):
+            return new_rotation, new_position, step, max(mu / DAMPING_FACTOR, MIN_DAMPING)
+        mu *= DAMPING_FACTOR
+    return rotation, position, np.zeros(6), mu
+
+
+def _start_orientation(projection: np.ndarray, problem: _Problem) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and position (3,) from a projection matrix and the interior orientation.
+
+    The projection matrix has a principal distance of its own. The ratio of distance and principal
+    distance is preserved, so the image scale stays. Then the sensor is turned about the source
+    until the centre of the targets is imaged at the median image point.
+    """
+    k, rotation, position = decompose(projection)
+    xp, yp, c = problem.interior
+    centre = problem.xyz.mean(axis=0)
+    position = centre + (position - centre) * c / np.sqrt(k[0, 0] * k[1, 1])
+    pixel = np.median(problem.uv, axis=0)
+    present = rotation @ (centre - position)
+    wanted = np.array([(pixel[0] - xp) / c, (pixel[1] - yp) / c, 1.0])
+    present = present / np.linalg.norm(present)
     wanted = wanted / np.linalg.norm(wanted)
-    axis = np.cross(there, wanted)
+    axis = np.cross(present, wanted)
     sine = np.linalg.norm(axis)
     if sine < 1e-12:
         return rotation, position
-    return matrix_from_vector(axis / sine * np.arctan2(sine, there @ wanted)) @ rotation, position
+    angle = np.arctan2(sine, present @ wanted)
+    return matrix_from_vector(axis / sine * angle) @ rotation, position

@@ -155,7 +155,7 @@ class UnknownLayout:
         return ReducedLayout(self.n_points, POINT_SIZE, self.n_free_globals)
 
     def expand_globals(self, free_values: np.ndarray) -> np.ndarray:
-        """Values (G, ...) of all global unknowns, zeros where held, from those of the free ones."""
+        """Values (G, ...) of all global unknowns from those of the free ones; zeros where held."""
         out = np.zeros((self.n_globals, *free_values.shape[1:]))
         out[self.free] = free_values
         return out

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import DataError
-from ..photogrammetry.rig_orientation import UNKNOWNS
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE
 from ..photogrammetry.rotations import cross_matrix
 
 MIN_BASE = 1e-6  # distance of the sources over their distance from the rig's origin
@@ -46,7 +46,7 @@ class EpipolarGeometry:
     """
 
     def __init__(self, orientation, a, b):
-        rows = [orientation.number(a), orientation.number(b)]
+        rows = [orientation.index(a), orientation.index(b)]
         r_a, r_b = orientation.rotation[rows]
         between = orientation.position_mm[rows[0]] - orientation.position_mm[rows[1]]
         size = np.max(np.linalg.norm(orientation.position_mm[rows], axis=1))
@@ -59,7 +59,7 @@ class EpipolarGeometry:
         turn = r_b @ r_a.T
         shift = r_b @ between
         self.essential = cross_matrix(shift) @ turn
-        columns = np.concatenate([np.arange(UNKNOWNS * row, UNKNOWNS * (row + 1)) for row in rows])
+        columns = orientation.covariance_rows(rows)
         derivative = _derivative(turn, shift, r_b, self._interior[:, 2])
         self._covariance = (
             derivative @ orientation.covariance[np.ix_(columns, columns)] @ derivative.T
@@ -126,7 +126,7 @@ def _derivative(turn, shift, r_b, c):
     by_i_a = -essential @ m / c[0]
     by_i_b = -m.transpose(0, 2, 1) @ essential / c[1]
     every = np.concatenate([of_shift, by_w_a, by_i_a, -of_shift, by_w_b, by_i_b])
-    return every.reshape(2 * UNKNOWNS, 9).T
+    return every.reshape(2 * ORIENTATION_SIZE, 9).T
 
 
 def epipolar_residuals(orientation, a, b, uv_a, uv_b, sigma_a, sigma_b):

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.special import chdtri, erfc
 
 from ..errors import DataError
-from ..photogrammetry.rig_orientation import UNKNOWNS
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE
 
 # status of a point
 OK = 0
@@ -125,7 +125,9 @@ class Intersector:
         self._distance = interior[:, 2:]
         depth = _depth_of_axes(orientation)
         self._start_rows = rows / depth[:, None, None], shift / depth[:, None]
-        self._by_orientation = _through(_derivative_functions(orientation), orientation.root())
+        self._by_orientation = _through(
+            _derivative_functions(orientation), orientation.covariance_root()
+        )
         self._limit = _limits(np.inf if reject is None else float(reject), count)
 
     def intersect(self, uv, sigma, outside=None):
@@ -250,7 +252,7 @@ class Intersector:
         return (
             (functions @ self._by_orientation)
             .transpose(1, 0, 2)
-            .reshape(n, 2 * count, UNKNOWNS * count)
+            .reshape(n, 2 * count, ORIENTATION_SIZE * count)
         )
 
     def _judged(self, uv, weight, rays, found):
@@ -375,7 +377,7 @@ def _derivative_functions(orientation):
     """Coefficients (F, 9, 2, 9) of the functions 1, x, y, x^2, y^2, xy, 1/Z, x/Z, y/Z (x = X/Z, y
     = Y/Z) in the derivatives of u and v by T, w, xp, yp, c: those of collinearity, multiplied out.
     """
-    out = np.zeros((len(orientation.fluoroscopes), _FUNCTIONS, 2, UNKNOWNS))
+    out = np.zeros((len(orientation.fluoroscopes), _FUNCTIONS, 2, ORIENTATION_SIZE))
     for k, r, c in zip(out, orientation.rotation, orientation.interior[:, 2]):
         k[6, 0, :3] = -c * r[0]
         k[6, 1, :3] = -c * r[1]
@@ -397,5 +399,7 @@ def _through(functions, root):
     (9F, 9F).
     """
     count = len(functions)
-    out = functions.reshape(count, 2 * _FUNCTIONS, UNKNOWNS) @ root.reshape(count, UNKNOWNS, -1)
+    out = functions.reshape(count, 2 * _FUNCTIONS, ORIENTATION_SIZE) @ root.reshape(
+        count, ORIENTATION_SIZE, -1
+    )
     return out.reshape(count, _FUNCTIONS, -1)

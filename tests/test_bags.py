@@ -26,14 +26,14 @@ from fluoro_calib_ros.bags.definitions import (
     type_hash,
     typestore,
 )
-from fluoro_calib_ros.bags.reader import (
+from fluoro_calib_ros.bags.frames import (
     frame_from_message,
-    iterate_messages,
-    read_frames,
-    storage_files,
-    topics_of,
+    message_from_frame,
+    observations_topic,
 )
-from fluoro_calib_ros.bags.writer import BagWriter, message_from_frame, observations_topic
+from fluoro_calib_ros.bags.reader import iterate_messages, read_frames, topics_of
+from fluoro_calib_ros.bags.storage import storage_files
+from fluoro_calib_ros.bags.writer import BagWriter
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 
@@ -438,10 +438,10 @@ def test_only_a_bag_is_overwritten_and_only_on_request(tmp_path):
     assert os.listdir(tmp_path) == ['run']
     (tmp_path / 'run/thesis.doc').write_text('precious')
     for options in ({'live': True, 'overwrite': True}, {'overwrite': True}):
-        with pytest.raises(DataError, match='thesis.doc'):
+        with pytest.raises(DataError, match=r'thesis\.doc'):
             write_bag(path, **options)
     (tmp_path / 'file').write_text('')
-    with pytest.raises(DataError, match='no bag folder'):
+    with pytest.raises(DataError, match='not a bag folder'):
         write_bag(tmp_path / 'file', overwrite=True)
     assert_holds(path, [frame()])
 
@@ -468,7 +468,7 @@ def test_a_disk_that_is_full_is_told_and_leaves_nothing(tmp_path, monkeypatch):
         (('a/b', TARGET_OBSERVATIONS, b'', 0), "'a/b' cannot be the name of a ROS topic"),
         (('/c-arm/x', TARGET_OBSERVATIONS, b'', 0), "'/c-arm/x' cannot be the name"),
         (('/x', 'some_msgs/msg/Thing', b'', 0), "'some_msgs/msg/Thing' is not known"),
-        (('/x', 'std_msgs/msg/Empty', b'', -1), 'the time -1 ns cannot stand in a bag'),
+        (('/x', 'std_msgs/msg/Empty', b'', -1), '-1 ns is not a time that a bag can hold'),
         (('/x', 'std_msgs/msg/String', 'hello', 0), 'not a message of type std_msgs/msg/String'),
         ((TOPIC, 'std_msgs/msg/Empty', b'', 0), 'does not belong to this topic of type'),
     ],
@@ -490,7 +490,7 @@ def test_sources_that_are_no_bag(tmp_path):
         return text
 
     assert 'there is no such bag' in said(tmp_path / 'missing')
-    assert 'this folder is no bag' in said(tmp_path)
+    assert 'this folder is not a bag' in said(tmp_path)
     (tmp_path / 'x.mcap').write_bytes(b'')
     assert 'empty' in said(tmp_path / 'x.mcap')
     (tmp_path / 'x.mcap').write_bytes(b'hello, this is a text and no bag')
@@ -504,9 +504,9 @@ def test_sources_that_are_no_bag(tmp_path):
     [
         (
             {'relative_file_paths': ['run_0.mcap', 'run_1.mcap']},
-            'it names run_1.mcap, but there is no such file',
+            'it lists run_1.mcap, but the folder has no such file',
         ),
-        ({'storage_identifier': 'sqlite3'}, 'stored as sqlite3, only mcap is read'),
+        ({'storage_identifier': 'sqlite3'}, 'stored as sqlite3, only mcap is supported'),
         ({'compression_mode': 'FILE'}, 'compressed as a whole'),
         ({'relative_file_paths': []}, 'has no files'),
         ({'relative_file_paths': 5}, 'not the metadata of a bag'),
@@ -627,7 +627,7 @@ def test_a_wrong_frame_is_named_by_bag_topic_and_message(tmp_path, changes, sent
 
 def test_frames_need_not_be_checked(tmp_path):
     path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr(u=np.full(30, np.nan)))])
-    assert np.isnan(read_frames(path, check=False).frames['a'][0].uv[:, 0]).all()
+    assert np.isnan(read_frames(path, validate=False).frames['a'][0].uv[:, 0]).all()
 
 
 def test_a_message_that_is_none_is_named(tmp_path):
@@ -649,7 +649,7 @@ def test_a_message_that_is_none_is_named(tmp_path):
 
 def test_a_frame_that_is_there_twice_is_named(tmp_path):
     path = write_bag(tmp_path / 'run', [frame(number=1), frame(number=2), frame(number=1)])
-    assert 'frame 1 is there already' in message_of(read_frames, path)
+    assert 'frame 1 is already given in message 1' in message_of(read_frames, path)
 
 
 def test_two_topics_of_one_fluoroscope_are_named(tmp_path):
@@ -681,7 +681,7 @@ def test_another_definition_of_the_message_is_told(tmp_path):
     )
     assert 'differently' in message_of(read_frames, path)
     path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], message_encoding='json')
-    assert 'only cdr is read' in message_of(read_frames, path)
+    assert 'only cdr is supported' in message_of(read_frames, path)
 
 
 def test_comments_and_blanks_of_a_definition_do_not_matter(tmp_path):

@@ -1,95 +1,113 @@
-"""Message definitions without ROS: those of Jazzy, and fluoro_calib_msgs from the files in msg/."""
+"""Message definitions without ROS: those of Jazzy, and fluoro_calib_msgs from msg/."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable
 from functools import cache
 from importlib.resources import files
+from typing import Any
 
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
 
 from ..errors import DataError
 
 PACKAGE = 'fluoro_calib_msgs'
 TARGET_OBSERVATIONS = f'{PACKAGE}/msg/TargetObservations'
-_SEPARATOR = '=' * 80
+_SEPARATOR = '=' * 80  # between the definitions of a schema
 
 
 @cache
-def typestore():
-    """The rosbags typestore of Jazzy with the messages of fluoro_calib_msgs."""
+def typestore() -> Typestore:
+    """Return the rosbags typestore of Jazzy with the messages of fluoro_calib_msgs."""
     store = get_typestore(Stores.ROS2_JAZZY)
-    for name, text in _own_texts().items():
+    for name, text in _package_texts().items():
         store.register(get_types_from_msg(text, name))
     return store
 
 
-def message_class(msg_type):
-    """The dataclass of a message type such as 'std_msgs/msg/Header'. Raises DataError for one not
-    known.
+def message_class(msg_type: str) -> type[Any]:
+    """Return the dataclass of a message type such as 'std_msgs/msg/Header'.
+
+    Raises DataError for an unknown type.
     """
-    if msg_type not in typestore().types:
+    types = typestore().types
+    if msg_type not in types:
         raise DataError(f'the message type {msg_type!r} is not known')
-    return typestore().types[msg_type]
+    return types[msg_type]
 
 
 @cache
-def type_hash(msg_type):
-    """Hash 'RIHS01_...' of a message type (REP-2016)."""
+def type_hash(msg_type: str) -> str:
+    """Return the hash 'RIHS01_...' of a message type (REP-2016)."""
     message_class(msg_type)
     return typestore().hash_rihs01(msg_type)
 
 
 @cache
-def full_text(msg_type):
-    """Definition of a message type, and behind it those of all types it is made of, as in a bag's
-    schema.
+def full_text(msg_type: str) -> str:
+    """Return the definition of a message type as the schema of a bag contains it.
 
-    Each has a line of 80 '=' and a line 'MSG: package/Type' before it, in the order in which
-    rosbag2 finds them.
+    The definitions of all types it depends on follow, each after a line of 80 '=' and a line
+    'MSG: package/Type', in the order in which rosbag2 finds them.
     """
     message_class(msg_type)
     return _with_dependencies(msg_type, set())
 
 
-def to_cdr(message, msg_type):
-    """CDR bytes of a message dataclass. Raises DataError where a field has a value it cannot have."""
+def to_cdr(message: Any, msg_type: str) -> bytes:
+    """Return a message dataclass as CDR. Raises DataError for a value that a field cannot have."""
     message_class(msg_type)
     try:
         return bytes(typestore().serialize_cdr(message, msg_type, little_endian=True))
-    except Exception as error:  # generated code: whatever the wrong value brings about
+    except Exception as error:  # generated code raises almost anything for a wrong value
         raise DataError(f'this is not a message of type {msg_type} ({error})') from None
 
 
-def from_cdr(data, msg_type):
-    """Message dataclass of CDR bytes. Raises DataError where they are not a message of that type."""
+def from_cdr(data: bytes, msg_type: str) -> Any:
+    """Return CDR as a message dataclass. Raises DataError for other bytes."""
     message_class(msg_type)
     try:
         return typestore().deserialize_cdr(data, msg_type)
-    except Exception as error:  # generated code on bytes that may be anything
+    except Exception as error:  # generated code raises almost anything for damaged bytes
         raise DataError(f'the content is not a {msg_type} ({error})') from None
 
 
-def fields_of(msg_type, text, encoding):
-    """Fields of a message type and of those it is made of, {type: fields}, from the definition in
-    a bag.
+def fields_of(msg_type: str, text: str, encoding: str) -> dict[str, Any]:
+    """Return the fields of a message type and of those it depends on, by type.
 
-    encoding 'ros2msg' or 'ros2idl'. Raises DataError where the definition cannot be read.
+    Parameters
+    ----------
+    msg_type : str
+    text : str
+        Definition in the schema of a bag.
+    encoding : {'ros2msg', 'ros2idl'}
+
+    Raises
+    ------
+    DataError
+        For a definition that cannot be read.
     """
-    parse = {
-        'ros2msg': get_types_from_msg,
-        'ros2idl': lambda text, _: get_types_from_idl(text),
-    }.get(encoding)
-    if parse is None:
-        raise DataError(
-            f'the definition of {msg_type} has the encoding {encoding!r}, ros2msg is expected'
-        )
     try:
-        return {name: fields for name, (_, fields) in parse(text, msg_type).items()}
-    except Exception as error:  # a parser on text that may be anything
+        if encoding == 'ros2msg':
+            parsed = get_types_from_msg(text, msg_type)
+        elif encoding == 'ros2idl':
+            parsed = get_types_from_idl(text)
+        else:
+            raise DataError(
+                f'the definition of {msg_type} has the encoding {encoding!r}, ros2msg is expected'
+            )
+    except DataError:
+        raise
+    except Exception as error:  # the parser raises almost anything for a damaged text
         raise DataError(
             f'the definition of {msg_type} cannot be read ({type(error).__name__})'
         ) from None
+    return {name: fields for name, (_, fields) in parsed.items()}
 
 
-def _own_texts():
+def _package_texts() -> dict[str, str]:
+    """Return the definitions of fluoro_calib_msgs by message type."""
     folder = files(__package__) / 'msg'
     return {
         f'{PACKAGE}/msg/{file.name[:-4]}': file.read_text(encoding='utf-8')
@@ -98,23 +116,23 @@ def _own_texts():
     }
 
 
-def _with_dependencies(msg_type, seen):
+def _with_dependencies(msg_type: str, seen: set[str]) -> str:
+    """Return the definition of a type and of those it depends on, unless they were seen."""
     store = typestore()
-    text = _own_texts().get(msg_type) or store.gendefhash(msg_type, {}, ros_version=2)[0]
-    for name in sorted(_parts(store.fielddefs[msg_type][1])):
+    text = _package_texts().get(msg_type) or store.gendefhash(msg_type, {}, ros_version=2)[0]
+    for name in sorted(_nested_types(store.fielddefs[msg_type][1])):
         if name not in seen:
             seen.add(name)
-            text += f'\n{_SEPARATOR}\nMSG: {name.replace("/msg/", "/")}\n' + _with_dependencies(
-                name, seen
-            )
+            heading = f'\n{_SEPARATOR}\nMSG: {name.replace("/msg/", "/")}\n'
+            text += heading + _with_dependencies(name, seen)
     return text
 
 
-def _parts(fields):
-    """Names of the message types among fields, looking into arrays."""
+def _nested_types(fields: Iterable[Any]) -> set[str]:
+    """Return the names of the message types of fields, including those of array elements."""
     names = set()
     for _, description in fields:
-        while isinstance(description[1][0], tuple):  # an array or a sequence of something
+        while isinstance(description[1][0], tuple):  # an array or a sequence
             description = description[1][0]
         if isinstance(description[1], str):
             names.add(description[1])

@@ -1,10 +1,14 @@
-"""Quality of service as it stands in bags: YAML in a channel's metadata and in metadata.yaml."""
+"""QoS profiles as bags contain them: YAML in a channel's metadata and in metadata.yaml."""
+
+from __future__ import annotations
+
+from typing import Any
 
 import yaml
 
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
-# Numbers of the policies, in bags from before Jazzy (rmw/types.h).
-_NUMBERED = {
+# Bags from before Jazzy number the policies (rmw/types.h).
+_POLICY_NAMES = {
     'history': ('system_default', 'keep_last', 'keep_all', 'unknown'),
     'reliability': ('system_default', 'reliable', 'best_effort', 'unknown', 'best_available'),
     'durability': ('system_default', 'transient_local', 'volatile', 'unknown', 'best_available'),
@@ -19,9 +23,12 @@ _NUMBERED = {
 }
 
 
-def profile(reliability='reliable', durability='volatile', depth=10):
-    """A quality of service {policy: value} as rosbag2 writes it; keep last, no deadline, no
-    lifespan.
+def profile(
+    reliability: str = 'reliable', durability: str = 'volatile', depth: int = 10
+) -> dict[str, Any]:
+    """Return a QoS profile {policy: value} as rosbag2 writes it.
+
+    Keep last, without deadline and lifespan.
     """
     return {
         'history': 'keep_last',
@@ -39,33 +46,30 @@ def profile(reliability='reliable', durability='volatile', depth=10):
 PROFILES = {'observations': profile(), 'latched': profile(durability='transient_local', depth=1)}
 
 
-def to_yaml(value):
-    """YAML text in the form of rosbag2: blocks, keys in their order, no line end behind it."""
+def to_yaml(value: Any) -> str:
+    """Return a value as YAML as rosbag2 does: block style, keys in order, no final newline."""
     return yaml.dump(
         value, Dumper=_Dumper, sort_keys=False, default_flow_style=False, width=10**6
     ).rstrip('\n')
 
 
-def parse_profiles(value):
-    """Qualities of service [{policy: value}, ...] from the YAML text or list in a bag; policies by
-    name.
+def parse_profiles(value: Any) -> list[dict[str, Any]]:
+    """Return QoS profiles from the YAML text, or the list, in a bag; policies by name.
 
-    What cannot be understood is left out: a bag is readable without it.
+    A text that cannot be parsed gives no profiles: a bag can be read without them.
     """
     try:
         items = yaml.safe_load(value) if isinstance(value, str) else value
     except yaml.YAMLError:
         return []
-    return (
-        [_named(item) for item in items if isinstance(item, dict)]
-        if isinstance(items, list)
-        else []
-    )
+    if not isinstance(items, list):
+        return []
+    return [_with_policy_names(item) for item in items if isinstance(item, dict)]
 
 
-def _named(item):
+def _with_policy_names(item: dict[str, Any]) -> dict[str, Any]:
     item = dict(item)
-    for policy, names in _NUMBERED.items():
+    for policy, names in _POLICY_NAMES.items():
         number = item.get(policy)
         if isinstance(number, int):
             item[policy] = names[number] if 0 <= number < len(names) else 'unknown'
@@ -75,10 +79,10 @@ def _named(item):
 class _Dumper(yaml.SafeDumper):
     """Block style as yaml-cpp writes it."""
 
-    def increase_indent(self, flow=False, indentless=False):
+    def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
         return super().increase_indent(flow, False)
 
-    def ignore_aliases(self, data):
+    def ignore_aliases(self, data: Any) -> bool:
         return True
 
 

@@ -1,89 +1,70 @@
-"""Writing a bag as rosbag2 (Jazzy) does: a folder NAME with NAME_0.mcap and metadata.yaml.
+"""Write a bag as rosbag2 (Jazzy) does: a folder NAME with NAME_0.mcap and metadata.yaml.
 
 The layout follows rosbag2's sources (sequential_writer.cpp, mcap_storage.cpp, yaml.hpp of the
 branch jazzy).
 """
 
+from __future__ import annotations
+
 import os
 import re
 import secrets
 import shutil
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from types import TracebackType
+from typing import Any, BinaryIO
 
-import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from ..errors import DataError
-from ..files.access import cause_of
+from ..exposures.frame import Frame
+from ..files.access import os_error_reason
 from ..files.atomic import sync_folder, write_text
 from .definitions import TARGET_OBSERVATIONS, full_text, message_class, to_cdr, type_hash
+from .frames import message_from_frame, observations_topic
+from .metadata import NO_MESSAGE_NS, BagTopic, FileSpan, bag_metadata
 from .qos import PROFILES, to_yaml
 
 LIBRARY = 'fluoro_calib_ros'
-NEVER = 2**63 - 1  # starting time of a bag without messages
-CHUNK_SIZE = 768 * 1024  # of rosbag2
-_TOPIC = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
+CHUNK_SIZE = 768 * 1024  # that of rosbag2 [bytes]
+_TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
 
-
-@dataclass
-class _Span:
-    """Number of messages and the time they span [ns]."""
-
-    path: str = ''
-    count: int = 0
-    start: int = NEVER
-    end: int = -1
-
-    def add(self, time):
-        self.count, self.start, self.end = (
-            self.count + 1,
-            min(self.start, time),
-            max(self.end, time),
-        )
-
-    def times(self):
-        return {
-            'starting_time': {'nanoseconds_since_epoch': self.start},
-            'duration': {'nanoseconds': max(self.end - self.start, 0)},
-        }
-
-
-@dataclass
-class _Topic:
-    """A topic of a bag: its type, its quality of service and the number of its messages."""
-
-    name: str
-    msg_type: str
-    qos: list
-    count: int = 0
-    channel: int = field(default=0, compare=False)  # in the present file
-
-    def metadata(self):
-        return {
-            'topic_metadata': {
-                'name': self.name,
-                'type': self.msg_type,
-                'serialization_format': 'cdr',
-                'offered_qos_profiles': self.qos,
-                'type_description_hash': type_hash(self.msg_type),
-            },
-            'message_count': self.count,
-        }
+Qos = str | list[dict[str, Any]]  # a name in PROFILES, or QoS profiles
 
 
 class BagWriter:
     """A new bag, as a context manager; the same messages give the same bytes.
 
-    path: the bag's folder. It is written under another name and gets its own when the block has
-    ended well; an exception leaves nothing behind, and what was there before as it was. overwrite:
-    replace a bag of that name. live, for recording: written in place, and what came before an
-    exception is kept. split_bytes: size of a file [bytes] at which the next one is begun, 0:
-    never. Raises DataError where a folder or file of that name is there, where it cannot be
-    written, and for topics, types and messages that cannot be.
+    The bag is written under a temporary name and renamed when the block ends without an error. An
+    exception leaves nothing behind, and a bag that is to be replaced as it was.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder of the bag.
+    overwrite : bool
+        Whether a bag of that name is replaced.
+    live : bool
+        For recording: the bag is written under its own name, and what was written before an
+        exception is kept.
+    split_bytes : int
+        Size of a file [bytes] after which the next one is begun; 0 for a single file.
+
+    Raises
+    ------
+    DataError
+        For a folder or file that must not be replaced, where the bag cannot be written, and for
+        an invalid topic, type or message.
     """
 
-    def __init__(self, path, overwrite=False, live=False, split_bytes=0):
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        overwrite: bool = False,
+        live: bool = False,
+        split_bytes: int = 0,
+    ) -> None:
         self.path = os.path.abspath(path)
         self.name = os.path.basename(self.path)
         self._overwrite = overwrite
@@ -93,13 +74,14 @@ class BagWriter:
         if not live:
             hidden = f'.{self.name}.{secrets.token_hex(8)}.tmp'
             self._folder = os.path.join(os.path.dirname(self.path), hidden)
-        self._topics = {}
-        self._files = []
-        self._total = _Span()
-        self._file = self._mcap = None
-        self._schemas = {}
+        self._topics: dict[str, BagTopic] = {}
+        self._files: list[FileSpan] = []
+        self._total = FileSpan()
+        self._schemas: dict[str, int] = {}  # schema of a message type in the file being written
+        self._file: BinaryIO
+        self._mcap: Writer
 
-    def __enter__(self):
+    def __enter__(self) -> BagWriter:
         check_replaceable(self.path, self._overwrite)
         try:
             with _writing(self.path):
@@ -108,13 +90,18 @@ class BagWriter:
                 os.makedirs(self._folder)
                 self._open_file()
         except BaseException:
-            self._give_up()
+            self._abandon()
             raise
         return self
 
-    def __exit__(self, kind, error, trace):
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
         if kind is not None and not self._live:
-            self._give_up()
+            self._abandon()
             return
         try:
             with _writing(self.path):
@@ -123,29 +110,46 @@ class BagWriter:
                 if not self._live:
                     _put_in_place(self._folder, self.path, self._overwrite)
         except BaseException:
-            self._give_up()
+            self._abandon()
             raise
 
     def write(
-        self, topic, msg_type, message, log_time_ns, publish_time_ns=None, qos='observations'
-    ):
-        """Write a message, a dataclass of the typestore or CDR bytes.
+        self,
+        topic: str,
+        msg_type: str,
+        message: Any,
+        log_time_ns: int,
+        publish_time_ns: int | None = None,
+        qos: Qos = 'observations',
+    ) -> None:
+        """Write a message.
 
-        log_time_ns: when it was received, publish_time_ns: when it was sent (None: the same). qos:
-        a name in PROFILES or a list of profiles, of the first message of a topic. Raises
-        DataError.
+        Parameters
+        ----------
+        topic : str
+        msg_type : str
+        message : object
+            A dataclass of the typestore, or CDR as bytes.
+        log_time_ns : int
+            Time at which the message was received [ns].
+        publish_time_ns : int, optional
+            Time at which it was sent [ns]; by default log_time_ns.
+        qos : str or list of dict
+            A name in PROFILES or QoS profiles; those of the first message of a topic count.
+
+        Raises
+        ------
+        DataError
         """
-        data = (
-            bytes(message)
-            if isinstance(message, (bytes, bytearray, memoryview))
-            else to_cdr(message, msg_type)
-        )
-        time = int(log_time_ns)
-        sent = time if publish_time_ns is None else int(publish_time_ns)
-        if not (0 <= time < NEVER and 0 <= sent < NEVER):
-            raise DataError(
-                f'{self.path}, topic {topic}: the time {min(time, sent)} ns cannot stand in a bag'
-            )
+        is_cdr = isinstance(message, (bytes, bytearray, memoryview))
+        data = bytes(message) if is_cdr else to_cdr(message, msg_type)
+        received = int(log_time_ns)
+        sent = received if publish_time_ns is None else int(publish_time_ns)
+        for time_ns in (received, sent):
+            if not 0 <= time_ns < NO_MESSAGE_NS:
+                raise DataError(
+                    f'{self.path}, topic {topic}: {time_ns} ns is not a time that a bag can hold'
+                )
         with _writing(self.path):
             entry = self._topics.get(topic) or self.add_topic(topic, msg_type, qos)
             if entry.msg_type != msg_type:
@@ -153,49 +157,67 @@ class BagWriter:
                     f'{self.path}, topic {topic}: a message of type {msg_type} does not belong to '
                     f'this topic of type {entry.msg_type}'
                 )
-            if (
-                self._split_bytes
-                and self._files[-1].count
-                and self._file.tell() >= self._split_bytes
-            ):
+            if self._file_is_full():
                 self._close_file()
                 self._open_file()
-            self._mcap.add_message(entry.channel, time, data, sent)
+            self._mcap.add_message(entry.channel, received, data, sent)
         entry.count += 1
-        self._files[-1].add(time)
-        self._total.add(time)
+        self._files[-1].add(received)
+        self._total.add(received)
 
-    def write_frame(self, frame, topic=None, namespace='', log_time_ns=None):
-        """Write a Frame as TargetObservations to topic, None:
-        <namespace>/<fluoroscope>/target_observations.
+    def write_frame(
+        self,
+        frame: Frame,
+        topic: str | None = None,
+        namespace: str = '',
+        log_time_ns: int | None = None,
+    ) -> None:
+        """Write a Frame as TargetObservations.
 
-        log_time_ns None: the stamp of the frame. Raises DataError.
+        Parameters
+        ----------
+        frame : Frame
+        topic : str, optional
+            By default <namespace>/<fluoroscope>/target_observations.
+        namespace : str
+        log_time_ns : int, optional
+            By default the stamp of the frame.
+
+        Raises
+        ------
+        DataError
         """
         topic = topic or observations_topic(frame.fluoroscope, namespace)
         time = frame.stamp_ns if log_time_ns is None else log_time_ns
         self.write(topic, TARGET_OBSERVATIONS, message_from_frame(frame), time)
 
-    def add_topic(self, topic, msg_type, qos='observations'):
-        """Make a topic known that may stay without messages. Raises DataError for a name or type
-        that cannot be.
+    def add_topic(self, topic: str, msg_type: str, qos: Qos = 'observations') -> BagTopic:
+        """Add a topic, which may remain without messages.
+
+        Raises DataError for an invalid name and an unknown type.
         """
-        if not _TOPIC.fullmatch(topic):
+        if not _TOPIC_NAME.fullmatch(topic):
             raise DataError(f'{self.path}: {topic!r} cannot be the name of a ROS topic')
         message_class(msg_type)
         profiles = [PROFILES[qos]] if isinstance(qos, str) else list(qos)
-        self._topics[topic] = _Topic(topic, msg_type, profiles)
+        self._topics[topic] = BagTopic(topic, msg_type, profiles)
         self._register(self._topics[topic])
         return self._topics[topic]
 
-    def flush(self):
-        """Hand all messages so far to the system: a recording that is killed keeps them."""
+    def flush(self) -> None:
+        """Hand all messages to the operating system: they survive the end of the process."""
         with _writing(self.path):
             self._mcap.flush()
 
-    def _open_file(self):
+    def _file_is_full(self) -> bool:
+        return bool(
+            self._split_bytes and self._files[-1].count and self._file.tell() >= self._split_bytes
+        )
+
+    def _open_file(self) -> None:
         name = f'{self.name}_{len(self._files)}.mcap'
-        self._files.append(_Span(name))
-        self._file = open(os.path.join(self._folder, name), 'xb')
+        self._files.append(FileSpan(name))
+        self._file = open(os.path.join(self._folder, name), 'xb')  # noqa: SIM115
         chunk_size = min(CHUNK_SIZE, self._split_bytes or CHUNK_SIZE)  # a file grows by chunks
         self._mcap = Writer(
             self._file,
@@ -205,13 +227,13 @@ class BagWriter:
             enable_data_crcs=True,
         )
         self._mcap.start(profile='ros2', library=LIBRARY)
-        self._write_metadata([])  # rosbag2 does so too: a killed recording tells what it is
+        self._write_metadata([])  # as rosbag2 does: a recording that was killed has metadata
         self._schemas = {}
         for topic in self._topics.values():
             self._register(topic)
 
-    def _register(self, topic):
-        """Schema and channel of a topic in the present file."""
+    def _register(self, topic: BagTopic) -> None:
+        """Write schema and channel of a topic into the file."""
         if topic.msg_type not in self._schemas:
             self._schemas[topic.msg_type] = self._mcap.register_schema(
                 topic.msg_type, 'ros2msg', full_text(topic.msg_type).encode()
@@ -226,7 +248,7 @@ class BagWriter:
             },
         )
 
-    def _close_file(self):
+    def _close_file(self) -> None:
         self._mcap.flush()  # the last chunk comes before the metadata
         self._write_metadata(self._topics.values())
         self._mcap.finish()
@@ -234,90 +256,43 @@ class BagWriter:
         os.fsync(self._file.fileno())
         self._file.close()
 
-    def _write_metadata(self, topics):
-        self._mcap.add_metadata(
-            'rosbag2', {'serialized_metadata': to_yaml(self._metadata(topics))}
-        )
+    def _write_metadata(self, topics: Iterable[BagTopic]) -> None:
+        document = bag_metadata(topics, self._files, self._total)
+        self._mcap.add_metadata('rosbag2', {'serialized_metadata': to_yaml(document)})
 
-    def _metadata(self, topics):
-        return {
-            'version': 9,
-            'storage_identifier': 'mcap',
-            'duration': self._total.times()['duration'],
-            'starting_time': self._total.times()['starting_time'],
-            'message_count': self._total.count,
-            'topics_with_message_count': [t.metadata() for t in topics],
-            'compression_format': '',
-            'compression_mode': '',  # of whole files; the chunks have their own
-            'relative_file_paths': [file.path for file in self._files],
-            'files': [
-                {'path': file.path, **file.times(), 'message_count': file.count}
-                for file in self._files
-            ],
-            'custom_data': None,
-            'ros_distro': 'jazzy',
-        }
+    def _metadata_yaml(self) -> str:
+        document = bag_metadata(self._topics.values(), self._files, self._total)
+        return to_yaml({'rosbag2_bagfile_information': document}) + '\n'
 
-    def _metadata_yaml(self):
-        return (
-            to_yaml({'rosbag2_bagfile_information': self._metadata(self._topics.values())}) + '\n'
-        )
-
-    def _give_up(self):
+    def _abandon(self) -> None:
+        """Close the file; delete the folder unless the bag is a recording."""
         with suppress(OSError, AttributeError):
             self._file.close()
         if not self._live:
             shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def observations_topic(fluoroscope, namespace=''):
-    """Absolute topic of the observations of a fluoroscope, in a namespace such as '/rig'."""
-    return '/' + '/'.join(
-        [*namespace.strip('/').split('/'), fluoroscope, 'target_observations']
-    ).lstrip('/')
+def check_replaceable(path: str, overwrite: bool) -> None:
+    """Raise DataError unless a new bag may have this path.
 
-
-def message_from_frame(frame):
-    """TargetObservations of a Frame, as a dataclass of the typestore."""
-    uv = np.asarray(frame.uv, dtype=np.float64).reshape(-1, 2)
-    stamp = message_class('builtin_interfaces/msg/Time')(*divmod(int(frame.stamp_ns), 10**9))
-    sigma = [] if frame.sigma is None else frame.sigma
-    return message_class(TARGET_OBSERVATIONS)(
-        header=message_class('std_msgs/msg/Header')(stamp, frame.frame_id),
-        frame_number=int(frame.number),
-        image_width=int(frame.image_size[0]),
-        image_height=int(frame.image_size[1]),
-        target_id=np.asarray(frame.target_id).astype(np.uint32),
-        u=np.ascontiguousarray(uv[:, 0]),
-        v=np.ascontiguousarray(uv[:, 1]),
-        sigma=np.asarray(sigma, dtype=np.float64),
-    )
-
-
-def check_replaceable(path, overwrite):
-    """Check that a new bag may get the name path: nothing is there, or with overwrite a bag.
-    Raises DataError.
+    There must be nothing, or with overwrite a folder with nothing but a bag.
     """
     if not os.path.lexists(path):
         return
     if not overwrite:
-        raise DataError(f'{path}: this is there already, and is not overwritten')
+        raise DataError(f'{path}: this already exists, and is not overwritten')
     if not os.path.isdir(path) or os.path.islink(path):
-        raise DataError(f'{path}: this is no bag folder, it is not overwritten')
-    strange = [
-        name
-        for name in sorted(os.listdir(path))
-        if name != 'metadata.yaml' and not name.endswith('.mcap')
-    ]
-    if strange:
-        raise DataError(
-            f'{path}: the folder holds {strange[0]}, which does not belong to a bag; '
-            f'it is not overwritten'
-        )
+        raise DataError(f'{path}: this is not a bag folder, it is not overwritten')
+    for name in sorted(os.listdir(path)):
+        if name != 'metadata.yaml' and not name.endswith('.mcap'):
+            raise DataError(
+                f'{path}: the folder holds {name}, which does not belong to a bag; '
+                f'it is not overwritten'
+            )
 
 
-def _put_in_place(folder, path, overwrite):
-    """Give a folder its final name; with overwrite a bag of that name goes away, but not before."""
+def _put_in_place(folder: str, path: str, overwrite: bool) -> None:
+    """Rename a finished folder; with overwrite the bag of that name is deleted last."""
     sync_folder(folder)
     old = f'{folder}.old'
     replaced = overwrite and os.path.isdir(path)
@@ -335,9 +310,9 @@ def _put_in_place(folder, path, overwrite):
 
 
 @contextmanager
-def _writing(path):
-    """Turns what the system says against writing into DataError."""
+def _writing(path: str) -> Iterator[None]:
+    """Raise DataError for an OSError while a bag is written."""
     try:
         yield
     except OSError as error:
-        raise DataError(f'{path}: the bag cannot be written ({cause_of(error)})') from None
+        raise DataError(f'{path}: the bag cannot be written ({os_error_reason(error)})') from None

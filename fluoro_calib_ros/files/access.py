@@ -8,7 +8,7 @@ from ..errors import DataError
 _SAFE_NAME = re.compile(r'[A-Za-z0-9_-]{1,100}')
 
 
-def cause_of(error):
+def os_error_reason(error):
     """The cause of an OSError, in a few words."""
     return (error.strerror or type(error).__name__).lower()
 
@@ -27,7 +27,7 @@ def read_bytes(path):
     except IsADirectoryError:
         raise DataError(f'{path}: this is a folder, not a file') from None
     except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
-        cause = cause_of(error) if isinstance(error, OSError) else error
+        cause = os_error_reason(error) if isinstance(error, OSError) else error
         raise DataError(f'{path}: cannot be read ({cause})') from None
     if not content:
         raise DataError(f'{path}: the file is empty')
@@ -66,4 +66,4 @@ def make_folder(path):
     except FileExistsError:
         raise DataError(f'{path}: this is a file, not a folder') from None
     except OSError as error:
-        raise DataError(f'{path}: the folder cannot be made ({cause_of(error)})') from None
+        raise DataError(f'{path}: the folder cannot be made ({os_error_reason(error)})') from None

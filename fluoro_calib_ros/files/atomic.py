@@ -5,7 +5,7 @@ import secrets
 from contextlib import contextmanager, suppress
 
 from ..errors import DataError
-from .access import cause_of
+from .access import os_error_reason
 
 
 @contextmanager
@@ -29,7 +29,7 @@ def atomic_file(path, mode='wb'):
         sync_folder(folder)
     except OSError as error:
         _remove(temporary)
-        raise DataError(f'{path}: cannot be written ({cause_of(error)})') from None
+        raise DataError(f'{path}: cannot be written ({os_error_reason(error)})') from None
     except BaseException:
         _remove(temporary)
         raise

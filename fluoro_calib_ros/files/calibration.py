@@ -8,7 +8,7 @@ from ..calibration.result import FluoroscopeCalibration
 from ..distortion.models import CorrectionModel
 from ..distortion.series import packed, unpacked
 from ..errors import DataError
-from .access import cause_of, check_safe_name, make_folder
+from .access import check_safe_name, make_folder, os_error_reason
 from .arrays import Field, array_of, read_arrays, values_of, write_arrays
 
 VERSION = 2  # of the layout
@@ -121,7 +121,7 @@ def load_calibrations(directory):
     except NotADirectoryError:
         raise DataError(f'{directory}: this is a file, not a folder with calibrations') from None
     except OSError as error:
-        raise DataError(f'{directory}: cannot be read ({cause_of(error)})') from None
+        raise DataError(f'{directory}: cannot be read ({os_error_reason(error)})') from None
     if not names:
         raise DataError(f'{directory}: there is no calibration in this folder (no file *{SUFFIX})')
     out = {}

@@ -15,7 +15,7 @@ from ..calibration.result import FluoroscopeCalibration, digest_of_sources
 from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
-from .access import cause_of
+from .access import os_error_reason
 from .atomic import write_text
 from .json_file import plain, read_result, write_result
 from .observations import read_observations_csv, write_observations_csv
@@ -37,7 +37,7 @@ def write_sources(directory: str | os.PathLike[str], request: CalibrationRequest
     try:
         (directory / RESULT).unlink(missing_ok=True)
     except OSError as error:
-        raise DataError(f'{directory / RESULT}: cannot be deleted ({cause_of(error)})') from None
+        raise DataError(f'{directory / RESULT}: cannot be deleted ({os_error_reason(error)})') from None
     write_observations_csv(directory / OBSERVATIONS, request.frames)
     write_phantom(directory / PHANTOM, request.phantom)
     document = {

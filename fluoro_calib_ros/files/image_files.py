@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import DataError
 from ..images.codec import decode, encode, grey
-from .access import cause_of, make_folder, read_bytes
+from .access import make_folder, os_error_reason, read_bytes
 from .atomic import atomic_file, sync_folder, write_bytes
 from .tiff import TiffWriter, count_pages
 
@@ -341,7 +341,7 @@ def _temporary(out):
     try:
         yield path
     except OSError as error:
-        raise DataError(f'{out}: cannot be written ({cause_of(error)})') from None
+        raise DataError(f'{out}: cannot be written ({os_error_reason(error)})') from None
     finally:
         if path.is_dir():
             shutil.rmtree(path, ignore_errors=True)

@@ -12,7 +12,7 @@ import struct
 import numpy as np
 
 from ..errors import DataError
-from .access import cause_of
+from .access import os_error_reason
 
 CLASSIC_BYTES = 4 * 10**9  # what a file with 32 bit offsets holds, with something to spare
 MAX_PAGES = 10**6
@@ -80,7 +80,7 @@ def count_pages(path):
         with open(path, 'rb') as file:
             return _count(file, os.fstat(file.fileno()).st_size)
     except OSError as error:
-        raise DataError(f'{path}: cannot be read ({cause_of(error)})') from None
+        raise DataError(f'{path}: cannot be read ({os_error_reason(error)})') from None
     except (struct.error, _Damaged):
         raise DataError(f'{path}: this is no TIFF file, or it is cut off or damaged') from None
 

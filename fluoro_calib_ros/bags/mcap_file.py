@@ -1,0 +1,201 @@
+"""Read one .mcap file, with every damage reported as DataError."""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import BinaryIO, NamedTuple
+
+from mcap.exceptions import EndOfFile
+from mcap.reader import SeekingReader
+from mcap.records import Channel, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader
+from mcap.summary import Summary
+
+from ..errors import DataError
+from ..files.access import os_error_reason
+
+MAGIC = b'\x89MCAP0\r\n'
+FOOTER_SIZE = 1 + 8 + 8 + 8 + 4  # bytes: opcode, length, two offsets, CRC
+FOOTER_OPCODE = 2
+MAX_CAUSE = 120  # characters
+
+
+class BagMessage(NamedTuple):
+    """A message of a bag.
+
+    Attributes
+    ----------
+    topic, type : str
+    log_time_ns : int
+        Time at which it was received [ns].
+    data : bytes
+        CDR.
+    """
+
+    topic: str
+    type: str
+    log_time_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class ChannelInfo:
+    """A channel of a file, its schema (None where the file has none) and number of messages."""
+
+    channel: Channel
+    schema: Schema | None
+    count: int
+
+
+@dataclass
+class _Scan:
+    """What a pass over all records of a file found, by id."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    ordered: bool = True  # by log time
+
+
+def channels_of_file(path: str) -> list[ChannelInfo]:
+    """Return all channels of a file. Raises DataError for a damaged file."""
+    with _open_checked(path) as file:
+        summary = _complete_summary(file)
+        if summary is not None and summary.statistics is not None:
+            schemas = summary.schemas
+            channels = summary.channels
+            counts = summary.statistics.channel_message_counts
+        else:
+            scan = _scan(file)
+            schemas = scan.schemas
+            channels = scan.channels
+            counts = scan.counts
+        return [
+            ChannelInfo(channel, schemas.get(channel.schema_id), counts.get(number, 0))
+            for number, channel in channels.items()
+        ]
+
+
+def messages_of_file(path: str, topics: Collection[str] | None) -> Iterator[BagMessage]:
+    """Yield the messages of a file in the order of log time.
+
+    topics are the names of those to read, None for all. Raises DataError for a damaged file.
+    """
+    with _open_checked(path) as file:
+        summary = _complete_summary(file)
+        if summary is None or not summary.chunk_indexes:
+            yield from _unindexed_messages(file, topics)
+            return
+        reader = SeekingReader(file, validate_crcs=True)
+        for schema, channel, message in reader.iter_messages(topics=topics):
+            yield BagMessage(
+                channel.topic, schema.name if schema else '', message.log_time, message.data
+            )
+
+
+@contextmanager
+def _open_checked(path: str) -> Iterator[BinaryIO]:
+    """Open a file and check both of its ends; errors of the MCAP reader become DataError."""
+    try:
+        with open(path, 'rb') as file:
+            _check_ends(path, file)
+            yield file
+    except DataError:
+        raise
+    except OSError as error:
+        raise DataError(f'{path}: the bag cannot be read ({os_error_reason(error)})') from None
+    except (EndOfFile, struct.error):
+        raise DataError(f'{path}: the bag is damaged, a record ends too early') from None
+    except Exception as error:  # damaged bytes make the reader raise almost anything
+        raise DataError(f'{path}: the bag is damaged ({_one_line(error)})') from None
+
+
+def _check_ends(path: str, file: BinaryIO) -> None:
+    """Check the magic at both ends and the CRC of the summary, which the MCAP reader does not."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    if size == 0:
+        raise DataError(f'{path}: the file is empty')
+    if file.read(len(MAGIC)) != MAGIC:
+        raise DataError(f'{path}: this is not an MCAP file')
+    file.seek(max(size - len(MAGIC), 0))
+    if size < 2 * len(MAGIC) + FOOTER_SIZE or file.read() != MAGIC:
+        raise DataError(f'{path}: the bag is cut off, the end of the file is missing')
+    file.seek(size - len(MAGIC) - FOOTER_SIZE)
+    opcode, _, start, _, crc = struct.unpack('<BQQQI', file.read(FOOTER_SIZE))
+    if opcode != FOOTER_OPCODE or start > size:
+        raise DataError(f'{path}: the bag is damaged, it has no footer')
+    if start and crc:
+        file.seek(start)
+        if zlib.crc32(file.read(size - len(MAGIC) - 4 - start)) != crc:
+            raise DataError(f'{path}: the bag is damaged, its summary has a wrong checksum')
+    file.seek(0)
+
+
+def _complete_summary(file: BinaryIO) -> Summary | None:
+    """Return the summary of a file, None unless it lists all channels and their schemas."""
+    summary = SeekingReader(file).get_summary()
+    if summary is None:
+        return None
+    if not summary.channels and (summary.statistics is None or summary.statistics.channel_count):
+        return None
+    used = {channel.schema_id for channel in summary.channels.values()} - {0}
+    return summary if used <= set(summary.schemas) else None
+
+
+def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Iterator[BagMessage]:
+    """Yield the messages of a file without chunk index in the order of log time.
+
+    They are read one after the other if that is their order, else sorted in memory.
+    """
+    ordered = _scan(file).ordered
+    messages = _messages_in_file_order(file, topics)
+    yield from messages if ordered else sorted(messages, key=lambda message: message.log_time_ns)
+
+
+def _messages_in_file_order(
+    file: BinaryIO, topics: Collection[str] | None
+) -> Iterator[BagMessage]:
+    type_names: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
+    for record in _records(file):
+        if isinstance(record, Schema):
+            type_names[record.id] = record.name
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Message):
+            channel = channels[record.channel_id]
+            if topics is None or channel.topic in topics:
+                name = type_names.get(channel.schema_id, '')
+                yield BagMessage(channel.topic, name, record.log_time, record.data)
+
+
+def _scan(file: BinaryIO) -> _Scan:
+    """Read all records of a file for its channels and counts."""
+    scan = _Scan()
+    last = 0
+    for record in _records(file):
+        if isinstance(record, Schema):
+            scan.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            scan.channels[record.id] = record
+        elif isinstance(record, Message):
+            scan.counts[record.channel_id] = scan.counts.get(record.channel_id, 0) + 1
+            scan.ordered = scan.ordered and record.log_time >= last
+            last = record.log_time
+    return scan
+
+
+def _records(file: BinaryIO) -> Iterator[McapRecord]:
+    file.seek(0)
+    return StreamReader(file, validate_crcs=True).records
+
+
+def _one_line(error: Exception) -> str:
+    text = ' '.join(str(error).split())
+    return text[:MAX_CAUSE] or type(error).__name__

@@ -93,12 +93,12 @@ def beside_colmap(exposures, repeats=3):
 HEADER = [
     'exposures x targets',
     'image points',
-    'ours',
+    'this package',
     'steps',
     'cost',
-    'COLMAP, solver alone',
-    'with its set-up',
+    'COLMAP, solver only',
+    'COLMAP with set-up',
     'steps',
     'cost',
-    'ours faster by (solver alone)',
+    'speed-up (solver only)',
 ]

@@ -319,7 +319,13 @@ def text_of(core, cases):
         for f in core
     ]
     first = table(
-        ['1024 x 1024', 'median [ms]', 'CPU [ms]', 'images per second and core', 'speed-up over scipy'],
+        [
+            '1024 x 1024',
+            'median [ms]',
+            'CPU [ms]',
+            'images per second and core',
+            'speed-up over scipy',
+        ],
         rows,
     )
     rows = [

@@ -1,5 +1,5 @@
-"""The lookup grid of the correction: points a second, frames of 30 points beside scikit-learn,
-building, accuracy.
+"""Benchmark of the lookup grid: points per second, frames of 30 points compared with scikit-learn,
+build time, accuracy.
 
 python -m benchmarks.lookup             all correction models
 python -m benchmarks.lookup knn auto    these only
@@ -28,13 +28,13 @@ ROUNDS = 41  # in each, ours and theirs one after the other
 HEADER = [
     'model',
     'cell [px]',
-    'largest difference [px]',
-    'built in',
-    'points a second',
+    'maximum difference [px]',
+    'build time',
+    'points per second',
     f'{FRAME} points',
     f'{FRAME} points corrected',
     'KNeighborsRegressor.predict',
-    'faster by',
+    'speed-up',
 ]
 
 
@@ -154,12 +154,12 @@ def lookup_section(models=MODELS):
     """The lookup grid by correction model."""
     return section(
         'Lookup of the correction',
-        'From the grid that is built when a calibration arrives: du, dv, standard deviation and status. Points a '
-        f'second are those of {POINTS:,} pixels in random order, a second being one of a core. Corrected: u, v, '
-        'standard deviation with that of the observation, and status, as the node needs them. Beside them '
-        'scikit-learn with the same training points and the same k (3 for a model without neighbours) in the same '
-        'rounds. The difference from the exact model is that of 20,000 random pixels of the calibrated area; knn is '
-        'piecewise constant, and its lookups lie between the values at the corners of a cell.',
+        'A grid is built when a calibration arrives; looking up a point gives du, dv, standard deviation and status. '
+        f'Points per second: {POINTS:,} pixels in random order, on one core. "Corrected" gives what the node needs: '
+        'u, v, the standard deviation including that of the observation, and the status. KNeighborsRegressor of '
+        'scikit-learn is timed in the same rounds, with the same training points and the same k (3 for a model '
+        'without neighbours). The maximum difference from the exact model is taken over 20,000 random pixels of the '
+        'calibrated area; knn is piecewise constant, and its lookups lie between the values at the corners of a cell.',
         HEADER,
         [row(measure(model)) for model in models],
     )

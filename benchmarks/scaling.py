@@ -22,10 +22,10 @@ HEADER = [
     'unknowns',
     'steps',
     'adjustment',
-    'a step',
-    'a step and image point',
+    'per step',
+    'per step and image point',
     'peak memory',
-    'of which before the adjustment',
+    'memory before the adjustment',
 ]
 
 

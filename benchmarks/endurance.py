@@ -60,7 +60,8 @@ def stream(reader, frames, rate_hz, note):
         while number - len(came) > AHEAD:
             if time.monotonic() > end:
                 raise SystemExit(
-                    f'{number} exposures went in, {len(came)} came out, and nothing more for a minute'
+                    f'{number} exposures went in, {len(came)} came out, and nothing more for a '
+                    'minute'
                 )
             time.sleep(0.0005)
         for name, message in pair:
@@ -128,8 +129,8 @@ def text_of(figures):
             else float('nan')
         )
         lines.append(
-            f'{node}: {of_one[0]:.1f} MB after a minute of the stream, {of_one[-1]:.1f} MB at the end, '
-            f'largest {max(of_one):.1f} MB, trend {slope:+.2f} MB an hour'
+            f'{node}: {of_one[0]:.1f} MB after a minute of the stream, {of_one[-1]:.1f} MB at the '
+            f'end, largest {max(of_one):.1f} MB, trend {slope:+.2f} MB an hour'
         )
     return '\n'.join(lines)
 

@@ -164,7 +164,7 @@ def available_models():
 
 
 def available_relative():
-    """Settings of the relative orientation constraint that CalibrationOptions takes beside 'none'."""
+    """Relative orientation constraints of CalibrationOptions, except 'none'."""
     return tuple(name for name in RELATIVE[1:] if _accepted(relative_orientation=name))
 
 
@@ -189,7 +189,7 @@ def options_of(case):
     )
 
 
-# ----------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # rigs
 
 
@@ -280,7 +280,7 @@ def scene_of(*key):
     return Scene(*key)
 
 
-# ---------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # cases
 
 
@@ -338,8 +338,8 @@ def run_case(case):
 def errors_of_test(scene, case, calibrations):
     """RMSE (6,) [mm] of the test exposures, adjusted with the calibrations held.
 
-    The same as adjust_with_calibrations, but for the start values, and without covariances and the adjustment
-    before the correction, which are not needed here: a third of the time.
+    The same as adjust_with_calibrations, except for the start values, and without covariances and
+    the adjustment before the correction, which are not needed here: a third of the time.
     """
     measured = scene.test_network(case.fluoroscopes, case.variant == KNOWN)
     correction, network = held_corrections(measured, calibrations)
@@ -411,7 +411,7 @@ def _details(job):
     return {'residuals': residuals, 'costs': costs}
 
 
-# ---------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # correction itself
 
 

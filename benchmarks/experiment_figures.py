@@ -93,7 +93,7 @@ def _figures(plan, outcomes):
     yield 'curves', curve_figure(plan, outcomes)
 
 
-# -------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # Figures 1 and 2
 
 
@@ -148,7 +148,7 @@ def _percent(axes, values):
     axes.xaxis.get_major_locator().set_params(integer=True)
 
 
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # Figures 3 to 10
 
 
@@ -202,7 +202,7 @@ def histogram_figure(residuals, system, axis):
 
 
 def position_figure(residuals, system, axis):
-    """Residuals of one coordinate over that coordinate; the panel before has a scale of its own."""
+    """Residuals of one coordinate over that coordinate; the first panel has its own scale."""
     number = (5 if system == '1' else 9) + axis
     figure = new_figure(
         3.6 * len(residuals),
@@ -267,7 +267,7 @@ def _scatter(axes, r, axis, limit, colour):
     )
 
 
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # beyond the paper
 
 

@@ -200,7 +200,7 @@ def quick_plan():
     )
 
 
-# -------------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # running
 
 
@@ -234,8 +234,9 @@ def _run_group(group):
         outcomes.append(outcome)
         told = outcome.failed or f'{outcome.points_mm():.4f} mm out of sample'
         print(
-            f'rig {case.seed} {"+".join(case.fluoroscopes)}, {case.training or case.exposures // case.every} '
-            f'exposures, {case.variant}{", joint" * case.joint}: {told}, {time.perf_counter() - began:.1f} s',
+            f'rig {case.seed} {"+".join(case.fluoroscopes)}, '
+            f'{case.training or case.exposures // case.every} exposures, '
+            f'{case.variant}{", joint" * case.joint}: {told}, {time.perf_counter() - began:.1f} s',
             file=sys.stderr,
         )
     return outcomes

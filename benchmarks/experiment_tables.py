@@ -155,7 +155,7 @@ def reprojection(outcome):
     return [both.cost(), *both.reweighted(), *both.raw()]
 
 
-# ------------------------------------------------------------------------------------------------
+# ------------------------------------------------------------------------------------------
 # beyond the paper
 
 
@@ -171,7 +171,7 @@ def curve_table(plan, outcomes, which, digits):
 
 
 class Comparison:
-    """What a comparison over several rigs says; figures by variant, nothing where a case failed."""
+    """Figures of a comparison over several rigs, by variant; failed cases are left out."""
 
     def __init__(self, plan, outcomes, setting):
         self._outcomes = {key: outcomes[case] for key, case in plan.setting_cases(setting).items()}
@@ -231,13 +231,13 @@ class Comparison:
             'model',
             'points 3-D [mm]',
             'ratio to known: mean',
-            'smallest',
-            'largest',
+            'minimum',
+            'maximum',
             'source 3-D [mm]',
             'ratio to known',
             'correction [px]',
-            'covers [%]',
-            'over what knn covers [px]',
+            'coverage [%]',
+            'in the knn area [px]',
             'ratio to knn',
             'calibration [s]',
         ]
@@ -300,7 +300,7 @@ def chosen(outcome):
     kinds = ', '.join(
         f'{kind}{f", k = {k}" if k else ""}' for kind, k in dict.fromkeys(outcome.model.values())
     )
-    return f'{kinds}; {outcome.rounds} rounds{"" if outcome.converged else ", NOT converged"}'
+    return f'{kinds}; {outcome.rounds} rounds{"" if outcome.converged else ", not converged"}'
 
 
 def joint_table(plan, outcomes):
@@ -341,7 +341,7 @@ def joint_table(plan, outcomes):
 
 
 def joint_figures(found):
-    """Rms over the rigs of points 3-D, source 3-D [mm] and correction [px], and the mean time [s]."""
+    """RMS over the rigs of points 3-D, source 3-D [mm] and correction [px]; mean time [s]."""
 
     def rms(values):
         return float(np.sqrt(np.mean(np.square(values))))

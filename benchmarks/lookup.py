@@ -98,8 +98,8 @@ def points_per_second(grid, rng):
 
 
 def measure(model):
-    """Figures of a correction model (of CalibrationOptions), of a calibration of the virtual rig with 15
-    exposures.
+    """Figures of a correction model (of CalibrationOptions) for a calibration of the virtual rig
+    with 15 exposures.
     """
     rig = virtual_rig(1)
     rng = np.random.default_rng(0)
@@ -154,12 +154,14 @@ def lookup_section(models=MODELS):
     """The lookup grid by correction model."""
     return section(
         'Lookup of the correction',
-        'A grid is built when a calibration arrives; looking up a point gives du, dv, standard deviation and status. '
-        f'Points per second: {POINTS:,} pixels in random order, on one core. "Corrected" gives what the node needs: '
-        'u, v, the standard deviation including that of the observation, and the status. KNeighborsRegressor of '
-        'scikit-learn is timed in the same rounds, with the same training points and the same k (3 for a model '
-        'without neighbours). The maximum difference from the exact model is taken over 20,000 random pixels of the '
-        'calibrated area; knn is piecewise constant, and its lookups lie between the values at the corners of a cell.',
+        'A grid is built when a calibration arrives; looking up a point gives du, dv, standard '
+        f'deviation and status. Points per second: {POINTS:,} pixels in random order, on one '
+        'core. "Corrected" gives what the node needs: u, v, the standard deviation including that '
+        'of the observation, and the status. KNeighborsRegressor of scikit-learn is timed in the '
+        'same rounds, with the same training points and the same k (3 for a model without '
+        'neighbours). The maximum difference from the exact model is taken over 20,000 random '
+        'pixels of the calibrated area; knn is piecewise constant, and its lookups lie between '
+        'the values at the corners of a cell.',
         HEADER,
         [row(measure(model)) for model in models],
     )

@@ -247,7 +247,9 @@ def self_calibrate_with_peers(network, start, folds=10, rounds=30, settled_px=2e
     converged = False
     colmap = ColmapAdjustment(network, start, noise, held, LOOP)
     search_seconds = 0.0
-    for number in range(1, rounds + 1):
+    number = 0
+    for _ in range(rounds):
+        number += 1
         colmap.observe(network.uv - correction)
         colmap.set_noise(noise)
         colmap.solve()

@@ -65,7 +65,7 @@ class Outcome:
 
 
 def capture(rig, seed, count=CAPTURED):
-    """{fluoroscope: [Frame, ...]} of the phantom standing in the rig frame, count frames of each."""
+    """Return {fluoroscope: [Frame, ...]} of the phantom in the rig frame, count frames of each."""
     rng = np.random.default_rng([seed, 4])
     return {
         f.name: [
@@ -201,8 +201,8 @@ def table(outcomes):
         for suffix in ('', FROM_EXPOSURES)
     }
     lines = [
-        '| way | RMSE, 3-D [mm] | of known distortion | normalised squared error | squared standardised epipolar '
-        'distance | lost points [%] | RMSE of distances in clusters [mm] |',
+        '| way | RMSE, 3-D [mm] | of known distortion | normalised squared error | squared '
+        'standardised epipolar distance | lost points [%] | RMSE of distances in clusters [mm] |',
         '| --- ' + '| ---: ' * 6 + '|',
     ]
     for way, of_rigs in outcomes.items():
@@ -215,7 +215,8 @@ def table(outcomes):
         )
         ratio = rmse / known[FROM_EXPOSURES if way.endswith(FROM_EXPOSURES) else '']
         lines.append(
-            f'| {way} | {rmse:.4f} | {ratio:.3f} | {said} | {np.mean([o.epipolar for o in of_rigs]):.3f} | '
+            f'| {way} | {rmse:.4f} | {ratio:.3f} | {said} | '
+            f'{np.mean([o.epipolar for o in of_rigs]):.3f} | '
             f'{100 * np.mean([o.lost for o in of_rigs]):.2f} | '
             f'{_rms([o.distance_mm for o in of_rigs]):.4f} |'
         )
@@ -288,11 +289,12 @@ def main(arguments=None):
             outcomes.setdefault(way, []).append(outcome)
         print(f'rig {seed}', file=sys.stderr, flush=True)
     print(
-        f'{options.count} virtual rigs, {EXPOSURES} exposures, noise {NOISE_PX} px, orientation from '
-        f'{options.captured} frame(s) of the standing phantom\n\n{table(outcomes)}\n'
+        f'{options.count} virtual rigs, {EXPOSURES} exposures, noise {NOISE_PX} px, orientation '
+        f'from {options.captured} frame(s) of the standing phantom\n\n{table(outcomes)}\n'
     )
     print(
-        'Standard deviation over time of the distances in rigid clusters, observed over predicted\n'
+        'Standard deviation over time of the distances in rigid clusters, observed over '
+        'predicted\n'
     )
     print(f'{cluster_table(outcomes)}\n')
     print(

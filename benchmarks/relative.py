@@ -2,8 +2,8 @@
 benchmarks.relative`.
 
 Virtual rigs whose fluoroscopes see the phantom in the same pose in every exposure. Errors are
-those of other exposures, adjusted with the calibration held (adjust_with_calibrations), against the truth of
-the rig.
+those of other exposures, adjusted with the calibration held fixed (adjust_with_calibrations),
+against the truth of the rig.
 """
 
 import argparse
@@ -122,8 +122,8 @@ def compare(counts=(5, 15), seeds=(1, 2, 3), model='auto', flex=(0.0, 0.0), told
 def table(gains):
     """Markdown table of the outcome of compare: means over the rigs, squares averaged."""
     lines = [
-        '| exposures | adjustment | object points, 3-D [mm] | sources, 3-D [mm] | distance of the sources [mm] | '
-        'sd of c [px] | time [s] |',
+        '| exposures | adjustment | object points, 3-D [mm] | sources, 3-D [mm] | distance of the '
+        'sources [mm] | sd of c [px] | time [s] |',
         '| ---: | --- | ---: | ---: | ---: | ---: | ---: |',
     ]
     for (count, way), of_seeds in gains.items():

@@ -16,7 +16,7 @@ from fluoro_calib_ros.nodes.streams import StreamReader
 
 
 class Relay(support.ManagedNode):
-    """Publishes every message of <fluoroscope>/target_observations on <fluoroscope>/relayed_KIND."""
+    """Republish <fluoroscope>/target_observations on <fluoroscope>/relayed_KIND."""
 
     def __init__(self, kind):
         super().__init__(f'relay_{kind}')

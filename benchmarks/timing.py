@@ -25,4 +25,5 @@ def table(header, rows):
 
 def section(title, text, header, rows):
     """A section of the report: title, a paragraph and a table."""
-    return f'## {title}\n\n{textwrap.fill(text, 118, break_on_hyphens=False)}\n\n{table(header, rows)}'
+    filled = textwrap.fill(text, 118, break_on_hyphens=False)
+    return f'## {title}\n\n{filled}\n\n{table(header, rows)}'

@@ -78,12 +78,12 @@ def test_document_has_every_table_and_picture(experiment):
     assert len(links) == len(set(links)) == 12
     assert all((document.parent / link).is_file() for link in links)
     for heading in (
-        '## In short',
+        '## Summary',
         '## 1. ',
         '## 2. ',
         '## 3. ',
         '## 4. ',
-        '## 5. What falls short',
+        '## 5. Shortcomings',
         '## 6. ',
     ):
         assert text.count(heading) == 1
@@ -143,9 +143,7 @@ def test_comparison_counts_from_known_distortion(experiment):
 
 
 def test_failed_case_is_told(experiment, tmp_path):
-    """A calibration that failed leaves a dash in the tables, and its reason under what falls
-    short.
-    """
+    """A failed calibration leaves a dash in the tables, and its reason among the shortcomings."""
     plan, outcomes, _ = experiment
     broken = dict(outcomes)
     for cases in (
@@ -181,7 +179,7 @@ def test_tested_is_adjust_with():
 
 
 def test_training_and_test_exposures_do_not_meet():
-    """Every so many exposures are for the calibration; other counts are recordings of their own."""
+    """Training and test exposures are disjoint; other counts are separate recordings."""
     case = Case(2, 'knn', **SMALL)
     scene = scene_of(*case.scene)
     frames, _ = scene.training(None, False)

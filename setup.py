@@ -46,7 +46,7 @@ setup(
             'image_node = fluoro_calib_ros.nodes.image_node:main',
             'player_node = fluoro_calib_ros.nodes.player_node:main',
             'simulator_node = fluoro_calib_ros.nodes.simulator_node:main',
-            'fluoro_calib_demo = fluoro_calib_ros.nodes.demo:main',
+            'fluoro_calib_demo = fluoro_calib_ros.demo.demo:main',
             'fluoro-calib = fluoro_calib_ros.cli:main',
         ],
     },

@@ -21,15 +21,15 @@ import numpy as np
 import rclpy
 from fluoro_calib_msgs.msg import TargetObservations
 
-from fluoro_calib_ros.nodes.conversion import message_from_frame
-from fluoro_calib_ros.nodes.graph import isolate
-from fluoro_calib_ros.nodes.qos import OBSERVATIONS
+from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
+from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
+from fluoro_calib_ros.nodes.runtime.qos import OBSERVATION_DEPTH, observations_qos
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
 from .online import NAMES, Reader, _command, rig_of_the_simulator
 
 NODES = ('correction_node', 'reconstruction_node')
-AHEAD = OBSERVATIONS.depth // 4
+AHEAD = OBSERVATION_DEPTH // 4
 PAGE_MB = os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
@@ -43,7 +43,9 @@ def stream(reader, frames, rate_hz, note):
     of the stream.
     """
     outputs = {
-        n: reader.create_publisher(TargetObservations, f'{n}/target_observations', OBSERVATIONS)
+        n: reader.create_publisher(
+            TargetObservations, f'{n}/target_observations', observations_qos()
+        )
         for n in NAMES
     }
     tracking = simulate_tracking(virtual_rig(1), 10.0, rate_hz, 1, clusters=5).frames
@@ -77,7 +79,7 @@ def stream(reader, frames, rate_hz, note):
 
 def run(hours, rate_hz):
     """Figures: exposures, frames in and out, seconds, and memory {node: [MB by minute]}."""
-    isolate()
+    isolate_ros_graph()
     rclpy.init(args=[])
     reader = Reader(*rig_of_the_simulator())
     frames = round(3600 * hours * rate_hz)

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 from array import array
+from dataclasses import dataclass
 
 import numpy as np
 import rclpy
@@ -19,14 +20,29 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
-from fluoro_calib_ros.nodes import support
-from fluoro_calib_ros.nodes.qos import IMAGES
-from fluoro_calib_ros.nodes.streams import StreamReader
-from fluoro_calib_ros.nodes.support import declare
+from fluoro_calib_ros.nodes.runtime.discovery import wait_for_readers, wait_until_acknowledged
+from fluoro_calib_ros.nodes.runtime.lifecycle import ManagedNode
+from fluoro_calib_ros.nodes.runtime.main import run
+from fluoro_calib_ros.nodes.runtime.parameters import ParameterGroup
+from fluoro_calib_ros.nodes.runtime.qos import images_qos
+from fluoro_calib_ros.nodes.runtime.stream_reader import StreamReader
+from fluoro_calib_ros.options import option
 from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
+from .relay import all_fatal
+
 DIFFERENT = 8  # images that come over and over
+
+
+@dataclass(frozen=True)
+class CameraParameters:
+    """Parameters of the camera."""
+
+    rate: float = option(120.0, 'frame rate', minimum=0.1, maximum=2000.0, unit='Hz')
+    frames: int = option(600, 'images after which the process ends', minimum=1, maximum=10**6)
+    wait_for_readers: int = option(1, 'subscriptions to wait for', minimum=0, maximum=100)
+    encoding: str = option('mono8', 'encoding', choices=('mono8', 'mono16'))
 
 
 class Camera(Node):
@@ -34,12 +50,8 @@ class Camera(Node):
 
     def __init__(self):
         super().__init__('camera')
-        self._rate = declare(self, 'rate', 120.0, 'images a second', 0.1, 2000.0)
-        self._frames = declare(
-            self, 'frames', 600, 'images after which the process ends', 1, 10**6
-        )
-        self._wait = declare(self, 'wait_for_readers', 1, 'subscriptions to wait for', 0, 100)
-        encoding = declare(self, 'encoding', 'mono8', 'mono8 or mono16')
+        self._settings = ParameterGroup(CameraParameters).declare(self)
+        encoding = self._settings.encoding
         dtype = np.uint8 if encoding == 'mono8' else np.uint16
         exposures = simulate_exposures(virtual_rig(1), DIFFERENT, 1).frames['a']
         self._messages = []
@@ -54,24 +66,28 @@ class Camera(Node):
             )
             message.header.frame_id = frame.frame_id
             self._messages.append(bytearray(serialize_message(message)))
-        self._output = self.create_publisher(Image, 'a/image_raw', IMAGES)
+        self._output = self.create_publisher(Image, 'a/image_raw', images_qos())
         self._ending = threading.Event()
         self._worker = threading.Thread(target=self._run, daemon=True)
         self._worker.start()
 
     def _run(self):
-        support.wait_for_readers(self, [self._output], self._wait, self._ending)
+        wait_for_readers(self, [self._output], self._settings.wait_for_readers, self._ending)
         began = time.monotonic()
-        for number in range(self._frames):
-            if self._ending.wait(max(0.0, began + number / self._rate - time.monotonic())):
+        for number in range(self._settings.frames):
+            if self._ending.wait(
+                max(0.0, began + number / self._settings.rate - time.monotonic())
+            ):
                 return
             message = self._messages[number % DIFFERENT]
             struct.pack_into(
                 '<iI', message, 4, *divmod(time.time_ns(), 10**9)
             )  # behind the head of CDR
             self._output.publish(bytes(message))
-        self.get_logger().info(f'{self._frames} images in {time.monotonic() - began:.2f} s')
-        support.wait_until_taken([self._output], self._ending)
+        self.get_logger().info(
+            f'{self._settings.frames} images in {time.monotonic() - began:.2f} s'
+        )
+        wait_until_acknowledged([self._output], self._ending)
         rclpy.try_shutdown()
 
     def stop(self):
@@ -80,32 +96,27 @@ class Camera(Node):
         self._worker.join(2.0)
 
 
-class Relay(support.ManagedNode):
+class Relay(ManagedNode):
     """Publishes every image of a/image_raw on a/relayed."""
 
     def __init__(self):
         super().__init__('relay')
         self._reader = None
 
-    def begin(self):
-        """Take and publish."""
-        self._reader = StreamReader(self, self.fail, self.fail)
-        publisher = self.create_publisher(Image, 'a/relayed', IMAGES)
+    def activate(self):
+        """Begin to relay."""
+        self._reader = StreamReader(self, all_fatal(self))
+        publisher = self.create_publisher(Image, 'a/relayed', images_qos())
         self._reader.subscribe(
-            Image, 'a/image_raw', lambda message, _: publisher.publish(message), IMAGES
+            Image, 'a/image_raw', lambda message, _: publisher.publish(message), images_qos()
         )
         self._reader.start()
 
-    def end(self):
-        """Take no more."""
-        self._reader.stop()
-
-    def open(self):
-        """Nothing."""
-
-    def close(self):
-        """Nothing."""
+    def deactivate(self):
+        """Stop relaying."""
+        if self._reader is not None:
+            self._reader.stop()
 
 
 if __name__ == '__main__':
-    support.run({'camera': Camera, 'relay': Relay}[sys.argv[1]], sys.argv[:1] + sys.argv[2:])
+    run({'camera': Camera, 'relay': Relay}[sys.argv[1]], sys.argv[:1] + sys.argv[2:])

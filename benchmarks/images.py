@@ -114,12 +114,14 @@ class Reader:
         import rclpy
         from fluoro_calib_msgs.msg import FluoroscopeCalibration
 
-        from fluoro_calib_ros.nodes.conversion import message_from_calibration
-        from fluoro_calib_ros.nodes.qos import LATCHED
+        from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
+            message_from_calibration,
+        )
+        from fluoro_calib_ros.nodes.runtime.qos import latched_qos
 
         self.node = rclpy.create_node('reader')
         self._latched = self.node.create_publisher(
-            FluoroscopeCalibration, 'a/calibration', LATCHED
+            FluoroscopeCalibration, 'a/calibration', latched_qos()
         )
         self._latched.publish(message_from_calibration(calibration))
         self.came = []
@@ -129,19 +131,20 @@ class Reader:
         """Collect (stamp, latency) [ns] of a topic anew, with the images unread."""
         from sensor_msgs.msg import Image
 
-        from fluoro_calib_ros.nodes.qos import IMAGES
-        from fluoro_calib_ros.nodes.streams import StreamReader
+        from fluoro_calib_ros.nodes.runtime.qos import images_qos
+        from fluoro_calib_ros.nodes.runtime.stream_reader import StreamReader
 
-        self.came, fatal = [], self.node.get_logger().fatal
-        came = self.came
+        from .online import logged
+
+        came = self.came = []
 
         def take(data, info):
             seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
             stamp = seconds * 10**9 + nanoseconds
             came.append((stamp, info['source_timestamp'] - stamp))
 
-        self.reader = StreamReader(self.node, fatal, fatal)
-        self.reader.subscribe(Image, topic, take, IMAGES, decode=bytes)
+        self.reader = StreamReader(self.node, logged(self.node))
+        self.reader.subscribe(Image, topic, take, images_qos(), decode=bytes)
         self.reader.start()
 
 
@@ -233,9 +236,9 @@ def live(calibration, seconds, only=''):
     """
     import rclpy
 
-    from fluoro_calib_ros.nodes.graph import isolate
+    from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
 
-    isolate()
+    isolate_ros_graph()
     rclpy.init(args=[])
     reader = Reader(calibration)
     out = {}

@@ -36,11 +36,11 @@ from sensor_msgs.msg import CameraInfo
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.rig_orientation import orientation_of_exposures
-from fluoro_calib_ros.nodes.conversion import message_from_calibration
-from fluoro_calib_ros.nodes.graph import isolate
-from fluoro_calib_ros.nodes.qos import LATCHED, OBSERVATIONS
-from fluoro_calib_ros.nodes.spatial import message_from_orientation
-from fluoro_calib_ros.nodes.streams import StreamReader
+from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
+from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
+from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orientation
+from fluoro_calib_ros.nodes.runtime.qos import latched_qos, observations_qos
+from fluoro_calib_ros.nodes.runtime.stream_reader import FaultHandlers, StreamReader
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 from .timing import table
@@ -71,6 +71,12 @@ OUTPUTS = {
 TICK = os.sysconf('SC_CLK_TCK')
 
 
+def logged(node):
+    """Log every fault of a stream reader of this process."""
+    fatal = node.get_logger().fatal
+    return FaultHandlers(fatal, lambda topic, error: fatal(f'{topic}: {error!r}'), fatal)
+
+
 class Reader(Node):
     """Publishes the calibration, and counts what the nodes put out."""
 
@@ -79,10 +85,10 @@ class Reader(Node):
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self)
         for name, calibration in calibrations.items():
-            self.create_publisher(FluoroscopeCalibration, f'{name}/calibration', LATCHED).publish(
-                message_from_calibration(calibration)
-            )
-        self.create_publisher(RigOrientation, 'rig_orientation', LATCHED).publish(
+            self.create_publisher(
+                FluoroscopeCalibration, f'{name}/calibration', latched_qos()
+            ).publish(message_from_calibration(calibration))
+        self.create_publisher(RigOrientation, 'rig_orientation', latched_qos()).publish(
             message_from_orientation(orientation)
         )
         self.ready = set()  # fluoroscopes that are corrected
@@ -91,7 +97,7 @@ class Reader(Node):
                 CameraInfo,
                 f'{name}/camera_info',
                 lambda _, name=name: self.ready.add(name),
-                LATCHED,
+                latched_qos(),
             )
         self.within = {}  # node: [(p50, p99), ...] [ms]
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
@@ -110,7 +116,7 @@ class Reader(Node):
         """Count the outputs of nodes anew."""
         self.came = {}
         self.within = {}
-        self.reader = StreamReader(self, self.get_logger().fatal, self.get_logger().fatal)
+        self.reader = StreamReader(self, logged(self))
         for node in nodes:
             if node == 'reconstruction_node':
                 self._listen(
@@ -128,7 +134,7 @@ class Reader(Node):
             kind,
             topic,
             lambda data, info: came.append(_number_and_latency(data, info)),
-            OBSERVATIONS,
+            observations_qos(),
             decode=bytes,
         )
 
@@ -255,7 +261,7 @@ def rig_of_the_simulator():
 
 def run(seconds, only=''):
     """{case: figures of its nodes}."""
-    isolate()
+    isolate_ros_graph()
     rclpy.init(args=[])
     reader = Reader(*rig_of_the_simulator())
     out = {}

@@ -1,74 +1,88 @@
-"""A node that does nothing but hand target observations on: what rclpy and DDS cost without any
-work between.
+"""A node that only relays target observations: the cost of rclpy and DDS without any work.
 
-python -m benchmarks.relay plain     subscriptions as everybody makes them, in rclpy's executor
-python -m benchmarks.relay streams   taken as the nodes of this package take streams
+python -m benchmarks.relay plain     ordinary subscriptions in rclpy's executor
+python -m benchmarks.relay streams   received as the nodes of this package receive streams
 """
+
+from __future__ import annotations
 
 import sys
 import time
+from collections.abc import Callable
 
 from fluoro_calib_msgs.msg import TargetObservations
 
-from fluoro_calib_ros.nodes import support
-from fluoro_calib_ros.nodes.qos import OBSERVATIONS
-from fluoro_calib_ros.nodes.streams import StreamReader
+from fluoro_calib_ros.nodes.runtime.diagnostics import (
+    OK,
+    DiagnosticsPublisher,
+    LatencyWindow,
+    Status,
+)
+from fluoro_calib_ros.nodes.runtime.lifecycle import ManagedNode
+from fluoro_calib_ros.nodes.runtime.main import run
+from fluoro_calib_ros.nodes.runtime.qos import observations_qos
+from fluoro_calib_ros.nodes.runtime.stream_reader import FaultHandlers, StreamReader
 
 
-class Relay(support.ManagedNode):
+class Relay(ManagedNode):
     """Republish <fluoroscope>/target_observations on <fluoroscope>/relayed_KIND."""
 
-    def __init__(self, kind):
+    def __init__(self, kind: str) -> None:
         super().__init__(f'relay_{kind}')
         self._kind = kind
-        self._reader = None
-        self._latencies = {name: support.Latencies() for name in 'ab'}
+        self._reader: StreamReader | None = None
+        self._latencies = {name: LatencyWindow() for name in 'ab'}
 
-    def begin(self):
-        """Take and publish."""
-        self._reader = StreamReader(self, self.fail, self.fail)
+    def activate(self) -> None:
+        """Begin to relay."""
+        self._reader = StreamReader(self, all_fatal(self))
         for name in 'ab':
-            publisher = self.create_publisher(
-                TargetObservations, f'{name}/relayed_{self._kind}', OBSERVATIONS
-            )
             topic = f'{name}/target_observations'
-
-            def relay(message, info, publisher=publisher, latencies=self._latencies[name]):
-                publisher.publish(message)
-                latencies.add(time.time_ns() - info['received_timestamp'])
-
+            relay = self._relay(name)
             if self._kind == 'plain':
                 self.create_subscription(
                     TargetObservations,
                     topic,
                     lambda message, info, relay=relay: relay(message, info),
-                    OBSERVATIONS,
+                    observations_qos(),
                 )
             else:
-                self._reader.subscribe(TargetObservations, topic, relay, OBSERVATIONS)
+                self._reader.subscribe(TargetObservations, topic, relay, observations_qos())
         if self._kind == 'streams':
             self._reader.start()
-        diagnostics = support.Diagnostics(self)
+        diagnostics = DiagnosticsPublisher(self)
         self.create_timer(
             1.0,
             lambda: diagnostics.publish(
-                [
-                    (name, support.OK, '', latencies.values())
-                    for name, latencies in self._latencies.items()
-                ]
+                Status(name, OK, '', latencies.values())
+                for name, latencies in self._latencies.items()
             ),
         )
 
-    def end(self):
-        """Take no more."""
-        self._reader.stop()
+    def _relay(self, name: str) -> Callable[[TargetObservations, dict], None]:
+        publisher = self.create_publisher(
+            TargetObservations, f'{name}/relayed_{self._kind}', observations_qos()
+        )
+        latencies = self._latencies[name]
 
-    def open(self):
-        """Nothing."""
+        def relay(message: TargetObservations, info: dict) -> None:
+            publisher.publish(message)
+            latencies.add(time.time_ns() - info['received_timestamp'])
 
-    def close(self):
-        """Nothing."""
+        return relay
+
+    def deactivate(self) -> None:
+        """Stop relaying."""
+        if self._reader is not None:
+            self._reader.stop()
+
+
+def all_fatal(node: ManagedNode) -> FaultHandlers:
+    """End a benchmark's node at any fault."""
+    return FaultHandlers(
+        node.fail, lambda topic, error: node.fail(f'{topic}: {error!r}'), node.fail
+    )
 
 
 if __name__ == '__main__':
-    support.run(lambda: Relay(sys.argv[1]), sys.argv[:1] + sys.argv[2:])
+    run(lambda: Relay(sys.argv[1]), sys.argv[:1] + sys.argv[2:])

@@ -567,7 +567,7 @@ def test_wrong_recordings_are_refused_in_a_sentence():
             'fluoroscope b, frame 1: the image is 512 x 512 px, but the calibration is '
             'for 1024 x 1024 px',
         ),
-        ({'target_id': np.array([1, 2, 1])}, 'fluoroscope b, frame 1: target 1 is there 2 times'),
+        ({'target_id': np.array([1, 2, 1])}, 'fluoroscope b, frame 1: target 1 occurs 2 times'),
     ):
         wrong = {**frames, 'b': [replace(frames['b'][0], **change)]}
         with pytest.raises(DataError, match=sentence):

@@ -5,6 +5,7 @@ taking them over.
 import threading
 from array import array
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -15,12 +16,16 @@ from sensor_msgs.msg import Image
 from fluoro_calib_ros.distortion.models import CorrectionModel
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import ImageCorrector
-from fluoro_calib_ros.nodes.calibrations import Calibrations
-from fluoro_calib_ros.nodes.checks import Refused
-from fluoro_calib_ros.nodes.conversion import calibration_from_message, message_from_calibration
-from fluoro_calib_ros.nodes.orienting import Orienting
-from fluoro_calib_ros.nodes.pictures import Pictures
-from fluoro_calib_ros.nodes.support import check_timeout, path_of, sentence_of
+from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
+from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
+    calibration_from_message,
+    message_from_calibration,
+)
+from fluoro_calib_ros.nodes.messages.image import ImageConverter
+from fluoro_calib_ros.nodes.orientation_service import CaptureSettings, OrientationService
+from fluoro_calib_ros.nodes.runtime.errors import one_line
+from fluoro_calib_ros.nodes.runtime.parameters import check_timeout, expand_path
+from fluoro_calib_ros.nodes.runtime.refusals import Refused
 
 SIZE = (64, 48)
 
@@ -56,7 +61,7 @@ def test_rows_of_16_bits_may_begin_at_any_byte(calibration, gap):
         step=rows.shape[1],
         data=array('B', rows.tobytes()),
     )
-    image, _ = Pictures('a').array_of(message, calibration)
+    image, _ = ImageConverter('a').to_array(message, calibration)
     corrector = ImageCorrector(calibration)
     assert np.array_equal(corrector.correct(image), corrector.correct(pixels))
 
@@ -66,7 +71,7 @@ def test_names_of_any_length_are_cut_short(calibration):
     width, height = SIZE
     message = Image(width=width, height=height, encoding='x' * 10**6, step=width)
     with pytest.raises(Refused) as refused:
-        Pictures('a').array_of(message, calibration)
+        ImageConverter('a').to_array(message, calibration)
     assert 'its encoding' in str(refused.value) and len(str(refused.value)) < 600
 
 
@@ -91,7 +96,7 @@ def test_calibration_with_impossible_numbers_is_refused(calibration, change, sai
 
 
 class Inbox:
-    """A Calibrations of one fluoroscope, with what it has taken and refused; preparing waits for
+    """A CalibrationInput of one fluoroscope, with what it has taken and refused; preparing waits for
     go.
     """
 
@@ -109,7 +114,7 @@ class Inbox:
             destroy_subscription=lambda _: None,
             get_logger=lambda: SimpleNamespace(error=lambda text: None),
         )
-        self.calibrations = Calibrations(
+        self.calibrations = CalibrationInput(
             node,
             ['a'],
             self._prepare,
@@ -143,7 +148,7 @@ def test_of_a_flood_of_calibrations_one_is_prepared_at_a_time_and_the_last_one_s
             assert inbox.began.acquire(timeout=60)  # the first is at work
     inbox.go.set()
     assert all(inbox.ended.acquire(timeout=60) for _ in range(2))  # what came last was next
-    assert inbox.taken == [0, 49] and inbox.most == 1 and inbox.calibrations.of('a') == 49
+    assert inbox.taken == [0, 49] and inbox.most == 1 and inbox.calibrations.current('a') == 49
     inbox.put(message_from_calibration(replace(calibration, stamp_ns=99)))
     assert all(inbox.began.acquire(timeout=60) for _ in range(2))
     inbox.calibrations.close()  # waits for what is being prepared
@@ -158,48 +163,44 @@ def test_calibration_that_cannot_be_prepared_is_refused_whatever_the_reason(cali
     assert inbox.began.acquire(timeout=60)
     inbox.calibrations.close()
     assert (
-        inbox.refused == [sentence_of(fault)]
+        inbox.refused == [one_line(fault)]
         and not inbox.taken
-        and inbox.calibrations.of('a') is None
+        and inbox.calibrations.current('a') is None
     )
 
 
 # ---- orientation, and what requests may ask
 
 
-def test_orientation_of_calibrations_that_have_changed_meanwhile_is_none(monkeypatch):
-    """A self-calibration may end while a capture is being adjusted: what belongs to the old one is
-    not published.
-    """
-    now, old = (
+def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
+    """A self-calibration may end while a capture is being adjusted."""
+    new, old = (
         {name: SimpleNamespace(calibration_id=f'{name}-{age}') for name in 'ab'}
         for age in ('new', 'old')
     )
-    found = SimpleNamespace(fluoroscopes=('a', 'b'), calibration_ids=('a-old', 'b-old'))
-    held = dict(old)
+    outcome = SimpleNamespace(
+        orientation=SimpleNamespace(fluoroscopes=('a', 'b'), calibration_ids=('a-old', 'b-old'))
+    )
+    present = dict(old)
+    node = SimpleNamespace(
+        create_publisher=lambda *_: None,
+        create_service=lambda *_, **__: None,
+        create_timer=lambda *_, **__: None,
+        destroy_timer=lambda _: None,
+    )
+    settings = CaptureSettings(('a', 'b'), None, 'rig', 5.0, Path())
+    service = OrientationService(node, settings, lambda: present, None)
 
-    class Here(Orienting):
-        def __init__(self):
-            self._names = ('a', 'b')
-            self._phantom = None
-            self._rig_frame = 'rig'
-            self._timeout = 5.0
-            self._calibrations = lambda: held
-            self._capture = None
-            self._node = SimpleNamespace(
-                create_timer=lambda *_, **__: None, destroy_timer=lambda _: None
-            )
+    async def recalibrated(function):
+        present.update(new)
+        return outcome
 
-        async def _beside(self, function):
-            held.update(now)
-            return found
-
-    here = Here()
-    asked = here._captured(SimpleNamespace(timeout_sec=1.0, frames=1))
-    asked.send(None)  # it waits for its frames
-    here.take({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
+    monkeypatch.setattr(service, '_in_thread', recalibrated)
+    capture = service._orient(SimpleNamespace(timeout_sec=1.0, frames=1))
+    capture.send(None)  # it waits for its frames
+    service.add({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
     with pytest.raises(DataError, match='the calibrations have changed meanwhile'):
-        asked.send(None)
+        capture.send(None)
 
 
 @pytest.mark.parametrize(
@@ -220,4 +221,4 @@ def test_timeout_for_which_nobody_can_wait(seconds, said):
 
 def test_home_of_nobody():
     with pytest.raises(DataError, match='^~nobody_of_that_name/x: there is no such home folder$'):
-        path_of('~nobody_of_that_name/x')
+        expand_path('~nobody_of_that_name/x')

@@ -10,14 +10,17 @@ from fluoro_calib_msgs.msg import CorrectedObservations, ReconstructedPoints, Ta
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
-from fluoro_calib_ros.nodes.conversion import doubles, unsigned
-from fluoro_calib_ros.nodes.spatial import points_message
-from fluoro_calib_ros.nodes.wire import (
-    corrected_bytes,
-    corrected_of,
-    observations_of,
-    points_bytes,
+from fluoro_calib_ros.nodes.messages.corrected_observations import (
+    decode_corrected_observations,
+    encode_corrected_observations,
 )
+from fluoro_calib_ros.nodes.messages.fields import float64_field, uint32_field
+from fluoro_calib_ros.nodes.messages.reconstructed_points import (
+    PointsContent,
+    encode_reconstructed_points,
+    message_from_points,
+)
+from fluoro_calib_ros.nodes.messages.target_observations import decode_target_observations
 from fluoro_calib_ros.reconstruction.intersection import IntersectedPoints
 
 SIZES = [
@@ -36,10 +39,10 @@ def observed(n, frame_id='a_optical', sigma=True):
         image_width=1024,
         image_height=768,
     )
-    message.target_id = unsigned(rng.integers(0, 2**32, n))
-    message.u = doubles(rng.normal(500, 100, n))
-    message.v = doubles(rng.normal(500, 100, n))
-    message.sigma = doubles(rng.random(n) if sigma else [])
+    message.target_id = uint32_field(rng.integers(0, 2**32, n))
+    message.u = float64_field(rng.normal(500, 100, n))
+    message.v = float64_field(rng.normal(500, 100, n))
+    message.sigma = float64_field(rng.random(n) if sigma else [])
     return message
 
 
@@ -58,7 +61,9 @@ def message_of(source, calibration_id, arrays):
         calibration_id=calibration_id,
         target_id=source.target_id,
     )
-    message.u, message.v, message.sigma, message.correction_sd = (doubles(a) for a in arrays[:4])
+    message.u, message.v, message.sigma, message.correction_sd = (
+        float64_field(a) for a in arrays[:4]
+    )
     message.status = array('B', arrays[4].tobytes())
     return message
 
@@ -66,7 +71,7 @@ def message_of(source, calibration_id, arrays):
 @pytest.mark.parametrize('n, frame_id, sigma', SIZES)
 def test_observations_are_read_as_rclpy_reads_them(n, frame_id, sigma):
     message = observed(n, frame_id, sigma)
-    found = observations_of(serialize_message(message))
+    found = decode_target_observations(serialize_message(message))
     assert (found.sec, found.nanosec, found.frame_id) == (-5, 4_000_000_000, frame_id)
     assert (found.frame_number, found.image_size) == (4_000_000_000, (1024, 768))
     assert found.target_id == message.target_id.tobytes()
@@ -79,9 +84,11 @@ def test_observations_of_which_some_are_missing_are_read():
     """An empty sequence is not aligned, what comes behind it is."""
     for lengths in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (2, 1, 0), (0, 3, 3)):
         for ids in (0, 1, 2):
-            message = TargetObservations(target_id=unsigned(range(ids)))
-            message.u, message.v, message.sigma = (doubles(np.arange(n) + 0.5) for n in lengths)
-            found = observations_of(serialize_message(message))
+            message = TargetObservations(target_id=uint32_field(range(ids)))
+            message.u, message.v, message.sigma = (
+                float64_field(np.arange(n) + 0.5) for n in lengths
+            )
+            found = decode_target_observations(serialize_message(message))
             assert found.target_id == message.target_id.tobytes()
             assert all(
                 np.array_equal(a, b)
@@ -94,7 +101,9 @@ def test_corrected_observations_are_written_as_rclpy_reads_them(n, frame_id, sig
     source = observed(n, frame_id, sigma)
     arrays = corrected(n)
     for calibration_id in ('', 'a-123', 'a-2802e916511fc237'):
-        data = corrected_bytes(observations_of(serialize_message(source)), calibration_id, arrays)
+        data = encode_corrected_observations(
+            decode_target_observations(serialize_message(source)), calibration_id, arrays
+        )
         expected = message_of(source, calibration_id, arrays)
         assert len(data) <= len(
             serialize_message(expected)
@@ -108,7 +117,7 @@ def test_corrected_observations_are_written_as_rclpy_reads_them(n, frame_id, sig
 def test_corrected_observations_are_read_as_rclpy_writes_them(n, frame_id, _):
     arrays = corrected(n)
     message = message_of(observed(n, frame_id), 'a-2802e916511fc237', arrays)
-    found = corrected_of(serialize_message(message))
+    found = decode_corrected_observations(serialize_message(message))
     assert (
         found.sec,
         found.nanosec,
@@ -140,26 +149,26 @@ def test_points_are_written_as_rclpy_reads_them(n, frame_id, ids):
         rng.integers(0, 5, n).astype(np.uint8),
         rays - 1,
     )
-    rig = SimpleNamespace(
-        orientation_id='rig-60b34b648ddef0f3',
-        orientation=SimpleNamespace(frame_id=frame_id, calibration_ids=ids),
-    )
-    content = (
+    content = PointsContent(
         1_700_000_000_123_456_789,
         4_000_000_000,
-        rig,
+        'rig-60b34b648ddef0f3',
+        SimpleNamespace(frame_id=frame_id, calibration_ids=ids),
         rng.integers(0, 2**32, n, dtype=np.uint32),
         points,
     )
-    expected = points_message(*content)
-    found = deserialize_message(points_bytes(*content), ReconstructedPoints)
+    expected = message_from_points(content)
+    found = deserialize_message(encode_reconstructed_points(content), ReconstructedPoints)
     assert found == expected and list(found.rays) == rays.tolist()
     assert deserialize_message(serialize_message(expected), ReconstructedPoints) == found
 
 
 READERS = [
-    (observations_of, lambda: serialize_message(observed(30))),
-    (corrected_of, lambda: serialize_message(message_of(observed(30), 'a-1', corrected(30)))),
+    (decode_target_observations, lambda: serialize_message(observed(30))),
+    (
+        decode_corrected_observations,
+        lambda: serialize_message(message_of(observed(30), 'a-1', corrected(30))),
+    ),
 ]
 
 
@@ -188,7 +197,7 @@ def test_damaged_bytes_never_do_worse_than_be_refused(read, data):
 @pytest.mark.parametrize('read, data', READERS)
 def test_big_endian_messages_are_read_too(read, data):
     """A message of empty sequences, written by hand in the other order of bytes."""
-    count = 3 if read is observations_of else 0
+    count = 3 if read is decode_target_observations else 0
     numbers = (
         [(1, 4), (2, 4), (2, 4), (0x61000000, 4), (7, 4)]
         + [(640, 4), (480, 4)] * bool(count)

@@ -8,14 +8,45 @@ and nothing has to wait for it; only for one that is silent is there a wait, and
 """
 
 from collections import OrderedDict, deque
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+from ..options import option
+
+PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # views of an exposure that can be intersected
 # frames of two others for which a silent fluoroscope is waited for: a stall of 32 ms at 1000 Hz
 PATIENCE = 32
 RESTART_NS = (
     10**9
 )  # a stamp so much before the last one is no frame out of order, but a stream begun anew
+
+
+@dataclass(frozen=True)
+class PairingOptions:
+    """How frames of several fluoroscopes are paired."""
+
+    pair_by: str = option('frame_number', 'how frames are paired', choices=PAIR_BY)
+    tolerance_s: float = option(
+        0.002,
+        'largest difference between the stamps of an exposure',
+        minimum=0.0,
+        maximum=1.0,
+        unit='s',
+    )
+    waiting: int = option(
+        64, 'frames of a fluoroscope that may wait for their partners', minimum=1, maximum=10000
+    )
+    patience: int = option(
+        PATIENCE,
+        'frames of two others for which a silent one of three or more fluoroscopes is awaited',
+        minimum=1,
+        maximum=10000,
+    )
+
+    @property
+    def tolerance_ns(self) -> int:
+        """The tolerance in nanoseconds."""
+        return round(1e9 * self.tolerance_s)
 
 
 class FramePairer:

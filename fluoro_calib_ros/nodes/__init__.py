@@ -1,3 +1,4 @@
-"""ROS 2 nodes: parameters, topics and conversion around the other rooms. The only room that knows
-rclpy.
+"""ROS 2 nodes: parameters, topics and message conversion around the other rooms.
+
+Only this room imports rclpy and message packages.
 """

@@ -1,213 +1,215 @@
 """Node that collects exposures of the phantom and self-calibrates the fluoroscopes on request.
 
 One thread runs all callbacks. Those that take long (calibrate, capture) are coroutines that await
-what they wait for, and the calibration itself is a process of its own. rclpy's
-MultiThreadedExecutor would be the other way, but it hands a callback out again until it has
-started, which on a busy machine costs so much that frames are lost.
+what they need, and the calibration itself is a process of its own. rclpy's MultiThreadedExecutor
+is no alternative: it schedules a callback again until it has started, which on a busy machine
+takes so much time that frames are lost.
 """
+
+from __future__ import annotations
 
 import threading
 import time
 from collections import deque
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
-import numpy as np
 from fluoro_calib_msgs.action import SelfCalibrate
-from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration
+from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration, TargetObservations
 from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Reset, SaveCalibration
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
+from rclpy.qos import qos_policy_name_from_kind
 from rclpy.task import Future
 
-from ..bags.reader import frame_from_message
+from ..calibration import result as calibration_result
 from ..calibration.initial_network import MIN_TARGETS_OF_EXPOSURE
-from ..calibration.options import MODELS, CalibrationOptions
+from ..calibration.options import CalibrationOptions
 from ..calibration.request import CalibrationRequest
+from ..calibration.self_calibration import Round
 from ..errors import DataError
 from ..exposures.collector import ExposureCollector, StillOptions
-from ..exposures.frame import validate_frame
-from ..exposures.pairing import FramePairer
+from ..exposures.frame import Frame, validate_frame
+from ..exposures.pairing import FramePairer, PairingOptions
 from ..files.calibration import SUFFIX, load_calibrations, save_calibration
 from ..files.phantom import read_phantom
-from ..jobs.calibration import Rig
+from ..jobs.calibration import CalibrationOutcome, Rig
 from ..jobs.result_folder import save_outcome
 from ..jobs.worker_process import run_in_worker_process
-from . import support
-from .conversion import message_from_calibration
-from .orienting import Orienting
-from .qos import LATCHED
-from .support import StartError, declare
+from ..options import option
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..validation.verdict import Validation
+from .messages.calibration_status import FluoroscopeProgress, message_from_progress
+from .messages.fluoroscope_calibration import message_from_calibration
+from .messages.self_calibration import (
+    Request,
+    Result,
+    fill_feedback,
+    fill_result,
+    fill_verdict,
+    options_of_request,
+)
+from .messages.target_observations import frame_from_message
+from .orientation_service import CaptureSettings, OrientationService
+from .runtime.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, Status
+from .runtime.errors import StartError
+from .runtime.logging import RateLimitedLogger
+from .runtime.main import run
+from .runtime.parameters import ParameterGroup, RigParameters, check_timeout, expand_path
+from .runtime.qos import (
+    incompatible_qos_message,
+    latched_qos,
+    observations_qos,
+    qos_overrides,
+)
+from .runtime.refusals import RefusalLog
 
-COLLECT = ('still', 'request')
+COLLECT_MODES = ('still', 'request')
+
+
+@dataclass(frozen=True)
+class CalibrationParameters(RigParameters):
+    """Parameters of the calibration node."""
+
+    phantom: str = option(
+        '', 'file phantom.csv with the surveyed coordinates of the beads; required', unit='mm'
+    )
+    calibration_directory: str = option(
+        '~/.ros/fluoro_calib',
+        'folder in which calibrations are saved, and from which they are loaded at the start',
+    )
+    collect: str = option(
+        'still',
+        'when an exposure is collected: whenever the phantom stands still in a new pose, '
+        'or on request by the service capture',
+        choices=COLLECT_MODES,
+    )
+    joint: bool = option(False, 'whether all fluoroscopes are adjusted together')
+    rig_frame: str = option(
+        'rig', 'name of the rig frame, which is that of the phantom captured by orient'
+    )
+    capture_timeout: float = option(
+        5.0,
+        'longest wait of capture and orient where the request leaves it open',
+        minimum=0.1,
+        maximum=600.0,
+        unit='s',
+    )
+
+
+_NODE = ParameterGroup(CalibrationParameters)
+_STILL = ParameterGroup(
+    StillOptions, {'still_time_s': 'still_time', 'still_px': 'still_px', 'new_px': 'new_px'}
+)
+_PAIRING = ParameterGroup(PairingOptions, {'pair_by': 'pair_by', 'tolerance_s': 'pair_tolerance'})
+_CALIBRATION = ParameterGroup(
+    CalibrationOptions,
+    {
+        name: name
+        for name in (
+            'model',
+            'interior',
+            'loss',
+            'max_iterations',
+            'relative_orientation',
+            'datum',
+        )
+    },
+)
+PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION)
 
 
 class Cancelled(Exception):
-    """The running job is to stop."""
+    """The running job has to stop."""
+
+
+class _Fluoroscope:
+    """What the node knows of one fluoroscope."""
+
+    def __init__(self, name: str, logger: RateLimitedLogger) -> None:
+        self.name = name
+        self.received = 0
+        self.refusals = RefusalLog('frame', logger)
+        self.incompatible = ''  # message about a publisher whose frames are not received
+        self.image_size: tuple[int, int] | None = None
+        self.is_other_object_logged = False
+        self.last_round: Round | None = None
+        self.calibration: calibration_result.FluoroscopeCalibration | None = None
+        self.calibrated_at = float('nan')
+
+    def use(self, calibration: calibration_result.FluoroscopeCalibration) -> None:
+        """Use a calibration from now on."""
+        self.calibration = calibration
+        self.calibrated_at = time.monotonic()
 
 
 class CalibrationNode(Node):
-    """Collects exposures of any number of fluoroscopes; one self-calibration at a time runs beside
-    them.
-    """
+    """Collects exposures of the fluoroscopes, and runs one self-calibration at a time."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('calibration_node')
-        self._read_parameters()
-        self._sentences = support.Sentences(self.get_logger())
-        self._captures = deque()  # a Future for every capture that waits for its pair
-        self._not_captured = ''  # why the last pair was none
-        self._new_collection()
-        self._image_size = {}
-        self._not_phantom = set()
-        self._received = dict.fromkeys(self._names, 0)
-        self._rejected = dict.fromkeys(self._names, 0)
-        self._last_fault = dict.fromkeys(self._names, '')
-        self._deaf = dict.fromkeys(self._names, '')  # what keeps a publisher from being heard
+        self._settings = _NODE.declare(self)
+        self._still = _STILL.declare(self)
+        self._pairing = _PAIRING.declare(self)
+        self._options = _CALIBRATION.declare(self)
+        self._read_files()
+        self._names = self._settings.fluoroscopes
+        self._collect = self._settings.collect
+        self._limited_logger = RateLimitedLogger(self.get_logger())
+        self._fluoroscopes = {
+            name: _Fluoroscope(name, self._limited_logger) for name in self._names
+        }
+        self._captures: deque[Future] = deque()  # one for every capture that waits for its pair
+        self._capture_refusal = ''  # why the last pair was not captured
+        self._start_collection()
         self._load_fault = ''
         self._stopping = threading.Event()
-        self._rounds = {}
-        self._calibrations = {}
-        self._made_at = {}
-        # fluoroscopes of the running job, and the thread that waits for it
-        self._busy = ()
-        self._job = None
-        self._make_interfaces()
+        self._running: tuple[str, ...] = ()  # fluoroscopes of the running job
+        self._job: threading.Thread | None = None  # waits for the worker process
+        self._create_interfaces()
         self._load_at_start()
 
-    def _read_parameters(self):
-        self._names = support.fluoroscopes_of(self)
-        phantom = declare(
-            self, 'phantom', '', 'file phantom.csv with the surveyed coordinates of the beads [mm]'
-        )
-        if not phantom:
+    def _read_files(self) -> None:
+        """Read the phantom. Raises StartError."""
+        if not self._settings.phantom:
             raise StartError('parameter phantom is not set: it names the file phantom.csv')
         try:
-            self._phantom = read_phantom(support.path_of(phantom))
+            self._phantom = read_phantom(expand_path(self._settings.phantom))
         except DataError as error:
             raise StartError(str(error)) from None
-        self._directory = support.path_of(
-            declare(
-                self,
-                'calibration_directory',
-                '~/.ros/fluoro_calib',
-                'folder where calibrations are saved, and from which they are read at the start',
-            )
-        )
-        self._collect = declare(
-            self,
-            'collect',
-            'still',
-            'how exposures are collected: still (by itself, when '
-            'the phantom stands still in a new pose) or request (by the service capture)',
-        )
-        if self._collect not in COLLECT:
-            raise StartError(f'parameter collect is {" or ".join(COLLECT)}, not {self._collect!r}')
-        self._still = StillOptions(
-            declare(
-                self,
-                'still_time',
-                0.1,
-                'time for which the phantom has to stand still [s]',
-                0.0,
-                60.0,
-            ),
-            declare(
-                self,
-                'still_px',
-                1.0,
-                'displacement of the targets that counts as still [px]',
-                0.0,
-                100.0,
-            ),
-            declare(
-                self,
-                'new_px',
-                10.0,
-                'displacement of the targets that makes a new pose [px]',
-                0.0,
-                1000.0,
-            ),
-        )
-        self._pairing = (
-            declare(
-                self, 'pair_by', 'frame_number', 'how frames are paired: frame_number or stamp'
-            ),
-            round(
-                1e9
-                * declare(
-                    self,
-                    'pair_tolerance',
-                    0.002,
-                    'largest difference of the stamps of a pair [s]',
-                    0.0,
-                    1.0,
-                )
-            ),
-        )
-        self._defaults = {
-            'model': declare(self, 'model', 'auto', f'correction model: {", ".join(MODELS)}'),
-            'interior': declare(
-                self, 'interior', 'estimated', 'interior orientation: estimated or fixed'
-            ),
-            'loss': declare(
-                self, 'loss', 'student_t', 'noise model: student_t, huber or gaussian'
-            ),
-            'max_iterations': declare(
-                self, 'max_iterations', 60, 'most rounds of a self-calibration', 1, 1000
-            ),
-        }
-        self._joint = declare(self, 'joint', False, 'adjust all fluoroscopes together')
-        self._fixed = {
-            'relative_orientation': declare(
-                self,
-                'relative_orientation',
-                'none',
-                'between fluoroscopes adjusted together: none, soft or hard',
-            ),
-            'datum': declare(self, 'datum', 'survey', 'survey (weighted) or inner (free network)'),
-        }
-        self._rig_frame = declare(
-            self,
-            'rig_frame',
-            'rig',
-            'name of the rig frame, that of the phantom where orient captures it',
-        )
-        self._capture_timeout = declare(
-            self, 'capture_timeout', 5.0, 'longest wait of a capture [s]', 0.1, 600.0
-        )
-        try:
-            CalibrationOptions(**self._defaults, **self._fixed)
-            FramePairer(self._names, *self._pairing)
-        except ValueError as error:
-            raise StartError(f'parameter {error}') from None
+        self._directory = expand_path(self._settings.calibration_directory)
 
-    def _make_interfaces(self):
-        services = (
-            ReentrantCallbackGroup()
-        )  # those that await must not keep others from being answered
+    def _create_interfaces(self) -> None:
+        # Services that await must not keep others from being answered.
+        services = ReentrantCallbackGroup()
         self._calibration_outputs = {}
-        self._status = {}
+        self._status_outputs = {}
         for name in self._names:
             self._calibration_outputs[name] = self.create_publisher(
-                FluoroscopeCalibration, f'{name}/calibration', LATCHED
+                FluoroscopeCalibration, f'{name}/calibration', latched_qos()
             )
-            self._status[name] = self.create_publisher(
+            self._status_outputs[name] = self.create_publisher(
                 CalibrationStatus, f'{name}/calibration_status', 10
             )
-            support.subscribe_observations(self, name, self._on_frame, self._on_deaf)
-        self._orienting = Orienting(
+            self._subscribe(self._fluoroscopes[name])
+        self._orientation = OrientationService(
             self,
-            self._names,
-            self._phantom,
-            self._rig_frame,
-            self._capture_timeout,
-            lambda: self._directory,
-            lambda: self._calibrations,
+            CaptureSettings(
+                self._names,
+                self._phantom,
+                self._settings.rig_frame,
+                self._settings.capture_timeout,
+                self._directory,
+            ),
+            self._calibrations,
             services,
         )
-        for kind, name, callback in (
+        for kind, service, callback in (
             (Calibrate, 'calibrate', self._on_calibrate),
             (Capture, 'capture', self._on_capture),
             (Reset, 'reset', self._on_reset),
@@ -215,7 +217,7 @@ class CalibrationNode(Node):
             (SaveCalibration, 'save_calibration', self._on_save),
             (LoadCalibration, 'load_calibration', self._on_load),
         ):
-            self.create_service(kind, name, callback, callback_group=services)
+            self.create_service(kind, service, callback, callback_group=services)
         self._action = ActionServer(
             self,
             SelfCalibrate,
@@ -225,74 +227,101 @@ class CalibrationNode(Node):
             cancel_callback=lambda _: CancelResponse.ACCEPT,
             callback_group=services,
         )
-        self._diagnostics = support.Diagnostics(self)
+        self._diagnostics = DiagnosticsPublisher(self)
         self.create_timer(1.0, self._on_timer)
 
-    def _new_collection(self):
-        self._pairer = FramePairer(self._names, *self._pairing)
+    def _subscribe(self, fluoroscope: _Fluoroscope) -> None:
+        """Subscribe to the observations of a fluoroscope."""
+        topic = f'{fluoroscope.name}/target_observations'
+
+        def on_message(message: TargetObservations) -> None:
+            try:
+                self._on_frame(fluoroscope, message)
+            except Exception as error:  # a message may hold anything and must not end the node
+                fluoroscope.refusals.fail(topic, error)
+
+        def on_incompatible(event: Any) -> None:
+            policy = qos_policy_name_from_kind(event.last_policy_kind)
+            fluoroscope.incompatible = incompatible_qos_message(topic, policy)
+            self._limited_logger.warning(fluoroscope.incompatible)
+
+        self.create_subscription(
+            TargetObservations,
+            topic,
+            on_message,
+            observations_qos(),
+            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible),
+            qos_overriding_options=qos_overrides(),
+        )
+
+    def _start_collection(self) -> None:
+        self._pairer = FramePairer(self._names, self._pairing.pair_by, self._pairing.tolerance_ns)
         self._collector = ExposureCollector(self._names, self._still)
+
+    def _calibrations(self) -> dict[str, calibration_result.FluoroscopeCalibration]:
+        """Return the present calibrations by fluoroscope."""
+        return {
+            fluoroscope.name: fluoroscope.calibration
+            for fluoroscope in self._fluoroscopes.values()
+            if fluoroscope.calibration is not None
+        }
 
     # -- observations
 
-    def _on_deaf(self, name, fault):
-        """Say that nothing can come from a publisher."""
-        self._deaf[name] = fault
-        self._sentences.warn(fault)
-
-    def _on_frame(self, name, message):
-        """Check a frame, pair it, and collect the pair where it is wanted."""
-        self._received[name] += 1
+    def _on_frame(self, fluoroscope: _Fluoroscope, message: TargetObservations) -> None:
+        """Validate a frame, pair it, and collect the pair where it is wanted."""
+        fluoroscope.received += 1
         try:
-            frame = self._checked(name, message)
+            frame = self._validated(fluoroscope, message)
         except DataError as error:
-            self._rejected[name] += 1
-            self._last_fault[name] = str(error)
-            self._sentences.warn(f'frame refused: {error}')
+            fluoroscope.refusals.refuse(error)
             return
         pair = None if frame is None else self._pairer.add(frame)
         if pair is not None:
             self._collect_pair(pair)
 
-    def _checked(self, name, message):
-        """Frame of a message, None for one that does not show the phantom. Raises DataError for a
-        wrong one.
+    def _validated(self, fluoroscope: _Fluoroscope, message: TargetObservations) -> Frame | None:
+        """Return the frame of a message, None where it does not show the phantom.
+
+        Raises DataError for an invalid frame.
         """
-        frame = frame_from_message(message, name, f'fluoroscope {name}')
+        name = fluoroscope.name
+        frame = frame_from_message(message, name)
         if len(frame.target_id) and (self._phantom.index(frame.target_id) < 0).all():
-            if name not in self._not_phantom:
-                self._not_phantom.add(name)
+            if not fluoroscope.is_other_object_logged:
+                fluoroscope.is_other_object_logged = True
                 self.get_logger().info(
                     f'fluoroscope {name}: frames without any target of the phantom, such as '
-                    f'frame {frame.number}, are passed over'
+                    f'frame {frame.number}, are ignored'
                 )
             return None
         frame = frame.sorted()
-        validate_frame(frame, self._phantom, self._image_size.get(name))
+        validate_frame(frame, self._phantom, fluoroscope.image_size)
         if len(frame.target_id) < MIN_TARGETS_OF_EXPOSURE:
             raise DataError(
-                f'fluoroscope {name}, frame {frame.number}: {len(frame.target_id)} targets are too few, '
-                f'{MIN_TARGETS_OF_EXPOSURE} are needed'
+                f'fluoroscope {name}, frame {frame.number}: {len(frame.target_id)} targets are '
+                f'too few, {MIN_TARGETS_OF_EXPOSURE} are needed'
             )
-        self._image_size.setdefault(name, frame.image_size)
+        if fluoroscope.image_size is None:
+            fluoroscope.image_size = frame.image_size
         return frame
 
-    def _collect_pair(self, pair):
-        """Collect a pair, for the capture that has waited longest or because the phantom stands
-        still.
-        """
-        self._orienting.take(pair)
+    def _collect_pair(self, pair: Mapping[str, Frame]) -> None:
+        """Collect a pair for the oldest capture, or because the phantom stands still."""
+        self._orientation.add(pair)
         if self._captures:
-            refused = self._not_captured = self._collector.take(pair)
-            if not refused:
+            refusal = self._capture_refusal = self._collector.take(pair)
+            if not refusal:
                 self._captures.popleft().set_result(pair)
         elif self._collect == 'still':
-            refused = self._collector.offer(pair)
+            refusal = self._collector.offer(pair)
         else:
             return
-        if not refused:
+        if not refusal:
             counts = ', '.join(
-                f'{n}: {len(pair[n].target_id)} targets, {100 * c.fraction:.0f} % of the image covered'
-                for n, c in self._collector.coverage.items()
+                f'{name}: {len(pair[name].target_id)} targets, '
+                f'{100 * coverage.fraction:.0f} % of the image covered'
+                for name, coverage in self._collector.coverage.items()
             )
             self.get_logger().info(
                 f'exposure {len(self._collector.exposures)} collected ({counts})'
@@ -300,15 +329,17 @@ class CalibrationNode(Node):
 
     # -- services
 
-    async def _on_capture(self, request, response):
-        timeout = request.timeout_sec or self._capture_timeout
-        captured = Future()
+    async def _on_capture(
+        self, request: Capture.Request, response: Capture.Response
+    ) -> Capture.Response:
+        timeout = request.timeout_sec or self._settings.capture_timeout
         try:
-            support.check_timeout(timeout)
+            check_timeout(timeout)
         except ValueError as error:
             response.message = str(error)
             return response
-        self._not_captured = ''
+        captured = Future()
+        self._capture_refusal = ''
         self._captures.append(captured)
         timer = self.create_timer(
             timeout,
@@ -324,106 +355,112 @@ class CalibrationNode(Node):
             response.message = f'frame {number} captured, {response.exposures} exposures now'
         else:
             self._captures.remove(captured)
-            response.message = self._not_captured or (
-                f'no frame of all fluoroscopes ({", ".join(self._names)}) came within {timeout:g} s; '
-                f'frames received: {", ".join(f"{n} {count}" for n, count in self._received.items())}'
+            received = ', '.join(f'{f.name} {f.received}' for f in self._fluoroscopes.values())
+            response.message = self._capture_refusal or (
+                f'no frame of all fluoroscopes ({", ".join(self._names)}) came within '
+                f'{timeout:g} s; frames received: {received}'
             )
         return response
 
-    def _on_reset(self, _, response):
+    def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
         count = len(self._collector.exposures)
-        self._new_collection()
-        self._image_size.clear()
+        self._start_collection()
+        for fluoroscope in self._fluoroscopes.values():
+            fluoroscope.image_size = None
         response.success = True
-        response.message = f'{count} exposures forgotten, the calibration stays'
+        response.message = f'{count} exposures discarded, the calibration stays in use'
         return response
 
-    def _on_collect_anew(self, request, response):
+    def _on_collect_anew(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
         self._collect = 'still'
         self._on_reset(request, response)
         response.message += (
-            '; exposures are collected anew, whenever the phantom stands still in a new pose'
+            '; new exposures are collected whenever the phantom stands still in a new pose'
         )
         self.get_logger().info(response.message)
         return response
 
-    def _on_save(self, request, response):
+    def _on_save(
+        self, request: SaveCalibration.Request, response: SaveCalibration.Response
+    ) -> SaveCalibration.Response:
+        calibrations = self._calibrations()
         try:
-            directory = (
-                support.path_of(request.directory) if request.directory else self._directory
-            )
-            if not self._calibrations:
+            directory = self._directory_of(request)
+            if not calibrations:
                 raise DataError('there is no calibration to save')
-            for calibration in self._calibrations.values():
+            for calibration in calibrations.values():
                 save_calibration(directory, calibration)
-            self._orienting.save(directory)
+            self._orientation.save(directory)
         except (DataError, OSError) as error:
             response.message = f'not saved: {error}'
             self.get_logger().error(response.message)
             return response
         response.success = True
-        response.message = f'{", ".join(self._calibrations)} saved to {directory}'
+        response.message = f'{", ".join(calibrations)} saved to {directory}'
         return response
 
-    def _on_load(self, request, response):
+    def _on_load(
+        self, request: LoadCalibration.Request, response: LoadCalibration.Response
+    ) -> LoadCalibration.Response:
         try:
-            directory = (
-                support.path_of(request.directory) if request.directory else self._directory
-            )
-            found = self._read_calibrations(directory)
-            if not found:
+            directory = self._directory_of(request)
+            loaded, orientation = self._load(directory)
+            if not loaded:
                 raise DataError(
                     f'{directory}: there is no calibration of {", ".join(self._names)}'
                 )
-            orientation = self._orienting.read(directory, found)
         except (DataError, OSError) as error:
-            response.message = f'not loaded, the running calibration stays: {error}'
+            response.message = f'not loaded, the calibration in use stays: {error}'
             self.get_logger().error(response.message)
             return response
-        self._publish(found, orientation)
+        self._publish(loaded, orientation)
         response.success = True
-        response.message = f'{", ".join(found)} loaded from {directory}'
+        response.message = f'{", ".join(loaded)} loaded from {directory}'
         return response
 
-    def _read_calibrations(self, directory):
-        return {n: c for n, c in load_calibrations(directory).items() if n in self._names}
+    def _directory_of(self, request: SaveCalibration.Request | LoadCalibration.Request) -> Path:
+        """Return the folder of a request. Raises DataError."""
+        return expand_path(request.directory) if request.directory else self._directory
 
-    def _load_at_start(self):
+    def _load(
+        self, directory: Path
+    ) -> tuple[dict[str, calibration_result.FluoroscopeCalibration], RigOrientation | None]:
+        """Return the calibrations of the node's fluoroscopes in a folder, and their orientation.
+
+        Raises DataError and OSError.
+        """
+        loaded = {n: c for n, c in load_calibrations(directory).items() if n in self._names}
+        return loaded, self._orientation.load(directory, loaded) if loaded else None
+
+    def _load_at_start(self) -> None:
         if not any(self._directory.glob('*' + SUFFIX)):
             return
         try:
-            found = self._read_calibrations(self._directory)
-            orientation = self._orienting.read(self._directory, found)
+            loaded, orientation = self._load(self._directory)
         except (DataError, OSError) as error:
             self._load_fault = str(error)
             self.get_logger().error(f'no calibration loaded: {error}')
             return
-        if found:
-            self._publish(found, orientation)
+        if loaded:
+            self._publish(loaded, orientation)
             self.get_logger().info(
-                f'calibration of {", ".join(found)} loaded from {self._directory}'
+                f'calibration of {", ".join(loaded)} loaded from {self._directory}'
             )
 
     # -- self-calibration
 
-    async def _on_calibrate(self, request, response):
+    async def _on_calibrate(
+        self, request: Calibrate.Request, response: Calibrate.Response
+    ) -> Calibrate.Response:
         await self._run_job(request, response, lambda *_: None, lambda: False)
         return response
 
-    async def _on_action(self, goal):
+    async def _on_action(self, goal: Any) -> SelfCalibrate.Result:
         result = SelfCalibrate.Result()
         feedback = SelfCalibrate.Feedback()
 
-        def progress(label, this):
-            feedback.fluoroscope = label
-            feedback.iteration = this.iteration
-            feedback.cost_adjustment = this.F
-            feedback.cost_regression = this.G
-            feedback.k = max(this.k.values())
-            feedback.rmse_u, feedback.rmse_v = (
-                float(x)
-                for x in np.sqrt(np.mean([np.square(r) for r in this.rmse.values()], axis=0))
-            )
+        def progress(label: str, last: Round) -> None:
+            fill_feedback(feedback, label, last)
             goal.publish_feedback(feedback)
 
         cancelled = await self._run_job(
@@ -437,33 +474,24 @@ class CalibrationNode(Node):
             goal.abort()
         return result
 
-    async def _run_job(self, request, result, progress, cancel_requested):
-        """Run a job and fill in result; returns whether it was cancelled. Without success nothing
-        is changed.
+    async def _run_job(
+        self,
+        request: Request,
+        result: Result,
+        progress: Callable[[str, Round], None],
+        is_cancel_requested: Callable[[], bool],
+    ) -> bool:
+        """Run a calibration and fill in the result; returns whether it was cancelled.
+
+        Without success nothing is changed.
         """
         if self._job is not None:
-            result.message = 'refused: a self-calibration is running already'
+            result.message = 'refused: a self-calibration is already running'
             self.get_logger().warning(result.message)
             return False
         try:
-            outcome = await self._start_job(request, progress, cancel_requested)
-            calibrations = {
-                name: replace(calibration, seconds=outcome.result.seconds)
-                for name, calibration in outcome.result.calibrations.items()
-            }
-            orientation = save_outcome(self._directory, outcome, self._orienting.present)
-            if outcome.orientation is None:
-                self.get_logger().warning(
-                    f'no new orientation of the rig: {outcome.orientation_note}'
-                )
-            if orientation is None:
-                self._orienting.clear()
-            self._publish(calibrations, orientation)
-            _fill_result(result, outcome.result, calibrations)
-            for sentence in outcome.result.left_out:
-                self.get_logger().warning(f'not used: {sentence}')
-            self.get_logger().info(result.message)
-            self._report_verdict(result, outcome.validation)
+            outcome = await self._start_job(request, progress, is_cancel_requested)
+            self._use_outcome(outcome, result)
         except Cancelled:
             result.message = 'cancelled, nothing was changed'
             self.get_logger().info(result.message)
@@ -471,45 +499,68 @@ class CalibrationNode(Node):
         except (DataError, ValueError, OSError) as error:
             result.message = str(error)
             self.get_logger().error(result.message)
-        except (
-            Exception
-        ) as error:  # a fault of ours must reach the caller, and must not end the node
+        except Exception as error:  # a bug must reach the caller, and must not end the node
             result.message = f'the self-calibration failed unexpectedly: {error}'
             self.get_logger().error(result.message)
         finally:
-            self._busy = ()
+            self._running = ()
             self._job = None
         return False
 
-    def _start_job(self, request, progress, cancel_requested):
+    def _use_outcome(self, outcome: CalibrationOutcome, result: Result) -> None:
+        """Save and publish the outcome of a job, and fill in the result. Raises DataError."""
+        calibrations = {
+            name: replace(calibration, seconds=outcome.result.seconds)
+            for name, calibration in outcome.result.calibrations.items()
+        }
+        orientation = save_outcome(self._directory, outcome, self._orientation.present)
+        if outcome.orientation is None:
+            self.get_logger().warning(f'no new orientation of the rig: {outcome.orientation_note}')
+        if orientation is None:
+            self._orientation.clear()
+        self._publish(calibrations, orientation)
+        fill_result(result, outcome.result, calibrations)
+        for sentence in outcome.result.left_out:
+            self.get_logger().warning(f'not used: {sentence}')
+        self.get_logger().info(result.message)
+        if outcome.validation is not None:
+            fill_verdict(result, outcome.validation)
+            self._log_verdict(outcome.validation)
+
+    def _start_job(
+        self,
+        request: Request,
+        progress: Callable[[str, Round], None],
+        is_cancel_requested: Callable[[], bool],
+    ) -> Future:
         """Start a calibration in a worker process; returns the Future of its CalibrationOutcome.
 
         Raises DataError and ValueError.
         """
         frames = self._collector.frames(list(request.fluoroscopes))
-        joint = self._joint and len(frames) > 1
+        joint = self._settings.joint and len(frames) > 1
         job = CalibrationRequest(
             frames,
             self._phantom,
-            self._options_of(request, joint),
+            options_of_request(request, self._options, joint),
             joint,
             request.principal_distance or None,
         )
-        others = {n: c for n, c in self._calibrations.items() if n not in frames}
+        others = {n: c for n, c in self._calibrations().items() if n not in frames}
         all_frames = self._collector.frames()
         rig = Rig(self._names, {name: all_frames[name] for name in others}, others)
         done = Future()
 
-        def on_round(label, this):
+        def on_round(label: str, last: Round) -> None:
             for name in label.split('+'):
-                self._rounds[name] = this
-            progress(label, this)
+                self._fluoroscopes[name].last_round = last
+            progress(label, last)
 
-        def raise_if_cancelled():
-            if cancel_requested() or self._stopping.is_set():
+        def raise_if_cancelled() -> None:
+            if is_cancel_requested() or self._stopping.is_set():
                 raise Cancelled
 
-        def wait():
+        def wait() -> None:
             try:
                 done.set_result(
                     run_in_worker_process(
@@ -523,178 +574,120 @@ class CalibrationNode(Node):
             except Exception as error:
                 done.set_exception(error)
             if self.executor is not None:
-                self.executor.wake()  # to look at what has been awaited
+                self.executor.wake()  # to continue what awaits the result
 
-        self._busy = tuple(frames)
+        self._running = tuple(frames)
         self._job = threading.Thread(target=wait, daemon=True)
         self._job.start()
         return done
 
-    def _options_of(self, request, joint):
-        """CalibrationOptions of a request, with the node's parameters where it leaves them open. Raises
-        ValueError.
-        """
-        if request.principal_distance < 0 or not np.isfinite(request.principal_distance):
-            raise ValueError(
-                f'principal_distance is a length in pixels, not {request.principal_distance}'
-            )
-        fixed = dict(self._fixed)
-        if not joint:
-            del fixed['relative_orientation']
-        return CalibrationOptions(
-            **{
-                name: getattr(request, name) or default for name, default in self._defaults.items()
-            },
-            **fixed,
-        )
+    def _log_verdict(self, validation: Validation) -> None:
+        self.get_logger().info(f'verdict: {validation.verdict} ({validation.seconds:.1f} s)')
+        for sentence in validation.findings:
+            self.get_logger().warning(sentence)
 
-    def _report_verdict(self, result, validation):
-        """Fill in and log the verdict on a calibration, where one was asked for."""
-        if validation is not None:
-            result.verdict = validation.verdict
-            result.findings = list(validation.findings)
-            result.message += f'; verdict: {validation.verdict}'
-            self.get_logger().info(f'verdict: {validation.verdict} ({validation.seconds:.1f} s)')
-            for sentence in validation.findings:
-                self.get_logger().warning(sentence)
-
-    def _publish(self, calibrations, orientation=None):
-        """Take calibrations and, where there is one, the orientation that belongs to them over,
-        and publish them.
-        """
-        # First, so that it is there when the first points come that are corrected with the new
-        # calibrations.
-        self._orienting.publish(orientation)
+    def _publish(
+        self,
+        calibrations: Mapping[str, calibration_result.FluoroscopeCalibration],
+        orientation: RigOrientation | None,
+    ) -> None:
+        """Use and publish calibrations, and the orientation that belongs to them, if any."""
+        # The orientation first, so that it is there when the first points come that are corrected
+        # with the new calibrations.
+        self._orientation.publish(orientation)
         for name, calibration in calibrations.items():
-            self._calibrations[name] = calibration
-            self._made_at[name] = time.monotonic()
+            self._fluoroscopes[name].use(calibration)
             self._load_fault = ''
             self._calibration_outputs[name].publish(message_from_calibration(calibration))
 
     # -- status
 
-    def _on_timer(self):
-        self._diagnostics.publish([self._report(name) for name in self._names])
+    def _on_timer(self) -> None:
+        """Publish the status and the diagnostics of every fluoroscope."""
+        statuses = []
+        stamp = self.get_clock().now().to_msg()
+        for fluoroscope in self._fluoroscopes.values():
+            progress = self._progress_of(fluoroscope)
+            self._status_outputs[fluoroscope.name].publish(message_from_progress(progress, stamp))
+            statuses.append(self._diagnose(fluoroscope, progress))
+        self._diagnostics.publish(statuses)
 
-    def _report(self, name):
-        """Publish the status of a fluoroscope; returns its diagnostics."""
-        message = CalibrationStatus(fluoroscope=name)
-        calibration = self._calibrations.get(name)
-        message.header.stamp = self.get_clock().now().to_msg()
-        message.header.frame_id = f'{name}_optical'
-        message.state = (
-            CalibrationStatus.CALIBRATING
-            if name in self._busy
-            else CalibrationStatus.CALIBRATED
-            if calibration
-            else CalibrationStatus.COLLECTING
+    def _progress_of(self, fluoroscope: _Fluoroscope) -> FluoroscopeProgress:
+        name = fluoroscope.name
+        exposures = self._collector.exposures
+        coverage = self._collector.coverage.get(name)
+        return FluoroscopeProgress(
+            fluoroscope=name,
+            frames_received=fluoroscope.received,
+            frames_rejected=fluoroscope.refusals.total + fluoroscope.refusals.failures,
+            frames_unpaired=self._pairer.unpaired[name],
+            exposures=len(exposures),
+            observations=sum(len(pair[name].target_id) for pair in exposures),
+            coverage=coverage.fraction if coverage else 0.0,
+            is_calibrating=name in self._running,
+            last_round=fluoroscope.last_round,
+            calibration=fluoroscope.calibration,
+            calibration_age_s=time.monotonic() - fluoroscope.calibrated_at,
         )
-        message.frames_received = self._received[name]
-        message.frames_rejected = self._rejected[name]
-        message.frames_unpaired = self._pairer.unpaired[name]
-        message.exposures = len(self._collector.exposures)
-        message.observations = sum(len(pair[name].target_id) for pair in self._collector.exposures)
-        if name in self._collector.coverage:
-            message.coverage = self._collector.coverage[name].fraction
-        if name in self._rounds:
-            last = self._rounds[name]
-            message.iteration = last.iteration
-            message.k = last.k[name]
-            message.cost_adjustment = last.F
-            message.cost_regression = last.G
-            message.rmse_u, message.rmse_v = (float(x) for x in last.rmse[name])
-        message.calibration_age = (
-            time.monotonic() - self._made_at[name] if calibration else float('nan')
-        )
-        message.calibration_id = calibration.calibration_id if calibration else ''
-        self._status[name].publish(message)
-        return (
-            name,
-            *self._verdict(name, message),
+
+    def _diagnose(self, fluoroscope: _Fluoroscope, progress: FluoroscopeProgress) -> Status:
+        """Return the diagnostics of a fluoroscope."""
+        return Status(
+            fluoroscope.name,
+            *self._verdict(fluoroscope, progress),
             {
-                'exposures': message.exposures,
-                'coverage': f'{message.coverage:.2f}',
-                'frames received': message.frames_received,
-                'frames rejected': message.frames_rejected,
-                'frames unpaired': message.frames_unpaired,
-                'last fault': self._last_fault[name],
-                'calibration': message.calibration_id,
+                'exposures': progress.exposures,
+                'coverage': f'{progress.coverage:.2f}',
+                'frames received': progress.frames_received,
+                'frames rejected': progress.frames_rejected,
+                'frames unpaired': progress.frames_unpaired,
+                'last fault': fluoroscope.refusals.last_fault,
+                'calibration': progress.calibration_id,
             },
         )
 
-    def _verdict(self, name, status):
-        """Level and message of the diagnostics of a fluoroscope."""
-        if self._deaf[name]:
-            return support.WARN, self._deaf[name]
+    def _verdict(
+        self, fluoroscope: _Fluoroscope, progress: FluoroscopeProgress
+    ) -> tuple[bytes, str]:
+        """Return level and message of the diagnostics of a fluoroscope."""
+        failure = fluoroscope.refusals.failure_status()
+        if failure:
+            return failure
+        if fluoroscope.incompatible:
+            return WARN, fluoroscope.incompatible
         if self._load_fault:
-            return support.ERROR, f'no calibration loaded: {self._load_fault}'
-        if (
-            self.count_publishers(f'{name}/target_observations') == 0
-            and status.frames_received == 0
-        ):
-            return support.WARN, 'nobody publishes target observations'
-        if status.frames_unpaired:
+            return ERROR, f'no calibration loaded: {self._load_fault}'
+        topic = f'{fluoroscope.name}/target_observations'
+        if not fluoroscope.received and not self.count_publishers(topic):
+            return WARN, 'no publisher of target observations'
+        if progress.frames_unpaired:
             return (
-                support.WARN,
-                f'{status.frames_unpaired} frames without partner of the other fluoroscopes',
+                WARN,
+                f'{progress.frames_unpaired} frames without partner of the other fluoroscopes',
             )
-        if status.frames_rejected:
-            return (
-                support.WARN,
-                f'{status.frames_rejected} frames refused: {self._last_fault[name]}',
-            )
-        if name in self._busy:
-            return support.OK, f'self-calibration running, round {status.iteration}'
-        return support.OK, 'calibrated' if name in self._calibrations else 'collecting exposures'
+        refusals = fluoroscope.refusals.refusal_status()
+        if refusals:
+            return refusals
+        if progress.is_calibrating:
+            last = progress.last_round
+            return OK, f'self-calibration running, round {last.iteration if last else 0}'
+        return OK, 'collecting exposures' if progress.calibration is None else 'calibrated'
 
-    def stop(self):
-        """End the running job: the node is to go."""
+    def stop(self) -> None:
+        """End the running job before the node is destroyed."""
         self._stopping.set()
         if self._job is not None:
             self._job.join()
 
-    def destroy_node(self):
-        """Take the action server down with the node."""
+    def destroy_node(self) -> None:
+        """Destroy the action server with the node."""
         self._action.destroy()
         super().destroy_node()
 
 
-def _fill_result(result, job, calibrations):
-    """Fill in a Calibrate response or SelfCalibrate result."""
-    result.success = True
-    result.seconds = job.seconds
-    for name, calibration in calibrations.items():
-        sd = np.sqrt(np.diagonal(calibration.interior_covariance))
-        result.fluoroscope = [*result.fluoroscope, name]
-        result.calibration_id = [*result.calibration_id, calibration.calibration_id]
-        result.model_kind = [*result.model_kind, calibration.model.kind]
-        result.converged = [*result.converged, calibration.converged]
-        for field, value in (
-            ('k', calibration.model.k),
-            ('iterations', calibration.iterations),
-            ('observations', calibration.observations),
-            ('inliers', calibration.inliers),
-            ('xp', calibration.interior[0]),
-            ('yp', calibration.interior[1]),
-            ('c', calibration.interior[2]),
-            ('sd_xp', sd[0]),
-            ('sd_yp', sd[1]),
-            ('sd_c', sd[2]),
-            ('rmse_before_u', calibration.rmse_before[0]),
-            ('rmse_before_v', calibration.rmse_before[1]),
-            ('rmse_after_u', calibration.rmse_after[0]),
-            ('rmse_after_v', calibration.rmse_after[1]),
-        ):
-            getattr(result, field).append(value if isinstance(value, int) else float(value))
-    unsettled = (
-        '' if job.converged else ' (stopped at the largest number of rounds, not converged)'
-    )
-    result.message = f'{", ".join(calibrations)} calibrated in {job.seconds:.1f} s{unsettled}'
-
-
-def main(args=None):
-    """Entry point."""
-    support.run(CalibrationNode, args)
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node."""
+    run(CalibrationNode, args)
 
 
 if __name__ == '__main__':

@@ -1,157 +1,168 @@
 """Node that removes the distortion from every observation of the fluoroscopes, live."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from functools import partial
+
 import numpy as np
 from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from sensor_msgs.msg import CameraInfo
 
+from ..calibration.result import FluoroscopeCalibration
 from ..distortion.grid import INVALID
-from . import support
-from .checks import KINDS, FrameChecks, Refused
-from .conversion import camera_info
-from .correcting import CorrectingNode, Stream
-from .qos import LATCHED, OBSERVATIONS
-from .wire import corrected_bytes, observations_of
+from .correcting_node import CorrectingNode, Stream
+from .frame_validation import OBSERVED_REFUSALS, FrameValidator
+from .messages.camera_info import message_of_corrected_stream
+from .messages.corrected_observations import encode_corrected_observations
+from .messages.target_observations import ObservedFrame, decode_target_observations
+from .runtime.logging import RateLimitedLogger
+from .runtime.main import run
+from .runtime.parameters import ManagedParameters, ParameterGroup
+from .runtime.qos import latched_qos, observations_qos
+from .runtime.refusals import Refused
+
+_NODE = ParameterGroup(ManagedParameters)
+PARAMETERS = (_NODE,)
 
 
-class _Stream(Stream):
-    """What the node holds of one fluoroscope."""
+class _ObservationStream(Stream):
+    """State of one fluoroscope."""
 
-    def __init__(self, name):
-        super().__init__()
-        self.checks = FrameChecks(name)
+    def __init__(self, name: str, item: str, logger: RateLimitedLogger) -> None:
+        super().__init__(name, item, logger)
+        self.validator = FrameValidator(name)
         self.invalid_points = 0
-        self.stamp = None  # seconds and nanoseconds of the newest frame
+        self.stamp: tuple[int, int] | None = None  # seconds and nanoseconds of the newest frame
 
 
 class CorrectionNode(CorrectingNode):
-    """Publishes corrected observations; nothing before there is a calibration."""
+    """Publishes corrected observations; nothing before the first calibration."""
 
     item = 'frame'
     subject = 'target observations'
+    refusal_kinds = OBSERVED_REFUSALS
     topics = ('target_observations',)
-    kinds = KINDS
-    new_stream = _Stream
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('correction_node')
+        self.use_parameters(_NODE.declare(self))
 
-    def make(self):
-        """Make outputs, and take calibrations."""
+    def make_stream(self, name: str) -> _ObservationStream:
+        """Return the state of one fluoroscope before the first frame."""
+        return _ObservationStream(name, self.item, self.limited_logger)
+
+    def create_outputs(self) -> None:
+        """Make the outputs and subscribe to calibrations."""
         self._corrected = {}
         self._info = {}
         for name in self.names:
-            self._corrected[name] = self.publisher(
-                CorrectedObservations, f'{name}/corrected_observations', OBSERVATIONS
+            self._corrected[name] = self.create_output(
+                CorrectedObservations, f'{name}/corrected_observations', observations_qos()
             )
-            self._info[name] = info = self.create_publisher(
-                CameraInfo, f'{name}/camera_info', LATCHED
-            )
-            self.kept(info, self.destroy_publisher, info)
-        self.take_calibrations()
+            info = self.create_publisher(CameraInfo, f'{name}/camera_info', latched_qos())
+            self._info[name] = self.own(info, self.destroy_publisher, info)
+        self.subscribe_calibrations()
 
-    def listen(self):
-        """Take observations, all in one thread."""
-        reader = self.reader(self.undecodable)
+    def create_readers(self) -> None:
+        """Receive the observations of all fluoroscopes in one thread."""
+        reader = self.create_reader(self.fault_handlers)
         for name in self.names:
             reader.subscribe(
                 TargetObservations,
                 f'{name}/target_observations',
-                lambda frame, info, name=name: self._on_frame(name, frame, info),
-                OBSERVATIONS,
-                observations_of,
+                partial(self._on_frame, name),
+                observations_qos(),
+                decode_target_observations,
             )
 
-    # -- calibrations
-
-    @staticmethod
-    def prepared(calibration):
-        """The calibration with its grid."""
+    def prepare(self, calibration: FluoroscopeCalibration) -> FluoroscopeCalibration:
+        """Return the calibration with its lookup grid."""
         calibration.prepare()
         return calibration
 
-    def taken(self, name, calibration):
-        """Tell that a calibration is in use."""
+    def on_calibration_ready(self, name: str, prepared: FluoroscopeCalibration) -> None:
+        """Publish the CameraInfo and log that a calibration is in use."""
         self._publish_info(name)
-        grid = calibration.grid
+        grid = prepared.grid
         self.get_logger().info(
-            f'fluoroscope {name}: corrected with calibration {calibration.calibration_id} now '
-            f'(grid of {grid.cell_px:g} px cells, within {grid.error_px:.4f} px of the model)'
+            f'fluoroscope {name}: calibration {prepared.calibration_id} in use '
+            f'(grid cells of {grid.cell_px:g} px, within {grid.error_px:.4f} px of the model)'
         )
 
-    def _publish_info(self, name):
-        calibration = self.calibrations.of(name)
-        if calibration is not None:
-            stamp = self.streams[name].stamp
-            self._info[name].publish(
-                camera_info(
-                    calibration,
-                    self.get_clock().now().to_msg()
-                    if stamp is None
-                    else Time(sec=stamp[0], nanosec=stamp[1]),
-                )
-            )
+    def diagnose(self) -> list:
+        """Return the status of every fluoroscope, and publish its CameraInfo again."""
+        for name in self.names:
+            self._publish_info(name)
+        return super().diagnose()
 
-    # -- observations
+    def extra_values(
+        self, stream: _ObservationStream, prepared: FluoroscopeCalibration | None
+    ) -> dict[str, object]:
+        """Return further values for the diagnostics of a fluoroscope."""
+        return {
+            'invalid points': stream.invalid_points,
+            'readers': self._corrected[stream.name].get_subscription_count(),
+            'calibration': prepared.calibration_id if prepared else '',
+            'grid error [px]': f'{prepared.grid.error_px:.4f}' if prepared else '',
+        }
 
-    def _on_frame(self, name, frame, info):
-        """Correct a frame, Observations, and publish it."""
+    def _publish_info(self, name: str) -> None:
+        calibration = self.prepared(name)
+        if calibration is None:
+            return
+        stamp = self.streams[name].stamp
+        now = (
+            self.get_clock().now().to_msg()
+            if stamp is None
+            else Time(sec=stamp[0], nanosec=stamp[1])
+        )
+        self._info[name].publish(message_of_corrected_stream(calibration, now))
+
+    def _on_frame(self, name: str, frame: ObservedFrame, info: Mapping[str, int]) -> None:
+        """Correct a frame and publish it."""
         stream = self.streams[name]
         stream.received += 1
         stream.stamp = frame.sec, frame.nanosec
-        calibration = self.calibrations.of(name)
+        calibration = self.prepared(name)
         if calibration is None:
             stream.waiting += 1
             return
         try:
-            arrays = stream.checks.arrays_of(frame, calibration)
+            arrays = stream.validator.validated_arrays(frame, calibration)
         except Refused as error:
-            self.refuse(stream, error)
+            stream.refusals.refuse(error)
             return
         corrected = calibration.correct_arrays(*arrays)
         self._corrected[name].publish(
-            corrected_bytes(frame, calibration.calibration_id, corrected)
+            encode_corrected_observations(frame, calibration.calibration_id, corrected)
         )
-        stream.published(info)
+        stream.count_corrected(info)
         status = corrected[-1]
         if not len(status) or status.max() == INVALID:
-            self._remark(name, stream, frame, status)
+            self._note_invalid_points(stream, frame, status)
 
-    def _remark(self, name, stream, frame, status):
-        """Say what was wrong with single points of a frame that has been published."""
-        where = f'fluoroscope {name}, frame {frame.frame_number}'
+    @staticmethod
+    def _note_invalid_points(
+        stream: _ObservationStream, frame: ObservedFrame, status: np.ndarray
+    ) -> None:
+        """Count and log points of a published frame that are not on the image."""
+        where = f'fluoroscope {stream.name}, frame {frame.frame_number}'
         if not len(status):
-            stream.last_fault = f'{where}: the frame is empty, it has no targets'
-        else:
-            invalid = np.flatnonzero(status == INVALID)
-            stream.invalid_points += len(invalid)
-            number = np.frombuffer(frame.target_id, np.uint32)[invalid[0]]
-            stream.last_fault = (
-                f'{where}: target {number} is not a point of the image, it is published as INVALID'
-            )
-        self.sentences.warn(stream.last_fault)
-
-    # -- diagnostics
-
-    def report(self):
-        """Diagnostics of every fluoroscope; with them the camera infos are repeated."""
-        for name in self.names:
-            self._publish_info(name)
-        return super().report()
-
-    def more(self, name, stream, calibration):
-        """Further values of the diagnostics."""
-        return {
-            'invalid points': stream.invalid_points,
-            'readers': self._corrected[name].get_subscription_count(),
-            'calibration': calibration.calibration_id if calibration else '',
-            'grid error [px]': f'{calibration.grid.error_px:.4f}' if calibration else '',
-        }
+            stream.refusals.note(f'{where}: the frame is empty, it has no targets')
+            return
+        invalid = np.flatnonzero(status == INVALID)
+        stream.invalid_points += len(invalid)
+        number = np.frombuffer(frame.target_id, np.uint32)[invalid[0]]
+        stream.refusals.note(
+            f'{where}: target {number} is not a point of the image, it is published as INVALID'
+        )
 
 
-def main(args=None):
-    """Entry point."""
-    support.run(CorrectionNode, args)
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node."""
+    run(CorrectionNode, args)
 
 
 if __name__ == '__main__':

@@ -1,169 +1,185 @@
 """Node that removes the distortion from the images of the fluoroscopes, live.
 
-Images of a fluoroscope are taken and corrected by a thread of its own: what costs time, the remap
-and the copies in and out of DDS, is done beside the other fluoroscopes as far as Python's lock
-allows.
+A thread of its own receives and corrects the images of each fluoroscope. What takes time, the
+remap and the copies in and out of DDS, runs in parallel as far as Python's lock allows.
 """
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
+from ..calibration.result import FluoroscopeCalibration
 from ..images.corrector import INTERPOLATIONS, ImageCorrector
-from . import support
-from .checks import Refused
-from .conversion import camera_info
-from .correcting import CorrectingNode, Stream
-from .pictures import COMPRESSIONS, IMAGE_KINDS, Pictures, compressed, one_thread
-from .qos import IMAGES
-from .support import StartError, declare
+from ..options import option
+from .correcting_node import CorrectingNode, Stream
+from .messages.camera_info import message_of_corrected_stream
+from .messages.image import (
+    COMPRESSIONS,
+    IMAGE_REFUSALS,
+    ImageConverter,
+    compressed_message,
+    use_single_thread,
+)
+from .runtime.logging import RateLimitedLogger
+from .runtime.main import run
+from .runtime.parameters import ManagedParameters, ParameterGroup
+from .runtime.qos import images_qos
+from .runtime.refusals import Refused
 
-INPUTS = {
-    'raw': ((Image, 'image_raw'),),
-    'compressed': ((CompressedImage, 'image_raw/compressed'),),
-}
-INPUTS['both'] = INPUTS['raw'] + INPUTS['compressed']
+RAW = (Image, 'image_raw')
+COMPRESSED = (CompressedImage, 'image_raw/compressed')
+INPUTS = {'raw': (RAW,), 'compressed': (COMPRESSED,), 'both': (RAW, COMPRESSED)}
 CORRECTED = 'image_corrected'
 
 
-class _Calibrated:
-    """A calibration, and what is made of it once."""
+@dataclass(frozen=True)
+class ImageParameters(ManagedParameters):
+    """Parameters of the image node."""
 
-    def __init__(self, calibration, interpolation):
+    interpolation: str = option(
+        'linear',
+        'interpolation between pixels of the observed image; cubic is sharper and slower',
+        choices=INTERPOLATIONS,
+    )
+    inputs: str = option(
+        'both',
+        'topics to subscribe to; of a camera that offers both, choose one',
+        choices=INPUTS,
+    )
+    compressed_format: str = option(
+        'png',
+        'format of compressed corrected images; png is lossless, and used for 16 bits always',
+        choices=COMPRESSIONS,
+    )
+    jpeg_quality: int = option(95, 'quality of jpeg images', minimum=1, maximum=100)
+
+
+_NODE = ParameterGroup(ImageParameters)
+PARAMETERS = (_NODE,)
+
+
+class _PreparedCalibration:
+    """A calibration with its map of pixels."""
+
+    def __init__(self, calibration: FluoroscopeCalibration, interpolation: str) -> None:
         calibration.prepare()
         self.calibration = calibration
         self.corrector = ImageCorrector(calibration, interpolation)
-        self.info = camera_info(calibration, Time())  # its header is that of each image
+        # Its header is replaced by that of each image.
+        self.info = message_of_corrected_stream(calibration, Time())
 
 
-class _Stream(Stream):
-    """What the node holds of one fluoroscope."""
+class _ImageStream(Stream):
+    """State of one fluoroscope."""
 
-    def __init__(self, name):
-        super().__init__()
-        self.pictures = Pictures(name)
+    def __init__(self, name: str, item: str, logger: RateLimitedLogger) -> None:
+        super().__init__(name, item, logger)
+        self.converter = ImageConverter(name)
         self.compressed = 0
 
 
 class ImageNode(CorrectingNode):
-    """Publishes corrected images and their CameraInfo; nothing before there is a calibration."""
+    """Publishes corrected images and their CameraInfo; nothing before the first calibration."""
 
     item = 'image'
     subject = 'images'
-    kinds = IMAGE_KINDS
-    new_stream = _Stream
+    refusal_kinds = IMAGE_REFUSALS
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('image_node')
-        self._interpolation = self._one_of(
-            'interpolation',
-            'linear',
-            INTERPOLATIONS,
-            'between the pixels of the '
-            'observed image: linear, or cubic, which is sharper and takes longer',
-        )
-        self._inputs = INPUTS[
-            self._one_of(
-                'inputs',
-                'both',
-                INPUTS,
-                'what is subscribed to: raw, compressed or both; '
-                'a camera that offers both is to be taken in one form',
-            )
-        ]
+        self._settings = _NODE.declare(self)
+        self._inputs = INPUTS[self._settings.inputs]
         self.topics = tuple(topic for _, topic in self._inputs)
-        self._format = self._one_of(
-            'compressed_format',
-            'png',
-            COMPRESSIONS,
-            'format of compressed corrected images: '
-            'png (without loss) or jpeg; images of 16 bits are png',
-        )
-        self._quality = declare(self, 'jpeg_quality', 95, 'quality of jpeg', 1, 100)
-        one_thread()
+        self.use_parameters(self._settings)
+        use_single_thread()
 
-    def _one_of(self, name, default, values, description):
-        value = declare(self, name, default, description)
-        if value not in values:
-            raise StartError(f'parameter {name} is one of {", ".join(values)}, not {value!r}')
-        return value
+    def make_stream(self, name: str) -> _ImageStream:
+        """Return the state of one fluoroscope before the first image."""
+        return _ImageStream(name, self.item, self.limited_logger)
 
-    def make(self):
-        """Make outputs, and take calibrations."""
-        self._images, self._compressed, self._infos = (
-            {name: self.publisher(kind, f'{name}/{topic}', IMAGES) for name in self.names}
-            for kind, topic in (
-                (Image, CORRECTED),
-                (CompressedImage, f'{CORRECTED}/compressed'),
-                (CameraInfo, f'{CORRECTED}/camera_info'),
-            )
-        )
-        self.take_calibrations()
+    def create_outputs(self) -> None:
+        """Make the outputs and subscribe to calibrations."""
+        self._images = self._create_outputs(Image, CORRECTED)
+        self._compressed = self._create_outputs(CompressedImage, f'{CORRECTED}/compressed')
+        self._infos = self._create_outputs(CameraInfo, f'{CORRECTED}/camera_info')
+        self.subscribe_calibrations()
 
-    def listen(self):
-        """Take images, those of each fluoroscope in a thread of its own."""
+    def _create_outputs(self, kind: type, topic: str) -> dict:
+        return {
+            name: self.create_output(kind, f'{name}/{topic}', images_qos()) for name in self.names
+        }
+
+    def create_readers(self) -> None:
+        """Receive images, those of each fluoroscope in a thread of its own."""
         for name in self.names:
-            reader = self.reader(self.undecodable)
+            reader = self.create_reader(self.fault_handlers)
             for kind, topic in self._inputs:
                 reader.subscribe(
                     kind,
                     f'{name}/{topic}',
-                    lambda message, info, name=name: self._on_image(name, message, info),
-                    IMAGES,
+                    partial(self._on_image, name),
+                    images_qos(),
                 )
 
-    # -- calibrations
+    def prepare(self, calibration: FluoroscopeCalibration) -> _PreparedCalibration:
+        """Return the calibration with its map of pixels."""
+        return _PreparedCalibration(calibration, self._settings.interpolation)
 
-    def prepared(self, calibration):
-        """The calibration with its map of pixels."""
-        return _Calibrated(calibration, self._interpolation)
-
-    def taken(self, name, calibrated):
-        """Tell that a calibration is in use."""
-        empty = int((~calibrated.corrector.mask).sum())
+    def on_calibration_ready(self, name: str, prepared: _PreparedCalibration) -> None:
+        """Log that a calibration is in use."""
+        empty = int((~prepared.corrector.mask).sum())
         self.get_logger().info(
-            f'fluoroscope {name}: images corrected with calibration '
-            f'{calibrated.calibration.calibration_id} now ({empty} pixels are empty, nothing was '
-            'seen there)'
+            f'fluoroscope {name}: calibration {prepared.calibration.calibration_id} in use '
+            f'({empty} pixels of the corrected image are empty)'
         )
 
-    # -- images
+    def extra_values(
+        self, stream: _ImageStream, prepared: _PreparedCalibration | None
+    ) -> dict[str, object]:
+        """Return further values for the diagnostics of a fluoroscope."""
+        return {
+            'images compressed': stream.compressed,
+            'calibration': prepared.calibration.calibration_id if prepared else '',
+        }
 
-    def _on_image(self, name, message, info):
+    def _on_image(
+        self, name: str, message: Image | CompressedImage, info: Mapping[str, int]
+    ) -> None:
         """Correct an image and publish it."""
         stream = self.streams[name]
         stream.received += 1
-        calibrated = self.calibrations.of(name)
-        if calibrated is None:
+        prepared = self.prepared(name)
+        if prepared is None:
             stream.waiting += 1
             return
         try:
-            image, encoding = stream.pictures.array_of(message, calibrated.calibration)
+            image, encoding = stream.converter.to_array(message, prepared.calibration)
         except Refused as error:
-            self.refuse(stream, error)
+            stream.refusals.refuse(error)
             return
-        out, pixels = stream.pictures.out(message.header, encoding, image.shape)
-        calibrated.corrector.correct(image, pixels)
-        self._images[name].publish(out)  # this copies it
-        calibrated.info.header = message.header
-        self._infos[name].publish(calibrated.info)
-        stream.published(info)
+        out, pixels = stream.converter.prepare_output(message.header, encoding, image.shape)
+        prepared.corrector.correct(image, pixels)
+        self._images[name].publish(out)  # copies the image
+        prepared.info.header = message.header
+        self._infos[name].publish(prepared.info)
+        stream.count_corrected(info)
         if self._compressed[name].get_subscription_count():
-            self._compressed[name].publish(compressed(out, pixels, self._format, self._quality))
+            self._compressed[name].publish(
+                compressed_message(
+                    out, pixels, self._settings.compressed_format, self._settings.jpeg_quality
+                )
+            )
             stream.compressed += 1
 
-    # -- diagnostics
 
-    def more(self, name, stream, calibrated):
-        """Further values of the diagnostics."""
-        return {
-            'images compressed': stream.compressed,
-            'calibration': calibrated.calibration.calibration_id if calibrated else '',
-        }
-
-
-def main(args=None):
-    """Entry point."""
-    support.run(ImageNode, args)
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node."""
+    run(ImageNode, args)
 
 
 if __name__ == '__main__':

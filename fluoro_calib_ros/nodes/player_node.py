@@ -1,101 +1,122 @@
 """Node that publishes the messages of a bag as they were recorded, and ends."""
 
+from __future__ import annotations
+
 import threading
 import time
 import traceback
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib import import_module
 
 import rclpy
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
+from rclpy.publisher import Publisher
 from rclpy.type_support import check_for_type_support
 
-from ..bags.reader import iterate_messages, topics_of
+from ..bags.reader import TopicInfo, iterate_messages, topics_of
 from ..errors import DataError
-from . import support
-from .qos import LATCHED_RECORDED, OBSERVATIONS, overridable
-from .support import StartError, declare, sentence_of
+from ..options import option
+from .runtime.discovery import wait_for_readers, wait_until_acknowledged
+from .runtime.errors import StartError, one_line
+from .runtime.main import run
+from .runtime.parameters import ParameterGroup
+from .runtime.qos import observations_qos, qos_overrides, recorded_latched_qos
+
+
+@dataclass(frozen=True)
+class PlayerParameters:
+    """Parameters of the player."""
+
+    bag: str = option('', 'bag to play: an .mcap file or a folder of rosbag2')
+    rate: float = option(1.0, 'speed relative to the recording', minimum=0.001, maximum=1e6)
+    loop: bool = option(False, 'whether the bag is played over and over')
+    wait_for_readers: int = option(
+        1, 'subscriptions of every topic to wait for', minimum=0, maximum=100
+    )
+    strip_prefix: str = option('', 'prefix removed from recorded topics')
+    topics: tuple[str, ...] = option(('',), 'topics to play; empty: all')
+
+
+_NODE = ParameterGroup(PlayerParameters)
+PARAMETERS = (_NODE,)
 
 
 class PlayerNode(Node):
     """Plays a bag once, or over and over; stamps are those of the recording."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('player_node')
-        self._bag = declare(self, 'bag', '', 'bag to play: an .mcap file or a folder of rosbag2')
-        self._rate = declare(self, 'rate', 1.0, 'speed against the recording', 0.001, 1e6)
-        self._loop = declare(self, 'loop', False, 'play over and over')
-        self._readers = declare(
-            self, 'wait_for_readers', 1, 'subscriptions of every topic to wait for', 0, 100
-        )
-        self._namespace = declare(
-            self, 'strip_prefix', '', 'beginning of the recorded topics that is left out'
-        )
-        wanted = list(declare(self, 'topics', [''], 'topics to play; empty: all'))
-        if not self._bag:
+        self._settings = _NODE.declare(self)
+        if not self._settings.bag:
             raise StartError('parameter bag is not set: it names the bag to play')
-        try:
-            found = topics_of(self._bag)
-        except DataError as error:
-            raise StartError(str(error)) from None
-        self._outputs = {
-            topic: self._output(topic, info.type, is_latched(info))
-            for topic, info in found.items()
-            if wanted in ([''], []) or topic in wanted
-        }
-        self._outputs = {
-            topic: output for topic, output in self._outputs.items() if output is not None
-        }
-        if not self._outputs:
-            raise StartError(
-                f'{self._bag}: there is nothing to play among its topics {", ".join(found) or "(none)"}'
-            )
-        if not any(found[topic].count for topic in self._outputs):
-            raise StartError(f'{self._bag}: there are no messages on {", ".join(self._outputs)}')
+        self._outputs = self._create_outputs(self._settings.bag)
         self.failed = False
         self._stopping = threading.Event()
         self._worker = threading.Thread(target=self._play, daemon=True)
         self._worker.start()
 
-    def _output(self, topic, type_name, latched):
-        """Publisher of a recorded topic, relative so that it can be remapped; None for a type that
-        is not here.
+    def _create_outputs(self, bag: str) -> dict[str, Publisher]:
+        """Return the publishers of the topics to play. Raises StartError."""
+        try:
+            topics = topics_of(bag)
+        except DataError as error:
+            raise StartError(str(error)) from None
+        wanted = [topic for topic in self._settings.topics if topic]
+        outputs = {}
+        for topic, info in topics.items():
+            if not wanted or topic in wanted:
+                output = self._create_output(topic, info)
+                if output is not None:
+                    outputs[topic] = output
+        if not outputs:
+            raise StartError(
+                f'{bag}: there is nothing to play among its topics {", ".join(topics) or "(none)"}'
+            )
+        if not any(topics[topic].count for topic in outputs):
+            raise StartError(f'{bag}: there are no messages on {", ".join(outputs)}')
+        return outputs
+
+    def _create_output(self, topic: str, info: TopicInfo) -> Publisher | None:
+        """Return the publisher of a topic, relative so that it can be remapped.
+
+        Returns None for a type that is not installed. Raises StartError.
         """
-        package, _, name = type_name.partition('/msg/')
+        package, _, name = info.type.partition('/msg/')
         try:
             message_type = getattr(import_module(f'{package or "no"}.msg'), name)
             check_for_type_support(message_type)
         except (ImportError, AttributeError):
             self.get_logger().warning(
-                f'{topic} is not played: the type {type_name or "(none)"} is not installed'
+                f'{topic} is not played: the type {info.type or "(none)"} is not installed'
             )
             return None
-        relative = topic.removeprefix(self._namespace).lstrip('/')
+        relative = topic.removeprefix(self._settings.strip_prefix).lstrip('/')
         try:
             return self.create_publisher(
                 message_type,
                 relative,
-                LATCHED_RECORDED if latched else OBSERVATIONS,
-                qos_overriding_options=overridable(),
+                recorded_latched_qos() if is_latched(info) else observations_qos(),
+                qos_overriding_options=qos_overrides(),
             )
         except NameValidationException as error:
             raise StartError(
-                f'{topic} cannot be played as {relative!r}: {sentence_of(error)}'
+                f'{topic} cannot be played as {relative!r}: {one_line(error)}'
             ) from None
 
-    def _play(self):
+    def _play(self) -> None:
         try:
-            support.wait_for_readers(self, self._outputs.values(), self._readers, self._stopping)
+            outputs = self._outputs.values()
+            wait_for_readers(self, outputs, self._settings.wait_for_readers, self._stopping)
             while not self._stopping.is_set():
                 self._play_once()
-                if not self._loop:
+                if not self._settings.loop:
                     break
-            if (
-                not support.wait_until_taken(self._outputs.values(), self._stopping)
-                and not self._stopping.is_set()
-            ):
+            arrived = wait_until_acknowledged(outputs, self._stopping)
+            if not arrived and not self._stopping.is_set():
                 self.get_logger().warning(
-                    'not all messages have arrived: a reader does not answer'
+                    'not all messages have arrived: a reader does not respond'
                 )
         except DataError as error:
             self.get_logger().fatal(str(error))
@@ -108,34 +129,34 @@ class PlayerNode(Node):
             if rclpy.ok():
                 rclpy.shutdown()
 
-    def _play_once(self):
+    def _play_once(self) -> None:
         """Publish every message at its time."""
         start = time.monotonic()
-        first = None
+        first_ns = None
         count = 0
-        for message in iterate_messages(self._bag, list(self._outputs)):
-            first = message.log_time_ns if first is None else first
-            due = start + (message.log_time_ns - first) * 1e-9 / self._rate
+        for message in iterate_messages(self._settings.bag, list(self._outputs)):
+            first_ns = message.log_time_ns if first_ns is None else first_ns
+            due = start + (message.log_time_ns - first_ns) * 1e-9 / self._settings.rate
             if self._stopping.wait(max(0.0, due - time.monotonic())):
                 return
             self._outputs[message.topic].publish(message.data)
             count += 1
         self.get_logger().info(f'{count} messages played in {time.monotonic() - start:.1f} s')
 
-    def stop(self):
-        """End playing: the node is to go."""
+    def stop(self) -> None:
+        """Stop playing before the node is destroyed."""
         self._stopping.set()
         self._worker.join(2.0)
 
 
-def is_latched(info):
-    """Whether what was recorded on a topic is heard by those too who come later."""
+def is_latched(info: TopicInfo) -> bool:
+    """Return whether late subscribers received the messages of a recorded topic, too."""
     return any(profile.get('durability') == 'transient_local' for profile in info.offered_qos)
 
 
-def main(args=None):
-    """Entry point."""
-    support.run(PlayerNode, args)
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node."""
+    run(PlayerNode, args)
 
 
 if __name__ == '__main__':

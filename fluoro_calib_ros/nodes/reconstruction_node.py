@@ -1,10 +1,12 @@
-"""Node that intersects the corrected views of a rig: points in space, with how good they are,
-live.
-"""
+"""Node that intersects the corrected views of a rig: points in space with covariance, live."""
+
+from __future__ import annotations
 
 import time
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -19,34 +21,102 @@ from sensor_msgs.msg import CameraInfo, PointCloud2
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
-from ..drift.clusters import parse_clusters
 from ..drift.options import DriftOptions
 from ..drift.rig_watch import RigDriftWatch
 from ..errors import DataError
-from ..exposures.pairing import PATIENCE, exposure_pairer
+from ..exposures.pairing import PairingOptions, exposure_pairer
 from ..files.rig_orientation import load_orientation
-from ..reconstruction.intersection import FAILED, OUTSIDE, REJECTED, SINGLE_VIEW, Intersector
-from ..reconstruction.reconstruct import CorrectedView, intersect_views, watch_views
-from . import support
-from .checks import Refused, check_corrected
-from .conversion import to_stamp
-from .qos import LATCHED, OBSERVATIONS
-from .spatial import (
-    MocapMarkers,
-    cloud_message,
-    drift_message,
-    ellipsoids_message,
-    message_from_orientation,
-    mocap_message,
-    orientation_from_message,
-    points_message,
-    transforms_of,
+from ..options import option
+from ..photogrammetry import rig_orientation
+from ..reconstruction.intersection import (
+    FAILED,
+    OUTSIDE,
+    REJECTED,
+    SINGLE_VIEW,
+    IntersectedPoints,
+    Intersector,
 )
-from .support import StartError, declare
-from .wire import Corrected, corrected_of, points_bytes
+from ..reconstruction.reconstruct import CorrectedView, intersect_views, watch_views
+from .drift_monitor import DriftMonitor, DriftParameters
+from .frame_validation import CORRECTED_REFUSALS, validate_corrected
+from .messages.camera_info import image_size_of
+from .messages.corrected_observations import CorrectedFrame, decode_corrected_observations
+from .messages.marker_array import ellipsoid_markers
+from .messages.mocap_markers import MocapMarkers, mocap_markers
+from .messages.point_cloud import point_cloud
+from .messages.reconstructed_points import (
+    PointsContent,
+    encode_reconstructed_points,
+    message_from_points,
+)
+from .messages.rig_orientation import (
+    description_of,
+    message_from_orientation,
+    orientation_from_message,
+)
+from .messages.transforms import transforms_of_orientation
+from .runtime.diagnostics import OK, WARN, LatencyWindow, Status
+from .runtime.lifecycle import StreamNode
+from .runtime.main import run
+from .runtime.parameters import ManagedParameters, ParameterGroup
+from .runtime.qos import latched_qos, observations_qos
+from .runtime.refusals import RefusalLog, Refused
+from .runtime.stream_reader import FaultHandlers
 
-KINDS = ('undecodable', 'lengths', 'repeated target', 'sigma')  # of refused messages
-ORIENTATIONS = 4  # that are kept: frames of the calibration before may still come
+MAX_ORIENTATIONS = 4  # frames of the previous calibrations may still come
+COUNTED_STATUSES = {
+    'outside': OUTSIDE,
+    'rejected': REJECTED,
+    'failed': FAILED,
+    'in a single view': SINGLE_VIEW,
+}
+
+
+@dataclass(frozen=True)
+class ReconstructionParameters(ManagedParameters):
+    """Parameters of the reconstruction node."""
+
+    reject: float = option(
+        4.0,
+        'epipolar distance above which image points do not belong together',
+        minimum=1.0,
+        maximum=1000.0,
+        unit='standard deviations',
+    )
+    orientation_file: str = option(
+        '',
+        'rig_orientation.npz to begin with; empty: the orientation comes from a topic',
+    )
+    ellipsoid_sigmas: float = option(
+        10.0,
+        'half axes of the ellipsoids for RViz',
+        minimum=0.1,
+        maximum=1000.0,
+        unit='standard deviations',
+    )
+    ellipsoid_rate: float = option(
+        30.0, 'maximum rate of the MarkerArrays', minimum=0.1, maximum=1000.0, unit='Hz'
+    )
+
+    min_fluoroscopes = 2
+
+
+_NODE = ParameterGroup(ReconstructionParameters)
+_PAIRING = ParameterGroup(
+    PairingOptions,
+    {
+        'pair_by': 'pair_by',
+        'tolerance_s': 'pair_tolerance',
+        'waiting': 'waiting',
+        'patience': 'patience',
+    },
+)
+_DRIFT = ParameterGroup(DriftParameters)
+_DRIFT_OPTIONS = ParameterGroup(
+    DriftOptions,
+    {'warn_interval_h': 'drift_warn_interval', 'error_interval_h': 'drift_error_interval'},
+)
+PARAMETERS = (_NODE, _PAIRING, _DRIFT, _DRIFT_OPTIONS)
 
 
 @dataclass(frozen=True)
@@ -56,157 +126,58 @@ class _View:
     fluoroscope: str
     number: int
     stamp_ns: int
-    frame: Corrected
+    frame: CorrectedFrame
 
 
 class _Rig(NamedTuple):
-    """An orientation that arrived, and what is made of it once; watch: RigDriftWatch, None while there
-    is none.
-    """
+    """An orientation that has arrived, with its intersector and drift watch, if there is one."""
 
     orientation_id: str
-    orientation: object
+    orientation: rig_orientation.RigOrientation
     intersector: Intersector
     watch: RigDriftWatch | None
 
 
-class ReconstructionNode(support.StreamNode):
-    """Publishes points in space for every exposure of which two fluoroscopes have come, or more."""
+class ReconstructionNode(StreamNode):
+    """Publishes points in space for every exposure of which at least two views have come."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('reconstruction_node')
-        self._names = support.fluoroscopes_of(self, least=2)
-        self._pairing = (
-            declare(
-                self, 'pair_by', 'frame_number', 'how frames are paired: frame_number or stamp'
-            ),
-            round(
-                1e9
-                * declare(
-                    self,
-                    'pair_tolerance',
-                    0.002,
-                    'largest difference of the stamps of a pair [s]',
-                    0.0,
-                    1.0,
-                )
-            ),
-            declare(
-                self,
-                'waiting',
-                64,
-                'frames of a fluoroscope that wait for their partners',
-                1,
-                10000,
-            ),
-            declare(
-                self,
-                'patience',
-                PATIENCE,
-                'frames of two others for which a silent one of three or '
-                'more fluoroscopes is waited for',
-                1,
-                10000,
-            ),
+        self._settings = _NODE.declare(self)
+        self._pairing = _PAIRING.declare(self)
+        self.autostart = self._settings.autostart
+        self._names = self._settings.fluoroscopes
+        self._marker_interval_ns = round(1e9 / self._settings.ellipsoid_rate)
+        self._drift = DriftMonitor(
+            self._names, _DRIFT.declare(self), _DRIFT_OPTIONS.declare(self), self.get_logger()
         )
-        self._reject = declare(
-            self,
-            'reject',
-            4.0,
-            'epipolar distance above which image points do not belong '
-            'together [standard deviations]',
-            1.0,
-            1000.0,
-        )
-        self._file = declare(
-            self,
-            'orientation_file',
-            '',
-            'rig_orientation.npz to begin with; empty: the orientation '
-            'comes from the topic rig_orientation',
-        )
-        self._sigmas = declare(
-            self,
-            'ellipsoid_sigmas',
-            10.0,
-            'half axes of the ellipsoids for RViz [standard deviations]',
-            0.1,
-            1000.0,
-        )
-        self._every_ns = round(
-            1e9 / declare(self, 'ellipsoid_rate', 30.0, 'most MarkerArrays a second', 0.1, 1000.0)
-        )
-        self._read_watch()
-        try:
-            exposure_pairer(self._names, *self._pairing)
-        except ValueError as error:
-            raise StartError(f'parameter {error}') from None
-        self.forget()
+        self.reset()
 
-    def _read_watch(self):
-        """Parameters of the drift watch. Raises StartError."""
-        self._watching = declare(
-            self, 'drift_watch', True, 'look in the stream for a drift of the calibration'
+    def reset(self) -> None:
+        """Forget the orientations and start counting from zero."""
+        # By calibration ids, the oldest first; replaced as a whole.
+        self._rigs: dict[tuple[str | None, ...], _Rig] = {}
+        self._pairer = exposure_pairer(
+            self._names,
+            self._pairing.pair_by,
+            self._pairing.tolerance_ns,
+            self._pairing.waiting,
+            self._pairing.patience,
         )
-        hours = [
-            declare(
-                self,
-                f'drift_{level}_interval',
-                default,
-                f'mean time between two false alarms of the level {level.upper()} [h of stream]',
-                0.01,
-                1e6,
-            )
-            for level, default in (('warn', 10.0), ('error', 1000.0))
-        ]
-        self._watch_rate = declare(
-            self,
-            'drift_rate',
-            120.0,
-            'most exposures a second that the drift watch looks at',
-            1.0,
-            10000.0,
-        )
-        clusters = declare(
-            self,
-            'clusters',
-            [''],
-            'rigid clusters of targets, whose distances must not change: '
-            "'tibia: 1001 1002 1003', ...",
-        )
-        self._collect_on_drift = declare(
-            self,
-            'collect_on_drift',
-            False,
-            'at a drift of level ERROR call the service collect_anew of the calibration node',
-        )
-        try:
-            self._clusters = parse_clusters([text for text in clusters if text])
-            self._watch_options = DriftOptions(warn_interval_h=hours[0], error_interval_h=hours[1])
-        except ValueError as error:
-            raise StartError(
-                f'parameter clusters, drift_warn_interval or drift_error_interval: {error}'
-            ) from None
-
-    def forget(self):
-        """Begin to count, without an orientation."""
-        self._rigs = {}  # calibration ids: _Rig; replaced as a whole
-        self._pairer = exposure_pairer(self._names, *self._pairing)
-        self._received = Counter()
-        self._refused = Counter()
-        self._points = Counter()
-        self._exposures = self._reconstructed = self._without_orientation = 0
-        self._last_fault = ''
-        self._latencies = support.Latencies()
-        self._drawn = 0
-        self._sizes = {}
-        self._newest = None
-        self._alarmed = False
+        self._received: Counter[str] = Counter()
+        self._refusals = RefusalLog('frame', self.limited_logger)
+        self._points: Counter[str] = Counter()
+        self._exposures = 0
+        self._reconstructed = 0
+        self._without_orientation = 0
+        self._latencies = LatencyWindow()
+        self._markers_published_ns = 0
+        self._drift.reset()
 
     # -- lifecycle
 
-    def make(self):
-        """Make outputs, and take orientations."""
+    def create_outputs(self) -> None:
+        """Make the outputs and subscribe to orientations."""
         kinds = {
             'points_with_covariance': ReconstructedPoints,
             'points': PointCloud2,
@@ -215,125 +186,114 @@ class ReconstructionNode(support.StreamNode):
         if MocapMarkers is not None:
             kinds['mocap_markers'] = MocapMarkers
         self._outputs = {
-            name: self.publisher(kind, f'reconstruction/{name}', OBSERVATIONS)
+            name: self.create_output(kind, f'reconstruction/{name}', observations_qos())
             for name, kind in kinds.items()
         }
-        for name, made in (
-            ('drift', self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)),
-            ('tf', self.create_publisher(TFMessage, '/tf_static', LATCHED)),
-        ):
-            self._outputs[name] = self.kept(made, self.destroy_publisher, made)
-        self._collect_anew = client = self.create_client(Reset, 'collect_anew')
-        self.kept(client, self.destroy_client, client)
-        inputs = [
-            self.create_subscription(
-                RigOrientation, 'rig_orientation', self._on_orientation, LATCHED
-            )
-        ]
-        inputs += [
-            self.create_subscription(
+        drift = self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)
+        self.own(drift, self.destroy_publisher, drift)
+        collect_anew = self.create_client(Reset, 'collect_anew')
+        self.own(collect_anew, self.destroy_client, collect_anew)
+        self._drift.connect(drift, collect_anew)
+        self._transforms = self.create_publisher(TFMessage, '/tf_static', latched_qos())
+        self.own(self._transforms, self.destroy_publisher, self._transforms)
+        self._create_inputs()
+        if self._settings.orientation_file:
+            self._load_orientation(self._settings.orientation_file)
+
+    def _create_inputs(self) -> None:
+        self.create_input(
+            RigOrientation,
+            'rig_orientation',
+            self._on_orientation,
+            latched_qos(),
+            self._refusals,
+        )
+        for name in self._names:
+            self.create_input(
                 CameraInfo,
                 f'{name}/camera_info',
-                lambda message, name=name: self._on_info(name, message),
-                LATCHED,
+                partial(self._on_camera_info, name),
+                latched_qos(),
+                self._refusals,
             )
-            for name in self._names
-        ]
-        for subscription in inputs:
-            self.kept(subscription, self.destroy_subscription, subscription)
-        if self._file:
-            try:
-                self._on_orientation(message_from_orientation(load_orientation(self._file)))
-            except DataError as error:
-                self.get_logger().error(str(error))
-                self._last_fault = str(error)
 
-    def listen(self):
-        """Take corrected observations, all in one thread."""
-        reader = self.reader(self._on_undecodable)
+    def create_readers(self) -> None:
+        """Receive the corrected observations of all fluoroscopes in one thread."""
+        reader = self.create_reader(
+            FaultHandlers(
+                self._on_undecodable,
+                self._refusals.fail,
+                self.fail,
+            )
+        )
         for name in self._names:
             reader.subscribe(
                 CorrectedObservations,
                 f'{name}/corrected_observations',
-                lambda frame, info, name=name: self._on_view(name, frame, info),
-                OBSERVATIONS,
-                corrected_of,
+                partial(self._on_view, name),
+                observations_qos(),
+                decode_corrected_observations,
             )
 
     # -- orientation
 
-    def _on_orientation(self, message):
-        """Take an orientation over, and tell TF."""
+    def _load_orientation(self, path: str) -> None:
+        try:
+            self._on_orientation(message_from_orientation(load_orientation(path)))
+        except DataError as error:
+            self.get_logger().error(str(error))
+            self._refusals.last_fault = str(error)
+
+    def _on_orientation(self, message: RigOrientation) -> None:
+        """Use an orientation, and publish its transforms."""
         try:
             orientation = orientation_from_message(message).subset(self._names)
             rig = _Rig(
                 message.orientation_id,
                 orientation,
-                Intersector(orientation, self._reject),
-                self._watch_of(orientation),
+                Intersector(orientation, self._settings.reject),
+                self._drift.make_watch(orientation),
             )
         except ValueError as error:  # DataError among them
-            self._last_fault = str(error)
-            self.get_logger().error(f'orientation refused, the running one stays: {error}')
+            self._refusals.last_fault = str(error)
+            self.get_logger().error(f'orientation refused, the current one stays in use: {error}')
             return
-        kept = list(self._rigs.items())[-(ORIENTATIONS - 1) :]
-        self._rigs = {
-            **{ids: old for ids, old in kept if ids != orientation.calibration_ids},
-            orientation.calibration_ids: rig,
-        }
-        self._outputs['tf'].publish(transforms_of(message))
-        self.get_logger().info(
-            f'orientation {message.orientation_id} now, by {message.source} '
-            f'({message.exposures} exposures), in frame {message.header.frame_id}'
-        )
+        ids = orientation.calibration_ids
+        newest = list(self._rigs.items())[-(MAX_ORIENTATIONS - 1) :]
+        self._rigs = {**{i: old for i, old in newest if i != ids}, ids: rig}
+        self._transforms.publish(transforms_of_orientation(message))
+        self.get_logger().info(f'{description_of(message)}, in use')
 
-    def _watch_of(self, orientation):
-        """RigDriftWatch of an orientation, None where none is wanted or the sizes of the images are not
-        known yet.
-        """
-        if not self._watching or any(name not in self._sizes for name in self._names):
-            return None
-        return RigDriftWatch(
-            orientation, self._sizes, self._watch_options, self._clusters, self._watch_rate
-        )
-
-    def _on_info(self, name, message):
-        """Take the size of a fluoroscope's images, which the drift watch needs."""
-        size = message.width, message.height
-        if self._sizes.get(name) != size:
-            self._sizes = {**self._sizes, name: size}
-            try:
+    def _on_camera_info(self, name: str, message: CameraInfo) -> None:
+        """Take the image size of a fluoroscope, which the drift watch needs."""
+        try:
+            size = image_size_of(message, f'{name}/camera_info')
+        except DataError as error:
+            self._refusals.note(f'camera_info ignored: {error}')
+            return
+        try:
+            if self._drift.set_image_size(name, size):
                 self._rigs = {
-                    ids: rig._replace(watch=self._watch_of(rig.orientation))
+                    ids: rig._replace(watch=self._drift.make_watch(rig.orientation))
                     for ids, rig in self._rigs.items()
                 }
-            except ValueError as error:  # DataError among them
-                self._last_fault = f'no drift watch: {error}'
-                self.get_logger().error(self._last_fault)
+        except ValueError as error:  # DataError among them
+            self._refusals.last_fault = f'no drift watch: {error}'
+            self.get_logger().error(self._refusals.last_fault)
 
     # -- corrected observations
 
-    def _on_undecodable(self, topic):
-        name = topic.partition('/')[0]
-        self._received[name] += 1
-        self._refuse(
-            Refused('undecodable', f'fluoroscope {name}: a message on {topic} cannot be decoded')
-        )
+    def _on_undecodable(self, topic: str) -> None:
+        self._received[topic.partition('/')[0]] += 1
+        self._refusals.refuse_undecodable(topic)
 
-    def _refuse(self, error):
-        self._refused[error.kind] += 1
-        self._last_fault = str(error)
-        self.sentences.warn(f'frame refused: {error}')
-
-    def _on_view(self, name, frame, info):
-        """Take a corrected frame; once it is known what belongs to an exposure the points are
-        intersected.
-        """
+    def _on_view(self, name: str, frame: CorrectedFrame, info: Mapping[str, int]) -> None:
+        """Pair a corrected frame, and reconstruct the exposures that are complete by it."""
         self._received[name] += 1
         try:
-            check_corrected(name, frame)
+            validate_corrected(name, frame)
         except Refused as error:
-            self._refuse(error)
+            self._refusals.refuse(error)
             return
         stamp_ns = 1_000_000_000 * frame.sec + frame.nanosec
         for exposure in self._pairer.add(_View(name, frame.frame_number, stamp_ns, frame)):
@@ -345,10 +305,8 @@ class ReconstructionNode(support.StreamNode):
             self._reconstruct(rig, exposure)
             self._latencies.add(time.time_ns() - info['received_timestamp'])
 
-    def _rig_of(self, exposure):
-        """The newest _Rig of just the calibrations with which the views of an exposure were
-        corrected, or None.
-        """
+    def _rig_of(self, exposure: Mapping[str, _View]) -> _Rig | None:
+        """Return the newest rig with the calibrations by which the views were corrected."""
         rigs = self._rigs
         ids = tuple(
             exposure[name].frame.calibration_id if name in exposure else None
@@ -356,75 +314,69 @@ class ReconstructionNode(support.StreamNode):
         )
         if len(exposure) == len(ids):
             return rigs.get(ids)
-        return next(
-            (
-                rig
-                for of_rig, rig in reversed(rigs.items())
-                if all(own in (None, known) for own, known in zip(ids, of_rig))
-            ),
-            None,
-        )
+        for known_ids, rig in reversed(rigs.items()):
+            if all(own in (None, known) for own, known in zip(ids, known_ids)):
+                return rig
+        return None
 
-    def _reconstruct(self, rig, exposure):
+    def _reconstruct(self, rig: _Rig, exposure: Mapping[str, _View]) -> None:
         """Intersect the views of an exposure and publish the points."""
         views = [
             _corrected_view(exposure[name].frame) if name in exposure else None
             for name in self._names
         ]
         first = next(exposure[name] for name in self._names if name in exposure)
-        self._newest = rig, first.stamp_ns
+        self._drift.newest = rig.watch, rig.orientation, first.stamp_ns
         found = intersect_views(views, rig.intersector)
-        content = first.stamp_ns, first.frame.frame_number, rig, found.target_id, found.points
-        self._outputs['points_with_covariance'].publish(points_bytes(*content))
+        content = PointsContent(
+            first.stamp_ns,
+            first.frame.frame_number,
+            rig.orientation_id,
+            rig.orientation,
+            found.target_id,
+            found.points,
+        )
+        self._outputs['points_with_covariance'].publish(encode_reconstructed_points(content))
         self._reconstructed += 1
-        self._count(found.points)
+        self._count_points(found.points)
         self._publish_views(content)
         if rig.watch is not None:
             watch_views(rig.watch, first.stamp_ns, views, found)
 
-    def _count(self, points):
+    def _count_points(self, points: IntersectedPoints) -> None:
         """Count the points by status."""
         self._points['points'] += len(points.status)
         if points.status.any():
-            for status, name in (
-                (OUTSIDE, 'outside'),
-                (REJECTED, 'rejected'),
-                (FAILED, 'failed'),
-                (SINGLE_VIEW, 'in a single view'),
-            ):
+            for name, status in COUNTED_STATUSES.items():
                 self._points[name] += int(np.count_nonzero(points.status == status))
 
-    def _publish_views(self, content):
-        """Publish the other forms of the points, the content of their message, where somebody
-        listens.
-        """
-        cloud, markers, mocap = (
-            self._outputs.get(name) for name in ('points', 'markers', 'mocap_markers')
-        )
+    def _publish_views(self, content: PointsContent) -> None:
+        """Publish the other forms of the points that have subscribers."""
         wanted = [
-            output is not None and output.get_subscription_count() > 0
-            for output in (cloud, markers, mocap)
+            name
+            for name in ('points', 'markers', 'mocap_markers')
+            if name in self._outputs and self._outputs[name].get_subscription_count()
         ]
-        if not any(wanted):
+        if not wanted:
             return
-        message = points_message(*content)
-        good = np.flatnonzero(content[-1].status <= OUTSIDE)
-        if wanted[0]:
-            cloud.publish(cloud_message(message, good))
-        if wanted[2]:
-            mocap.publish(mocap_message(message, good.tolist()))
+        message = message_from_points(content)
+        good = np.flatnonzero(content.points.status <= OUTSIDE)
+        if 'points' in wanted:
+            self._outputs['points'].publish(point_cloud(message, good))
+        if 'mocap_markers' in wanted:
+            self._outputs['mocap_markers'].publish(mocap_markers(message, good))
         now = time.monotonic_ns()
-        if wanted[1] and now - self._drawn >= self._every_ns:
-            self._drawn = now
-            markers.publish(ellipsoids_message(message, good.tolist(), self._sigmas))
+        if 'markers' in wanted and now - self._markers_published_ns >= self._marker_interval_ns:
+            self._markers_published_ns = now
+            self._outputs['markers'].publish(
+                ellipsoid_markers(message, good, self._settings.ellipsoid_sigmas)
+            )
 
     # -- diagnostics
 
-    def report(self):
-        """Diagnostics of the reconstruction and of the drift watch."""
-        unpaired, late = (
-            sum(counts.values()) for counts in (self._pairer.unpaired, self._pairer.late)
-        )
+    def diagnose(self) -> list[Status]:
+        """Return the status of the reconstruction and of the drift watch."""
+        unpaired = sum(self._pairer.unpaired.values())
         rig = next(reversed(self._rigs.values()), None)
         values = {
             **{f'frames received of {name}': self._received[name] for name in self._names},
@@ -433,113 +385,66 @@ class ReconstructionNode(support.StreamNode):
             'exposures incomplete': self._pairer.incomplete,
             'exposures without orientation': self._without_orientation,
             'frames unpaired': unpaired,
-            'frames late': late,
-            'frames refused': self._refused.total(),
-            **{f'refused: {kind}': self._refused[kind] for kind in KINDS},
-            **{
-                f'points {name}' if name != 'points' else name: self._points[name]
-                for name in ('points', 'outside', 'rejected', 'failed', 'in a single view')
-            },
-            'last fault': self._last_fault,
+            'frames late': sum(self._pairer.late.values()),
+            **self._refusals.values(CORRECTED_REFUSALS),
+            'points': self._points['points'],
+            **{f'points {name}': self._points[name] for name in COUNTED_STATUSES},
+            'last fault': self._refusals.last_fault,
             'orientation': rig.orientation_id if rig else '',
             'source of the orientation': rig.orientation.source if rig else '',
             **self._latencies.values(),
         }
-        return [('reconstruction', *self._verdict(unpaired), values), *self._drift()]
+        status = Status('reconstruction', *self._verdict(unpaired), values)
+        return [status, *self._drift.publish_state()]
 
-    def _drift(self):
-        """Publish the state of the drift watch; returns its diagnostics, none where nothing is
-        watched.
-        """
-        newest = self._newest
-        if not self._watching or newest is None:
-            return []
-        if newest[0].watch is None:
-            silent = [name for name in self._names if name not in self._sizes]
-            return [
-                (
-                    'drift',
-                    support.WARN,
-                    'nothing is watched: there is no camera_info of ' + ', '.join(silent),
-                    {},
-                )
-            ]
-        state = newest[0].watch.state
-        message = drift_message(state, to_stamp(newest[1]), newest[0].orientation)
-        self._outputs['drift'].publish(message)
-        alarmed = state.level == DriftStatus.ERROR
-        if alarmed and not self._alarmed:
-            self.get_logger().error(state.message)
-            if self._collect_on_drift and self._collect_anew.service_is_ready():
-                self._collect_anew.call_async(Reset.Request())
-            elif self._collect_on_drift:
-                self.get_logger().error(
-                    'nobody offers the service collect_anew: no exposures are collected'
-                )
-        self._alarmed = alarmed
-        level = (support.OK, support.WARN, support.ERROR)[state.level]
-        return [
-            (
-                'drift',
-                level,
-                state.message,
-                {
-                    'fluoroscope': state.fluoroscope,
-                    'place': state.place,
-                    'source': state.source,
-                    'size [px]': f'{state.size:.2f}',
-                    'sd [px]': f'{state.sd:.2f}',
-                    'evidence': f'{state.evidence:.1f}',
-                    'threshold of WARN': f'{state.threshold_warn:.1f}',
-                    'threshold of ERROR': f'{state.threshold_error:.1f}',
-                    'since [s]': f'{state.since_s:.1f}',
-                    'observations': state.observations,
-                },
-            )
-        ]
-
-    def _verdict(self, unpaired):
-        """Level and message of the diagnostics."""
-        deaf = [
-            sentence
-            for reader in self.readers
-            for sentence in support.deafness(reader, self.sentences).values()
-        ]
-        if deaf:
-            return support.WARN, deaf[0]
+    def _verdict(self, unpaired: int) -> tuple[bytes, str]:
+        """Return level and message of the diagnostics."""
+        failure = self._refusals.failure_status()
+        if failure:
+            return failure
+        incompatible = self.incompatible_publishers()
+        if incompatible:
+            return WARN, next(iter(incompatible.values()))
         if not self._rigs:
-            return support.WARN, self._last_fault or (
+            return WARN, self._refusals.last_fault or (
                 'no orientation of the rig yet: calibrate with all fluoroscopes, '
                 'or capture the phantom with the service orient'
             )
         if not self.readers:
-            return support.WARN, 'the node is not active'
-        silent = [
-            n for n in self._names if self.count_publishers(f'{n}/corrected_observations') == 0
+            return WARN, 'the node is not active'
+        return self._stream_fault(unpaired) or (OK, 'reconstructing')
+
+    def _stream_fault(self, unpaired: int) -> tuple[bytes, str] | None:
+        """Return level and message where something is wrong with the streams."""
+        missing = [
+            n for n in self._names if not self.count_publishers(f'{n}/corrected_observations')
         ]
-        if silent:
-            return support.WARN, f'nobody publishes corrected observations of {", ".join(silent)}'
+        if missing:
+            return WARN, f'no publisher of corrected observations of {", ".join(missing)}'
         if self._pairer.silent:
             return (
-                support.WARN,
-                f'nothing comes of {", ".join(sorted(self._pairer.silent))}, points are of the others',
+                WARN,
+                f'no frames of {", ".join(sorted(self._pairer.silent))}, '
+                'points are reconstructed from the other fluoroscopes',
             )
         if self._without_orientation:
-            return support.WARN, (
-                f'{self._without_orientation} exposures were corrected with calibrations to which no '
-                'orientation of the rig belongs'
+            return (
+                WARN,
+                f'{self._without_orientation} exposures were corrected with calibrations to which '
+                'no orientation of the rig belongs',
             )
-        if self._refused:
-            return support.WARN, f'{self._refused.total()} frames refused: {self._last_fault}'
+        refusals = self._refusals.refusal_status()
+        if refusals:
+            return refusals
         if unpaired:
-            return support.WARN, f'{unpaired} frames without partner of the other fluoroscopes'
+            return WARN, f'{unpaired} frames without partner of the other fluoroscopes'
         if self._pairer.incomplete:
-            return support.WARN, f'{self._pairer.incomplete} exposures without all fluoroscopes'
-        return support.OK, 'reconstructing'
+            return WARN, f'{self._pairer.incomplete} exposures without all fluoroscopes'
+        return None
 
 
-def _corrected_view(frame):
-    """CorrectedView of a Corrected frame."""
+def _corrected_view(frame: CorrectedFrame) -> CorrectedView:
+    """Return the CorrectedView of a frame."""
     return CorrectedView(
         frame.target_id,
         np.array([frame.u, frame.v]).T,
@@ -549,9 +454,9 @@ def _corrected_view(frame):
     )
 
 
-def main(args=None):
-    """Entry point."""
-    support.run(ReconstructionNode, args)
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node."""
+    run(ReconstructionNode, args)
 
 
 if __name__ == '__main__':

@@ -1,10 +1,12 @@
-"""Node that publishes what the virtual dual fluoroscope sees: the phantom, set up in pose after
-pose, a grid, or markers.
-"""
+"""Node that publishes what the virtual dual fluoroscope sees: the phantom, a grid, or markers."""
+
+from __future__ import annotations
 
 import threading
 import time
 import traceback
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 import rclpy
@@ -13,6 +15,7 @@ from rclpy.node import Node
 from scipy.spatial.transform import Rotation
 
 from ..exposures.frame import Frame
+from ..options import option
 from ..photogrammetry.rotations import matrix_from_vector
 from ..simulation.rig import (
     CLUSTER,
@@ -22,129 +25,161 @@ from ..simulation.rig import (
     simulate_tracking,
     virtual_rig,
 )
-from . import support
-from .conversion import message_from_frame
-from .qos import OBSERVATIONS, overridable
-from .support import StartError, declare
+from .messages.target_observations import message_from_frame, set_number_and_stamp
+from .runtime.discovery import wait_for_readers, wait_until_acknowledged
+from .runtime.main import run
+from .runtime.parameters import ParameterGroup, RigParameters
+from .runtime.qos import observations_qos, qos_overrides
 
 SCENES = ('phantom', 'standing', 'markers', 'grid')
-LOOP_S = 10.0  # length of a scene that is made before, and comes over and over
+LOOP_S = 10.0  # length of a scene that is computed in advance and repeated
+VISIBLE_BEADS = (130, 160)  # least and largest number of beads in a frame
+
+
+@dataclass(frozen=True)
+class SimulatorParameters(RigParameters):
+    """Parameters of the simulator."""
+
+    scene: str = option(
+        'phantom',
+        'what is seen: the phantom set up in pose after pose, or standing in the rig frame, '
+        'markers on a moving joint, or a grid of 2,028 points',
+        choices=SCENES,
+    )
+    rate: float = option(60.0, 'frame rate', minimum=0.1, maximum=2000.0, unit='Hz')
+    frames: int = option(0, 'frames after which the node ends; 0: never', minimum=0, maximum=2**31)
+    wait_for_readers: int = option(
+        0, 'subscriptions of every topic to wait for', minimum=0, maximum=100
+    )
+    seed: int = option(
+        1,
+        'number of the rig, as of fluoro-calib simulate; 1 is the rig of bags/',
+        minimum=0,
+        maximum=2**31,
+    )
+    strength: float = option(1.0, 'strength of the distortion', minimum=0.0, maximum=10.0)
+    noise: float = option(
+        0.25, 'noise of an image coordinate', minimum=0.0, maximum=100.0, unit='px'
+    )
+    false_matches: float = option(
+        0.01, "fraction of the phantom's targets with a wrong number", minimum=0.0, maximum=0.5
+    )
+    stand_time: float = option(
+        1.0,
+        'time for which the phantom stands in a pose',
+        minimum=0.0,
+        maximum=3600.0,
+        unit='s',
+    )
+    move_time: float = option(
+        1.0,
+        'time in which the phantom is moved to the next pose',
+        minimum=0.0,
+        maximum=3600.0,
+        unit='s',
+    )
+    poses: int = option(
+        15, 'number of poses, after which the first one follows', minimum=1, maximum=10000
+    )
+    clusters: int = option(
+        4, f'rigid clusters of {CLUSTER} markers each in the scene markers', minimum=1, maximum=8
+    )
+
+
+_NODE = ParameterGroup(SimulatorParameters)
+PARAMETERS = (_NODE,)
 
 
 class SimulatorNode(Node):
-    """Publishes target observations of every fluoroscope at a rate, with stamps of now."""
+    """Publishes target observations of every fluoroscope at a rate, with present stamps."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('simulator_node')
-        names = support.fluoroscopes_of(self)
-        self._scene = declare(
-            self,
-            'scene',
-            'phantom',
-            'what is seen: phantom (set up in pose after pose), standing '
-            '(the phantom in the rig frame), markers (a joint in motion) or grid (2,028 points)',
-        )
-        if self._scene not in SCENES:
-            raise StartError(f'parameter scene is one of {", ".join(SCENES)}, not {self._scene!r}')
-        self._rate = declare(self, 'rate', 60.0, 'frames a second', 0.1, 2000.0)
-        seed = declare(
-            self, 'seed', 1, 'number of the rig, the same as of fluoro-calib simulate', 0, 2**31
-        )
-        strength = declare(self, 'strength', 1.0, 'strength of the distortion', 0.0, 10.0)
-        self._noise = declare(self, 'noise', 0.25, 'noise of an image coordinate [px]', 0.0, 100.0)
-        self._false = declare(
-            self, 'false_matches', 0.01, 'part of the targets with a wrong number', 0.0, 0.5
-        )
-        self._stand = declare(
-            self, 'stand_time', 1.0, 'time for which the phantom stands in a pose [s]', 0.0, 3600.0
-        )
-        self._move = declare(
-            self, 'move_time', 1.0, 'time in which it is moved to the next one [s]', 0.0, 3600.0
-        )
-        poses = declare(self, 'poses', 15, 'number of poses, then from the first again', 1, 10000)
-        clusters = declare(self, 'clusters', 4, f'rigid clusters of {CLUSTER} markers each', 1, 8)
-        self._frames = declare(
-            self, 'frames', 0, 'frames after which the node ends; 0: never', 0, 2**31
-        )
-        wait = declare(
-            self, 'wait_for_readers', 0, 'subscriptions of every topic to wait for', 0, 100
-        )
-        self._rig = virtual_rig(seed, strength, tuple(names))
-        self._rng = np.random.default_rng([seed, 4])
-        self._poses = phantom_poses(self._rng, poses)
+        self._settings = parameters = _NODE.declare(self)
+        self._rig = virtual_rig(parameters.seed, parameters.strength, parameters.fluoroscopes)
+        self._rng = np.random.default_rng([parameters.seed, 4])
+        self._poses = phantom_poses(self._rng, parameters.poses)
         self._outputs = {
-            n: self.create_publisher(
+            name: self.create_publisher(
                 TargetObservations,
-                f'{n}/target_observations',
-                OBSERVATIONS,
-                qos_overriding_options=overridable(),
+                f'{name}/target_observations',
+                observations_qos(),
+                qos_overriding_options=qos_overrides(),
             )
-            for n in names
+            for name in parameters.fluoroscopes
         }
-        self._ready = self._made_before(seed, clusters)
-        self._ending = threading.Event()
+        self._precomputed = self._precompute()
+        self._stopping = threading.Event()
         self.failed = False
-        self._worker = threading.Thread(target=self._run, args=(wait,), daemon=True)
+        self._worker = threading.Thread(target=self._run, daemon=True)
         self._worker.start()
 
-    def _made_before(self, seed, clusters):
-        """Messages {fluoroscope: [message, ...]} of a scene that comes over and over, {} for one
-        that is drawn live.
-        """
-        if self._scene == 'markers':
+    def _precompute(self) -> dict[str, list[TargetObservations]]:
+        """Return the messages of a scene that is repeated; nothing for one that is drawn live."""
+        parameters = self._settings
+        if parameters.scene == 'markers':
             frames = simulate_tracking(
-                self._rig, LOOP_S, self._rate, seed, self._noise, clusters=clusters
+                self._rig,
+                LOOP_S,
+                parameters.rate,
+                parameters.seed,
+                parameters.noise,
+                clusters=parameters.clusters,
             ).frames
-        elif self._scene == 'grid':
-            frames = simulate_grid(
-                self._rig, max(1, round(LOOP_S * self._rate)), seed, self._noise
-            )
+        elif parameters.scene == 'grid':
+            count = max(1, round(LOOP_S * parameters.rate))
+            frames = simulate_grid(self._rig, count, parameters.seed, parameters.noise)
         else:
             return {}
         return {
-            name: [message_from_frame(frame) for frame in of_one]
-            for name, of_one in frames.items()
+            name: [message_from_frame(frame) for frame in of_fluoroscope]
+            for name, of_fluoroscope in frames.items()
         }
 
-    def _run(self, wait):
-        """Publish frame after frame at its time, from a thread: a timer of an executor costs more
-        than a frame.
-        """
+    def _run(self) -> None:
+        """Publish frame after frame, from a thread: a timer of rclpy costs more than a frame."""
+        parameters = self._settings
+        outputs = self._outputs.values()
         try:
-            support.wait_for_readers(self, self._outputs.values(), wait, self._ending)
-            began = time.monotonic()
+            wait_for_readers(self, outputs, parameters.wait_for_readers, self._stopping)
+            start = time.monotonic()
             number = 0
-            while not (self._frames and number >= self._frames):
-                if self._ending.wait(max(0.0, began + number / self._rate - time.monotonic())):
+            while not (parameters.frames and number >= parameters.frames):
+                due = start + number / parameters.rate
+                if self._stopping.wait(max(0.0, due - time.monotonic())):
                     return
                 number += 1
                 self._publish(number)
-            support.wait_until_taken(self._outputs.values(), self._ending)
+            wait_until_acknowledged(outputs, self._stopping)
             rclpy.try_shutdown()
         except Exception:
-            if not self._ending.is_set():  # else the node has been ended between two messages
+            if not self._stopping.is_set():  # else the node has been ended between two messages
                 self.get_logger().fatal(traceback.format_exc())
                 self.failed = True
                 rclpy.try_shutdown()
 
-    def _publish(self, number):
-        if self._ready:
+    def _publish(self, number: int) -> None:
+        """Publish the frames of an exposure."""
+        if self._precomputed:
             messages = [
-                (name, of_one[(number - 1) % len(of_one)]) for name, of_one in self._ready.items()
+                (name, of_fluoroscope[(number - 1) % len(of_fluoroscope)])
+                for name, of_fluoroscope in self._precomputed.items()
             ]
         else:
-            messages = [(name, message_from_frame(frame)) for name, frame in self._phantom(number)]
-        seconds, nanoseconds = divmod(self.get_clock().now().nanoseconds, 1_000_000_000)
+            messages = [
+                (frame.fluoroscope, message_from_frame(frame))
+                for frame in self._phantom_frames(number)
+            ]
+        stamp_ns = self.get_clock().now().nanoseconds
         for name, message in messages:
-            message.frame_number = number
-            message.header.stamp.sec = seconds
-            message.header.stamp.nanosec = nanoseconds
+            set_number_and_stamp(message, number, stamp_ns)
             self._outputs[name].publish(message)
 
-    def _phantom(self, number):
-        """Frames of the phantom at its pose of now."""
+    def _phantom_frames(self, number: int) -> Iterator[Frame]:
+        """Return the frames of the phantom in its present pose."""
+        parameters = self._settings
         rotation, shift = (
-            self._pose(number) if self._scene == 'phantom' else (np.eye(3), np.zeros(3))
+            self._pose(number) if parameters.scene == 'phantom' else (np.eye(3), np.zeros(3))
         )
         points = self._rig.true_mm @ rotation.T + shift
         for fluoroscope in self._rig.fluoroscopes:
@@ -153,43 +188,42 @@ class SimulatorNode(Node):
                 fluoroscope,
                 points,
                 self._rig.phantom.target_id,
-                self._noise,
-                self._false,
-                (130, 160),
+                parameters.noise,
+                parameters.false_matches,
+                VISIBLE_BEADS,
             )
-            yield (
+            yield Frame(
                 fluoroscope.name,
-                Frame(
-                    fluoroscope.name,
-                    number,
-                    ids,
-                    uv,
-                    fluoroscope.image_size,
-                    frame_id=f'{fluoroscope.name}_optical',
-                ),
+                number,
+                ids,
+                uv,
+                fluoroscope.image_size,
+                frame_id=f'{fluoroscope.name}_optical',
             )
 
-    def _pose(self, number):
-        """Pose of now: standing, or on the way to the next one."""
-        cycle = self._stand + self._move
-        turn, time_s = divmod(number / self._rate, cycle) if cycle else (0, 0.0)
-        start = self._poses[int(turn) % len(self._poses)]
-        if time_s <= self._stand:
+    def _pose(self, number: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the present pose: standing, or on the way to the next one."""
+        stand_s = self._settings.stand_time
+        move_s = self._settings.move_time
+        cycle_s = stand_s + move_s
+        cycle, time_s = divmod(number / self._settings.rate, cycle_s) if cycle_s else (0, 0.0)
+        start = self._poses[int(cycle) % len(self._poses)]
+        if time_s <= stand_s:
             return start
-        end = self._poses[(int(turn) + 1) % len(self._poses)]
-        part = (time_s - self._stand) / self._move
+        end = self._poses[(int(cycle) + 1) % len(self._poses)]
+        part = (time_s - stand_s) / move_s
         turn = matrix_from_vector(part * Rotation.from_matrix(end[0] @ start[0].T).as_rotvec())
         return turn @ start[0], start[1] + part * (end[1] - start[1])
 
-    def stop(self):
-        """End publishing: the node is to go."""
-        self._ending.set()
+    def stop(self) -> None:
+        """Stop publishing before the node is destroyed."""
+        self._stopping.set()
         self._worker.join(2.0)
 
 
-def main(args=None):
-    """Entry point."""
-    support.run(SimulatorNode, args)
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node."""
+    run(SimulatorNode, args)
 
 
 if __name__ == '__main__':

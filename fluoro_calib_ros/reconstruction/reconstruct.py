@@ -127,7 +127,7 @@ def _corrected(frame, calibration):
         )
     ids, counts = np.unique(frame.target_id, return_counts=True)
     if (counts > 1).any():
-        raise DataError(f'{where}: target {ids[counts > 1][0]} is there {counts.max()} times')
+        raise DataError(f'{where}: target {ids[counts > 1][0]} occurs {counts.max()} times')
     u, v, sigma, correction_sd, status = calibration.correct_arrays(
         frame.uv[:, 0], frame.uv[:, 1], frame.sigma
     )

@@ -44,8 +44,8 @@ from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.nodes.conversion import message_from_frame
-from fluoro_calib_ros.nodes.qos import LATCHED, OBSERVATIONS
+from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
+from fluoro_calib_ros.nodes.runtime.qos import OBSERVATION_DEPTH, latched_qos, observations_qos
 
 ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'
@@ -55,17 +55,17 @@ SUCCEEDED = GoalStatus.STATUS_SUCCEEDED
 CANCELED = GoalStatus.STATUS_CANCELED
 ABORTED = GoalStatus.STATUS_ABORTED
 TOPICS = {
-    'target_observations': (TargetObservations, OBSERVATIONS),
-    'corrected_observations': (CorrectedObservations, OBSERVATIONS),
-    'calibration': (FluoroscopeCalibration, LATCHED),
-    'camera_info': (CameraInfo, LATCHED),
+    'target_observations': (TargetObservations, observations_qos()),
+    'corrected_observations': (CorrectedObservations, observations_qos()),
+    'calibration': (FluoroscopeCalibration, latched_qos()),
+    'camera_info': (CameraInfo, latched_qos()),
     'calibration_status': (CalibrationStatus, 10),
-    'rig_orientation': (RigOrientation, LATCHED),
-    'points_with_covariance': (ReconstructedPoints, OBSERVATIONS),
-    'points': (PointCloud2, OBSERVATIONS),
-    'markers': (MarkerArray, OBSERVATIONS),
+    'rig_orientation': (RigOrientation, latched_qos()),
+    'points_with_covariance': (ReconstructedPoints, observations_qos()),
+    'points': (PointCloud2, observations_qos()),
+    'markers': (MarkerArray, observations_qos()),
     'drift': (DriftStatus, 10),
-    'tf_static': (TFMessage, LATCHED),
+    'tf_static': (TFMessage, latched_qos()),
 }
 
 SERVICES = {
@@ -293,7 +293,7 @@ class Client(Node):
             assert time.monotonic() < end, f'waited {seconds:g} s for {what}'
             self._spinner.spin_once(timeout_sec=0.1)
 
-    def publish_in_step(self, messages, came, ahead=OBSERVATIONS.depth // 4):
+    def publish_in_step(self, messages, came, ahead=OBSERVATION_DEPTH // 4):
         """Publish (fluoroscope, message) one after the other, never more than so many ahead of
         came(), the number that has come back or never will: what is lost is then not lost in a
         queue.
@@ -413,7 +413,7 @@ class Client(Node):
         self.published = 0
 
         def publish():
-            if answered is not None and self.published - answered() >= OBSERVATIONS.depth // 2:
+            if answered is not None and self.published - answered() >= OBSERVATION_DEPTH // 2:
                 return
             pair = next(pairs, None)
             if pair is not None:

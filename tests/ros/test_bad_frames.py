@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.files.calibration import load_calibrations
-from fluoro_calib_ros.nodes.conversion import doubles, message_from_frame
+from fluoro_calib_ros.nodes.messages.fields import float64_field
+from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
 
 BOTH = ('calibration_node', 'correction_node')
 COLLECTS = ('calibration_node',)
@@ -40,17 +41,17 @@ def empty(message):
 
 
 def sigma_of(value):
-    return put_all(sigma=lambda m: doubles([0.2] * (len(m.u) - 1) + [value]))
+    return put_all(sigma=lambda m: float64_field([0.2] * (len(m.u) - 1) + [value]))
 
 
 BAD = {  # change of the message, nodes that refuse it, what they say
     'lengths': (put_all(u=lambda m: m.u[:-1]), BOTH, 'target ids, but'),
     'sigma lengths': (
-        put_all(sigma=doubles([0.2, 0.3])),
+        put_all(sigma=float64_field([0.2, 0.3])),
         BOTH,
         'target ids, but 2 values of sigma',
     ),
-    'duplicate': (lambda m: put('target_id', 1, m.target_id[0])(m), BOTH, 'is there 2 times'),
+    'duplicate': (lambda m: put('target_id', 1, m.target_id[0])(m), BOTH, 'occurs 2 times'),
     'image size': (put_all(image_width=512), BOTH, 'the image is 512 x 1024 px'),
     'no image size': (put_all(image_width=0, image_height=0), BOTH, '0 x 0 px'),
     'negative sigma': (sigma_of(-0.1), BOTH, 'is not a positive number'),

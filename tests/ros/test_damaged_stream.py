@@ -10,7 +10,8 @@ from fluoro_calib_msgs.msg import TargetObservations
 from rclpy.serialization import deserialize_message, serialize_message
 from ros_graph import NAMES, value_of
 
-from fluoro_calib_ros.nodes.conversion import doubles, message_from_frame
+from fluoro_calib_ros.nodes.messages.fields import float64_field
+from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
 
 
 def shorter(message):
@@ -30,7 +31,7 @@ def repeated(message):
 
 
 def bad_sigma(message):
-    message.sigma = doubles([0.2] * (len(message.u) - 1) + [-0.2])
+    message.sigma = float64_field([0.2] * (len(message.u) - 1) + [-0.2])
 
 
 def no_number(message):

@@ -18,8 +18,10 @@ from fluoro_calib_ros.distortion.models import no_correction
 from fluoro_calib_ros.files.calibration import load_calibrations
 from fluoro_calib_ros.images.codec import decode, encode
 from fluoro_calib_ros.images.corrector import ImageCorrector
-from fluoro_calib_ros.nodes.conversion import camera_info, message_from_calibration, to_stamp
-from fluoro_calib_ros.nodes.qos import IMAGES, LATCHED
+from fluoro_calib_ros.nodes.messages.camera_info import message_of_corrected_stream
+from fluoro_calib_ros.nodes.messages.fields import stamp_from_nanoseconds
+from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
+from fluoro_calib_ros.nodes.runtime.qos import images_qos, latched_qos
 from fluoro_calib_ros.simulation.bead_images import bead_image
 
 SIZE = (1024, 1024)
@@ -38,16 +40,18 @@ class Eyes:
     def __init__(self, graph):
         self.client = graph.client
         self.number = 0
-        self.raw = self.client.create_publisher(Image, 'a/image_raw', IMAGES)
+        self.raw = self.client.create_publisher(Image, 'a/image_raw', images_qos())
         self.compressed = self.client.create_publisher(
-            CompressedImage, 'a/image_raw/compressed', IMAGES
+            CompressedImage, 'a/image_raw/compressed', images_qos()
         )
         self.images = []
         self.infos = []
         self.small = []
-        self.client.create_subscription(Image, 'a/image_corrected', self.images.append, IMAGES)
         self.client.create_subscription(
-            CameraInfo, 'a/image_corrected/camera_info', self.infos.append, IMAGES
+            Image, 'a/image_corrected', self.images.append, images_qos()
+        )
+        self.client.create_subscription(
+            CameraInfo, 'a/image_corrected/camera_info', self.infos.append, images_qos()
         )
 
     def connected(self):
@@ -61,7 +65,7 @@ class Eyes:
     def stamped(self, message):
         """A message with a stamp of its own, which is returned too."""
         self.number += 1
-        message.header.stamp = to_stamp(10**18 + self.number)
+        message.header.stamp = stamp_from_nanoseconds(10**18 + self.number)
         message.header.frame_id = 'a_optical'
         return message
 
@@ -162,7 +166,7 @@ def test_image_comes_out_corrected(eyes, pictures, encoding, kind):
     assert np.array_equal(pixels_of(out), eyes.corrector.correct(image))
     assert out.encoding == encoding and out.step == 1024 * image.itemsize and not out.is_bigendian
     assert out.header == info.header == message.header
-    wanted = camera_info(eyes.calibration, message.header.stamp)
+    wanted = message_of_corrected_stream(eyes.calibration, message.header.stamp)
     assert info == wanted and info.k[0] == eyes.calibration.interior[2] and not any(info.d)
 
 
@@ -171,7 +175,7 @@ def test_corrected_images_are_compressed_for_who_listens(eyes, pictures):
     assert eyes.diagnostics(lambda v, _: True)['images compressed'] == '0'
     small = eyes.small
     eyes.client.create_subscription(
-        CompressedImage, 'a/image_corrected/compressed', small.append, IMAGES
+        CompressedImage, 'a/image_corrected/compressed', small.append, images_qos()
     )
     eyes.client.wait_until(lambda: eyes.client.count_publishers('a/image_corrected/compressed'))
 
@@ -345,7 +349,7 @@ def test_calibrations_change_between_two_images(graph, by_command, pictures):
     graph.start('image_node', {'fluoroscopes': '[a]'})
     eyes = Eyes(graph)
     image = pictures['mono8']
-    latched = eyes.client.create_publisher(FluoroscopeCalibration, 'a/calibration', LATCHED)
+    latched = eyes.client.create_publisher(FluoroscopeCalibration, 'a/calibration', latched_qos())
     eyes.client.wait_until(
         lambda: eyes.connected() and latched.get_subscription_count(), what='the image node'
     )

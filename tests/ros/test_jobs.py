@@ -10,7 +10,7 @@ from fluoro_calib_msgs.msg import CalibrationStatus
 from fluoro_calib_msgs.srv import Calibrate, Capture, Reset
 from ros_graph import ABORTED, CANCELED, NAMES, SUCCEEDED, standing
 
-REFUSED = 'refused: a self-calibration is running already'
+REFUSED = 'refused: a self-calibration is already running'
 
 
 class Rig:
@@ -188,7 +188,9 @@ def test_wrong_request_is_refused_in_a_sentence(rig, request_fields, message):
 def test_too_few_exposures_are_refused(rig, exposures):
     before = rig.state()
     answer = rig.client.call(Reset, 'reset')
-    assert answer.success and answer.message == '15 exposures forgotten, the calibration stays'
+    assert (
+        answer.success and answer.message == '15 exposures discarded, the calibration stays in use'
+    )
     rig.client.wait_for_status(lambda s: s.exposures == 0)
     rig.collect({n: f[:2] for n, f in exposures.items()})
     answer = rig.client.call(Calibrate, 'calibrate')

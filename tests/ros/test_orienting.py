@@ -8,7 +8,7 @@ from ros_graph import BAGS, NAMES, value_of
 from test_reconstruction import coordinates, publish, truth
 
 from fluoro_calib_ros.files.rig_orientation import load_orientation, orientation_path
-from fluoro_calib_ros.nodes.spatial import orientation_from_message
+from fluoro_calib_ros.nodes.messages.rig_orientation import orientation_from_message
 
 
 def test_a_calibration_brings_the_orientation_and_the_stream_goes_on(graph, tmp_path, tracking):
@@ -145,7 +145,7 @@ def test_exposures_are_collected_anew_on_demand(graph, by_command):
     graph.calibration_node(by_command[0], collect='request')
     collect(graph, readers=1)
     answer = client.call(Reset, 'collect_anew')
-    assert answer.success and '15 exposures forgotten' in answer.message
+    assert answer.success and '15 exposures discarded' in answer.message
     assert client.wait_for_status(lambda s: s.exposures == 0).calibration_id, (
         'the calibration stays'
     )

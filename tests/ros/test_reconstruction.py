@@ -12,8 +12,8 @@ from fluoro_calib_msgs.msg import CorrectedObservations
 from ros_graph import BAGS, NAMES, entry_point, value_of
 
 from fluoro_calib_ros.files.rig_orientation import load_orientation, orientation_path
-from fluoro_calib_ros.nodes.conversion import message_from_frame
-from fluoro_calib_ros.nodes.spatial import CLOUD
+from fluoro_calib_ros.nodes.messages.point_cloud import POINT_TYPE
+from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
 
 FRAMES = 120
 
@@ -155,9 +155,9 @@ def test_cloud_and_ellipsoids_are_the_same_points(rig):
         ],
         what='the cloud',
     )[0]
-    points = np.frombuffer(bytes(cloud.data), dtype=CLOUD)
+    points = np.frombuffer(bytes(cloud.data), dtype=POINT_TYPE)
     good = np.array(message.status) <= 1
-    assert cloud.width == len(points) == good.sum() and cloud.point_step == CLOUD.itemsize
+    assert cloud.width == len(points) == good.sum() and cloud.point_step == POINT_TYPE.itemsize
     assert np.array_equal(points['id'], np.array(message.target_id)[good])
     assert np.allclose(points['x'], np.array(message.x)[good], atol=1e-6)
     _, covariance = coordinates(message)

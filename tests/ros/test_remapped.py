@@ -6,7 +6,7 @@ import pytest
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from ros_graph import value_of
 
-from fluoro_calib_ros.nodes.qos import OBSERVATIONS
+from fluoro_calib_ros.nodes.runtime.qos import observations_qos
 
 
 @pytest.mark.parametrize(
@@ -18,7 +18,7 @@ from fluoro_calib_ros.nodes.qos import OBSERVATIONS
 )
 def test_undecodable_message_on_a_remapped_topic(graph, node, topic, kind, about):
     client = graph.client
-    output = client.create_publisher(kind, 'hospital/camera/left', OBSERVATIONS)
+    output = client.create_publisher(kind, 'hospital/camera/left', observations_qos())
     process = graph.start(node, remaps={f'a/{topic}': 'hospital/camera/left'}, wait=False)
     client.wait_until(output.get_subscription_count, what='the reader')
     client.wait_until_known_to(node)

@@ -13,7 +13,7 @@ from rclpy.serialization import serialize_message
 from ros_graph import BAGS, NAMES, standing, value_of
 
 from fluoro_calib_ros.files.calibration import load_calibrations
-from fluoro_calib_ros.nodes.conversion import message_from_calibration
+from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 
 TROUBLE = ('Traceback', 'Exception', 'exception', 'Error:', 'never retrieved', 'never awaited')
 

@@ -14,8 +14,8 @@ from ros_graph import entry_point, value_of
 
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.jobs.dataset import write_bag
-from fluoro_calib_ros.nodes.conversion import message_from_frame
-from fluoro_calib_ros.nodes.qos import OBSERVATIONS
+from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
+from fluoro_calib_ros.nodes.runtime.qos import observations_qos
 from fluoro_calib_ros.simulation.rig import (
     START_NS,
     seen_beads,
@@ -56,7 +56,7 @@ def started(graph, folder):
     client = graph.client
     three = {'fluoroscopes': '[a, b, c]'}
     client._outputs['c'] = client.create_publisher(
-        TargetObservations, 'c/target_observations', OBSERVATIONS
+        TargetObservations, 'c/target_observations', observations_qos()
     )
     client.listen('c/calibration_status')
     graph.calibration_node(folder, **three)
@@ -197,7 +197,7 @@ def check_mixed(client, last, markers, points):
     )
     outputs = [
         client.create_publisher(
-            CorrectedObservations, f'{name}/corrected_observations', OBSERVATIONS
+            CorrectedObservations, f'{name}/corrected_observations', observations_qos()
         )
         for name in 'ab'
     ]
@@ -280,7 +280,7 @@ def test_points_come_while_views_are_missing(graph, tmp_path):
         'the count of incomplete exposures',
     )
     assert value_of(status, 'frames late') == value_of(before, 'frames late')
-    assert status.message == 'nothing comes of c, points are of the others'
+    assert status.message == 'no frames of c, points are reconstructed from the other fluoroscopes'
     rows, result = offline(folder, kept, tmp_path)
     live = np.concatenate([1e3 * np.stack([m.x, m.y, m.z], axis=1) for m in messages])
     of_file = np.array([[float(row[c] or 'nan') for c in 'xyz'] for row in rows])

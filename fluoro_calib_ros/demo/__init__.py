@@ -1,0 +1,1 @@
+"""The demonstration: the whole graph on recorded bags."""

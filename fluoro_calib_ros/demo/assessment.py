@@ -1,0 +1,161 @@
+"""How good the live results of the demonstration are, against the truth of the virtual rig."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..photogrammetry.collinearity import project
+from ..photogrammetry.rotations import matrix_from_quaternion
+
+# Frames and source timestamps [ns] by (fluoroscope, frame number); frames have target_id, u and v.
+Frames = Mapping[tuple[str, int], tuple[Any, int]]
+IMAGE_CENTRE = 511.5  # [px] of the images of the virtual rig
+IMAGE_SCALE = 512.0
+
+
+@dataclass(frozen=True)
+class SpaceFigures:
+    """Accuracy and latency of the points in space.
+
+    Attributes
+    ----------
+    rmse_mm : float
+        Against the true markers, after the rotation and shift that fit best.
+    normalised : float
+        Mean square of a coordinate's error over its variance.
+    good_fraction : float
+        Part of the points that were intersected.
+    exposures : int
+    latency_ms : float
+        Median, from the publication of the frames by the player to that of the points.
+    """
+
+    rmse_mm: float
+    normalised: float
+    good_fraction: float
+    exposures: int
+    latency_ms: float
+
+
+def latencies_ms(sent: Frames, corrected: Frames) -> np.ndarray:
+    """Return the latency of every corrected frame [ms].
+
+    It runs from the publication of the frame by the player to that of its correction.
+    """
+    return np.array([(corrected[key][1] - sent[key][1]) * 1e-6 for key in corrected])
+
+
+def image_errors(
+    bags: Path, names: Sequence[str], sent: Frames, corrected: Frames
+) -> dict[str, tuple[float, float]]:
+    """Return the RMSE of the observed and of the corrected markers by fluoroscope [px].
+
+    A calibration is known up to a rotation of the sensor and what corresponds to it in the
+    interior orientation. So a projective map of the image to the truth is fitted first, for the
+    observed markers as for the corrected ones.
+    """
+    rig = json.loads((bags / 'truth' / 'rig.json').read_text())['fluoroscopes']
+    truth = _true_markers(bags)
+    errors = {}
+    for name in names:
+        observed = []
+        undistorted = []
+        points = []
+        for (fluoroscope, number), (frame, _) in corrected.items():
+            if fluoroscope == name:
+                source = sent[name, number][0]
+                observed.append(np.stack([source.u, source.v], axis=1))
+                undistorted.append(np.stack([frame.u, frame.v], axis=1))
+                points += [truth[number, i] for i in frame.target_id]
+        ideal = _ideal_projection(rig[name], np.array(points))
+        errors[name] = (
+            projective_misfit(np.concatenate(observed), ideal),
+            projective_misfit(np.concatenate(undistorted), ideal),
+        )
+    return errors
+
+
+def space_figures(
+    bags: Path, points: Sequence[tuple[Any, int]], sent: Frames, first: str
+) -> SpaceFigures:
+    """Return the figures of the points in space.
+
+    Parameters
+    ----------
+    bags : Path
+        Folder of the bags with their truth.
+    points : sequence of (GoodPoints, int)
+        Points and their source timestamps [ns].
+    sent : mapping
+        Frames that the player has published.
+    first : str
+        First fluoroscope, whose frame numbers the points have.
+    """
+    truth = _true_markers(bags)
+    true = [truth[p.frame_number, i] for p, _ in points for i in p.target_id]
+    measured = np.concatenate([p.xyz_mm for p, _ in points])
+    covariance = np.concatenate([p.covariance for p, _ in points])
+    error = _error_after_rigid_fit(measured, np.array(true))
+    weighted = np.einsum('ni,nij,nj->n', error, np.linalg.inv(covariance), error)
+    latency = [
+        (stamp - sent[first, p.frame_number][1]) * 1e-6
+        for p, stamp in points
+        if (first, p.frame_number) in sent
+    ]
+    return SpaceFigures(
+        rmse_mm=float(np.sqrt((error**2).sum(axis=1).mean())),
+        normalised=float(weighted.mean() / 3),
+        good_fraction=len(measured) / sum(p.total for p, _ in points),
+        exposures=len(points),
+        latency_ms=float(np.median(latency)),
+    )
+
+
+def projective_misfit(uv: np.ndarray, ideal: np.ndarray) -> float:
+    """Return the RMSE of a coordinate after the best projective map of uv (n, 2) to ideal [px]."""
+    x, y = (uv - IMAGE_CENTRE).T / IMAGE_SCALE
+    u, v = (ideal - IMAGE_CENTRE).T / IMAGE_SCALE
+    one = np.ones_like(x)
+    zero = np.zeros_like(x)
+    rows = np.concatenate(
+        [
+            np.stack([x, y, one, zero, zero, zero, -u * x, -u * y], axis=1),
+            np.stack([zero, zero, zero, x, y, one, -v * x, -v * y], axis=1),
+        ]
+    )
+    h, *_ = np.linalg.lstsq(rows, np.concatenate([u, v]), rcond=None)
+    h = np.append(h, 1.0).reshape(3, 3)
+    mapped = np.stack([x, y, one], axis=1) @ h.T
+    residual = IMAGE_SCALE * (mapped[:, :2] / mapped[:, 2:] - np.stack([u, v], axis=1))
+    return float(np.sqrt(np.mean(residual**2)))
+
+
+def _true_markers(bags: Path) -> dict[tuple[int, int], np.ndarray]:
+    """Return the true positions [mm] by (frame, target)."""
+    rows = np.loadtxt(bags / 'truth' / 'markers.csv', delimiter=',', skiprows=1)
+    return {(int(row[0]), int(row[1])): row[2:] for row in rows}
+
+
+def _ideal_projection(true: Mapping[str, Any], points: np.ndarray) -> np.ndarray:
+    """Return the undistorted image points (n, 2) of points (n, 3) in a true fluoroscope."""
+    n = len(points)
+    return project(
+        np.broadcast_to(matrix_from_quaternion(true['quaternion_wxyz']), (n, 3, 3)),
+        np.broadcast_to(true['position_mm'], (n, 3)),
+        points,
+        np.array([true['interior'][key] for key in ('xp', 'yp', 'c')]),
+    )
+
+
+def _error_after_rigid_fit(measured: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return measured - true (n, 3) after the best rotation and shift of true (Kabsch)."""
+    a = measured - measured.mean(axis=0)
+    b = true - true.mean(axis=0)
+    u, _, vt = np.linalg.svd(a.T @ b)
+    return a - b @ (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).T

@@ -1,0 +1,245 @@
+"""Run the main job on recorded bags over real ROS 2: collect, self-calibrate, correct and
+reconstruct live, and report.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..bags.reader import read_frames
+from ..calibration.calibrate import CalibrationResult, calibrate
+from ..errors import DataError
+from ..exposures.collector import collect_recorded
+from ..files.atomic import write_text
+from ..files.phantom import read_phantom
+from ..nodes.demo_client import DemoClient, DemoError, demo_client
+from ..report.figures import write_figures
+from ..report.tables import markdown_table, summary_table
+from .assessment import image_errors, latencies_ms, space_figures
+from .node_processes import NodeProcesses, isolate_ros_graph
+
+QUIET_S = 3.0  # after which no more messages are expected
+
+
+def run_graph(bags: Path, out: Path, client: DemoClient) -> int:
+    """Run the graph from the first exposure to the last corrected frame.
+
+    Returns the number of corrected frames that were lost. Raises DemoError.
+    """
+    _clear(out)
+    recorded = _frame_counts(bags / 'calibration')
+    tracked = _frame_counts(bags / 'tracking')
+    with NodeProcesses(out) as nodes:
+        _start_nodes(nodes, bags, out, client.names)
+        print(
+            f'1  player -> calibration node: {min(recorded.values())} exposures of '
+            f'{" and ".join(client.names)}'
+        )
+        nodes.start(
+            'player_node', {'bag': bags / 'calibration', 'rate': 5.0, 'wait_for_readers': 3}
+        )
+        client.wait(
+            lambda: _has_exposures(client, min(recorded.values())) or nodes.failed(),
+            60,
+            'the exposures',
+        )
+        _raise_if_failed(nodes, out)
+        print('2  client -> calibration node: self-calibrate')
+        message = client.self_calibrate(lambda line: print(f'    {line}', flush=True))
+        print(f'    {message}')
+        client.wait(lambda: client.is_correcting, 20, 'the correction node to use the calibration')
+        client.wait(lambda: client.is_reconstructing, 20, 'the reconstruction node')
+        print('3  player -> correction node -> reconstruction node: markers in motion, live')
+        client.sent.clear()
+        player = nodes.start('player_node', {'bag': bags / 'tracking', 'wait_for_readers': 3})
+        wait_for_stream(client, player, nodes, tracked)
+        _raise_if_failed(nodes, out)
+    if not client.corrected or not client.points:
+        raise DemoError(f'no corrected frames or no points have arrived, see the logs in {out}')
+    return sum(tracked.values()) - len(client.corrected)
+
+
+def wait_for_stream(
+    client: DemoClient,
+    player: subprocess.Popen,
+    nodes: NodeProcesses,
+    tracked: Mapping[str, int],
+) -> None:
+    """Wait until all frames have come out, or the player has ended and nothing comes any more.
+
+    tracked: number of frames by fluoroscope. Raises DemoError.
+    """
+    seen = 0
+    quiet_since = time.monotonic()
+
+    def is_over() -> bool:
+        nonlocal seen, quiet_since
+        count = len(client.sent) + len(client.corrected) + len(client.points)
+        if count != seen or player.poll() is None:
+            seen = count
+            quiet_since = time.monotonic()
+        complete = (
+            len(client.corrected) >= sum(tracked.values())
+            and len(client.points) >= min(tracked.values())
+            and client.corrected.keys() <= client.sent.keys()
+        )
+        return complete or bool(nodes.failed()) or time.monotonic() > quiet_since + QUIET_S
+
+    client.wait(is_over, 120, 'the end of the stream')
+    for key in client.corrected.keys() - client.sent.keys():  # without its source, no latency
+        del client.corrected[key]
+
+
+def report(bags: Path, out: Path, client: DemoClient, lost: int, start: float) -> bool:
+    """Write and print the table; returns whether live and offline calibration are identical.
+
+    The figures need the residuals, so the bag is calibrated once more without ROS.
+
+    Parameters
+    ----------
+    bags, out : Path
+    client : DemoClient
+        With what it has recorded.
+    lost : int
+        Number of corrected frames that did not arrive.
+    start : float
+        Monotonic time of the start of the demonstration [s].
+    """
+    print('4  the same bag without ROS, figures and table')
+    frames, _ = collect_recorded(read_frames(bags / 'calibration').frames)
+    job = calibrate(frames, read_phantom(bags / 'phantom.csv'))
+    figures = write_figures(job, out / 'figures')
+    same = {
+        name: job.calibrations[name].calibration_id == calibration.calibration_id
+        for name, calibration in client.calibrations.items()
+    }
+    lines = [*_image_lines(bags, client, job), '', _space_line(bags, client), '']
+    lines.append(
+        'Calibration through the nodes and without ROS the same to the last bit: '
+        + ', '.join(f'{name} {"yes" if ok else "NO"}' for name, ok in same.items())
+    )
+    lines.append(
+        f'Figures: {out / "figures"} ({len(figures)} pictures), calibration: {out / "calibration"}'
+    )
+    if lost:
+        lines.append(f'{lost} corrected frames were lost: the machine is too busy for the rate')
+    lines.append(f'{time.monotonic() - start:.0f} s in all')
+    text = '\n'.join(lines)
+    write_text(out / 'table.txt', text + '\n')
+    print('\n' + text)
+    return all(same.values())
+
+
+def _image_lines(bags: Path, client: DemoClient, job: CalibrationResult) -> list[str]:
+    """Return the tables of the calibration and of the corrected markers."""
+    latency = latencies_ms(client.sent, client.corrected)
+    errors = image_errors(bags, client.names, client.sent, client.corrected)
+    summary = summary_table(
+        job,
+        {
+            'p50': np.percentile(latency, 50),
+            'p99': np.percentile(latency, 99),
+            'max': latency.max(),
+            'frames': len(latency),
+        },
+    )
+    head = ['fluoroscope', 'observed RMSE [px]', 'corrected RMSE [px]', 'frames in', 'frames out']
+    rows = [
+        [
+            name,
+            f'{errors[name][0]:.3f}',
+            f'{errors[name][1]:.3f}',
+            str(sum(key[0] == name for key in client.sent)),
+            str(sum(key[0] == name for key in client.corrected)),
+        ]
+        for name in client.names
+    ]
+    return [
+        summary,
+        '',
+        'Markers in motion against the truth (after the best projective map):',
+        markdown_table(head, rows),
+    ]
+
+
+def _space_line(bags: Path, client: DemoClient) -> str:
+    """Return the figures of the points in space in one line."""
+    space = space_figures(bags, client.good_points(), client.sent, client.names[0])
+    return (
+        f'In space: {space.exposures} exposures, {100 * space.good_fraction:.1f} % of the points; '
+        f'RMSE against the truth {space.rmse_mm:.3f} mm (3-D), squared error over its variance '
+        f'{space.normalised:.2f}; latency {space.latency_ms:.1f} ms (median)'
+    )
+
+
+def _clear(out: Path) -> None:
+    """Make the folder of the results, and delete the logs and calibrations of an earlier run."""
+    out.mkdir(parents=True, exist_ok=True)
+    for old in (*out.glob('*.log'), *(out / 'calibration').glob('*.calibration.npz')):
+        old.unlink()
+
+
+def _frame_counts(bag: Path) -> dict[str, int]:
+    return {name: len(frames) for name, frames in read_frames(bag).frames.items()}
+
+
+def _start_nodes(nodes: NodeProcesses, bags: Path, out: Path, names: Sequence[str]) -> None:
+    fluoroscopes = f'[{",".join(names)}]'
+    nodes.start(
+        'calibration_node',
+        {
+            'fluoroscopes': fluoroscopes,
+            'phantom': bags / 'phantom.csv',
+            'calibration_directory': out / 'calibration',
+        },
+    )
+    nodes.start('correction_node', {'fluoroscopes': fluoroscopes})
+    nodes.start('reconstruction_node', {'fluoroscopes': fluoroscopes})
+
+
+def _has_exposures(client: DemoClient, count: int) -> bool:
+    return bool(client.exposures) and min(client.exposures.values()) >= count
+
+
+def _raise_if_failed(nodes: NodeProcesses, out: Path) -> None:
+    if nodes.failed():
+        raise DemoError(f'a node ended with a fault, see the logs in {out}')
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the demonstration; exit status 0 when all of it worked."""
+    parser = argparse.ArgumentParser(prog='fluoro_calib_demo', description=__doc__)
+    parser.add_argument(
+        '--bags', type=Path, default=Path('bags'), help='folder of the bags (default: bags)'
+    )
+    parser.add_argument(
+        '--out',
+        type=Path,
+        default=Path('demo_result'),
+        help='folder to write (default: demo_result)',
+    )
+    options = parser.parse_args(arguments)
+    start = time.monotonic()
+    isolate_ros_graph()
+    try:
+        names = sorted(read_frames(options.bags / 'calibration').frames)
+        with demo_client(names) as client:
+            lost = run_graph(options.bags, options.out, client)
+            good = report(options.bags, options.out, client, lost, start)
+    except (DemoError, DataError, OSError) as error:
+        print(f'fluoro_calib_demo: {error}', file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    sys.exit(0 if good else 1)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,165 @@
+"""What the nodes that correct streams have in common."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from typing import Any, ClassVar
+
+from ..calibration.result import FluoroscopeCalibration
+from .calibration_input import CalibrationInput
+from .runtime.diagnostics import OK, WARN, LatencyWindow, Status
+from .runtime.lifecycle import StreamNode
+from .runtime.logging import RateLimitedLogger
+from .runtime.parameters import ManagedParameters
+from .runtime.refusals import RefusalLog
+from .runtime.stream_reader import FaultHandlers
+
+
+class Stream:
+    """Counts of one fluoroscope.
+
+    Attributes
+    ----------
+    received, corrected : int
+        Number of frames or images.
+    waiting : int
+        Number of those that came before the first calibration.
+    refusals : RefusalLog
+    latencies : LatencyWindow
+        From the arrival of a message to the publication of its correction.
+    """
+
+    def __init__(self, name: str, item: str, logger: RateLimitedLogger) -> None:
+        self.name = name
+        self.received = 0
+        self.corrected = 0
+        self.waiting = 0
+        self.refusals = RefusalLog(item, logger)
+        self.latencies = LatencyWindow()
+
+    def count_corrected(self, info: Mapping[str, int]) -> None:
+        """Count a message that was corrected and published; info: see StreamReader.subscribe."""
+        self.corrected += 1
+        self.latencies.add(time.time_ns() - info['received_timestamp'])
+
+
+class CorrectingNode(StreamNode):
+    """Node that corrects a stream of each fluoroscope with its newest calibration.
+
+    Nothing is corrected before the first calibration. Subclasses set the class attributes and
+    override prepare(), on_calibration_ready(), make_stream() and extra_values().
+
+    Attributes
+    ----------
+    item : str
+        What is corrected: frame or image.
+    subject : str
+        What is subscribed to, in words.
+    refusal_kinds : tuple of str
+    topics : tuple of str
+        What is subscribed to, below each fluoroscope.
+    """
+
+    item: ClassVar[str] = ''
+    subject: ClassVar[str] = ''
+    refusal_kinds: ClassVar[tuple[str, ...]] = ()
+    topics: tuple[str, ...] = ()
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.names: tuple[str, ...] = ()
+        self.streams: dict[str, Any] = {}
+
+    def use_parameters(self, parameters: ManagedParameters) -> None:
+        """Take the parameters that all these nodes have; subclasses call it in __init__."""
+        self.autostart = parameters.autostart
+        self.names = parameters.fluoroscopes
+        self.reset()
+
+    def make_stream(self, name: str) -> Stream:
+        """Return the state of one fluoroscope before the first message."""
+        return Stream(name, self.item, self.limited_logger)
+
+    def prepare(self, calibration: FluoroscopeCalibration) -> Any:
+        """Return what is kept of a calibration; called in a thread."""
+        return calibration
+
+    def on_calibration_ready(self, name: str, prepared: Any) -> None:
+        """Log that a calibration is in use; called in a thread."""
+
+    def extra_values(self, stream: Any, prepared: Any) -> dict[str, object]:
+        """Return further values for the diagnostics of a fluoroscope."""
+        return {}
+
+    def reset(self) -> None:
+        """Start counting from zero."""
+        self.streams = {name: self.make_stream(name) for name in self.names}
+
+    def prepared(self, name: str) -> Any:
+        """Return what is kept of the calibration in use, None before the first one."""
+        return self._calibrations.current(name)
+
+    def subscribe_calibrations(self) -> None:
+        """Subscribe to calibrations; the outputs that they need must exist."""
+        self._calibrations = CalibrationInput(
+            self, self.names, self.prepare, self.on_calibration_ready, self._on_refused_calibration
+        )
+        self.own(self._calibrations, self._calibrations.close)
+
+    @property
+    def fault_handlers(self) -> FaultHandlers:
+        """What a stream reader calls when something goes wrong."""
+        return FaultHandlers(
+            lambda topic: self._count_undecodable(self.stream_of(topic), topic),
+            lambda topic, error: self.stream_of(topic).refusals.fail(topic, error),
+            self.fail,
+        )
+
+    def stream_of(self, topic: str) -> Any:
+        """Return the Stream of a topic <fluoroscope>/<...>."""
+        return self.streams[topic.partition('/')[0]]
+
+    def diagnose(self) -> list[Status]:
+        """Return the status of every fluoroscope."""
+        incompatible = self.incompatible_publishers()
+        return [
+            Status(name, *self._verdict(stream, incompatible), self._values(stream))
+            for name, stream in self.streams.items()
+        ]
+
+    def _on_refused_calibration(self, name: str, reason: str) -> None:
+        self.streams[name].refusals.last_fault = reason
+
+    @staticmethod
+    def _count_undecodable(stream: Stream, topic: str) -> None:
+        stream.received += 1
+        stream.refusals.refuse_undecodable(topic)
+
+    def _values(self, stream: Stream) -> dict[str, object]:
+        return {
+            f'{self.item}s received': stream.received,
+            f'{self.item}s corrected': stream.corrected,
+            f'{self.item}s without calibration': stream.waiting,
+            **stream.refusals.values(self.refusal_kinds),
+            'last fault': stream.refusals.last_fault,
+            **self.extra_values(stream, self.prepared(stream.name)),
+            **stream.latencies.values(),
+        }
+
+    def _verdict(self, stream: Stream, incompatible: Mapping[str, str]) -> tuple[bytes, str]:
+        """Return level and message of the diagnostics of a fluoroscope."""
+        failure = stream.refusals.failure_status()
+        if failure:
+            return failure
+        topics = [f'{stream.name}/{topic}' for topic in self.topics]
+        for topic in topics:
+            if topic in incompatible:
+                return WARN, incompatible[topic]
+        if self.prepared(stream.name) is None:
+            return WARN, f'no calibration yet: {stream.waiting} {self.item}s were not corrected'
+        if not self.readers:
+            return WARN, 'the node is not active'
+        if not any(map(self.count_publishers, topics)):
+            return WARN, f'no publisher of {self.subject}'
+        return stream.refusals.refusal_status() or (OK, 'correcting')

@@ -1,0 +1,217 @@
+"""ROS client of the demonstration: calls the action, and records what the graph publishes."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Any
+
+import rclpy
+from action_msgs.msg import GoalStatus
+from diagnostic_msgs.msg import DiagnosticArray
+from fluoro_calib_msgs.action import SelfCalibrate
+from fluoro_calib_msgs.msg import (
+    CalibrationStatus,
+    CorrectedObservations,
+    FluoroscopeCalibration,
+    ReconstructedPoints,
+    RigOrientation,
+    TargetObservations,
+)
+from rclpy.action import ActionClient
+from rclpy.node import Node
+from rclpy.task import Future
+from sensor_msgs.msg import CameraInfo
+
+from ..calibration import result as calibration_result
+from .messages.corrected_observations import CorrectedFrame, decode_corrected_observations
+from .messages.fluoroscope_calibration import calibration_from_message
+from .messages.reconstructed_points import GoodPoints, good_points_of
+from .messages.self_calibration import feedback_text
+from .messages.target_observations import ObservedFrame, decode_target_observations
+from .runtime.qos import latched_qos, observations_qos
+from .runtime.stream_reader import FaultHandlers, StreamReader
+
+
+class DemoError(RuntimeError):
+    """Reason why the demonstration failed, in one sentence."""
+
+
+class DemoClient(Node):
+    """User of the graph.
+
+    Attributes
+    ----------
+    names : sequence of str
+        Fluoroscopes.
+    exposures : dict of str to int
+        Number of collected exposures by fluoroscope.
+    corrected_readers : dict of str to int
+        Subscriptions to the corrected observations that the correction node knows.
+    sent, corrected : dict
+        Frames and their source timestamps [ns] by (fluoroscope, frame number).
+    points : list
+        ReconstructedPoints messages and their source timestamps [ns].
+    """
+
+    def __init__(self, names: Sequence[str]) -> None:
+        super().__init__('demo_client')
+        self.names = tuple(names)
+        self.exposures: dict[str, int] = {}
+        self.corrected_readers: dict[str, int] = {}
+        self.sent: dict[tuple[str, int], tuple[ObservedFrame, int]] = {}
+        self.corrected: dict[tuple[str, int], tuple[CorrectedFrame, int]] = {}
+        self.points: list[tuple[ReconstructedPoints, int]] = []
+        self._calibrations: dict[str, FluoroscopeCalibration] = {}
+        self._camera_infos: dict[str, CameraInfo] = {}
+        self._orientations: list[RigOrientation] = []
+        self._streams = StreamReader(
+            self,
+            FaultHandlers(
+                self._on_undecodable,
+                lambda topic, error: self.get_logger().error(f'topic {topic}: {error!r}'),
+                lambda text: self.get_logger().error(text),
+            ),
+        )
+        self._subscribe_streams()
+        self._subscribe_states()
+        self._action = ActionClient(self, SelfCalibrate, 'self_calibrate')
+        self._streams.start()
+
+    @property
+    def calibrations(self) -> dict[str, calibration_result.FluoroscopeCalibration]:
+        """The published calibrations by fluoroscope."""
+        return {name: calibration_from_message(m) for name, m in self._calibrations.items()}
+
+    @property
+    def is_correcting(self) -> bool:
+        """Whether the correction node uses calibrations of all fluoroscopes.
+
+        It publishes its first CameraInfo when it does.
+        """
+        return len(self._camera_infos) == len(self.names)
+
+    @property
+    def is_reconstructing(self) -> bool:
+        """Whether an orientation is published and the reconstruction node receives frames."""
+        readers = [self.corrected_readers.get(name, 0) for name in self.names]
+        return bool(self._orientations) and all(count > 1 for count in readers)
+
+    def good_points(self) -> list[tuple[GoodPoints, int]]:
+        """Return the intersected points and their source timestamps [ns]."""
+        return [(good_points_of(message), stamp) for message, stamp in self.points]
+
+    def self_calibrate(self, show: Callable[[str], None]) -> str:
+        """Call the action and return the message of its result.
+
+        show: called with a line of text after every round. Raises DemoError.
+        """
+        self.wait(self._action.server_is_ready, 20, 'the action self_calibrate')
+        goal = self._result_of(
+            self._action.send_goal_async(
+                SelfCalibrate.Goal(), feedback_callback=lambda m: show(feedback_text(m.feedback))
+            ),
+            10,
+            'the answer to the goal',
+        )
+        answer = self._result_of(goal.get_result_async(), 120, 'the self-calibration')
+        if answer.status != GoalStatus.STATUS_SUCCEEDED:
+            raise DemoError(answer.result.message)
+        return answer.result.message
+
+    def wait(self, condition: Callable[[], Any], timeout_s: float, what: str) -> None:
+        """Spin until a condition is true. Raises DemoError when the time is up."""
+        end = time.monotonic() + timeout_s
+        while not condition():
+            if time.monotonic() > end:
+                raise DemoError(f'waited {timeout_s:g} s for {what}')
+            rclpy.spin_once(self, timeout_sec=0.1)
+
+    def destroy_node(self) -> None:
+        """Stop the streams with the node."""
+        self._streams.stop()
+        super().destroy_node()
+
+    def _result_of(self, future: Future, timeout_s: float, what: str) -> Any:
+        self.wait(future.done, timeout_s, what)
+        return future.result()
+
+    def _subscribe_streams(self) -> None:
+        self._streams.subscribe(
+            ReconstructedPoints,
+            'reconstruction/points_with_covariance',
+            lambda message, info: self.points.append((message, info['source_timestamp'])),
+            observations_qos(),
+        )
+        for name in self.names:
+            self._streams.subscribe(
+                TargetObservations,
+                f'{name}/target_observations',
+                partial(self._record, self.sent, name),
+                observations_qos(),
+                decode_target_observations,
+            )
+            self._streams.subscribe(
+                CorrectedObservations,
+                f'{name}/corrected_observations',
+                partial(self._record, self.corrected, name),
+                observations_qos(),
+                decode_corrected_observations,
+            )
+
+    def _subscribe_states(self) -> None:
+        self.create_subscription(
+            RigOrientation, 'rig_orientation', self._orientations.append, latched_qos()
+        )
+        self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 10)
+        for name in self.names:
+            self.create_subscription(
+                CalibrationStatus,
+                f'{name}/calibration_status',
+                lambda message, name=name: self.exposures.update({name: message.exposures}),
+                10,
+            )
+            self.create_subscription(
+                FluoroscopeCalibration,
+                f'{name}/calibration',
+                lambda message, name=name: self._calibrations.update({name: message}),
+                latched_qos(),
+            )
+            self.create_subscription(
+                CameraInfo,
+                f'{name}/camera_info',
+                lambda message, name=name: self._camera_infos.update({name: message}),
+                latched_qos(),
+            )
+
+    def _on_undecodable(self, topic: str) -> None:
+        self.get_logger().error(f'topic {topic}: a message cannot be decoded')
+
+    def _on_diagnostics(self, array: DiagnosticArray) -> None:
+        for status in array.status:
+            if status.name.startswith('/correction_node: '):
+                for value in status.values:
+                    if value.key == 'readers':
+                        self.corrected_readers[status.hardware_id] = int(value.value)
+
+    @staticmethod
+    def _record(
+        frames: dict, name: str, frame: ObservedFrame | CorrectedFrame, info: Mapping[str, int]
+    ) -> None:
+        frames[name, frame.frame_number] = (frame, info['source_timestamp'])
+
+
+@contextmanager
+def demo_client(names: Sequence[str]) -> Iterator[DemoClient]:
+    """Run a DemoClient in a ROS context of its own."""
+    rclpy.init(args=[])
+    try:
+        client = DemoClient(names)
+        try:
+            yield client
+        finally:
+            client.destroy_node()
+    finally:
+        rclpy.try_shutdown()

@@ -1,0 +1,158 @@
+"""The drift watch of the reconstruction node: parameters, published state and alarms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fluoro_calib_msgs.srv import Reset
+from rclpy.client import Client
+from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.publisher import Publisher
+
+from ..drift.clusters import Cluster, parse_clusters
+from ..drift.options import DriftOptions
+from ..drift.rig_watch import RigDriftWatch
+from ..drift.state import DriftState
+from ..options import option
+from ..photogrammetry.rig_orientation import RigOrientation
+from .messages.drift_status import ALARM, message_from_drift_state
+from .runtime.diagnostics import ERROR, OK, WARN, Status
+
+LEVELS = (OK, WARN, ERROR)  # of the diagnostics, by the level of a DriftState
+
+
+@dataclass(frozen=True)
+class DriftParameters:
+    """Parameters of the drift watch that belong to the node."""
+
+    drift_watch: bool = option(True, 'whether the stream is watched for drift of the calibration')
+    drift_rate: float = option(
+        120.0,
+        'maximum rate of the exposures that the drift watch examines',
+        minimum=1.0,
+        maximum=10000.0,
+        unit='Hz',
+    )
+    clusters: tuple[str, ...] = option(
+        ('',),
+        "rigid clusters of targets, each a text such as 'tibia: 1001 1002 1003'",
+    )
+    collect_on_drift: bool = option(
+        False,
+        'whether drift of level ERROR calls the service collect_anew of the calibration node',
+    )
+
+    def __post_init__(self) -> None:
+        try:
+            self.rigid_clusters()
+        except ValueError as error:
+            raise ValueError(f'clusters: {error}') from None
+
+    def rigid_clusters(self) -> tuple[Cluster, ...]:
+        """Return the clusters. Raises ValueError for a text that declares none."""
+        return parse_clusters([text for text in self.clusters if text])
+
+
+class DriftMonitor:
+    """Makes the drift watches of orientations, and publishes the state of the newest one.
+
+    Attributes
+    ----------
+    newest : (RigDriftWatch or None, RigOrientation, int) or None
+        Watch, orientation and stamp [ns] of the newest exposure; the stream's thread sets it.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        parameters: DriftParameters,
+        options: DriftOptions,
+        logger: RcutilsLogger,
+    ) -> None:
+        self._names = tuple(names)
+        self._parameters = parameters
+        self._options = options
+        self._clusters = parameters.rigid_clusters()
+        self._logger = logger
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget image sizes, exposures and alarms."""
+        self._sizes: dict[str, tuple[int, int]] = {}
+        self.newest: tuple[RigDriftWatch | None, RigOrientation, int] | None = None
+        self._alarmed = False
+
+    def connect(self, publisher: Publisher, collect_anew: Client) -> None:
+        """Set where the state is published, and the service that an alarm may call."""
+        self._publisher = publisher
+        self._collect_anew = collect_anew
+
+    def set_image_size(self, name: str, size: tuple[int, int]) -> bool:
+        """Set the image size of a fluoroscope; returns whether it has changed."""
+        if self._sizes.get(name) == size:
+            return False
+        self._sizes = {**self._sizes, name: size}
+        return True
+
+    def make_watch(self, orientation: RigOrientation) -> RigDriftWatch | None:
+        """Return the watch of an orientation, None without one or before all sizes are known.
+
+        Raises ValueError, DataError among them, for an orientation that cannot be watched.
+        """
+        if not self._parameters.drift_watch or self._missing_sizes():
+            return None
+        return RigDriftWatch(
+            orientation,
+            self._sizes,
+            self._options,
+            self._clusters,
+            self._parameters.drift_rate,
+        )
+
+    def publish_state(self) -> list[Status]:
+        """Publish the state of the watch; returns its diagnostics, nothing without exposures."""
+        newest = self.newest
+        if not self._parameters.drift_watch or newest is None:
+            return []
+        watch, orientation, stamp_ns = newest
+        if watch is None:
+            missing = ', '.join(self._missing_sizes())
+            return [Status('drift', WARN, f'drift is not watched: no camera_info of {missing}')]
+        state = watch.state
+        message = message_from_drift_state(state, stamp_ns, orientation)
+        self._publisher.publish(message)
+        is_alarm = state.level == ALARM
+        if is_alarm and not self._alarmed:
+            self._raise_alarm(state)
+        self._alarmed = is_alarm
+        return [Status('drift', LEVELS[state.level], state.message, _values(state))]
+
+    def _missing_sizes(self) -> list[str]:
+        return [name for name in self._names if name not in self._sizes]
+
+    def _raise_alarm(self, state: DriftState) -> None:
+        self._logger.error(state.message)
+        if not self._parameters.collect_on_drift:
+            return
+        if self._collect_anew.service_is_ready():
+            self._collect_anew.call_async(Reset.Request())
+        else:
+            self._logger.error(
+                'the service collect_anew is not available: no new exposures are collected'
+            )
+
+
+def _values(state: DriftState) -> dict[str, object]:
+    return {
+        'fluoroscope': state.fluoroscope,
+        'place': state.place,
+        'source': state.source,
+        'size [px]': f'{state.size:.2f}',
+        'sd [px]': f'{state.sd:.2f}',
+        'evidence': f'{state.evidence:.1f}',
+        'threshold of WARN': f'{state.threshold_warn:.1f}',
+        'threshold of ERROR': f'{state.threshold_error:.1f}',
+        'since [s]': f'{state.since_s:.1f}',
+        'observations': state.observations,
+    }

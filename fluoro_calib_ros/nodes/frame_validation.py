@@ -1,0 +1,124 @@
+"""Validation of frames on the live path, in microseconds."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..calibration.result import FluoroscopeCalibration
+from ..exposures.frame import (
+    image_size_error,
+    length_error,
+    repeated_target_error,
+    sigma_error,
+)
+from .messages.corrected_observations import CorrectedFrame
+from .messages.target_observations import ObservedFrame
+from .runtime.refusals import Refused
+
+# Kinds of refusals.
+OBSERVED_REFUSALS = (
+    'undecodable',
+    'lengths',
+    'image size',
+    'frame id',
+    'repeated target',
+    'sigma',
+)
+CORRECTED_REFUSALS = ('undecodable', 'lengths', 'repeated target', 'sigma')
+
+
+class FrameValidator:
+    """Validates the frames of one fluoroscope before they are corrected.
+
+    A stream shows the same targets frame after frame: their ids are examined when they change.
+    """
+
+    def __init__(self, fluoroscope: str) -> None:
+        self._fluoroscope = fluoroscope
+        self._unique: bytes | None = None  # target ids that were examined last
+
+    def validated_arrays(
+        self, frame: ObservedFrame, calibration: FluoroscopeCalibration
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Return u, v (n,) and sigma (n,) or None of a frame that a calibration can correct.
+
+        Raises Refused for a frame that cannot be corrected as a whole.
+        """
+        sigma = frame.sigma
+        count = len(frame.target_id) // 4
+        if len(frame.u) != count or len(frame.v) != count or len(sigma) not in (0, count):
+            raise self._refused('lengths', frame, _length_error(frame))
+        if frame.image_size != calibration.image_size:
+            raise self._refused(
+                'image size', frame, image_size_error(frame.image_size, calibration.image_size)
+            )
+        frame_id = frame.frame_id
+        if frame_id != calibration.frame_id and frame_id and calibration.frame_id:
+            raise self._refused(
+                'frame id',
+                frame,
+                f'the frame id is {frame_id}, but the calibration is of {calibration.frame_id}',
+            )
+        if frame.target_id != self._unique:
+            error = repeated_target_error(_target_ids(frame))
+            if error:
+                raise self._refused('repeated target', frame, error)
+            self._unique = frame.target_id
+        if not len(sigma):
+            return frame.u, frame.v, None
+        if not (sigma.min() > 0 and sigma.max() < np.inf):  # false for NaN, too
+            raise self._refused('sigma', frame, sigma_error(_target_ids(frame), sigma))
+        return frame.u, frame.v, sigma
+
+    def _refused(self, kind: str, frame: ObservedFrame, reason: str) -> Refused:
+        return Refused(
+            kind, f'fluoroscope {self._fluoroscope}, frame {frame.frame_number}: {reason}'
+        )
+
+
+def _target_ids(frame: ObservedFrame) -> np.ndarray:
+    return np.frombuffer(frame.target_id, np.uint32)
+
+
+def _length_error(frame: ObservedFrame) -> str:
+    """Return the error of the first array with another length than the target ids."""
+    arrays = {'u': frame.u, 'v': frame.v}
+    if len(frame.sigma):
+        arrays['sigma'] = frame.sigma
+    return length_error(_target_ids(frame), **arrays)
+
+
+def validate_corrected(fluoroscope: str, frame: CorrectedFrame) -> None:
+    """Raise Refused for arrays of different lengths, repeated targets and invalid deviations.
+
+    Standard deviations may be NaN: those of points that are INVALID are.
+    """
+    count = len(frame.target_id)
+    where = f'fluoroscope {fluoroscope}, frame {frame.frame_number}'
+    if not len(frame.u) == len(frame.v) == len(frame.sigma) == len(frame.status) == count or (
+        len(frame.correction_sd) != count
+    ):
+        raise Refused(
+            'lengths',
+            f'{where}: '
+            + length_error(
+                frame.target_id,
+                u=frame.u,
+                v=frame.v,
+                sigma=frame.sigma,
+                correction_sd=frame.correction_sd,
+                status=frame.status,
+            ),
+        )
+    if len(set(frame.target_id.tolist())) < count:
+        raise Refused('repeated target', f'{where}: a target occurs more than once')
+    for name, wrong in (
+        ('sigma', frame.sigma <= 0),
+        ('correction_sd', frame.correction_sd < 0),
+    ):  # false for NaN
+        if wrong.any():
+            raise Refused(
+                'sigma',
+                f'{where}: {name} of target {frame.target_id[wrong.argmax()]} is not a standard '
+                'deviation',
+            )

@@ -1,0 +1,137 @@
+"""FluoroscopeCalibration: interior orientation and correction model, to the last bit."""
+
+from __future__ import annotations
+
+import numpy as np
+from fluoro_calib_msgs.msg import FluoroscopeCalibration
+
+from ...calibration import result as calibration_result
+from ...distortion.models import CorrectionModel
+from ...distortion.series import SD_GRID, Series, packed, unpacked
+from ...errors import DataError
+from ...files.calibration import checked_arrays
+from .fields import (
+    float64_field,
+    nanoseconds_from_stamp,
+    stamp_from_nanoseconds,
+    uint32_field,
+)
+
+# Fields with the same name and content in message and calibration.
+SAME_NAME = (
+    'fluoroscope',
+    'interior_estimated',
+    'image_sd',
+    'sigma0',
+    'nu',
+    'exposures',
+    'observations',
+    'inliers',
+    'cost_adjustment',
+    'cost_regression',
+    'iterations',
+    'converged',
+    'seconds',
+    'source_digest',
+)
+
+
+def message_from_calibration(
+    calibration: calibration_result.FluoroscopeCalibration,
+) -> FluoroscopeCalibration:
+    """Return the message of a calibration."""
+    message = FluoroscopeCalibration()
+    message.header.stamp = stamp_from_nanoseconds(calibration.stamp_ns)
+    message.header.frame_id = calibration.frame_id
+    message.image_width, message.image_height = calibration.image_size
+    message.xp, message.yp, message.c = (float(x) for x in calibration.interior)
+    message.interior_covariance = np.asarray(calibration.interior_covariance, dtype=float).ravel()
+    message.train_exposure = uint32_field(calibration.train_exposure)
+    _set_model(message, calibration.model)
+    message.rmse_before_u, message.rmse_before_v = (float(x) for x in calibration.rmse_before)
+    message.rmse_after_u, message.rmse_after_v = (float(x) for x in calibration.rmse_after)
+    for name in SAME_NAME:
+        setattr(message, name, getattr(calibration, name))
+    message.calibration_id = calibration.calibration_id
+    return message
+
+
+def calibration_from_message(
+    message: FluoroscopeCalibration,
+) -> calibration_result.FluoroscopeCalibration:
+    """Return the calibration of a message, identical to the one that was sent.
+
+    Raises DataError where the message holds no valid calibration, or not the one its id says.
+    """
+    where = f'calibration of fluoroscope {message.fluoroscope}'
+    calibration = calibration_result.FluoroscopeCalibration(
+        image_size=(message.image_width, message.image_height),
+        interior=np.array([message.xp, message.yp, message.c]),
+        interior_covariance=np.array(message.interior_covariance).reshape(3, 3),
+        model=_model_of(message, where),
+        train_exposure=np.array(message.train_exposure, dtype=np.int64),
+        rmse_before=np.array([message.rmse_before_u, message.rmse_before_v]),
+        rmse_after=np.array([message.rmse_after_u, message.rmse_after_v]),
+        stamp_ns=nanoseconds_from_stamp(message.header.stamp),
+        frame_id=message.header.frame_id,
+        **{name: getattr(message, name) for name in SAME_NAME},
+    )
+    if calibration.calibration_id != message.calibration_id:
+        raise DataError(f'{where}: its content does not match its id {message.calibration_id}')
+    checked_arrays(where, calibration)
+    return calibration
+
+
+def _set_model(message: FluoroscopeCalibration, model: CorrectionModel) -> None:
+    """Fill in the correction model."""
+    message.model_kind = model.kind
+    message.k = model.k
+    message.model_noise = model.noise_px
+    message.model_bias = model.bias_px
+    message.train_u = float64_field(model.train_uv[:, 0])
+    message.train_v = float64_field(model.train_uv[:, 1])
+    message.train_du = float64_field(model.train_duv[:, 0])
+    message.train_dv = float64_field(model.train_duv[:, 1])
+    message.series_degree, message.series_modes, coefficients, sd = packed(model.series)
+    message.series_u = float64_field(coefficients[0])
+    message.series_v = float64_field(coefficients[1])
+    message.series_sd = float64_field(sd)
+
+
+def _model_of(message: FluoroscopeCalibration, where: str) -> CorrectionModel:
+    """Return the correction model of a message. Raises DataError, beginning with `where`."""
+    train = [
+        np.array(field)
+        for field in (message.train_u, message.train_v, message.train_du, message.train_dv)
+    ]
+    if len({len(field) for field in train} | {len(message.train_exposure)}) != 1:
+        raise DataError(
+            f'{where}: its training points have different numbers of coordinates and corrections'
+        )
+    try:
+        return CorrectionModel(
+            message.model_kind,
+            message.k,
+            np.stack(train[:2], axis=1),
+            np.stack(train[2:], axis=1),
+            message.model_noise,
+            message.model_bias,
+            _series_of(message),
+        )
+    except ValueError as error:
+        raise DataError(f'{where}: {error}') from None
+
+
+def _series_of(message: FluoroscopeCalibration) -> Series | None:
+    """Return the series of a message, None where it has none. Raises ValueError."""
+    if len(message.series_u) != len(message.series_v):
+        raise ValueError('its series has different numbers of coefficients in u and in v')
+    sd = np.array(message.series_sd)
+    sd = sd.reshape(SD_GRID, SD_GRID) if len(sd) == SD_GRID**2 else sd[None]
+    return unpacked(
+        (message.image_width, message.image_height),
+        message.series_degree,
+        message.series_modes,
+        np.array([message.series_u, message.series_v]),
+        sd,
+    )

@@ -1,0 +1,153 @@
+"""Image and CompressedImage, without avoidable copies of a megabyte."""
+
+from __future__ import annotations
+
+from array import array
+
+import cv2
+import numpy as np
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
+
+from ...calibration.result import FluoroscopeCalibration
+from ...errors import DataError
+from ...images.codec import decode, encode
+from ..runtime.refusals import Refused
+
+# Pixel type of each encoding; 8UC1 and 16UC1 are the same without saying that they are grey.
+PIXEL_TYPES = {'mono8': np.uint8, '8UC1': np.uint8, 'mono16': np.uint16, '16UC1': np.uint16}
+ENCODINGS = {np.dtype(np.uint8): 'mono8', np.dtype(np.uint16): 'mono16'}
+COMPRESSIONS = {'png': '.png', 'jpeg': '.jpg'}
+# Kinds of refusals.
+IMAGE_REFUSALS = ('undecodable', 'encoding', 'image size', 'frame id', 'damaged')
+
+
+class ImageConverter:
+    """Converts the images of one fluoroscope: messages to arrays, and back in reused memory."""
+
+    def __init__(self, fluoroscope: str) -> None:
+        self._fluoroscope = fluoroscope
+        # Of one (encoding, shape): message, and its data as an array.
+        self._output: dict[tuple, tuple[Image, np.ndarray]] = {}
+
+    def to_array(
+        self, message: Image | CompressedImage, calibration: FluoroscopeCalibration
+    ) -> tuple[np.ndarray, str]:
+        """Return the grey image (h, w) uint8 or uint16, and the encoding of the corrected one.
+
+        The array is the memory of an Image where its byte order allows. Raises Refused for an
+        image that does not fit the calibration.
+        """
+        frame_id = message.header.frame_id
+        if frame_id != calibration.frame_id and frame_id and calibration.frame_id:
+            raise self._refused(
+                'frame id',
+                message,
+                f'the frame id is {frame_id}, but the calibration is of {calibration.frame_id}',
+            )
+        if isinstance(message, CompressedImage):
+            image = self._decompress(message)
+            encoding = ENCODINGS[image.dtype]
+        else:
+            image = self._view(message)
+            encoding = message.encoding
+        if image.shape[::-1] != tuple(calibration.image_size):
+            raise self._refused(
+                'image size',
+                message,
+                f'the image is {image.shape[1]} x {image.shape[0]} px, but the '
+                f'calibration is for {calibration.image_size[0]} x {calibration.image_size[1]} px',
+            )
+        return image, encoding
+
+    def prepare_output(
+        self, header: Header, encoding: str, shape: tuple[int, ...]
+    ) -> tuple[Image, np.ndarray]:
+        """Return an Image to be filled, and its pixels (h, w).
+
+        Publish it before the next call, which reuses the memory.
+        """
+        prepared = self._output.get((encoding, shape))
+        if prepared is None:
+            dtype = np.dtype(PIXEL_TYPES[encoding])
+            message = Image(
+                height=shape[0], width=shape[1], encoding=encoding, step=shape[1] * dtype.itemsize
+            )
+            # The assignment may copy: the view is of what the message has.
+            message.data = array('B', bytes(shape[0] * message.step))
+            prepared = message, np.frombuffer(message.data, dtype).reshape(shape)
+            self._output = {(encoding, shape): prepared}  # a stream has one encoding
+        prepared[0].header = header
+        return prepared
+
+    def _view(self, message: Image) -> np.ndarray:
+        pixel_type = PIXEL_TYPES.get(message.encoding)
+        if pixel_type is None:
+            raise self._refused(
+                'encoding', message, f'its encoding {message.encoding!r} is not mono8 or mono16'
+            )
+        dtype = np.dtype(pixel_type)
+        width = message.width
+        height = message.height
+        step = message.step
+        size = len(message.data)
+        row_size = width * dtype.itemsize
+        min_size = (height - 1) * step + row_size
+        if not width or not height or step < row_size or not min_size <= size <= height * step:
+            raise self._refused(
+                'image size',
+                message,
+                f'{size} bytes in rows of {step} are not an image of {width} x '
+                f'{height} px of {message.encoding}',
+            )
+        image = np.ndarray((height, width), dtype, message.data, strides=(step, dtype.itemsize))
+        if dtype == np.uint16 and message.is_bigendian:
+            return image.byteswap()
+        # OpenCV accepts no row that begins within a pixel.
+        return image if step % dtype.itemsize == 0 else image.copy()
+
+    def _decompress(self, message: CompressedImage) -> np.ndarray:
+        try:
+            return decode(message.data)
+        except DataError as error:
+            kind = 'encoding' if 'colour' in str(error) or 'pixels of' in str(error) else 'damaged'
+            raise self._refused(
+                kind, message, f'{message.format or "no format"}: {error}'
+            ) from None
+
+    def _refused(self, kind: str, message: Image | CompressedImage, reason: str) -> Refused:
+        stamp = message.header.stamp
+        return Refused(
+            kind,
+            f'fluoroscope {self._fluoroscope}, image of {stamp.sec}.{stamp.nanosec:09d} s: '
+            f'{reason}',
+        )
+
+
+def compressed_message(
+    message: Image, image: np.ndarray, kind: str, quality: int
+) -> CompressedImage:
+    """Return the CompressedImage of an Image.
+
+    Parameters
+    ----------
+    message : Image
+        Header and encoding are taken from it.
+    image : np.ndarray
+        Its pixels (h, w).
+    kind : {'png', 'jpeg'}
+        JPEG has 8 bits: images of 16 bits become png all the same.
+    quality : int
+        Of JPEG, 1 to 100.
+    """
+    kind = 'png' if image.dtype == np.uint16 else kind
+    out = CompressedImage(
+        header=message.header, format=f'{message.encoding}; {kind} compressed {message.encoding}'
+    )
+    out.data = array('B', encode(image, COMPRESSIONS[kind], quality))
+    return out
+
+
+def use_single_thread() -> None:
+    """Let OpenCV work in the calling thread: beside other streams, more threads are slower."""
+    cv2.setNumThreads(1)

@@ -1,0 +1,90 @@
+"""RigOrientation: interior and exterior orientation of the fluoroscopes of a rig, in metres."""
+
+from __future__ import annotations
+
+import numpy as np
+from fluoro_calib_msgs.msg import RigOrientation
+
+from ...errors import DataError
+from ...photogrammetry import rig_orientation as rig
+from ...photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from .fields import float64_field, nanoseconds_from_stamp, stamp_from_nanoseconds
+
+_INTERIOR = ('xp', 'yp', 'c')
+_POSITION = ('x', 'y', 'z')
+_ATTITUDE = ('qw', 'qx', 'qy', 'qz')
+MIN_QUATERNION_NORM = 0.5  # below, a quaternion is damaged and not only rounded
+
+
+def message_from_orientation(orientation: rig.RigOrientation) -> RigOrientation:
+    """Return the message of an orientation."""
+    message = RigOrientation()
+    message.header.stamp = stamp_from_nanoseconds(orientation.stamp_ns)
+    message.header.frame_id = orientation.frame_id
+    message.orientation_id = orientation.orientation_id
+    message.source = orientation.source
+    message.fluoroscope = list(orientation.fluoroscopes)
+    message.calibration_id = list(orientation.calibration_ids)
+    message.optical_frame_id = list(orientation.optical_frame_ids)
+    message.exposures = orientation.exposures
+    attitude = quaternion_from_matrix(orientation.rotation.transpose(0, 2, 1))
+    for names, columns in (
+        (_INTERIOR, orientation.interior.T),
+        (_POSITION, orientation.position_mm.T / 1000),
+        (_ATTITUDE, attitude.T),
+    ):
+        for name, column in zip(names, columns):
+            setattr(message, name, float64_field(column))
+    scale = _metre_scale(len(orientation.fluoroscopes))
+    message.covariance = float64_field(orientation.covariance * scale * scale[:, None])
+    return message
+
+
+def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
+    """Return the orientation of a message, except for rounding.
+
+    Raises DataError where the message holds no valid orientation.
+    """
+    count = len(message.fluoroscope)
+    columns = {
+        name: np.array(getattr(message, name)) for name in (*_INTERIOR, *_POSITION, *_ATTITUDE)
+    }
+    wrong = [name for name, column in columns.items() if len(column) != count]
+    if len(message.covariance) != (rig.ORIENTATION_SIZE * count) ** 2:
+        wrong.append('covariance')
+    if wrong:
+        raise DataError(
+            f'rig orientation: {count} fluoroscopes, but the array {wrong[0]} has another length'
+        )
+    scale = _metre_scale(count)
+    covariance = np.array(message.covariance).reshape(len(scale), -1) / (scale * scale[:, None])
+    attitude = np.stack([columns[name] for name in _ATTITUDE], axis=1)
+    norm = np.linalg.norm(attitude, axis=1)
+    if not np.isfinite(attitude).all() or not (norm > MIN_QUATERNION_NORM).all():
+        raise DataError('rig orientation: an attitude is not a unit quaternion')
+    return rig.RigOrientation(
+        tuple(message.fluoroscope),
+        np.stack([columns[name] for name in _INTERIOR], axis=1),
+        matrix_from_quaternion(attitude).transpose(0, 2, 1),
+        1000 * np.stack([columns[name] for name in _POSITION], axis=1),
+        covariance,
+        message.header.frame_id,
+        message.source,
+        tuple(message.calibration_id),
+        nanoseconds_from_stamp(message.header.stamp),
+        message.exposures,
+        tuple(message.optical_frame_id),
+    )
+
+
+def description_of(message: RigOrientation) -> str:
+    """Return id, source and frame of an orientation, for the log."""
+    return (
+        f'orientation {message.orientation_id} by {message.source} '
+        f'({message.exposures} exposures), in frame {message.header.frame_id}'
+    )
+
+
+def _metre_scale(count: int) -> np.ndarray:
+    """Return the factors (9 count,) that turn the unknowns of an orientation from mm into m."""
+    return np.tile(np.repeat([1e-3, 1.0], [3, 6]), count)

@@ -1,0 +1,98 @@
+"""Calibrate.srv and SelfCalibrate.action: the same request and the same result."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from fluoro_calib_msgs.action import SelfCalibrate
+
+from ...calibration.calibrate import CalibrationResult
+from ...calibration.options import CalibrationOptions
+from ...calibration.result import FluoroscopeCalibration
+from ...calibration.self_calibration import Round
+from ...validation.verdict import Validation
+
+Request = Any  # Calibrate.Request or SelfCalibrate.Goal
+Result = Any  # Calibrate.Response or SelfCalibrate.Result
+
+_REQUESTED = ('model', 'interior', 'loss', 'max_iterations')
+
+
+def options_of_request(
+    request: Request, defaults: CalibrationOptions, joint: bool
+) -> CalibrationOptions:
+    """Return the options of a request, with defaults where it leaves them open.
+
+    Raises ValueError for options that are invalid.
+    """
+    if request.principal_distance < 0 or not np.isfinite(request.principal_distance):
+        raise ValueError(
+            f'principal_distance is a length in pixels, not {request.principal_distance}'
+        )
+    requested = {name: getattr(request, name) or getattr(defaults, name) for name in _REQUESTED}
+    if not joint:
+        requested['relative_orientation'] = 'none'
+    return replace(defaults, **requested)
+
+
+def fill_feedback(feedback: SelfCalibrate.Feedback, label: str, last: Round) -> None:
+    """Fill in the feedback of a round of the fluoroscopes named by the label."""
+    feedback.fluoroscope = label
+    feedback.iteration = last.iteration
+    feedback.cost_adjustment = last.F
+    feedback.cost_regression = last.G
+    feedback.k = max(last.k.values())
+    mean_square = np.mean([np.square(rmse) for rmse in last.rmse.values()], axis=0)
+    feedback.rmse_u, feedback.rmse_v = (float(x) for x in np.sqrt(mean_square))
+
+
+def feedback_text(feedback: SelfCalibrate.Feedback) -> str:
+    """Return the feedback of a round in one line, for people."""
+    return (
+        f'fluoroscope {feedback.fluoroscope}  round {feedback.iteration:2d}  '
+        f'F {feedback.cost_adjustment:10.1f}  G {feedback.cost_regression:10.1f}  '
+        f'k {feedback.k:3d}  RMSE {feedback.rmse_u:.3f} {feedback.rmse_v:.3f} px'
+    )
+
+
+def fill_result(
+    result: Result, job: CalibrationResult, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> None:
+    """Fill in the result of a calibration that succeeded."""
+    result.success = True
+    result.seconds = job.seconds
+    for name, calibration in calibrations.items():
+        sd = np.sqrt(np.diagonal(calibration.interior_covariance))
+        result.fluoroscope = [*result.fluoroscope, name]
+        result.calibration_id = [*result.calibration_id, calibration.calibration_id]
+        result.model_kind = [*result.model_kind, calibration.model.kind]
+        result.converged = [*result.converged, calibration.converged]
+        for field, value in (
+            ('k', calibration.model.k),
+            ('iterations', calibration.iterations),
+            ('observations', calibration.observations),
+            ('inliers', calibration.inliers),
+            ('xp', calibration.interior[0]),
+            ('yp', calibration.interior[1]),
+            ('c', calibration.interior[2]),
+            ('sd_xp', sd[0]),
+            ('sd_yp', sd[1]),
+            ('sd_c', sd[2]),
+            ('rmse_before_u', calibration.rmse_before[0]),
+            ('rmse_before_v', calibration.rmse_before[1]),
+            ('rmse_after_u', calibration.rmse_after[0]),
+            ('rmse_after_v', calibration.rmse_after[1]),
+        ):
+            getattr(result, field).append(value if isinstance(value, int) else float(value))
+    note = '' if job.converged else ' (stopped at the maximum number of rounds, not converged)'
+    result.message = f'{", ".join(calibrations)} calibrated in {job.seconds:.1f} s{note}'
+
+
+def fill_verdict(result: Result, validation: Validation) -> None:
+    """Fill in the verdict on a calibration that succeeded."""
+    result.verdict = validation.verdict
+    result.findings = list(validation.findings)
+    result.message += f'; verdict: {validation.verdict}'

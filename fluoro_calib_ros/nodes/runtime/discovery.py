@@ -1,0 +1,49 @@
+"""Waiting for the other end of a topic."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Iterable
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+
+# Time in which readers discover a publisher that has discovered them, several times the measured
+# one.
+SETTLING_S = 0.3
+
+
+def wait_for_readers(
+    node: Node, publishers: Iterable[Publisher], count: int, stop: threading.Event
+) -> None:
+    """Wait until each publisher of a node has `count` readers, and these know it.
+
+    A publisher discovers a reader and the reader the publisher independently of each other. What
+    is published between these moments is lost, reliable or not, and nothing tells when the second
+    one has come. Setting `stop` ends the wait.
+    """
+    while missing := [p.topic_name for p in publishers if p.get_subscription_count() < count]:
+        node.get_logger().info(
+            f'waiting for {count} readers of {", ".join(missing)}', throttle_duration_sec=5.0
+        )
+        if stop.wait(0.05):
+            return
+    if count:
+        stop.wait(SETTLING_S)
+
+
+def wait_until_acknowledged(
+    publishers: Iterable[Publisher], stop: threading.Event, timeout_s: float = 10.0
+) -> bool:
+    """Wait until all messages have arrived, and return whether they have.
+
+    What is not acknowledged is lost when the process ends. Setting `stop` ends the wait.
+    """
+    end = time.monotonic() + timeout_s
+    for publisher in publishers:
+        while not publisher.wait_for_all_acked(Duration(seconds=0.1)):
+            if stop.is_set() or time.monotonic() > end:
+                return False
+    return True

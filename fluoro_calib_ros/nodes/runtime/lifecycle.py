@@ -1,0 +1,224 @@
+"""Managed nodes, and what the nodes that work on streams have in common."""
+
+from __future__ import annotations
+
+import traceback
+from collections.abc import Callable
+from contextlib import ExitStack
+from typing import Any, TypeVar
+
+import rclpy
+from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
+from rclpy.lifecycle.node import LifecycleState
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+
+from .diagnostics import DiagnosticsPublisher, Status
+from .errors import USER_ERRORS, StartError, one_line
+from .logging import RateLimitedLogger
+from .qos import qos_overrides
+from .refusals import RefusalLog
+from .stream_reader import FaultHandlers, StreamReader
+
+T = TypeVar('T')
+
+
+class ManagedNode(LifecycleNode):
+    """Lifecycle node that configures and activates itself, unless autostart is false.
+
+    Subclasses override configure(), activate(), deactivate() and cleanup(). The last two have to
+    work in every state. A transition that raises is undone and logged; rclpy would keep silent.
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.autostart = True
+        self.failed = False
+        self._starting = False
+        self._fault = ''
+
+    def configure(self) -> None:
+        """Make outputs and slow inputs."""
+
+    def activate(self) -> None:
+        """Begin to process streams."""
+
+    def deactivate(self) -> None:
+        """Stop processing streams."""
+
+    def cleanup(self) -> None:
+        """Destroy what configure() made."""
+
+    def bring_up(self) -> None:
+        """Configure and activate the node where it does so itself. Raises StartError."""
+        if not self.autostart:
+            return
+        self._starting = True
+        for trigger in (self.trigger_configure, self.trigger_activate):
+            if trigger() != TransitionCallbackReturn.SUCCESS:
+                raise StartError(self._fault)
+        self._starting = False
+
+    def fail(self, text: str) -> None:
+        """Log a fatal fault of the node itself and end it with exit status 1."""
+        self.get_logger().fatal(text)
+        self.failed = True
+        rclpy.try_shutdown()
+
+    def stop(self) -> None:
+        """Take everything down before the node is destroyed."""
+        self.deactivate()
+        self.cleanup()
+
+    def destroy_publisher(self, publisher: Publisher) -> bool:
+        """Destroy a publisher, also one that the lifecycle switches on and off."""
+        return self.destroy_lifecycle_publisher(publisher)
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run configure(); undo it where it fails."""
+        return self._try(self.configure, self.cleanup)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run activate(); undo it where it fails."""
+        super().on_activate(state)
+        result = self._try(self.activate, self.deactivate)
+        if result != TransitionCallbackReturn.SUCCESS:
+            super().on_deactivate(state)
+        return result
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run deactivate()."""
+        self.deactivate()
+        return super().on_deactivate(state)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Run cleanup()."""
+        self.cleanup()
+        return TransitionCallbackReturn.SUCCESS
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take everything down."""
+        self.stop()
+        return TransitionCallbackReturn.SUCCESS
+
+    def _try(
+        self, function: Callable[[], None], undo: Callable[[], None]
+    ) -> TransitionCallbackReturn:
+        try:
+            function()
+        except Exception as error:
+            is_user_error = isinstance(error, USER_ERRORS)
+            self._fault = one_line(error) if is_user_error else traceback.format_exc()
+            if not self._starting:  # else it is logged by the main loop
+                self.get_logger().error(self._fault)
+            undo()
+            return TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.SUCCESS
+
+
+class StreamNode(ManagedNode):
+    """Managed node with outputs, stream readers, and its diagnostics once a second.
+
+    Subclasses override create_outputs(), create_readers(), diagnose() and reset().
+    """
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        self.limited_logger = RateLimitedLogger(self.get_logger())
+        self.readers: list[StreamReader] = []
+        self._resources = ExitStack()
+
+    def create_outputs(self) -> None:
+        """Make what exists while the node is configured, by create_output() and own()."""
+
+    def create_readers(self) -> None:
+        """Make the stream readers of the active node by create_reader()."""
+
+    def diagnose(self) -> list[Status]:
+        """Return the state of the node."""
+        return []
+
+    def reset(self) -> None:
+        """Forget everything that was received."""
+
+    def own(self, resource: T, destroy: Callable[..., Any], *arguments: Any) -> T:
+        """Call destroy(*arguments) at cleanup, in reverse order; returns the resource."""
+        self._resources.callback(destroy, *arguments)
+        return resource
+
+    def create_output(self, kind: type, topic: str, qos: QoSProfile) -> Publisher:
+        """Make the publisher of a stream: silent while the node is inactive, QoS overridable."""
+        publisher = self.create_lifecycle_publisher(
+            kind, topic, qos, qos_overriding_options=qos_overrides()
+        )
+        return self.own(publisher, self.destroy_publisher, publisher)
+
+    def create_input(
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any], None],
+        qos: QoSProfile,
+        refusals: RefusalLog,
+    ) -> None:
+        """Subscribe to a slow topic, while configured; an exception in the callback is logged.
+
+        Parameters
+        ----------
+        kind : type
+            Message type.
+        topic : str
+        callback : callable
+            Called with every message.
+        qos : QoSProfile
+        refusals : RefusalLog
+            Counts the messages at which the callback raises.
+        """
+
+        def guarded(message: Any) -> None:
+            try:
+                callback(message)
+            except Exception as error:  # a message may hold anything and must not end the node
+                refusals.fail(topic, error)
+
+        subscription = self.create_subscription(kind, topic, guarded, qos)
+        self.own(subscription, self.destroy_subscription, subscription)
+
+    def create_reader(self, faults: FaultHandlers) -> StreamReader:
+        """Make a StreamReader that runs while the node is active."""
+        self.readers.append(StreamReader(self, faults))
+        return self.readers[-1]
+
+    def incompatible_publishers(self) -> dict[str, str]:
+        """Return a message for every topic with an incompatible publisher, and log them."""
+        found: dict[str, str] = {}
+        for reader in self.readers:
+            found.update(reader.incompatible_publishers())
+        for message in found.values():
+            self.limited_logger.warning(message)
+        return found
+
+    def configure(self) -> None:
+        """Make outputs, slow inputs and the diagnostics."""
+        self.create_outputs()
+        diagnostics = DiagnosticsPublisher(self)
+        self.own(diagnostics, diagnostics.close)
+        timer = self.create_timer(1.0, lambda: diagnostics.publish(self.diagnose()))
+        self.own(timer, self.destroy_timer, timer)
+
+    def activate(self) -> None:
+        """Start the stream readers."""
+        self.create_readers()
+        for reader in self.readers:
+            reader.start()
+
+    def deactivate(self) -> None:
+        """Stop the stream readers."""
+        for reader in self.readers:
+            reader.stop()
+        self.readers = []
+
+    def cleanup(self) -> None:
+        """Destroy outputs and inputs, and forget what was received."""
+        self._resources.close()
+        self.reset()

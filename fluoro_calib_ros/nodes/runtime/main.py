@@ -1,0 +1,97 @@
+"""Main loop of a node process: start, interrupt and end."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+from collections.abc import Callable, Sequence
+
+import rclpy
+from rclpy._rclpy_pybind11 import RCLError
+from rclpy.exceptions import ParameterException
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.signals import SignalHandlerOptions
+
+from .errors import USER_ERRORS, StartError, one_line
+
+INTERRUPTED = 130  # exit status after a second interrupt
+
+
+def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> None:
+    """Run a node until it is interrupted or the context is shut down, then exit.
+
+    The exit status is 1, after one sentence, where the node cannot start, and where its flag
+    `failed` is set; else 0. A node may have a method bring_up(), called before the loop, and a
+    method stop(), which ends everything that its callbacks wait for. The callbacks end before the
+    context does: rclpy's own signal handlers would shut it down while they run.
+    """
+    ended = threading.Event()
+    node = None
+    code = 0
+    try:
+        _init(args)
+        executor = SingleThreadedExecutor()
+
+        def end() -> None:
+            ended.set()
+            executor.create_task(lambda: None)  # something to do, so that spin_once returns
+
+        _call_on_interrupt(end)
+        node = _make(make_node)
+        executor.add_node(node)
+        getattr(node, 'bring_up', lambda: None)()
+        try:
+            while rclpy.ok() and not ended.is_set():
+                executor.spin_once()
+        except ExternalShutdownException:
+            pass
+        finally:
+            getattr(node, 'stop', lambda: None)()
+            executor.shutdown()
+        code = int(getattr(node, 'failed', False))
+    except (StartError, ParameterException) as error:
+        rclpy.logging.get_logger('fluoro_calib').fatal(str(error))
+        code = 1
+    finally:
+        if node is not None:
+            node.destroy_node()
+        rclpy.try_shutdown()
+    sys.exit(code)
+
+
+def _init(args: Sequence[str] | None) -> None:
+    try:
+        rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
+    except RCLError as error:  # invalid arguments after --ros-args
+        raise StartError(str(error).partition(', at /')[0]) from None
+
+
+def _make(make_node: Callable[[], Node]) -> Node:
+    """Make the node. Raises StartError where its arguments are invalid."""
+    try:
+        return make_node()
+    except USER_ERRORS as error:
+        raise StartError(one_line(error)) from None
+
+
+def _call_on_interrupt(end: Callable[[], None]) -> None:
+    """Call end() from a thread at SIGINT or SIGTERM, whatever the main thread waits for.
+
+    A second signal ends the process at once.
+    """
+    reading, writing = os.pipe()
+    os.set_blocking(writing, False)
+    signal.set_wakeup_fd(writing)
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: None)
+
+    def watch() -> None:
+        os.read(reading, 1)
+        end()
+        os.read(reading, 1)
+        os._exit(INTERRUPTED)
+
+    threading.Thread(target=watch, daemon=True).start()

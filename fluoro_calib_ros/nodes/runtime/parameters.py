@@ -1,0 +1,167 @@
+"""Parameters of the nodes, made from the options that dataclasses declare."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rclpy.exceptions import ParameterException
+from rclpy.node import Node
+
+from ...errors import DataError
+from ...options import Option, declared, option
+from .errors import StartError
+
+MAX_TIMEOUT_S = 86400.0  # longest time that a request may ask a node to wait
+MAX_INTEGER = 2**63 - 1
+# A fluoroscope's name is part of file names and topics.
+FLUOROSCOPE_NAME = re.compile('[A-Za-z_][A-Za-z0-9_]{0,99}')
+
+T = TypeVar('T')
+
+
+@dataclass(frozen=True)
+class RigParameters:
+    """Parameters of every node of a rig."""
+
+    fluoroscopes: tuple[str, ...] = option(('a', 'b'), 'names of the fluoroscopes')
+
+    min_fluoroscopes = 1  # not a parameter: no annotation
+
+    def __post_init__(self) -> None:
+        check_fluoroscopes(self.fluoroscopes, self.min_fluoroscopes)
+
+
+@dataclass(frozen=True)
+class ManagedParameters(RigParameters):
+    """Parameters of every managed node of a rig."""
+
+    autostart: bool = option(
+        True,
+        'whether the node configures and activates itself; else a lifecycle manager does',
+    )
+
+
+@dataclass(frozen=True)
+class ParameterGroup(Generic[T]):
+    """Options of a dataclass that are parameters of a node.
+
+    Attributes
+    ----------
+    options : type
+        Frozen dataclass that declares them.
+    names : mapping of str to str
+        Parameter names by option name; empty: all options under their own names.
+    """
+
+    options: type[T]
+    names: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def declarations(self) -> dict[str, Option]:
+        """Declared options by parameter name, in the order of `names`."""
+        options = declared(self.options)
+        names = self.names or {name: name for name in options}
+        return {
+            parameter: replace(options[name], name=parameter) for name, parameter in names.items()
+        }
+
+    def declare(self, node: Node) -> T:
+        """Declare the parameters of a node. Raises StartError for an invalid value."""
+        names = self.names or {name: name for name in declared(self.options)}
+        declarations = self.declarations
+        values = {
+            name: declare_parameter(node, declarations[parameter])
+            for name, parameter in names.items()
+        }
+        try:
+            for name, parameter in names.items():
+                declarations[parameter].validate(values[name])
+            return self.options(**values)
+        except ValueError as error:
+            raise StartError(f'parameter {error}') from None
+
+
+def declare_parameter(node: Node, declaration: Option) -> Any:
+    """Declare a read-only parameter and return its value. Raises StartError."""
+    default = declaration.default
+    is_list = isinstance(default, tuple)
+    try:
+        value = node.declare_parameter(
+            declaration.name,
+            list(default) if is_list else default,
+            descriptor_of(declaration),
+        ).value
+    except ParameterException as error:
+        raise StartError(f'parameter {declaration.name}: {error}') from None
+    if is_list:
+        return tuple(value or ())  # an empty list has no type and counts as not set
+    return value
+
+
+def descriptor_of(declaration: Option) -> ParameterDescriptor:
+    """Return the descriptor of a parameter: description, range and choices."""
+    descriptor = ParameterDescriptor(
+        name=declaration.name, description=declaration.help, read_only=True
+    )
+    if declaration.choices:
+        descriptor.additional_constraints = f'one of {", ".join(declaration.choices)}'
+    low = declaration.minimum
+    high = declaration.maximum
+    if low is None and high is None:
+        return descriptor
+    if isinstance(declaration.default, int):
+        descriptor.integer_range = [
+            IntegerRange(
+                from_value=-MAX_INTEGER if low is None else int(low),
+                to_value=MAX_INTEGER if high is None else int(high),
+            )
+        ]
+    else:
+        descriptor.floating_point_range = [
+            FloatingPointRange(
+                from_value=-sys.float_info.max if low is None else float(low),
+                to_value=sys.float_info.max if high is None else float(high),
+            )
+        ]
+    return descriptor
+
+
+def parameters_of(groups: Iterable[ParameterGroup[Any]]) -> dict[str, Option]:
+    """Return all parameters of a node by name."""
+    return {
+        name: declaration for group in groups for name, declaration in group.declarations.items()
+    }
+
+
+def check_fluoroscopes(names: tuple[str, ...], minimum: int = 1) -> None:
+    """Raise ValueError unless there are enough names, all different and valid in a topic."""
+    if len(names) < minimum or len(set(names)) != len(names):
+        more = f' ({minimum} or more)' if minimum > 1 else ''
+        raise ValueError(f'fluoroscopes: {list(names)} is not a list of different names{more}')
+    for name in names:
+        if not FLUOROSCOPE_NAME.fullmatch(name):
+            raise ValueError(
+                f'fluoroscopes: {name!r} cannot be part of the name of a topic, which consists of '
+                'letters, digits and _, and does not begin with a digit'
+            )
+
+
+def check_timeout(seconds: float) -> None:
+    """Raise ValueError for a time that a node cannot wait."""
+    if not 0 < seconds <= MAX_TIMEOUT_S:
+        limit = f', at most {MAX_TIMEOUT_S:g}' if seconds > MAX_TIMEOUT_S else ''
+        raise ValueError(f'timeout_sec is a time in seconds{limit}, not {seconds}')
+
+
+def expand_path(text: str) -> Path:
+    """Return a path with ~ expanded. Raises DataError for an unknown user."""
+    try:
+        return Path(text).expanduser()
+    except RuntimeError:
+        raise DataError(f'{text}: there is no such home folder') from None

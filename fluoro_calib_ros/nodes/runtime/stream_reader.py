@@ -1,0 +1,198 @@
+"""Receiving the messages of streams at lab rates.
+
+rclpy's executors build their wait set anew for every message, of everything a node has. With the
+services of parameters and lifecycle that takes some 0.2 ms, twice the time of handling a frame. So
+a thread of its own waits for the subscriptions of streams alone and takes all that has come;
+services and timers stay with the executor. What the two threads share is replaced as a whole,
+never changed in place.
+
+Events of these subscriptions are not requested: an event in a wait set wakes the executor at every
+message. Instead, incompatible_publishers() compares offered and requested quality of service once
+a second.
+"""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy._rclpy_pybind11 import InvalidHandle, RCLError
+from rclpy.callback_groups import CallbackGroup
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.impl.implementation_singleton import rclpy_implementation
+from rclpy.node import Node
+from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.serialization import deserialize_message
+from rclpy.subscription import Subscription
+
+from .qos import incompatible_qos_message, qos_overrides
+
+WAIT_NS = 50_000_000  # after which the thread checks whether it has to end
+# Messages of a topic that are handled before the next topic has its turn: views wait for each
+# other.
+MAX_BATCH = 8
+# What decoding a damaged message raises, in our decoders and in those of the middleware.
+DECODING_ERRORS = (ValueError, RCLError, RuntimeError, MemoryError)
+
+
+class _ReaderGroup(CallbackGroup):
+    """Callback group whose subscriptions no executor takes."""
+
+    def can_execute(self, entity: Any) -> bool:
+        return not isinstance(entity, Subscription)
+
+    def beginning_execution(self, entity: Any) -> bool:
+        return self.can_execute(entity)
+
+    def ending_execution(self, entity: Any) -> None:
+        pass
+
+
+@dataclass(frozen=True)
+class FaultHandlers:
+    """What a StreamReader calls when something goes wrong.
+
+    Attributes
+    ----------
+    undecodable : callable
+        Called with the topic of a message that cannot be decoded.
+    callback_error : callable
+        Called with topic and exception where a callback raises: that message is lost.
+    reader_error : callable
+        Called with a traceback where the thread itself fails and ends.
+    """
+
+    undecodable: Callable[[str], None]
+    callback_error: Callable[[str, Exception], None]
+    reader_error: Callable[[str], None]
+
+
+class StreamReader:
+    """Subscriptions of a node that a thread of their own serves between start() and stop()."""
+
+    def __init__(self, node: Node, faults: FaultHandlers) -> None:
+        self._node = node
+        self._faults = faults
+        self._group = _ReaderGroup()
+        # (topic, Subscription, decode, callback)
+        self._routes: list[tuple[str, Subscription, Callable, Callable]] = []
+        self._stopping = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def subscribe(
+        self,
+        kind: type,
+        topic: str,
+        callback: Callable[[Any, dict], None],
+        qos: QoSProfile,
+        decode: Callable[[bytes], Any] | None = None,
+    ) -> None:
+        """Subscribe to a topic.
+
+        Parameters
+        ----------
+        kind : type
+            Message type.
+        topic : str
+        callback : callable
+            Called with every message and a dictionary of its times, received_timestamp and
+            source_timestamp [ns, system clock].
+        qos : QoSProfile
+        decode : callable, optional
+            Makes the message from its bytes, or raises ValueError; by default that of ROS.
+        """
+        subscription = self._node.create_subscription(
+            kind,
+            topic,
+            lambda _: None,
+            qos,
+            callback_group=self._group,
+            qos_overriding_options=qos_overrides(),
+            event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+        )
+        decode = decode or (lambda data: deserialize_message(data, kind))
+        self._routes.append((topic, subscription, decode, callback))
+
+    def incompatible_publishers(self) -> dict[str, str]:
+        """Return a message for every topic with a publisher that offers less than is requested.
+
+        Keys are the topics as they were subscribed to, without namespace and remapping.
+        """
+        found = {}
+        for topic, subscription, *_ in self._routes:
+            for publisher in self._node.get_publishers_info_by_topic(subscription.topic_name):
+                result, reason = qos_check_compatible(
+                    publisher.qos_profile, subscription.qos_profile
+                )
+                if result == QoSCompatibility.ERROR:
+                    reason = reason.removeprefix('ERROR: ').strip(' ;.').lower()
+                    found[topic] = incompatible_qos_message(topic, reason)
+        return found
+
+    def start(self) -> None:
+        """Start to receive; to be called from the thread that made the subscriptions."""
+        self._stopping.clear()
+        self._thread = threading.Thread(target=self._run, name='streams', daemon=True)
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop after the message that is being handled, and destroy the subscriptions."""
+        self._stopping.set()
+        if self._thread is not None and self._thread is not threading.current_thread():
+            self._thread.join()
+        self._thread = None
+        for _, subscription, *_ in self._routes:
+            self._node.destroy_subscription(subscription)
+        self._routes = []
+
+    def _run(self) -> None:
+        try:
+            self._serve()
+        except InvalidHandle:
+            pass  # the node is being destroyed
+        except Exception:  # the thread must not die silently
+            if not self._stopping.is_set():
+                self._faults.reader_error(traceback.format_exc())
+
+    def _serve(self) -> None:
+        routes = {
+            s.handle.pointer: (topic, s.msg_type, s.handle, decode, callback)
+            for topic, s, decode, callback in self._routes
+        }
+        wait_set = rclpy_implementation.WaitSet(
+            len(routes), 0, 0, 0, 0, 0, self._node.context.handle
+        )
+        while not self._stopping.is_set() and self._node.context.ok():
+            wait_set.clear_entities()
+            for _, _, handle, *_ in routes.values():
+                wait_set.add_subscription(handle)
+            wait_set.wait(WAIT_NS)
+            for pointer in wait_set.get_ready_entities('subscription'):
+                self._drain(*routes[pointer])
+
+    def _drain(
+        self, topic: str, kind: type, handle: Any, decode: Callable, callback: Callable
+    ) -> None:
+        """Handle the messages that have come on a subscription, but at most MAX_BATCH of them."""
+        for _ in range(MAX_BATCH):
+            if self._stopping.is_set():
+                return
+            # As bytes: taking the message itself would not tell a damaged one from none.
+            received = handle.take_message(kind, True)
+            if received is None:
+                return
+            data, info = received
+            try:
+                message = decode(data)
+            except DECODING_ERRORS:
+                self._faults.undecodable(topic)
+                continue
+            try:
+                callback(message, info)
+            except Exception as error:  # this message is lost, the next ones are not
+                if self._stopping.is_set() or not self._node.context.ok():
+                    return  # the outputs are being destroyed
+                self._faults.callback_error(topic, error)

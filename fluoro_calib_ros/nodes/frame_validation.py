@@ -24,6 +24,7 @@ OBSERVED_REFUSALS = (
     'repeated target',
     'sigma',
 )
+CORRECTED_ARRAYS = ('u', 'v', 'sigma', 'correction_sd', 'status')
 CORRECTED_REFUSALS = ('undecodable', 'lengths', 'repeated target', 'sigma')
 
 
@@ -95,21 +96,9 @@ def validate_corrected(fluoroscope: str, frame: CorrectedFrame) -> None:
     """
     count = len(frame.target_id)
     where = f'fluoroscope {fluoroscope}, frame {frame.frame_number}'
-    if not len(frame.u) == len(frame.v) == len(frame.sigma) == len(frame.status) == count or (
-        len(frame.correction_sd) != count
-    ):
-        raise Refused(
-            'lengths',
-            f'{where}: '
-            + length_error(
-                frame.target_id,
-                u=frame.u,
-                v=frame.v,
-                sigma=frame.sigma,
-                correction_sd=frame.correction_sd,
-                status=frame.status,
-            ),
-        )
+    arrays = {name: getattr(frame, name) for name in CORRECTED_ARRAYS}
+    if any(len(values) != count for values in arrays.values()):
+        raise Refused('lengths', f'{where}: {length_error(frame.target_id, **arrays)}')
     if len(set(frame.target_id.tolist())) < count:
         raise Refused('repeated target', f'{where}: a target occurs more than once')
     for name, wrong in (

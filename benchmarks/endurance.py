@@ -131,8 +131,8 @@ def text_of(figures):
             else float('nan')
         )
         lines.append(
-            f'{node}: {of_one[0]:.1f} MB after a minute of the stream, {of_one[-1]:.1f} MB at the '
-            f'end, largest {max(of_one):.1f} MB, trend {slope:+.2f} MB an hour'
+            f'{node}: {of_one[0]:.1f} MB after one minute of the stream, {of_one[-1]:.1f} MB at '
+            f'the end, maximum {max(of_one):.1f} MB, trend {slope:+.2f} MB/h'
         )
     return '\n'.join(lines)
 

@@ -320,7 +320,7 @@ def text_of(results):
             'from the stamp p50 [ms]',
             'p99 [ms]',
             'max [ms]',
-            'CPU a message [us]',
+            'CPU per message [us]',
         ],
         rows,
     )

@@ -201,8 +201,8 @@ def table(outcomes):
         for suffix in ('', FROM_EXPOSURES)
     }
     lines = [
-        '| way | RMSE, 3-D [mm] | of known distortion | normalised squared error | squared '
-        'standardised epipolar distance | lost points [%] | RMSE of distances in clusters [mm] |',
+        '| correction | RMSE, 3-D [mm] | relative to known distortion | normalised squared error | '
+        'squared standardised epipolar distance | lost points [%] | RMSE of distances in clusters [mm] |',
         '| --- ' + '| ---: ' * 6 + '|',
     ]
     for way, of_rigs in outcomes.items():
@@ -228,9 +228,9 @@ def cluster_table(outcomes):
     by cluster.
     """
     lines = [
-        '| way | '
+        '| correction | '
         + ' | '.join(f'cluster {k + 1}' for k in range(len(CLUSTERS)))
-        + ' | all | largest of a rig |',
+        + ' | all | maximum of a rig |',
         '| --- ' + '| ---: ' * (len(CLUSTERS) + 2) + '|',
     ]
     for way, of_rigs in outcomes.items():

@@ -174,7 +174,7 @@ def blocks(scene_, rng, first, count, drift=None):
                     uv.shape
                 )
             found = scene_.calibrations[name].correct(uv.reshape(-1, 2), np.zeros(uv[..., 0].size))
-            # What lies beyond the calibrated area is not looked at, as by watch_views.
+            # What lies beyond the calibrated area is not looked at, as by watch_exposure.
             inside = np.where(found.status[:, None] == OUTSIDE, np.nan, found.uv)
             seen[name] = uv.reshape(-1, 2)
             corrected[name] = inside

@@ -15,7 +15,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.reconstruction.correspondence import matched
+from fluoro_calib_ros.reconstruction.correspondence import CorrectedView, match_views
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry, epipolar_residuals
 from fluoro_calib_ros.reconstruction.intersection import (
     FAILED,
@@ -128,7 +128,7 @@ def test_intersection_is_the_least_squares_solution(names):
     assert (
         (found.status == OK).all()
         and (found.rays == len(names)).all()
-        and (found.left_out == -1).all()
+        and (found.dropped_view == -1).all()
     )
 
 
@@ -137,7 +137,7 @@ def test_pycolmap_triangulates_the_same_points():
     the noise does.
     """
     orientation = orientation_of()
-    xyz, uv, sigma = seen(orientation, 10)
+    _, uv, sigma = seen(orientation, 10)
     found = Intersector(orientation).intersect(uv, sigma)
     cameras = []
     for xp, yp, c in orientation.interior:  # its pixels begin at the corner of the image
@@ -202,7 +202,7 @@ def test_covariance_is_that_of_noise_and_orientation(names):
 
 
 def test_covariance_against_monte_carlo():
-    """Points, epipolar distances and the test of the rays: normalised squares with a mean of one."""
+    """Normalised squares of points, epipolar distances and ray tests have a mean of one."""
     orientation = orientation_of()
     xyz, uv, sigma = seen(orientation, 20, noise_px=0)
     rng = np.random.default_rng(5)
@@ -330,10 +330,10 @@ def test_false_match_of_more_views_loses_its_ray(names):
     found = Intersector(orientation).intersect(uv, sigma)
     saved = found.status[:20] == OK
     assert saved.mean() >= 0.8 and set(found.status[:20][~saved]) <= {REJECTED}
-    assert (found.left_out[:20] == np.where(saved, false, -1)).all()
+    assert (found.dropped_view[:20] == np.where(saved, false, -1)).all()
     assert (found.rays[:20] == np.where(saved, count - 1, count)).all()
     assert (np.abs(found.xyz_mm[:20] - xyz[:20]) / found.sd_mm[:20])[saved].max() < 5
-    assert (found.status[20:] == OK).all() and (found.left_out[20:] == -1).all()
+    assert (found.status[20:] == OK).all() and (found.dropped_view[20:] == -1).all()
     alone = Intersector(orientation.subset(names[1:])).intersect(uv[1:, :1], sigma[1:, :1])
     np.testing.assert_allclose(found.xyz_mm[0], alone.xyz_mm[0], atol=1e-6)
     np.testing.assert_allclose(found.covariance[0], alone.covariance[0], rtol=1e-3, atol=1e-7)
@@ -406,11 +406,11 @@ def test_empty_frame_and_wrong_shapes():
     intersector = Intersector(orientation_of())
     assert intersector.intersect(np.zeros((2, 0, 2)), np.zeros((2, 0))).xyz_mm.shape == (0, 3)
     for uv, sigma in ((np.zeros((3, 4, 2)), np.ones((3, 4))), (np.zeros((2, 4, 2)), np.ones(4))):
-        with pytest.raises(ValueError, match=r'image points are \(2, n, 2\)'):
+        with pytest.raises(ValueError, match=r'image points must be \(2, n, 2\)'):
             intersector.intersect(uv, sigma)
     with pytest.raises(DataError, match='a single fluoroscope sees no third dimension'):
         Intersector(orientation_of().subset(['b']))
-    with pytest.raises(ValueError, match='reject is a number above 0'):
+    with pytest.raises(ValueError, match='reject must be above 0'):
         Intersector(orientation_of(), reject=0)
 
 
@@ -455,7 +455,7 @@ def test_a_wrong_orientation_is_refused_in_a_sentence(change, sentence):
 
 
 def test_orientation_by_name():
-    """Subsets in any order keep what belongs to each fluoroscope; the id follows from the content."""
+    """Subsets in any order keep the values of each fluoroscope; the id follows the content."""
     orientation = orientation_of(('a', 'b', 'c'))
     part = orientation.subset(['c', 'a'])
     assert part.fluoroscopes == ('c', 'a') and part.calibration_ids == ('c', 'a')
@@ -495,21 +495,24 @@ def test_views_are_matched_by_id():
     uv = [np.arange(6.0).reshape(3, 2), np.arange(8.0).reshape(4, 2) + 100]
     sigma = [np.ones(3), np.full(4, 2.0)]
     outside = [np.array([True, False, False]), np.zeros(4, dtype=bool)]
-    ids, points, sd, beyond = matched([[7, 2, 9], [2, 5, 7, 1]], uv, sigma, outside)
-    assert ids.tolist() == [1, 2, 5, 7, 9]
+    ids = [np.array([7, 2, 9]), np.array([2, 5, 7, 1])]
+    found = match_views([CorrectedView(*view) for view in zip(ids, uv, sigma, sigma, outside)])
+    assert found.target_id.tolist() == [1, 2, 5, 7, 9]
+    points = found.uv
     np.testing.assert_array_equal(points[0], [[np.nan] * 2, [2, 3], [np.nan] * 2, [0, 1], [4, 5]])
     np.testing.assert_array_equal(
         points[1], [[106, 107], [100, 101], [102, 103], [104, 105], [np.nan] * 2]
     )
-    np.testing.assert_array_equal(np.isnan(sd), np.isnan(points[:, :, 0]))
+    np.testing.assert_array_equal(np.isnan(found.sigma), np.isnan(points[:, :, 0]))
+    np.testing.assert_array_equal(found.correction_sd, found.sigma)
+    beyond = found.outside
     assert beyond[0].tolist() == [False, False, False, True, False] and not beyond[1].any()
-    same = np.array([7, 2, 9])
-    ids, points, sd, beyond = matched(
-        [same, same.copy()], [uv[0], uv[1][:3]], [sigma[0], sigma[1][:3]]
-    )
-    assert ids.tolist() == [7, 2, 9] and beyond is None
-    np.testing.assert_array_equal(points, [uv[0], uv[1][:3]])
-    assert sd.shape == (2, 3)
+    same = CorrectedView(ids[0], uv[0], sigma[0], sigma[0], outside[1][:3])
+    other = replace(same, target_id=ids[0].copy(), uv=uv[1][:3], sigma=sigma[1][:3])
+    found = match_views([same, other])
+    assert found.target_id.tolist() == [7, 2, 9] and not found.outside.any()
+    np.testing.assert_array_equal(found.uv, [uv[0], uv[1][:3]])
+    assert found.sigma.shape == (2, 3)
 
 
 def recording(count=3, **change):

@@ -20,13 +20,12 @@ from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.rig_orientation import save_orientation
 from fluoro_calib_ros.jobs.dataset import write_bag
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
-from fluoro_calib_ros.reconstruction.correspondence import matched
+from fluoro_calib_ros.reconstruction.correspondence import CorrectedView, match_views
 from fluoro_calib_ros.reconstruction.intersection import OK, SINGLE_VIEW, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import (
-    CorrectedView,
-    intersect_views,
+    intersect_exposure,
     reconstruct_recording,
-    watch_views,
+    watch_exposure,
 )
 from fluoro_calib_ros.simulation.rig import simulate_tracking, virtual_rig
 
@@ -115,21 +114,22 @@ def test_a_missing_view_is_matched_as_one_that_sees_nothing():
     ids = np.array([7, 2, 9])
     uv = np.arange(6.0).reshape(3, 2)
     sigma = np.array([0.1, 0.2, 0.3])
-    for outside in (None, [np.array([True, False, False]), None, np.zeros(3, dtype=bool)]):
-        found = matched([ids, None, ids], [uv, None, uv + 1], [sigma, None, sigma], outside)
-        assert found[0].tolist() == [7, 2, 9]
-        np.testing.assert_array_equal(found[1], [uv, np.full((3, 2), np.nan), uv + 1])
-        np.testing.assert_array_equal(found[2], [sigma, np.full(3, np.nan), sigma])
-        assert (
-            found[3] is None
-            if outside is None
-            else found[3].tolist() == [[True, False, False]] + 2 * [3 * [False]]
-        )
-    other = matched([ids[:2], None, ids], [uv[:2], None, uv], [sigma[:2], None, sigma])
+    inside = np.zeros(3, dtype=bool)
+    for outside in (inside, np.array([True, False, False])):
+        first = CorrectedView(ids, uv, sigma, sigma / 2, outside)
+        found = match_views([first, None, CorrectedView(ids, uv + 1, sigma, sigma, inside)])
+        assert found.target_id.tolist() == [7, 2, 9]
+        np.testing.assert_array_equal(found.uv, [uv, np.full((3, 2), np.nan), uv + 1])
+        np.testing.assert_array_equal(found.sigma, [sigma, np.full(3, np.nan), sigma])
+        np.testing.assert_array_equal(found.correction_sd, [sigma / 2, np.full(3, np.nan), sigma])
+        assert found.outside.tolist() == [outside.tolist()] + 2 * [3 * [False]]
+    first = CorrectedView(ids[:2], uv[:2], sigma[:2], sigma[:2], inside[:2])
+    other = match_views([first, None, CorrectedView(ids, uv, sigma, sigma, inside)])
     assert (
-        other[0].tolist() == [2, 7, 9]
-        and np.isnan(other[1][0, 2]).all()
-        and np.isnan(other[2][1]).all()
+        other.target_id.tolist() == [2, 7, 9]
+        and np.isnan(other.uv[0, 2]).all()
+        and np.isnan(other.sigma[1]).all()
+        and not other.outside.any()
     )
 
 
@@ -247,9 +247,8 @@ def test_what_lies_beyond_the_calibrated_area_is_no_drift(outside):
             )
             for f in exposure
         ]
-        watch_views(
-            watch, exposure[0].stamp_ns, views, intersect_views(views, Intersector(orientation))
-        )
+        found = intersect_exposure(views, Intersector(orientation))
+        watch_exposure(watch, exposure[0].stamp_ns, found)
     assert watch.verdict().level == ('ok' if outside else 'error')
 
 
@@ -293,7 +292,8 @@ def test_what_cannot_be_told_is_not_called_ok():
     frames = tracking(30.0, 30.0, 'ab').frames
     short = watched({name: of_one[:320] for name, of_one in frames.items()}, 'ab').verdict()
     assert short.level == 'learning' and short.message == (
-        'the recording is too short to detect a drift: it has 10.6 s, of which the first 10 s are learned'
+        'the recording is too short to detect a drift: it has 10.6 s, '
+        'of which the first 10 s are learned'
     )
     apart = {**frames, 'b': [replace(f, target_id=f.target_id + 100) for f in frames['b']]}
     few = {
@@ -331,7 +331,7 @@ def test_views_that_are_missing_are_no_drift_and_hide_none():
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """Calibrations and orientation of a rig of three, and bags: healthy, drifted and short ones."""
+    """Calibrations and orientation of a rig of three, with healthy, drifted and short bags."""
     path = tmp_path_factory.mktemp('recording')
     calibrations, orientation = known()
     for calibration in calibrations.values():

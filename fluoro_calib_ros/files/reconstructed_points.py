@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ..reconstruction.intersection import STATUS
+from ..reconstruction.intersection import STATUS_NAMES
 from .atomic import atomic_file
 from .csv_table import cell_of, write_rows
 
@@ -41,7 +41,7 @@ def write_reconstruction(path, frames):
                         target,
                         *map(cell_of, row),
                         rays,
-                        STATUS[status],
+                        STATUS_NAMES[status],
                     ]
                     for target, row, rays, status in zip(
                         frame.target_id.tolist(),

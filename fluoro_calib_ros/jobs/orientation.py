@@ -13,7 +13,7 @@ from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import Intersector
-from ..reconstruction.reconstruct import reconstruct_frame
+from ..reconstruction.reconstruct import reconstruct_exposure
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ def orient(
     orientation = orientation_of_capture(
         frames, phantom, calibrations, frame_id, raise_if_cancelled=raise_if_cancelled
     )
-    found = reconstruct_frame(
+    found = reconstruct_exposure(
         standing_frames(frames, calibrations), calibrations, Intersector(orientation)
     )
     offset = found.points.xyz_mm - phantom.xyz_mm[phantom.index(found.target_id)]

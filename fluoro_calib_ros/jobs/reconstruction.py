@@ -14,7 +14,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame
 from ..options import option, validate_options
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..reconstruction.intersection import STATUS, Intersector
+from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
 
 PAIR_BY = ('frame_number', 'stamp')
@@ -78,7 +78,7 @@ class ReconstructionOutcome:
     def status_counts(self) -> dict[str, int]:
         """Number of points by status."""
         status = np.concatenate([frame.points.status for frame in self.frames])
-        return dict(zip(STATUS, np.bincount(status, minlength=len(STATUS)).tolist()))
+        return dict(zip(STATUS_NAMES, np.bincount(status, minlength=len(STATUS_NAMES)).tolist()))
 
 
 def reconstruct(

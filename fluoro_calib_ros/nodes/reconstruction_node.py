@@ -28,6 +28,7 @@ from ..exposures.pairing import PairingOptions, exposure_pairer
 from ..files.rig_orientation import load_orientation
 from ..options import option
 from ..photogrammetry import rig_orientation
+from ..reconstruction.correspondence import CorrectedView
 from ..reconstruction.intersection import (
     FAILED,
     OUTSIDE,
@@ -36,7 +37,7 @@ from ..reconstruction.intersection import (
     IntersectedPoints,
     Intersector,
 )
-from ..reconstruction.reconstruct import CorrectedView, intersect_views, watch_views
+from ..reconstruction.reconstruct import intersect_exposure, watch_exposure
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected
 from .messages.camera_info import image_size_of
@@ -327,7 +328,7 @@ class ReconstructionNode(StreamNode):
         ]
         first = next(exposure[name] for name in self._names if name in exposure)
         self._drift.newest = rig.watch, rig.orientation, first.stamp_ns
-        found = intersect_views(views, rig.intersector)
+        found = intersect_exposure(views, rig.intersector)
         content = PointsContent(
             first.stamp_ns,
             first.frame.frame_number,
@@ -341,7 +342,7 @@ class ReconstructionNode(StreamNode):
         self._count_points(found.points)
         self._publish_views(content)
         if rig.watch is not None:
-            watch_views(rig.watch, first.stamp_ns, views, found)
+            watch_exposure(rig.watch, first.stamp_ns, found)
 
     def _count_points(self, points: IntersectedPoints) -> None:
         """Count the points by status."""

@@ -1,54 +1,96 @@
-"""Bringing together the image points of one exposure that bear the same id in several views."""
+"""Matching of the image points of one exposure that have the same target id in several views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
 
-def matched(target_ids, uv, sigma, outside=None):
-    """Image points of F views by target: ids (n,), uv (F, n, 2) and sigma (F, n) [px], and outside
-    (F, n).
+@dataclass(frozen=True)
+class CorrectedView:
+    """Corrected image points of one view of an exposure.
 
-    target_ids, uv, sigma and outside: for each view its ids (n_f,), each once, image points (n_f,
-    2), standard deviations (n_f,) [px] and, True or False, what lies beyond the calibrated area
-    (n_f,); outside None: None is returned. A view has NaN and False where it does not have a
-    target; one that is missing, for which all of these are None, throughout. Ids are ascending, or
-    where all views have the same in the same order, in that order.
+    Attributes
+    ----------
+    target_id : ndarray
+        (n,), each once.
+    uv : ndarray
+        (n, 2), corrected pixels.
+    sigma, correction_sd : ndarray
+        (n,), standard deviations of the coordinates, and of the correction alone [px].
+    outside : ndarray
+        (n,), True beyond the calibrated area.
     """
-    if any(ids is None for ids in target_ids):
-        return _with_gaps(target_ids, uv, sigma, outside)
-    target_ids = [np.asarray(ids) for ids in target_ids]
-    first = target_ids[0]
-    if all(len(ids) == len(first) and (ids == first).all() for ids in target_ids[1:]):
-        return (
+
+    target_id: np.ndarray
+    uv: np.ndarray
+    sigma: np.ndarray
+    correction_sd: np.ndarray
+    outside: np.ndarray
+
+
+@dataclass(frozen=True)
+class MatchedViews:
+    """Corrected image points of F views of an exposure, by target.
+
+    Values are NaN, and `outside` False, where a view does not see a target.
+
+    Attributes
+    ----------
+    target_id : ndarray
+        (n,), ascending; or, where all views have the same ids in the same order, in that order.
+    uv : ndarray
+        (F, n, 2), corrected pixels.
+    sigma, correction_sd : ndarray
+        (F, n), standard deviations of the coordinates, and of the correction alone [px].
+    outside : ndarray
+        (F, n), True beyond the calibrated area.
+    """
+
+    target_id: np.ndarray
+    uv: np.ndarray
+    sigma: np.ndarray
+    correction_sd: np.ndarray
+    outside: np.ndarray
+
+
+def match_views(views: Sequence[CorrectedView | None]) -> MatchedViews:
+    """Match the views of an exposure by target id; None stands for a view that is missing.
+
+    At least one view must be there.
+    """
+    present = [view for view in views if view is not None]
+    first = present[0].target_id
+    if len(present) == len(views) and all(_equal(first, view.target_id) for view in present[1:]):
+        return MatchedViews(
             first,
-            np.array(uv, dtype=float).reshape(len(uv), -1, 2),
-            np.array(sigma, dtype=float),
-            None if outside is None else np.array(outside, dtype=bool),
+            np.array([view.uv for view in present], dtype=float).reshape(len(views), -1, 2),
+            np.array([view.sigma for view in present], dtype=float),
+            np.array([view.correction_sd for view in present], dtype=float),
+            np.array([view.outside for view in present], dtype=bool),
         )
-    every = np.unique(np.concatenate(target_ids))
-    shape = (len(target_ids), len(every))
-    out_uv = np.full(shape + (2,), np.nan)
-    out_sigma = np.full(shape, np.nan)
-    out_outside = None if outside is None else np.zeros(shape, dtype=bool)
-    for view, ids in enumerate(target_ids):
-        rows = np.searchsorted(every, ids)
-        out_uv[view, rows] = uv[view]
-        out_sigma[view, rows] = sigma[view]
-        if outside is not None:
-            out_outside[view, rows] = outside[view]
-    return every, out_uv, out_sigma, out_outside
+    if all(_equal(first, view.target_id) for view in present[1:]):
+        target_id = first
+        rows: list[np.ndarray | slice] = [slice(None)] * len(present)
+    else:
+        target_id = np.unique(np.concatenate([view.target_id for view in present]))
+        rows = [np.searchsorted(target_id, view.target_id) for view in present]
+    shape = (len(views), len(target_id))
+    uv = np.full((*shape, 2), np.nan)
+    sigma = np.full(shape, np.nan)
+    correction_sd = np.full(shape, np.nan)
+    outside = np.zeros(shape, dtype=bool)
+    numbers = [number for number, view in enumerate(views) if view is not None]
+    for number, view, row in zip(numbers, present, rows):
+        uv[number, row] = view.uv
+        sigma[number, row] = view.sigma
+        correction_sd[number, row] = view.correction_sd
+        outside[number, row] = view.outside
+    return MatchedViews(target_id, uv, sigma, correction_sd, outside)
 
 
-def _with_gaps(target_ids, uv, sigma, outside):
-    """As matched, of views of which some are missing."""
-    there = [view for view, ids in enumerate(target_ids) if ids is not None]
-    ids, *found = matched(
-        *([values[view] for view in there] for values in (target_ids, uv, sigma)),
-        None if outside is None else [outside[view] for view in there],
-    )
-    out = []
-    for part, missing in zip(found, (np.nan, np.nan, False)):
-        if part is not None:
-            whole = np.full((len(target_ids), *part.shape[1:]), missing, dtype=part.dtype)
-            whole[there] = part
-        out.append(None if part is None else whole)
-    return ids, *out
+def _equal(one: np.ndarray, other: np.ndarray) -> bool:
+    """Whether two views have the same ids in the same order."""
+    return len(one) == len(other) and bool((one == other).all())

@@ -1,44 +1,59 @@
 """Intersection of rays: points in space from their image points in two or more corrected views.
 
 Maximum likelihood (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004, ch. 12):
-weighted least squares of the image residuals by Gauss-Newton, from the linear solution (12.2,
-inhomogeneous). Its covariance is by the law of propagation that of the image points and that of
-the rig's orientation o together,
+weighted least squares of the image residuals by Gauss-Newton, started from the linear solution
+(12.2, inhomogeneous). The covariance is propagated from the image points and the orientation o of
+the rig together,
 
-    P = X + dP/do do,  dP/do = -(A^T W A)^-1 A^T W B,  A and B the derivatives of the image points
-    by P and by o
+    P = X + dP/do do,  dP/do = -(A^T W A)^-1 A^T W B,
 
-(Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 2.7 and 4.2). Everything
-is calculated for all points of a frame at once: a frame has a few dozen points and a millisecond,
-and a numpy call costs a microsecond.
+where A and B are the derivatives of the image points by P and by o (Foerstner and Wrobel,
+"Photogrammetric Computer Vision", Springer 2016, 2.7 and 4.2). Everything is calculated for all
+points of a frame at once: a frame has a few dozen points and must take less than a millisecond,
+and each numpy call costs a microsecond.
 """
 
+from __future__ import annotations
+
 from dataclasses import dataclass, fields, replace
+from enum import IntEnum
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.special import chdtri, erfc
 
 from ..errors import DataError
-from ..photogrammetry.rig_orientation import ORIENTATION_SIZE
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 
-# status of a point
-OK = 0
-OUTSIDE = 1
-REJECTED = 2
-FAILED = 3
-SINGLE_VIEW = 4
-STATUS = ('OK', 'OUTSIDE', 'REJECTED', 'FAILED', 'SINGLE_VIEW')  # text of each status
+
+class PointStatus(IntEnum):
+    """Status of an intersected point; the values are those of the message ReconstructedPoints."""
+
+    OK = 0
+    OUTSIDE = 1  # one of the image points is beyond the calibrated area
+    REJECTED = 2  # a false match: the rays do not meet
+    FAILED = 3  # the rays are parallel, or meet behind a source
+    SINGLE_VIEW = 4  # seen by one fluoroscope, or by none
+
+
+# Plain integers: numpy compares arrays with them faster than with members of the enumeration.
+OK = int(PointStatus.OK)
+OUTSIDE = int(PointStatus.OUTSIDE)
+REJECTED = int(PointStatus.REJECTED)
+FAILED = int(PointStatus.FAILED)
+SINGLE_VIEW = int(PointStatus.SINGLE_VIEW)
+STATUS_NAMES = tuple(status.name for status in PointStatus)
 MAX_STEPS = 10
-# Square of a step, in standard deviations, after which none is taken: the error shrinks by the
-# residual over the principal distance in each, a thousandth, so that what is left is 1e-4 standard
-# deviations.
-SETTLED = 1e-2
-# Determinant of a normal matrix over the cube of its mean diagonal: rays that meet under 1e-4 rad
-# are parallel.
+# Square of a step, in standard deviations, after which the iteration ends. A step reduces the
+# error by the residual over the principal distance, a thousandth, so 1e-4 standard deviations
+# remain.
+MAX_LAST_STEP = 1e-2
+# Determinant of a normal matrix over the cube of its mean diagonal: rays that meet at less than
+# 1e-4 rad count as parallel.
 MIN_DETERMINANT = 1e-8
-_FUNCTIONS = (
-    9  # of x, y and 1/Z, of which the derivatives of an image point by T, w, xp, yp, c consist
-)
+# The derivatives of an image point by T, w, xp, yp, c are combinations of so many functions of
+# x, y and 1/Z.
+_FUNCTIONS = 9
 _COFACTORS = np.array(
     [
         [4, 5, 3, 7, 8, 6, 1, 2, 0],
@@ -53,15 +68,28 @@ _COFACTORS = np.array(
 class IntersectedPoints:
     """Points in the rig frame.
 
-    xyz_mm (n, 3); covariance (n, 3, 3) [mm^2] by image points and orientation of the rig;
-    covariance_noise (n, 3, 3) by the image points alone (noise and correction), which is that of
-    one point against another; residual (n,) RMS of the image residuals [px]; rays (n,) used;
-    standardised (n,): the root of the weighted square sum of the residuals over its expectation,
-    for two rays the epipolar distance over its standard deviation (sd_total); status (n,) OK,
-    OUTSIDE (one of the image points lies beyond the calibrated area), REJECTED (a false match: the
-    rays do not meet), FAILED (they are parallel, or meet behind a source) or SINGLE_VIEW (one
-    fluoroscope alone sees it, or none); left_out (n,): number of the fluoroscope whose ray was
-    thrown out, else -1. But for OK and OUTSIDE coordinates and covariances are NaN.
+    Coordinates and covariances are NaN unless the status is OK or OUTSIDE.
+
+    Attributes
+    ----------
+    xyz_mm : ndarray
+        (n, 3)
+    covariance : ndarray
+        (n, 3, 3), by the image points and the orientation of the rig [mm^2].
+    covariance_noise : ndarray
+        (n, 3, 3), by the image points alone, that is by noise and correction [mm^2]. It is the
+        one for positions of points relative to each other.
+    residual : ndarray
+        (n,), RMS of the image residuals [px].
+    rays : ndarray
+        (n,), number of rays used.
+    standardised : ndarray
+        (n,), root of the weighted square sum of the residuals over its expectation; for two rays
+        the epipolar distance over its standard deviation (sd_total).
+    status : ndarray
+        (n,), PointStatus as uint8.
+    dropped_view : ndarray
+        (n,), number of the fluoroscope whose ray was dropped as false, else -1.
     """
 
     xyz_mm: np.ndarray
@@ -71,48 +99,60 @@ class IntersectedPoints:
     rays: np.ndarray
     standardised: np.ndarray
     status: np.ndarray
-    left_out: np.ndarray
+    dropped_view: np.ndarray
 
     @property
-    def sd_mm(self):
+    def sd_mm(self) -> np.ndarray:
         """Standard deviations (n, 3) of the coordinates [mm]."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
 
 @dataclass(frozen=True)
 class _Solution:
-    """IntersectedPoints before the judgement: rays (n,) of each, bad: no intersection."""
+    """Least-squares solution of n points; failed (n,): the rays have no intersection."""
 
     xyz: np.ndarray
     covariance: np.ndarray
     noise: np.ndarray
     residual: np.ndarray
     standardised: np.ndarray
-    bad: np.ndarray
+    failed: np.ndarray
 
 
 class Intersector:
     """Intersection of rays for one RigOrientation, built once for all frames.
 
-    reject: standardised epipolar distance above which two rays do not belong together; None:
-    never; with more rays the quantile of chi-square of the same probability, and the one ray
-    without which the others agree is left out. Raises DataError for a rig of one fluoroscope,
-    ValueError for reject that is not above 0.
+    Parameters
+    ----------
+    orientation : RigOrientation
+        Of two or more fluoroscopes.
+    reject : float or None
+        Standardised epipolar distance above which two rays do not belong together; None: accept
+        all. With more rays the limit is the quantile of chi-square of the same probability, and a
+        ray is dropped if the others agree without it.
+
+    Raises
+    ------
+    DataError
+        For a rig of one fluoroscope.
+    ValueError
+        If reject is not above 0.
     """
 
-    def __init__(self, orientation, reject=4.0):
+    def __init__(self, orientation: RigOrientation, reject: float | None = 4.0) -> None:
         if len(orientation.fluoroscopes) < 2:
             raise DataError(
                 'rig orientation: a single fluoroscope sees no third dimension, two are needed'
             )
         if reject is not None and not reject > 0:
-            raise ValueError(f'reject is a number above 0, not {reject}')
+            raise ValueError(f'reject must be above 0, not {reject}')
         self.orientation = orientation
         self.reject = reject
         interior = orientation.interior
         count = len(orientation.fluoroscopes)
         camera = np.zeros((count, 3, 3))
-        camera[:, 0, 0] = camera[:, 1, 1] = interior[:, 2]
+        camera[:, 0, 0] = interior[:, 2]
+        camera[:, 1, 1] = interior[:, 2]
         camera[:, :, 2] = np.column_stack([interior[:, :2], np.ones(count)])
         rows = camera @ orientation.rotation
         shift = -(rows @ orientation.position_mm[:, :, None])[:, :, 0]
@@ -125,19 +165,34 @@ class Intersector:
         self._distance = interior[:, 2:]
         depth = _depth_of_axes(orientation)
         self._start_rows = rows / depth[:, None, None], shift / depth[:, None]
-        self._by_orientation = _through(
+        self._by_orientation = _by_independent_unknowns(
             _derivative_functions(orientation), orientation.covariance_root()
         )
         self._limit = _limits(np.inf if reject is None else float(reject), count)
 
-    def intersect(self, uv, sigma, outside=None):
-        """IntersectedPoints of corrected image points uv (F, n, 2) [px] with standard deviations
-        sigma (F, n) of their coordinates [px], in the order of the orientation's fluoroscopes; NaN
-        where a fluoroscope does not see a point.
+    def intersect(
+        self, uv: ArrayLike, sigma: ArrayLike, outside: ArrayLike | None = None
+    ) -> IntersectedPoints:
+        """Intersect the rays of n points.
 
-        outside (F, n): True for image points beyond the calibrated area; None: there are none.
-        Raises ValueError for arrays of other shapes; nothing that the points themselves are
-        raises.
+        Parameters
+        ----------
+        uv : array_like
+            (F, n, 2), corrected pixels in the order of the orientation's fluoroscopes, NaN where
+            a fluoroscope does not see a point.
+        sigma : array_like
+            (F, n), standard deviations of their coordinates [px].
+        outside : array_like, optional
+            (F, n), True for image points beyond the calibrated area.
+
+        Returns
+        -------
+        IntersectedPoints
+
+        Raises
+        ------
+        ValueError
+            For arrays of other shapes. Values of the points never raise; see PointStatus.
         """
         uv = np.asarray(uv, dtype=float)
         sigma = np.asarray(sigma, dtype=float)
@@ -148,38 +203,37 @@ class Intersector:
             or sigma.shape != uv.shape[:2]
         ):
             raise ValueError(
-                f'image points are ({self._count}, n, 2) and sigma ({self._count}, n), '
+                f'image points must be ({self._count}, n, 2) and sigma ({self._count}, n), '
                 f'not {uv.shape} and {sigma.shape}'
             )
         with np.errstate(all='ignore'):
             found = self._intersect(uv.transpose(1, 0, 2), sigma.T**-2.0)
         if outside is not None and np.any(outside):
-            used = np.isfinite(sigma) & (np.arange(self._count)[:, None] != found.left_out)
+            used = np.isfinite(sigma) & (np.arange(self._count)[:, None] != found.dropped_view)
             found.status[(found.status == OK) & (used & outside).any(axis=0)] = OUTSIDE
         return found
 
-    def _intersect(self, uv, weight):
-        """IntersectedPoints of image points uv (n, F, 2) of weights (n, F) [1/px^2]; NaN for those
-        that are not there.
-        """
+    def _intersect(self, uv: np.ndarray, weight: np.ndarray) -> IntersectedPoints:
+        """Intersect image points uv (n, F, 2) of weights (n, F) [1/px^2], NaN where unseen."""
         seen = np.isfinite(uv.sum(axis=2) + weight)
         rays = seen.sum(axis=1)
         if rays.min(initial=self._count) == self._count:  # the usual frame: nothing to mask
-            return self._judged(uv, weight, rays, self._solve(uv, weight, rays))
+            return self._classified(uv, weight, rays, self._solve(uv, weight, rays))
         uv = np.where(seen[:, :, None], uv, 0.0)
         weight = np.where(seen, weight, 0.0)
         enough = rays >= 2
-        found = self._judged(
+        found = self._classified(
             uv[enough],
             weight[enough],
             rays[enough],
             self._solve(uv[enough], weight[enough], rays[enough]),
         )
-        return found if enough.all() else _scattered(found, enough, rays)
+        return found if enough.all() else _expanded(found, enough, rays)
 
-    def _solve(self, uv, weight, rays):
-        """_Solution of image points uv (n, F, 2), of weights (n, F) [1/px^2], zero for those that
-        are not there.
+    def _solve(self, uv: np.ndarray, weight: np.ndarray, rays: np.ndarray) -> _Solution:
+        """Solve for the points of image points uv (n, F, 2).
+
+        Weights (n, F) [1/px^2] are 0 where a point is unseen; rays (n,) is their number.
         """
         n, count = weight.shape
         flat = np.repeat(weight, 2, axis=1)[:, :, None]
@@ -198,36 +252,33 @@ class Intersector:
             inverse, determinant = _inverse(weighted @ a)
             step = inverse @ right
             xyz = xyz + step[:, :, 0]
-            if not (
-                (right * step).sum(axis=1) > SETTLED
-            ).any():  # NaN, of rays that do not meet, is no step
+            # NaN, of rays that do not meet, does not keep the iteration going.
+            if not ((right * step).sum(axis=1) > MAX_LAST_STEP).any():
                 break
         r = r - a @ step
         squares = flat[:, :, 0] * (r * r)[:, :, 0]
-        by_image = self._by_image(predicted, depth)
-        by_point = (inverse @ weighted) @ by_image
-        left = by_image - a @ by_point
+        by_rig = self._image_jacobian(predicted, depth)
+        by_point = (inverse @ weighted) @ by_rig
+        by_residual = by_rig - a @ by_point
         freedom = 2 * rays - 3
-        expected = freedom + ((left * left).sum(axis=2) * flat[:, :, 0]).sum(axis=1)
+        expected = freedom + ((by_residual * by_residual).sum(axis=2) * flat[:, :, 0]).sum(axis=1)
         residual = np.sqrt(((r * r)[:, :, 0] * (flat[:, :, 0] > 0)).sum(axis=1) / (2 * rays))
-        bad = ~(np.where(weight > 0, depth, 1.0).min(axis=1, initial=1.0) > 0) | ~(
-            determinant > MIN_DETERMINANT
-        )
+        in_front = np.where(weight > 0, depth, 1.0).min(axis=1, initial=1.0) > 0
         return _Solution(
             xyz,
             inverse + by_point @ by_point.transpose(0, 2, 1),
             inverse,
             residual,
             np.sqrt(squares.sum(axis=1) / expected),
-            bad,
+            ~in_front | ~(determinant > MIN_DETERMINANT),
         )
 
-    def _start(self, uv, flat):
-        """Linear solution (n, 3) for image points uv (n, F, 2); flat (n, 2F, 1): weights of the
-        coordinates.
+    def _start(self, uv: np.ndarray, flat: np.ndarray) -> np.ndarray:
+        """Linear solution (n, 3) for image points uv (n, F, 2).
 
-        (P_1 - u P_3) (X, 1) = 0 and the same of v, with the projection matrices scaled so that a
-        point where the axes meet has depth one.
+        flat (n, 2F, 1): weights of the coordinates. It solves (P_1 - u P_3) (X, 1) = 0, and the
+        same for v, with the projection matrices scaled so that a point where the axes meet has
+        depth one.
         """
         rows, shift = self._start_rows
         a = (rows[:, :2] - uv[:, :, :, None] * rows[:, 2:]).reshape(-1, 2 * self._count, 3)
@@ -235,9 +286,11 @@ class Intersector:
         weighted = (a * flat).transpose(0, 2, 1)
         return (_inverse(weighted @ a)[0] @ (weighted @ b))[:, :, 0]
 
-    def _by_image(self, predicted, depth):
-        """Derivatives (n, 2F, 9F) of the image points by independent unknowns of the orientation
-        of variance one.
+    def _image_jacobian(self, predicted: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Derivatives (n, 2F, 9F) of the image points by the orientation.
+
+        Its unknowns are expressed by independent ones of variance one. predicted (n, F, 2) [px],
+        depth (n, F) [mm].
         """
         n, count = depth.shape
         functions = np.empty((count, n, _FUNCTIONS))
@@ -255,73 +308,78 @@ class Intersector:
             .reshape(n, 2 * count, ORIENTATION_SIZE * count)
         )
 
-    def _judged(self, uv, weight, rays, found):
-        """IntersectedPoints of a _Solution: rays that do not agree are thrown out, and points that
-        stay in doubt.
-        """
-        wrong = found.bad | (found.standardised > self._limit[rays])
-        left_out = np.full(len(rays), -1)
+    def _classified(
+        self, uv: np.ndarray, weight: np.ndarray, rays: np.ndarray, solution: _Solution
+    ) -> IntersectedPoints:
+        """Give the points of a solution their status; drop false rays where the others agree."""
+        wrong = solution.failed | (solution.standardised > self._limit[rays])
+        dropped_view = np.full(len(rays), -1)
         if wrong.any():
-            again = np.flatnonzero(wrong & (rays > 2))
-            if len(again):
-                found, left_out[again] = self._without_one(
-                    uv[again], weight[again], rays[again], again, found
+            rows = np.flatnonzero(wrong & (rays > 2))
+            if len(rows):
+                solution, dropped_view[rows] = self._drop_one_ray(
+                    uv[rows], weight[rows], rays[rows], rows, solution
                 )
-                rays = rays - (left_out >= 0)
-                wrong = wrong & (left_out < 0)
-            found = _blanked(found, wrong)
-        status = np.where(wrong, np.where(found.bad, FAILED, REJECTED), OK).astype(np.uint8)
+                rays = rays - (dropped_view >= 0)
+                wrong = wrong & (dropped_view < 0)
+            solution = _without_points(solution, wrong)
+        status = np.where(wrong, np.where(solution.failed, FAILED, REJECTED), OK).astype(np.uint8)
         return IntersectedPoints(
-            found.xyz,
-            found.covariance,
-            found.noise,
-            found.residual,
+            solution.xyz,
+            solution.covariance,
+            solution.noise,
+            solution.residual,
             rays,
-            found.standardised,
+            solution.standardised,
             status,
-            left_out,
+            dropped_view,
         )
 
-    def _without_one(self, uv, weight, rays, rows, found):
-        """A _Solution in which the points in rows (m,) are, and number (m,) of the ray each does
-        without.
+    def _drop_one_ray(
+        self,
+        uv: np.ndarray,
+        weight: np.ndarray,
+        rays: np.ndarray,
+        rows: np.ndarray,
+        solution: _Solution,
+    ) -> tuple[_Solution, np.ndarray]:
+        """Replace points of a solution by those without their false ray.
 
-        Of image points uv (m, F, 2) every ray is left out in turn. Where the others agree in one
-        case alone, that is the solution; where in none or in more, -1: which ray is the false one
-        cannot be told.
+        Each ray of the image points uv (m, F, 2) of the points in rows (m,) is dropped in turn.
+        If the remaining rays agree in exactly one case, that is the solution. Otherwise the false
+        ray cannot be identified. Returns the solution and the number (m,) of the dropped
+        fluoroscope, -1 where there is none.
         """
         m, count = weight.shape
-        kept = (weight[:, None, :] * (1 - np.eye(count))).reshape(m * count, count)
+        remaining = (weight[:, None, :] * (1 - np.eye(count))).reshape(m * count, count)
         fewer = np.repeat(rays - 1, count)
-        tried = self._solve(np.repeat(uv, count, axis=0), kept, fewer)
-        agree = (~tried.bad & (tried.standardised <= self._limit[fewer])).reshape(m, count) & (
-            weight > 0
-        )
-        out = np.where(agree.sum(axis=1) == 1, agree.argmax(axis=1), -1)
-        settled = np.flatnonzero(out >= 0)
-        if not len(settled):
-            return found, out
+        tried = self._solve(np.repeat(uv, count, axis=0), remaining, fewer)
+        agree = ~tried.failed & (tried.standardised <= self._limit[fewer])
+        agree = agree.reshape(m, count) & (weight > 0)
+        dropped = np.where(agree.sum(axis=1) == 1, agree.argmax(axis=1), -1)
+        identified = np.flatnonzero(dropped >= 0)
+        if not len(identified):
+            return solution, dropped
+        chosen = identified * count + dropped[identified]
         values = {}
         for field in fields(_Solution):
-            values[field.name] = getattr(found, field.name).copy()
-            values[field.name][rows[settled]] = getattr(tried, field.name)[
-                settled * count + out[settled]
-            ]
-        return _Solution(**values), out
+            values[field.name] = getattr(solution, field.name).copy()
+            values[field.name][rows[identified]] = getattr(tried, field.name)[chosen]
+        return _Solution(**values), dropped
 
 
-def _blanked(found, wrong):
-    """The _Solution with NaN for what is wrong (n,)."""
-    xyz = found.xyz.copy()
-    covariance = found.covariance.copy()
-    noise = found.noise.copy()
+def _without_points(solution: _Solution, wrong: np.ndarray) -> _Solution:
+    """Set coordinates and covariances of the points that are wrong (n,) to NaN."""
+    xyz = solution.xyz.copy()
+    covariance = solution.covariance.copy()
+    noise = solution.noise.copy()
     for value in (xyz, covariance, noise):
         value[wrong] = np.nan
-    return replace(found, xyz=xyz, covariance=covariance, noise=noise)
+    return replace(solution, xyz=xyz, covariance=covariance, noise=noise)
 
 
-def _scattered(found, enough, rays):
-    """IntersectedPoints of all points, of those (n,) that enough fluoroscopes see."""
+def _expanded(found: IntersectedPoints, enough: np.ndarray, rays: np.ndarray) -> IntersectedPoints:
+    """Points of all n targets, given those that enough (n,) fluoroscopes see."""
     n = len(enough)
     out = IntersectedPoints(
         np.full((n, 3), np.nan),
@@ -338,32 +396,34 @@ def _scattered(found, enough, rays):
     return out
 
 
-def _inverse(normal):
-    """Inverse of symmetric matrices (n, 3, 3) by cofactors, and their determinant (n,) over the
-    cube of the mean of their diagonal; a singular matrix gives infinite numbers, not an exception.
+def _inverse(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse of symmetric matrices (n, 3, 3) by cofactors.
+
+    Also returns their determinants (n,) over the cube of the mean of their diagonals. A singular
+    matrix gives infinite numbers, not an exception.
     """
     flat = normal.reshape(-1, 9)
-    one, two, three, four = (flat[:, index] for index in _COFACTORS)
-    cofactors = one * two - three * four
+    first, second, third, fourth = (flat[:, index] for index in _COFACTORS)
+    cofactors = first * second - third * fourth
     determinant = (flat[:, :3] * cofactors[:, :3]).sum(axis=1)
     mean = (flat[:, 0] + flat[:, 4] + flat[:, 8]) / 3
     return (cofactors / determinant[:, None]).reshape(-1, 3, 3), determinant / mean**3
 
 
-def _limits(reject, count):
-    """Largest standardised misfit (count + 1,) of points of 0, 1, .. rays that agree.
+def _limits(reject: float, count: int) -> np.ndarray:
+    """Largest standardised misfit (count + 1,) of points of 0, 1, ... rays that agree.
 
-    Q = r^T W r is chi-square with 2 rays - 3 degrees of freedom, and the misfit the root of Q over
-    these; two rays have one, and reject is their limit.
+    Q = r^T W r is chi-square with 2 rays - 3 degrees of freedom, and the misfit is the root of Q
+    over that number. Two rays have one degree of freedom, and reject is their limit.
     """
     freedom = np.maximum(2.0 * np.arange(count + 1) - 3, 1)
     tail = erfc(reject / np.sqrt(2))
-    # So far out that the probability is no number any more, all degrees of freedom come to the
-    # same.
-    return np.sqrt((chdtri(freedom, tail) if tail > 1e-200 else reject**2) / freedom)
+    # Where the probability underflows, the degrees of freedom make no difference.
+    quantile = chdtri(freedom, tail) if tail > 1e-200 else reject**2
+    return np.sqrt(quantile / freedom)
 
 
-def _depth_of_axes(orientation):
+def _depth_of_axes(orientation: RigOrientation) -> np.ndarray:
     """Depths (F,) [mm] of the point that is nearest to the axes of all fluoroscopes."""
     axis = orientation.rotation[:, 2]
     across = np.eye(3) - axis[:, :, None] * axis[:, None, :]
@@ -373,15 +433,18 @@ def _depth_of_axes(orientation):
     return np.where(depth > 0, depth, 1.0)
 
 
-def _derivative_functions(orientation):
-    """Coefficients (F, 9, 2, 9) of the functions 1, x, y, x^2, y^2, xy, 1/Z, x/Z, y/Z (x = X/Z, y
-    = Y/Z) in the derivatives of u and v by T, w, xp, yp, c: those of collinearity, multiplied out.
+def _derivative_functions(orientation: RigOrientation) -> np.ndarray:
+    """Coefficients (F, 9, 2, 9) of nine functions in the derivatives of u, v by T, w, xp, yp, c.
+
+    The functions are 1, x, y, x^2, y^2, xy, 1/Z, x/Z and y/Z with x = X/Z and y = Y/Z, and the
+    derivatives those of the collinearity equations, multiplied out.
     """
     out = np.zeros((len(orientation.fluoroscopes), _FUNCTIONS, 2, ORIENTATION_SIZE))
     for k, r, c in zip(out, orientation.rotation, orientation.interior[:, 2]):
         k[6, 0, :3] = -c * r[0]
         k[6, 1, :3] = -c * r[1]
-        k[7, 0, :3] = k[8, 1, :3] = c * r[2]
+        k[7, 0, :3] = c * r[2]
+        k[8, 1, :3] = c * r[2]
         k[5, 0, 3] = -c
         k[0, 0, 4] = c
         k[3, 0, 4] = c
@@ -390,13 +453,18 @@ def _derivative_functions(orientation):
         k[4, 1, 3] = -c
         k[5, 1, 4] = c
         k[1, 1, 5] = c
-        k[0, 0, 6] = k[0, 1, 7] = k[1, 0, 8] = k[2, 1, 8] = 1
+        k[0, 0, 6] = 1
+        k[0, 1, 7] = 1
+        k[1, 0, 8] = 1
+        k[2, 1, 8] = 1
     return out
 
 
-def _through(functions, root):
-    """Coefficients (F, 9, 18F) of the derivatives by independent unknowns: functions times root
-    (9F, 9F).
+def _by_independent_unknowns(functions: np.ndarray, root: np.ndarray) -> np.ndarray:
+    """Coefficients (F, 9, 18F) of the derivatives by independent unknowns of variance one.
+
+    functions (F, 9, 2, 9): coefficients by the unknowns of the orientation; root (9F, 9F): root
+    of their covariance.
     """
     count = len(functions)
     out = functions.reshape(count, 2 * _FUNCTIONS, ORIENTATION_SIZE) @ root.reshape(

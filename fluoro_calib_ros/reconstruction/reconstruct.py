@@ -1,148 +1,194 @@
-"""From observed image points to points in space: the frames of one exposure, and whole recordings.
+"""From observed image points to points in space, for single exposures and whole recordings.
 
-A recording is gone through frame by frame, so that its numbers are those the live node gives. What
-is done with the corrected views of an exposure is the same here and there.
+A recording is processed exposure by exposure, with the functions that the live node calls, so that
+both give the same numbers.
 """
 
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
-from ..calibration.result import OUTSIDE
+from ..calibration.result import OUTSIDE, FluoroscopeCalibration
 from ..errors import DataError
+from ..exposures.frame import Frame, image_size_error, repeated_target_error
 from ..exposures.pairing import recorded_pairer
-from .correspondence import matched
-from .intersection import IntersectedPoints
+from .correspondence import CorrectedView, MatchedViews, match_views
+from .intersection import IntersectedPoints, Intersector
 
 
-@dataclass(frozen=True)
-class CorrectedView:
-    """Corrected image points of one view of an exposure: target_id (n,), each once; uv (n, 2),
-    sigma (n,) and correction_sd (n,), that of the correction alone [px]; outside (n,): beyond the
-    calibrated area.
-    """
+class ExposureWatch(Protocol):
+    """What examines the exposures of a reconstruction, such as a RigDriftWatch."""
 
-    target_id: np.ndarray
-    uv: np.ndarray
-    sigma: np.ndarray
-    correction_sd: np.ndarray
-    outside: np.ndarray
+    def is_due(self, stamp_ns: int) -> bool:
+        """Whether the exposure with this stamp is to be examined."""
+
+    def add_exposure(
+        self,
+        stamp_ns: int,
+        target_id: np.ndarray,
+        uv: np.ndarray,
+        sigma: np.ndarray,
+        correction_sd: np.ndarray,
+        points: IntersectedPoints,
+    ) -> Any:
+        """Examine an exposure; the arrays are those of MatchedViews."""
 
 
 @dataclass(frozen=True)
 class IntersectedViews:
-    """The points of an exposure: target_id (n,), uv (F, n, 2) and sigma (F, n) [px] of the views,
-    NaN where a fluoroscope does not see a target; outside (F, n): True for what lies beyond the
-    calibrated area; points: IntersectedPoints.
-    """
+    """The matched views of an exposure and their intersected points."""
 
-    target_id: np.ndarray
-    uv: np.ndarray
-    sigma: np.ndarray
-    outside: np.ndarray
+    views: MatchedViews
     points: IntersectedPoints
 
-
-def intersect_views(views, intersector):
-    """IntersectedViews of the CorrectedViews of an exposure, in the order of the orientation's
-    fluoroscopes; None for one that is missing.
-    """
-    target_id, uv, sigma, outside = matched(
-        *(
-            [None if view is None else getattr(view, name) for view in views]
-            for name in ('target_id', 'uv', 'sigma', 'outside')
-        )
-    )
-    return IntersectedViews(
-        target_id, uv, sigma, outside, intersector.intersect(uv, sigma, outside)
-    )
-
-
-def watch_views(watch, stamp_ns, views, found):
-    """Give a RigDriftWatch the CorrectedViews of an exposure, None for a missing one, with their
-    IntersectedViews, if it wants it.
-
-    Image points beyond the calibrated area are left out: there the correction is extrapolated, and
-    markers that come to other places there would look like a drift.
-    """
-    if watch.is_due(stamp_ns):
-        correction_sd = matched(
-            *(
-                [None if view is None else getattr(view, name) for view in views]
-                for name in ('target_id', 'uv', 'correction_sd')
-            )
-        )[2]
-        inside = np.where(found.outside[:, :, None], np.nan, found.uv)
-        watch.add_exposure(stamp_ns, found.target_id, inside, found.sigma, correction_sd, found.points)
+    @property
+    def target_id(self) -> np.ndarray:
+        """Target ids (n,) of the points."""
+        return self.views.target_id
 
 
 @dataclass(frozen=True)
 class ReconstructedFrame:
-    """Points of one exposure: number and stamp_ns of the frame of its first fluoroscope; target_id
-    (n,); points; fluoroscopes: names of those that are in it.
+    """Points of one exposure.
+
+    Attributes
+    ----------
+    number, stamp_ns : int
+        Those of the frame of its first fluoroscope.
+    target_id : ndarray
+        (n,)
+    points : IntersectedPoints
+    fluoroscopes : tuple of str
+        Those that have a frame of the exposure.
     """
 
     number: int
     stamp_ns: int
     target_id: np.ndarray
     points: IntersectedPoints
-    fluoroscopes: tuple
+    fluoroscopes: tuple[str, ...]
 
 
-def reconstruct_frame(exposure, calibrations, intersector, watch=None):
-    """ReconstructedFrame of an exposure {fluoroscope: Frame} of OBSERVED image points: corrected,
-    then intersected.
+def intersect_exposure(
+    views: Sequence[CorrectedView | None], intersector: Intersector
+) -> IntersectedViews:
+    """Match and intersect the views of an exposure.
 
-    Two fluoroscopes of the orientation or more have to be there. calibrations {fluoroscope:
-    FluoroscopeCalibration}; watch: RigDriftWatch that looks at it, None: none does. Raises DataError
-    for an image of another size than that of the calibration, and for a target that is there
-    twice.
+    They are in the order of the orientation's fluoroscopes, None for one that is missing.
+    """
+    matched = match_views(views)
+    points = intersector.intersect(matched.uv, matched.sigma, matched.outside)
+    return IntersectedViews(matched, points)
+
+
+def watch_exposure(watch: ExposureWatch, stamp_ns: int, exposure: IntersectedViews) -> None:
+    """Hand an exposure to a watch, if it is due.
+
+    Image points beyond the calibrated area are omitted: the correction is extrapolated there, and
+    markers that move to other places would look like a drift.
+    """
+    if watch.is_due(stamp_ns):
+        views = exposure.views
+        inside = np.where(views.outside[:, :, None], np.nan, views.uv)
+        watch.add_exposure(
+            stamp_ns, views.target_id, inside, views.sigma, views.correction_sd, exposure.points
+        )
+
+
+def reconstruct_exposure(
+    exposure: Mapping[str, Frame],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    intersector: Intersector,
+    watch: ExposureWatch | None = None,
+) -> ReconstructedFrame:
+    """Correct and intersect the observed image points of one exposure.
+
+    Parameters
+    ----------
+    exposure : mapping of str to Frame
+        Frames by fluoroscope, of two or more fluoroscopes of the orientation.
+    calibrations : mapping of str to FluoroscopeCalibration
+    intersector : Intersector
+    watch : ExposureWatch, optional
+        Examines the exposure.
+
+    Returns
+    -------
+    ReconstructedFrame
+
+    Raises
+    ------
+    DataError
+        For an image whose size is not that of the calibration, and for a repeated target.
     """
     frames = [exposure.get(name) for name in intersector.orientation.fluoroscopes]
     views = [
-        None if frame is None else _corrected(frame, calibrations[frame.fluoroscope])
+        None if frame is None else _corrected_view(frame, calibrations[frame.fluoroscope])
         for frame in frames
     ]
-    found = intersect_views(views, intersector)
-    there = [frame for frame in frames if frame is not None]
+    found = intersect_exposure(views, intersector)
+    present = [frame for frame in frames if frame is not None]
     if watch is not None:
-        watch_views(watch, there[0].stamp_ns, views, found)
+        watch_exposure(watch, present[0].stamp_ns, found)
     return ReconstructedFrame(
-        there[0].number,
-        there[0].stamp_ns,
+        present[0].number,
+        present[0].stamp_ns,
         found.target_id,
         found.points,
-        tuple(frame.fluoroscope for frame in there),
+        tuple(frame.fluoroscope for frame in present),
     )
 
 
-def _corrected(frame, calibration):
-    """CorrectedView of a Frame. Raises DataError."""
+def _corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> CorrectedView:
+    """Correct a frame. Raises DataError."""
     where = f'fluoroscope {frame.fluoroscope}, frame {frame.number}'
-    if tuple(frame.image_size) != tuple(calibration.image_size):
-        (width, height) = frame.image_size
-        (w, h) = calibration.image_size
-        raise DataError(
-            f'{where}: the image is {width} x {height} px, but the calibration is for {w} x {h} px'
-        )
-    ids, counts = np.unique(frame.target_id, return_counts=True)
-    if (counts > 1).any():
-        raise DataError(f'{where}: target {ids[counts > 1][0]} occurs {counts.max()} times')
+    error = image_size_error(frame.image_size, calibration.image_size)
+    error = error or repeated_target_error(frame.target_id)
+    if error:
+        raise DataError(f'{where}: {error}')
     u, v, sigma, correction_sd, status = calibration.correct_arrays(
         frame.uv[:, 0], frame.uv[:, 1], frame.sigma
     )
-    return CorrectedView(
-        frame.target_id, np.stack([u, v], axis=1), sigma, correction_sd, status == OUTSIDE
-    )
+    uv = np.stack([u, v], axis=1)
+    return CorrectedView(frame.target_id, uv, sigma, correction_sd, status == OUTSIDE)
 
 
-def reconstruct_recording(frames, calibrations, intersector, pair_by='frame_number', watch=None):
-    """ReconstructedFrames of a recording in order of time, and the number of frames {fluoroscope:
-    n} whose partners are missing.
+def reconstruct_recording(
+    frames: Mapping[str, Sequence[Frame]],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    intersector: Intersector,
+    pair_by: str = 'frame_number',
+    watch: ExposureWatch | None = None,
+) -> tuple[list[ReconstructedFrame], dict[str, int]]:
+    """Reconstruct the exposures of a recording.
 
-    frames {fluoroscope: [Frame, ...]}; pair_by 'frame_number' or 'stamp'; watch: RigDriftWatch that
-    looks at the exposures. Of three or more fluoroscopes views may be missing. Raises DataError as
-    reconstruct_frame, and where a fluoroscope of the rig has no frames.
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        Observed frames by fluoroscope.
+    calibrations : mapping of str to FluoroscopeCalibration
+    intersector : Intersector
+        With three or more fluoroscopes, views of an exposure may be missing.
+    pair_by : {'frame_number', 'stamp'}
+        What the frames of an exposure have in common.
+    watch : ExposureWatch, optional
+        Examines the exposures.
+
+    Returns
+    -------
+    frames : list of ReconstructedFrame
+        In the order of time.
+    unpaired : dict of str to int
+        Frames whose partners are missing, by fluoroscope.
+
+    Raises
+    ------
+    DataError
+        As reconstruct_exposure, and where a fluoroscope of the rig has no frames.
     """
     names = intersector.orientation.fluoroscopes
     for name in names:
@@ -151,12 +197,12 @@ def reconstruct_recording(frames, calibrations, intersector, pair_by='frame_numb
                 f'there are no frames of fluoroscope {name}, only of {", ".join(frames)}'
             )
     pairer = recorded_pairer(names, pair_by)
-    out = []
-    everything = sorted(
+    ordered = sorted(
         (frame for name in names for frame in frames[name]), key=lambda f: (f.stamp_ns, f.number)
     )
-    for exposures in (*map(pairer.add, everything), pairer.flush()):
-        out += [
-            reconstruct_frame(exposure, calibrations, intersector, watch) for exposure in exposures
-        ]
+    exposures = [exposure for frame in ordered for exposure in pairer.add(frame)]
+    exposures += pairer.flush()
+    out = [
+        reconstruct_exposure(exposure, calibrations, intersector, watch) for exposure in exposures
+    ]
     return out, dict(pairer.unpaired)

@@ -1,4 +1,4 @@
-# make demo | make test are all that a bare clone needs. What they do first is in tools/setup.sh.
+# A bare clone needs only make demo and make test. tools/setup.sh installs what they require.
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
@@ -8,22 +8,22 @@ SHELL := /bin/sh
 RUN := .venv/bin/python
 
 help:
-	@echo 'make demo    calibrate the recorded rig in bags/, with real ROS 2 nodes (sets up first)'
-	@echo 'make test    run all tests (sets up first)'
-	@echo 'make lint    ruff, mypy and the import contracts (the tests run them too)'
-	@echo 'make docs    the documentation with the API reference, into docs/_build/html'
-	@echo 'make setup   make or refresh .venv: packages, ROS 2, messages; nothing is done twice'
-	@echo 'make bench   run the benchmarks'
-	@echo 'make online  the nodes at lab rates beside relays that do nothing, points in space, images (10 minutes)'
-	@echo 'make endurance   an hour of the stream, faster than real time: counts and memory (15 minutes)'
-	@echo 'make validation  the experiment of the paper, and more, against the truth: docs/accuracy.md (10 minutes)'
-	@echo 'make precision   errors of 200 simulated calibrations over what is claimed: docs/precision.md (5 minutes)'
-	@echo 'make convergence 200 random rigs with bad start values: docs/convergence.md (15 minutes)'
-	@echo 'make bags    write the bags in bags/ anew'
-	@echo 'make clean   delete .venv, .build and caches'
+	@echo 'make demo         calibrate, correct and reconstruct the recorded rig in bags/ over real ROS 2 nodes'
+	@echo 'make test         run all tests'
+	@echo 'make lint         run ruff, mypy and the import contracts (also part of the tests)'
+	@echo 'make docs         build the documentation and the API reference in docs/_build/html'
+	@echo 'make setup        create or update .venv: packages, ROS 2 and messages; demo, test, ... run it first'
+	@echo 'make bench        run the benchmarks and write docs/performance.md'
+	@echo 'make online       benchmark the nodes at lab rates against relays, points in space and images (10 min)'
+	@echo 'make endurance    stream one hour of data faster than real time: frame counts and memory (15 min)'
+	@echo 'make validation   repeat and extend the experiment of the paper: docs/accuracy.md (10 min)'
+	@echo 'make precision    compare errors of 200 simulations with their standard deviations: docs/precision.md (5 min)'
+	@echo 'make convergence  calibrate 200 random rigs with poor start values: docs/convergence.md (15 min)'
+	@echo 'make bags         regenerate the bags in bags/'
+	@echo 'make clean        delete .venv, .build and caches'
 	@echo
-	@echo 'PYTHON=python3.12 make setup   chooses the Python (3.10 to 3.13)'
-	@echo 'make test ARGS="-k simulation" hands arguments on (also to demo, bench, bags)'
+	@echo 'PYTHON=python3.12 make setup        selects the Python version (3.10 to 3.13)'
+	@echo 'make test ARGS="-k simulation"      passes arguments on (also for bags, bench, demo, ...)'
 
 setup:
 	@sh tools/setup.sh

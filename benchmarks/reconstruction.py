@@ -201,8 +201,9 @@ def table(outcomes):
         for suffix in ('', FROM_EXPOSURES)
     }
     lines = [
-        '| correction | RMSE, 3-D [mm] | relative to known distortion | normalised squared error | '
-        'squared standardised epipolar distance | lost points [%] | RMSE of distances in clusters [mm] |',
+        '| correction | RMSE, 3-D [mm] | relative to known distortion | normalised squared error '
+        '| squared standardised epipolar distance | lost points [%] | '
+        'RMSE of distances in clusters [mm] |',
         '| --- ' + '| ---: ' * 6 + '|',
     ]
     for way, of_rigs in outcomes.items():

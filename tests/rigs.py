@@ -1,4 +1,4 @@
-"""What several test files need: virtual rigs, calibrations of them (made once) and small networks."""
+"""Shared fixtures: virtual rigs, cached calibrations of them and small networks."""
 
 import functools
 
@@ -27,13 +27,13 @@ def rig():
 
 @functools.cache
 def exposures(count=15, seed=1):
-    """{fluoroscope: [Frame, ...]} of the rig, to be left as they are."""
+    """{fluoroscope: [Frame, ...]} of the rig; cached, so do not modify them."""
     return simulate_exposures(rig(), count, seed).frames
 
 
 @functools.cache
 def calibrated(name='a', count=15, **options):
-    """CalibrationResult of fluoroscope name of the rig with the first exposures of 15."""
+    """CalibrationResult of one fluoroscope of the rig from the first `count` of 15 exposures."""
     return calibrate(
         {name: exposures()[name][:count]}, rig().phantom, CalibrationOptions(**options)
     )
@@ -50,9 +50,7 @@ def small_network(
     free=True,
     seen=0.8,
 ):
-    """A Network and its true Parameters: targets in a box of 200 mm, of which a part is seen in
-    each exposure.
-    """
+    """Network and true Parameters: targets in a box of 200 mm, partly seen in each exposure."""
     rng = np.random.default_rng(seed)
     true_mm = rng.uniform(-100, 100, (targets, 3))
     survey = true_mm + rng.normal(0, survey_sd_mm, true_mm.shape)
@@ -86,7 +84,7 @@ def small_network(
 
 
 def disturbed(parameters, seed=0, degrees=0.5, mm=5.0):
-    """Start values some way off: rotations, positions, points and principal distances."""
+    """Start values with errors in rotations, positions, points and interior orientations."""
     rng = np.random.default_rng(seed)
     turn = matrix_from_vector(rng.normal(0, np.deg2rad(degrees), parameters.position_mm.shape))
     interior = parameters.interior + rng.normal(0, 5.0, parameters.interior.shape)
@@ -99,9 +97,7 @@ def disturbed(parameters, seed=0, degrees=0.5, mm=5.0):
 
 
 def moved(network, parameters, x):
-    """Parameters moved by a flat vector of all unknowns: T and w of the exposures, points, free
-    interiors.
-    """
+    """Parameters moved by a vector (u,) of T and w of the exposures, points and free interiors."""
     m, n = network.n_exposures, network.n_points
     exterior = x[: 6 * m].reshape(m, 6)
     points = x[6 * m : 6 * m + 3 * n].reshape(n, 3)
@@ -132,7 +128,7 @@ def design_matrix(network, parameters):
 
 
 def dense_normal_matrix(network, adjustment, factor=1.0):
-    """Dense normal matrix (u, u) of an adjustment, its image weights times factor."""
+    """Dense normal matrix (u, u) of an adjustment; factor of its image weights."""
     a = design_matrix(network, adjustment.parameters)
     weight = (
         factor

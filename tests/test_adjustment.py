@@ -27,26 +27,26 @@ from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy, precision
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 
-MANY_TARGETS = dict(exposures=4, targets=30)  # the points are eliminated
-MANY_EXPOSURES = dict(exposures=14, targets=20)  # the exposures are eliminated
+MANY_TARGETS = dict(exposures=4, targets=30)  # eliminates the points
+MANY_EXPOSURES = dict(exposures=14, targets=20)  # eliminates the exposures
 
 
 @pytest.fixture(autouse=True)
 def one_thread():
-    """As the calibration runs: two threads are slower for matrices of this size."""
+    """As in a calibration: two threads are slower for matrices of this size."""
     with threadpool_limits(1):
         yield
 
 
 def cost_at(network, result, x=None, correction=0.0):
-    """F at a solution moved by x, its noise model held."""
+    """F at a solution moved by x, for its noise model."""
     parameters = result.parameters if x is None else rigs.moved(network, result.parameters, x)
     _, q = residuals_and_q(network, parameters, correction, result.noise)
     return total_cost(network, parameters, q, result.noise)
 
 
 def standard_deviations(network, result):
-    """Of all unknowns, in the order of rigs.moved, by the dense weighted normal matrix."""
+    """Standard deviations of all unknowns from the dense weighted normal matrix."""
     return np.sqrt(np.diagonal(np.linalg.inv(rigs.dense_normal_matrix(network, result))))
 
 
@@ -71,8 +71,9 @@ def assert_same_solution(one, other, position_mm=1e-5, angle=1e-8, points_mm=1e-
 @pytest.mark.parametrize('shape', [MANY_TARGETS, MANY_EXPOSURES])
 @pytest.mark.parametrize('loss', LOSSES)
 def test_gradient_of_the_cost_is_zero_at_the_solution(loss, shape):
-    """Central differences of F in as many directions as there are unknowns, each of one standard
-    deviation.
+    """Central differences of F along as many directions as there are unknowns.
+
+    Each direction has the length of one standard deviation.
     """
     network, truth = rigs.small_network(**shape, nu=4.0)
     result = adjust_and_estimate_noise(network, rigs.disturbed(truth), noise=Noise(loss))
@@ -124,9 +125,7 @@ def test_gaussian_adjustment_equals_scipy_least_squares():
 @pytest.mark.long
 @pytest.mark.parametrize('loss', ['student_t', 'huber'])
 def test_no_better_solution_is_found_by_direct_minimisation(loss):
-    """With the noise model held, scipy gains nothing from our solution, and from elsewhere comes
-    back to it.
-    """
+    """For the same noise model, scipy cannot improve the solution, and finds it from elsewhere."""
     network, truth = rigs.small_network(exposures=3, targets=14, nu=4.0)
     result = adjust_and_estimate_noise(
         network, rigs.disturbed(truth), noise=Noise(loss), options=SolverOptions(tolerance=1e-12)
@@ -178,9 +177,7 @@ def test_both_eliminations_give_the_same_solution_and_covariances(shape, loss):
     'shape', [MANY_TARGETS, MANY_EXPOSURES, dict(exposures=3, targets=25, fluoroscopes=2)]
 )
 def test_covariances_equal_the_dense_inverse(shape, loss, free):
-    """Those of the unknowns under the Fisher information, those of the residuals under the
-    weighted problem.
-    """
+    """The unknowns by Fisher information, the residuals by the weighted problem."""
     network, truth = rigs.small_network(**shape, nu=5.0, free=free)
     result = adjust_and_estimate_noise(network, truth, noise=Noise(loss))
     precise = precision(network, result)
@@ -233,10 +230,8 @@ def test_redundancy_numbers_sum_to_observations_less_unknowns(shape, loss, free)
         assert numbers.min() > -1e-9 and numbers.max() < 1 + 1e-9
 
 
-def test_geometric_redundancy_is_that_of_equal_weights():
-    """It does not follow the residuals: the same as the redundancy numbers of a Gaussian
-    adjustment.
-    """
+def test_geometric_redundancy_assumes_equal_weights():
+    """It equals the redundancy numbers of a Gaussian adjustment."""
     network, truth = rigs.small_network(**MANY_TARGETS)
     result = adjust_and_estimate_noise(network, truth, noise=Noise('gaussian'))
     numbers = precision(network, result).redundancy.mean(axis=1)
@@ -247,8 +242,9 @@ def test_geometric_redundancy_is_that_of_equal_weights():
 
 
 def normalised_errors(count, loss, **network):
-    """Squared errors in units of their covariances, of `count` simulated adjustments: {unknowns:
-    (n,)}, scales.
+    """Squared errors in units of their covariances from `count` simulated adjustments.
+
+    Returns {unknowns: (n,)} and the estimated scales.
     """
     out = {'interior': [], 'exterior': [], 'points': []}
     scales = []
@@ -269,7 +265,7 @@ def normalised_errors(count, loss, **network):
 
 
 def test_standard_deviations_of_gaussian_noise_against_monte_carlo():
-    """60 simulated adjustments: errors have the size that their covariances claim."""
+    """60 simulated adjustments: errors agree with their covariances."""
     errors, scales = normalised_errors(60, 'gaussian', exposures=6, targets=40)
     assert np.mean(scales) == pytest.approx(0.3, rel=0.02)
     # Means of 180, of 2160 correlated and of 7200 hardly correlated squares of unit variance.
@@ -279,8 +275,9 @@ def test_standard_deviations_of_gaussian_noise_against_monte_carlo():
 
 
 def test_standard_deviations_of_heavy_tailed_noise_against_monte_carlo():
-    """The same under a true t of four degrees of freedom; without (nu+4)/(nu+2) the squares would
-    be 1.4.
+    """The same for t noise with four degrees of freedom.
+
+    Without the factor (nu+4)/(nu+2) the squares would be 1.4.
     """
     errors, scales = normalised_errors(
         40, 'student_t', exposures=5, targets=80, nu=4.0, survey_sd_mm=0.02
@@ -311,9 +308,7 @@ def small_vectors(turn):
 
 
 def test_false_matches_do_not_move_the_solution():
-    """With 5 % of them the Student-t solution is that of the others within a part of its standard
-    deviation.
-    """
+    """5 % false matches change the Student-t solution by a part of its standard deviation."""
     network, truth = rigs.small_network(exposures=6, targets=40)
     false = np.random.default_rng(1).permutation(len(network.uv))[: len(network.uv) // 20]
     uv = network.uv.copy()
@@ -340,10 +335,10 @@ def test_false_matches_do_not_move_the_solution():
 
     moved, found = shift('student_t')
     assert moved < 0.6 and not found.inliers[false].any() and found.inliers[keep].mean() > 0.98
-    assert shift('gaussian')[0] > 5, 'the false matches are no test of anything'
+    assert shift('gaussian')[0] > 5, 'the false matches are too small to test anything'
 
 
-def test_the_order_of_image_points_does_not_matter():
+def test_order_of_image_points_does_not_matter():
     network, truth = rigs.small_network(exposures=5, targets=30, nu=4.0)
     order = np.lexsort((np.random.default_rng(1).random(len(network.uv)), network.exposure))
     assert (order != np.arange(len(order))).any()
@@ -356,8 +351,8 @@ def test_the_order_of_image_points_does_not_matter():
     np.testing.assert_allclose(one.residuals[order], other.residuals, atol=1e-6)
 
 
-def test_sigma_has_a_unit_of_its_own():
-    """Ten times the sigma gives a tenth of the scale, and nothing else changes."""
+def test_scale_is_relative_to_sigma():
+    """Ten times sigma gives a tenth of the scale; nothing else changes."""
     network, truth = rigs.small_network(**MANY_TARGETS)
     one = adjust_and_estimate_noise(network, rigs.disturbed(truth))
     other = adjust_and_estimate_noise(
@@ -367,7 +362,7 @@ def test_sigma_has_a_unit_of_its_own():
     assert_same_solution(one, other)
 
 
-def test_image_points_of_small_sigma_decide():
+def test_image_points_with_small_sigma_dominate():
     """Where two exposures contradict each other on a point, it goes where the more precise one
     sees it.
     """
@@ -403,7 +398,7 @@ def test_image_points_of_small_sigma_decide():
     assert error[0] < 0.2 * error[1]
 
 
-def test_a_held_interior_orientation_stays_to_the_last_bit():
+def test_held_interior_orientation_does_not_change():
     """Also where that of the other fluoroscope is estimated."""
     network, truth = rigs.small_network(exposures=4, targets=30, fluoroscopes=2)
     network = replace(network, interior_free=np.array([False, True]))
@@ -416,10 +411,8 @@ def test_a_held_interior_orientation_stays_to_the_last_bit():
     assert not precise.interior[0].any() and np.all(np.diagonal(precise.interior[1]) > 0)
 
 
-def test_a_correction_is_taken_off_the_observed_points():
-    """Undistorted = observed - correction: adjusting distorted points with their correction is as
-    before.
-    """
+def test_correction_is_subtracted_from_the_observed_points():
+    """Undistorted = observed - correction: distorted points with their correction adjust alike."""
     network, truth = rigs.small_network(**MANY_TARGETS)
     correction = np.random.default_rng(1).normal(0, 5, network.uv.shape)
     one = adjust_and_estimate_noise(network, rigs.disturbed(truth))
@@ -435,7 +428,7 @@ def test_a_correction_is_taken_off_the_observed_points():
     )
 
 
-def test_a_far_start_ends_in_the_same_place():
+def test_distant_start_values_give_the_same_solution():
     network, truth = rigs.small_network(exposures=6, targets=40, nu=5.0)
     noise = Noise(scale=0.3)
     near = adjust(network, truth, noise=noise)
@@ -448,7 +441,7 @@ def test_a_far_start_ends_in_the_same_place():
     )
 
 
-def test_steps_that_run_out_are_told():
+def test_running_out_of_steps_is_reported():
     network, truth = rigs.small_network(**MANY_TARGETS)
     result = adjust(
         network, rigs.disturbed(truth, degrees=3.0, mm=40.0), options=SolverOptions(max_steps=2)
@@ -456,7 +449,7 @@ def test_steps_that_run_out_are_told():
     assert not result.converged and result.steps == 2
 
 
-def test_check_stops_an_adjustment_before_its_next_step():
+def test_cancellation_stops_an_adjustment_before_its_next_step():
     network, truth = rigs.small_network(**MANY_TARGETS)
     calls = []
 
@@ -472,8 +465,8 @@ def test_check_stops_an_adjustment_before_its_next_step():
     assert len(calls) == 3
 
 
-def test_a_network_that_leaves_unknowns_open_is_refused():
-    """Two targets do not give an exposure's orientation."""
+def test_undetermined_network_is_rejected():
+    """Two targets do not determine the orientation of an exposure."""
     network, truth = rigs.small_network(**MANY_TARGETS, seen=1.0)
     keep = (network.exposure != 1) | (network.point < 2)
     open_one = replace(
@@ -487,8 +480,8 @@ def test_a_network_that_leaves_unknowns_open_is_refused():
         adjusted_with_precision(open_one, truth, np.zeros_like(open_one.uv), Noise())
 
 
-def test_a_held_noise_model_stays():
-    """Scale and degrees of freedom as given; the solution is that of the cost under them."""
+def test_given_noise_model_is_not_changed():
+    """Scale and degrees of freedom stay as given, and the solution minimises their cost."""
     network, truth = rigs.small_network(**MANY_TARGETS)
     held = adjust(
         network,

@@ -1,4 +1,4 @@
-"""Free networks: inner constraints against a bordered dense solution, and against other datums."""
+"""Free networks: inner constraints against dense bordered systems and other datums."""
 
 from dataclasses import replace
 
@@ -19,9 +19,9 @@ from fluoro_calib_ros.photogrammetry.relative_orientation import RelativeConstra
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 
 SHAPES = [
-    dict(exposures=5, targets=30),
-    dict(exposures=14, targets=20),
-]  # points, exposures eliminated
+    dict(exposures=5, targets=30),  # eliminates the points
+    dict(exposures=14, targets=20),  # eliminates the exposures
+]
 
 
 @pytest.fixture(autouse=True)
@@ -36,7 +36,7 @@ def free_network(free=True, **shape):
 
 
 def dense_free(network, result, factor=1.0):
-    """Dense normal matrix (u, u) of the images alone, and the inner constraints (7, u)."""
+    """Dense normal matrix (u, u) of the images, and the inner constraints (7, u)."""
     counted = replace(network, datum='survey')
     a = rigs.design_matrix(counted, result.parameters)
     weight = factor * result.noise.weight(result.q) / (result.noise.scale * network.sigma) ** 2
@@ -49,9 +49,7 @@ def dense_free(network, result, factor=1.0):
 
 
 def bordered_inverse(normal, b):
-    """Inverse of the bordered matrix [N B; B^T 0], whose first block is the covariance (Granshaw
-    1980).
-    """
+    """Covariance: first block of the inverse of [N B; B^T 0] (Granshaw 1980)."""
     scale = np.sqrt(np.diagonal(normal))
     b = b / scale
     b = b / np.linalg.norm(b, axis=1, keepdims=True)
@@ -62,7 +60,7 @@ def bordered_inverse(normal, b):
 @pytest.mark.parametrize('free', [True, False])
 @pytest.mark.parametrize('loss', LOSSES)
 @pytest.mark.parametrize('shape', SHAPES)
-def test_solution_and_covariances_equal_those_of_a_bordered_dense_one(shape, loss, free):
+def test_solution_and_covariances_equal_a_dense_bordered_system(shape, loss, free):
     network, truth = free_network(free, **shape)
     start = rigs.disturbed(truth)
     start = start if free else replace(start, interior=truth.interior)
@@ -76,7 +74,9 @@ def test_solution_and_covariances_equal_those_of_a_bordered_dense_one(shape, los
     a = rigs.design_matrix(replace(network, datum='survey'), result.parameters)
     step = covariance @ (a.T @ (np.repeat(weight, 2) * result.residuals.ravel()))
     sd = np.sqrt(np.diagonal(covariance))
-    assert np.max(np.abs(step) / sd) < 1e-4, 'a bordered Newton step moves the solution'
+    assert np.max(np.abs(step) / sd) < 1e-4, (
+        'a Newton step of the bordered system moves the solution'
+    )
     m, n = network.n_exposures, network.n_points
     off = (result.parameters.points_mm - network.survey_mm).ravel()
     assert np.max(np.abs(b[:, 6 * m : 6 * m + 3 * n] @ off)) < 1e-6  # sums of mm and of mm^2
@@ -106,10 +106,8 @@ def test_solution_and_covariances_equal_those_of_a_bordered_dense_one(shape, los
 
 
 @pytest.mark.parametrize('shape', SHAPES)
-def test_residuals_and_interior_orientation_are_those_of_a_minimal_datum(shape):
-    """Two points and a coordinate of a third held by a survey of vanishing sd, the others free:
-    seven numbers.
-    """
+def test_residuals_and_interior_orientation_equal_a_minimal_datum(shape):
+    """Seven numbers are held: the first exposure and one coordinate of the second source."""
     network, truth = free_network(**shape)
     noise = Noise('gaussian', 0.3)
     inner = adjust(
@@ -139,7 +137,7 @@ def test_residuals_and_interior_orientation_are_those_of_a_minimal_datum(shape):
     assert m == network.n_exposures
 
 
-def test_a_turned_shifted_and_scaled_start_does_not_matter():
+def test_turned_shifted_and_scaled_start_values_do_not_matter():
     network, truth = free_network(**SHAPES[0])
     here = adjust_and_estimate_noise(network, rigs.disturbed(truth))
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
@@ -163,7 +161,7 @@ def test_a_turned_shifted_and_scaled_start_does_not_matter():
 
 @pytest.mark.parametrize('shape', SHAPES)
 @pytest.mark.parametrize('constrained', [True, False])
-def test_both_eliminations_give_the_same(shape, constrained):
+def test_both_eliminations_give_the_same_solution_and_covariances(shape, constrained):
     network, truth = rigid_network(**shape)
     length = float(np.linalg.norm(truth.relative[0].translation_mm))
     constraint = RelativeConstraint((0, 1), network.relative[0].pairs, 0.5, 2e-4, length)
@@ -194,7 +192,7 @@ def test_both_eliminations_give_the_same(shape, constrained):
         np.testing.assert_allclose(a, b, rtol=0, atol=1e-6 * np.max(np.abs(b)), err_msg=name)
 
 
-def test_a_wrong_survey_leaves_the_shape_of_a_free_network_alone():
+def test_wrong_survey_does_not_deform_a_free_network():
     network, truth = free_network(**SHAPES[0])
     survey = network.survey_mm.copy()
     survey[3] += [2.0, 0.0, 0.0]
@@ -207,8 +205,8 @@ def test_a_wrong_survey_leaves_the_shape_of_a_free_network_alone():
 
 
 @pytest.mark.parametrize('shape', SHAPES)
-def test_a_weighted_interior_orientation_is_a_pseudo_observation(shape):
-    """Solution and covariances are those of the dense normal matrix with its weights added."""
+def test_prior_of_the_interior_orientation_is_a_pseudo_observation(shape):
+    """Solution and covariances equal those of the dense normal matrix with its weights added."""
     network, truth = rigs.small_network(**shape)
     mean = truth.interior + [[3.0, -2.0, 30.0]]
     sd = np.array([[1.0, 2.0, 15.0]])
@@ -239,7 +237,7 @@ def test_a_weighted_interior_orientation_is_a_pseudo_observation(shape):
     )
 
 
-def test_weights_of_the_interior_orientation_lie_between_held_and_estimated():
+def test_prior_lies_between_held_and_estimated_interior_orientation():
     network, truth = rigs.small_network(**SHAPES[0])
     mean = truth.interior + [[0.0, 0.0, 50.0]]
     found = []

@@ -1,4 +1,4 @@
-"""What a network cannot determine, in words; no alarm where it can."""
+"""Reports of what a network cannot determine, and no false alarms."""
 
 from dataclasses import replace
 
@@ -41,9 +41,7 @@ def one_thread():
 
 
 def frames_of_poses(poses, points, noise_px=0.25, seed=0):
-    """Frames and the Phantom of points (n, 3) [mm] in poses (rotation, shift), the axis of the
-    image along y.
-    """
+    """Frames and Phantom of points (n, 3) [mm] in poses (rotation, shift); the image axis is y."""
     rng = np.random.default_rng(seed)
     look = looking_at_origin(SOURCE)
     frames = []
@@ -67,7 +65,7 @@ def beads(depth_mm, count=120, seed=1):
 
 
 def moved_across(count=6):
-    """Poses that are turned about the axis of the image and shifted across it, never tilted."""
+    """Poses turned about the image axis and shifted across it, but not tilted."""
     return [
         (matrix_from_vector([0, 0.9 * j, 0]), np.array([20.0 * (j % 3 - 1), 0, 15.0 * (j % 2)]))
         for j in range(count)
@@ -75,7 +73,7 @@ def moved_across(count=6):
 
 
 def tilted(count=6):
-    """Poses that are tilted by half a radian as well."""
+    """The same poses, also tilted by half a radian."""
     return [
         (matrix_from_vector([0.5 * np.cos(1.1 * j), 0, 0.5 * np.sin(1.1 * j)]) @ rotation, shift)
         for j, (rotation, shift) in enumerate(moved_across(count))
@@ -95,15 +93,15 @@ def test_poses_parallel_to_the_image_do_not_separate_c_and_the_distance():
     frames, phantom = frames_of_poses(moved_across(), beads(8.0))
     with pytest.raises(
         DataError,
-        match='fluoroscope a: principal distance and distance to the phantom cannot be sep.*'
-        'nearly in one plane.*tilted',
+        match=r'fluoroscope a: principal distance and distance to the phantom cannot be sep.*'
+        r'nearly in one plane.*tilted',
     ):
         calibrate(
             {'a': frames}, phantom, CalibrationOptions(model='none'), principal_distance=4000.0
         )
 
 
-def test_the_same_phantom_tilted_does():
+def test_tilted_poses_separate_c_and_the_distance():
     frames, phantom = frames_of_poses(tilted(), beads(8.0))
     job = calibrate(
         {'a': frames}, phantom, CalibrationOptions(model='none'), principal_distance=4000.0
@@ -113,7 +111,7 @@ def test_the_same_phantom_tilted_does():
     )
 
 
-def test_a_held_interior_orientation_needs_no_tilt():
+def test_fixed_interior_orientation_needs_no_tilt():
     frames, phantom = frames_of_poses(moved_across(), beads(8.0))
     calibrate(
         {'a': frames},
@@ -123,7 +121,7 @@ def test_a_held_interior_orientation_needs_no_tilt():
     )
 
 
-def test_beads_in_a_plane_are_named():
+def test_beads_in_a_plane_are_reported():
     frames, phantom = frames_of_poses(tilted(), beads(0.01))
     with pytest.raises(DataError, match='one plane'):
         calibrate(
@@ -131,7 +129,7 @@ def test_beads_in_a_plane_are_named():
         )
 
 
-def test_an_exposure_of_two_targets_is_named():
+def test_exposure_with_two_targets_is_reported():
     network, truth = rigs.small_network(exposures=4, targets=30, seen=1.0)
     keep = (network.exposure != 1) | (network.point < 2)
     network = replace(
@@ -151,12 +149,12 @@ def test_an_exposure_of_two_targets_is_named():
     )
 
 
-def test_the_datum_of_a_free_network_is_not_called_open():
+def test_datum_of_a_free_network_is_not_reported():
     network, truth = rigs.small_network(exposures=5, targets=30, seen=1.0)
     assert not undetermined_directions(replace(network, datum='inner'), truth, ('a',), range(5))
 
 
-def test_the_reduced_normal_matrix_is_the_schur_complement_of_the_dense_one():
+def test_reduced_normal_matrix_equals_the_dense_schur_complement():
     network, truth = rigid_network(4, 30)
     result = adjust(
         network,
@@ -181,7 +179,7 @@ def test_the_reduced_normal_matrix_is_the_schur_complement_of_the_dense_one():
     )
 
 
-def test_correlations_are_those_of_the_dense_inverse():
+def test_correlations_equal_the_dense_inverse():
     network, truth = rigid_network(5, 40)
     result = adjust_and_estimate_noise(network, disturbed(truth), noise=Noise('gaussian'))
     numbers = [1, 2, 3, 4, 5] * 2
@@ -220,10 +218,8 @@ def test_correlations_are_those_of_the_dense_inverse():
         )
 
 
-def test_a_principal_point_that_is_left_open_is_named():
-    """Judged by the precision alone, at a noise of a pixel at most: what a bent image adds does
-    not count.
-    """
+def test_undetermined_principal_point_is_reported():
+    """Judged by the precision at a noise of one pixel at most, whatever distortion adds."""
     network, truth = rigs.small_network()
     precise = precision(network, adjust_and_estimate_noise(network, truth))
     assert not undetermined_interiors(network, truth, precise, ('a',), 0.3)

@@ -1,6 +1,4 @@
-"""The same problems solved by other people's programs: COLMAP's bundle adjuster and scikit-learn's
-grid search.
-"""
+"""Comparison with independent programs: COLMAP's bundle adjuster, scikit-learn's grid search."""
 
 import functools
 import sys
@@ -29,7 +27,7 @@ pytestmark = pytest.mark.long
 
 
 def small_problem():
-    """Network, start values and noise: six exposures of some thirty targets, heavy tails."""
+    """Network, start values and noise: six exposures of about thirty targets, heavy tails."""
     network, truth = small_network(6, 40, noise_px=0.3, nu=4.0, seed=2, seen=0.8)
     network = replace(network, sigma=np.ones(len(network.uv)))
     return *seen_in(network, disturbed(truth, degrees=0.2, mm=2.0), 2), Noise(
@@ -39,9 +37,7 @@ def small_problem():
 
 @functools.cache
 def real_problem():
-    """The same of 15 exposures of some 132 targets with false matches, the distortion taken off,
-    from resections.
-    """
+    """The same for 15 undistorted exposures of about 132 targets, with false matches."""
     rig = virtual_rig(1)
     exposures = simulate_exposures(rig, 15, 1, matched=(130, 134))
     frames = [
@@ -53,23 +49,19 @@ def real_problem():
 
 
 def all_held(network):
-    """Every object point stays at its survey: the exposures share nothing but the interior
-    orientation.
-    """
+    """All object points stay at their survey; exposures share only the interior orientation."""
     return np.ones(len(network.survey_mm), dtype=bool)
 
 
 def few_held(network):
-    """Some object points fix the datum, and those that only two exposures show; all others are
-    unknown.
-    """
+    """Every tenth object point, and those seen in two exposures only, define the datum."""
     return (np.arange(len(network.survey_mm)) % 10 == 0) | (np.bincount(network.point) < 3)
 
 
 @pytest.mark.parametrize('held_points', [all_held, few_held])
 @pytest.mark.parametrize('problem', [small_problem, real_problem])
-def test_adjustment_is_that_of_colmap(problem, held_points):
-    """Cost, unknowns and standard deviations of the interior orientation; Student-t, noise held."""
+def test_adjustment_equals_colmap(problem, held_points):
+    """Cost, unknowns and standard deviations of the interior orientation for Student-t noise."""
     network, start, noise = problem()
     held = held_points(network)
     assert held.sum() >= 3 and (held.all() or (~held).sum() > len(held) / 2)
@@ -96,8 +88,8 @@ def test_adjustment_is_that_of_colmap(problem, held_points):
 
 
 @pytest.mark.parametrize('seed', [1, 2, 3])
-def test_k_of_a_calibration_is_that_of_grid_search(seed):
-    """Values of a real calibration, the same folds of whole exposures, every error counted alike."""
+def test_k_of_a_calibration_equals_grid_search(seed):
+    """Values of a calibration, folds of whole exposures, equal weights."""
     rig = virtual_rig(seed)
     frames = {'a': simulate_exposures(rig, 15, seed, matched=(130, 134)).frames['a']}
     run = calibrate(frames, rig.phantom, CalibrationOptions('knn', max_iterations=2)).runs['a']

@@ -1,4 +1,4 @@
-"""Tests of single observations: false alarms on clean data, gross errors that are found."""
+"""Outlier tests: false alarms on clean data, gross errors that must be found."""
 
 from dataclasses import replace
 
@@ -33,9 +33,7 @@ def adjusted(network, truth, loss='student_t'):
 
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t', 'huber'])
 def test_false_alarms_on_clean_data(loss):
-    """At 1 % for all together hardly any of 20 networks raises one; the single statistics have
-    their quantiles.
-    """
+    """At 1 % a network, 20 networks raise hardly any; the statistics have their quantiles."""
     alarms = 0
     image = []
     target = []
@@ -56,7 +54,7 @@ def test_false_alarms_on_clean_data(loss):
 
 
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t', 'huber'])
-def test_a_gross_error_of_two_pixels_is_found(loss):
+def test_gross_error_of_two_pixels_is_found(loss):
     found_rows = 0
     others = 0
     for seed in range(20):
@@ -74,7 +72,7 @@ def test_a_gross_error_of_two_pixels_is_found(loss):
 
 
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t'])
-def test_a_bead_moved_by_two_millimetres_is_found(loss):
+def test_bead_moved_by_two_millimetres_is_found(loss):
     hits = 0
     others = 0
     for seed in range(15):
@@ -93,7 +91,7 @@ def test_a_bead_moved_by_two_millimetres_is_found(loss):
     assert hits == 15 and others <= 2
 
 
-def test_a_free_network_has_no_survey_to_test():
+def test_surveys_of_a_free_network_are_not_tested():
     network, truth = rigs.small_network(**SHAPE, seen=1.0)
     network = replace(network, datum='inner')
     result, precise = adjusted(network, truth)

@@ -56,7 +56,7 @@ def test_rotation_matrices_of_vectors_and_quaternions_equal_scipy(angle):
 
 @pytest.mark.parametrize('angle', ANGLES)
 def test_quaternion_of_a_matrix_round_trips_at_every_angle(angle):
-    """The quaternion is of length one, has w >= 0 and gives the matrix back."""
+    """The quaternion has unit norm and w >= 0, and reproduces the matrix."""
     matrix = Rotation.from_rotvec(angle * some_axes()).as_matrix()
     q = quaternion_from_matrix(matrix)
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1, rtol=1e-14)
@@ -79,8 +79,8 @@ def test_rotation_vectors_keep_small_turns_to_the_last_digit():
     )
 
 
-def test_quaternions_are_normalised_and_turn_as_agreed():
-    """w, x, y, z: a quarter turn about z takes x to y, whatever the quaternion's length."""
+def test_quaternions_are_normalised_and_follow_the_convention():
+    """w, x, y, z: a quarter turn about z takes x to y for a quaternion of any norm."""
     np.testing.assert_allclose(
         matrix_from_quaternion([3.0, 0, 0, 3.0]) @ [1, 0, 0], [0, 1, 0], atol=1e-15
     )
@@ -172,7 +172,7 @@ def one_exposure(seed=0, targets=60):
 
 @pytest.mark.parametrize('seed', range(5))
 def test_resection_of_exact_data_is_exact(seed):
-    """From the fewest targets that are accepted, in any attitude."""
+    """From the smallest accepted number of targets, in any attitude."""
     xyz, uv, rotation, position, interior = one_exposure(seed, targets=8)
     assert principal_distance_of(robust_dlt(xyz, uv)) == pytest.approx(interior[2], rel=1e-6)
     found = resect(xyz, uv, interior)
@@ -181,7 +181,7 @@ def test_resection_of_exact_data_is_exact(seed):
     assert found.inliers.all()
 
 
-def test_projection_matrix_gives_back_its_parts():
+def test_projection_matrix_is_decomposed_into_its_parts():
     """decompose: calibration matrix with positive diagonal, rotation and source, whatever the
     matrix's sign.
     """
@@ -194,8 +194,8 @@ def test_projection_matrix_gives_back_its_parts():
             np.testing.assert_allclose(got, wanted, rtol=1e-9, atol=1e-9)
 
 
-def test_direct_linear_transformation_obeys_its_weights():
-    """Points of weight zero play no part."""
+def test_direct_linear_transformation_uses_its_weights():
+    """Points of weight zero have no influence."""
     xyz, uv, *_ = one_exposure()
     spoilt = uv.copy()
     weights = np.ones(len(uv))
@@ -207,7 +207,7 @@ def test_direct_linear_transformation_obeys_its_weights():
 
 
 @pytest.mark.parametrize('seed', range(4))
-def test_resection_withstands_false_matches_and_distortion(seed):
+def test_resection_is_robust_to_false_matches_and_distortion(seed):
     """A fifth of the targets bear the id of another one, the image is distorted by 10 px and
     noisy.
     """
@@ -240,7 +240,7 @@ def test_resection_withstands_false_matches_and_distortion(seed):
 
 
 @pytest.mark.parametrize(
-    'spoil, said',
+    'spoil, message',
     [
         (lambda xyz: xyz[:7], '7 targets are too few for a resection, 8 are needed'),
         (lambda xyz: xyz * (1, 1, 0), 'all targets lie in one plane'),
@@ -250,10 +250,10 @@ def test_resection_withstands_false_matches_and_distortion(seed):
         ),
     ],
 )
-def test_resection_refuses_too_few_and_planar_targets(spoil, said):
+def test_resection_rejects_too_few_and_planar_targets(spoil, message):
     xyz, uv, _, _, interior = one_exposure()
     xyz = spoil(xyz)
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=message):
         resect(xyz, uv[: len(xyz)], interior)
 
 
@@ -265,7 +265,7 @@ def bivariate_t(rng, n, nu, scale):
 
 
 def test_cost_is_the_negative_log_likelihood_of_scipy():
-    """With every constant, for a sigma of each image point."""
+    """Including all constants, with one sigma for each image point."""
     rng = np.random.default_rng(2)
     r = rng.normal(0, 2, (50, 2))
     sigma = rng.uniform(0.2, 3, 50)
@@ -332,7 +332,7 @@ def test_information_factor_against_monte_carlo(loss, nu):
 
 
 def test_information_factor_of_student_t_follows_from_its_definition():
-    """E[w^2 q] / 2 over E[w], where q/2 has the F distribution with 2 and nu degrees of freedom."""
+    """E[w^2 q] / 2 over E[w], where q/2 is F distributed with 2 and nu degrees of freedom."""
     for nu in (3.0, 5.0, 50.0):
         noise = Noise(nu=nu)
         f = stats.f(2, nu)
@@ -343,7 +343,7 @@ def test_information_factor_of_student_t_follows_from_its_definition():
 
 @pytest.mark.parametrize('nu', [4.0, 12.0])
 def test_scale_and_degrees_of_freedom_equal_direct_maximum_likelihood(nu):
-    """ECME finds the maximum of the likelihood, and in 20,000 points it is the truth."""
+    """ECME maximises the likelihood, and 20,000 points reproduce the truth."""
     squared = np.sum(bivariate_t(np.random.default_rng(7), 20_000, nu, 0.3) ** 2, axis=1)
     ones = np.ones(len(squared))
 
@@ -377,7 +377,7 @@ def test_scale_is_estimated_from_residuals_of_unequal_redundancy(loss):
 
 
 @pytest.mark.parametrize('nu', [4.0, 200.0])
-def test_gross_errors_beside_the_student_t_leave_its_core_alone(nu):
+def test_estimated_gross_errors_do_not_affect_the_core(nu):
     """One in twenty false matches all over the image: scale and degrees of freedom are those
     without them.
     """
@@ -395,7 +395,7 @@ def test_gross_errors_beside_the_student_t_leave_its_core_alone(nu):
     assert weight[:1000].max() < 0.2 and np.median(weight[:1000]) < 1e-6
 
 
-def test_robust_scale_withstands_false_matches():
+def test_robust_scale_is_robust_to_false_matches():
     """A tenth of huge residuals: Student-t and Huber keep the scale within some ten percent, Gauss
     does not.
     """
@@ -416,7 +416,7 @@ def test_degrees_of_freedom_stay_within_their_range():
     assert np.isfinite(Noise().estimate_from(np.zeros(100)).scale)
 
 
-def test_inliers_are_the_9999_of_10000_of_a_gaussian():
+def test_inliers_are_9999_of_10000_gaussian_residuals():
     assert stats.chi2(2).cdf(INLIER_Q) == pytest.approx(0.9999, abs=1e-12)
     assert Noise().inliers(np.array([INLIER_Q * 0.999, INLIER_Q * 1.001])).tolist() == [
         True,
@@ -424,7 +424,7 @@ def test_inliers_are_the_9999_of_10000_of_a_gaussian():
     ]
 
 
-def test_unknown_loss_is_refused():
+def test_unknown_loss_is_rejected():
     with pytest.raises(ValueError, match="student_t, huber, gaussian, not 'cauchy'"):
         Noise('cauchy')
 
@@ -450,7 +450,7 @@ def some_phantom():
 
 
 @pytest.mark.parametrize(
-    'changes, said',
+    'changes, message',
     [
         (
             {'target_id': np.array([], int), 'uv': np.zeros((0, 2)), 'sigma': None},
@@ -481,14 +481,14 @@ def some_phantom():
         ),
     ],
 )
-def test_a_wrong_frame_is_refused_by_name(changes, said):
-    """One sentence that names fluoroscope, frame and cause."""
+def test_invalid_frame_is_rejected(changes, message):
+    """One sentence naming fluoroscope, frame and cause."""
     validate_frame(some_frame(uv=np.full((4, 2), 9.0)), some_phantom(), (640, 480))
-    with pytest.raises(DataError, match=f'^fluoroscope a, frame 7: .*{said}'):
+    with pytest.raises(DataError, match=f'^fluoroscope a, frame 7: .*{message}'):
         validate_frame(some_frame(**changes), some_phantom(), (640, 480))
 
 
-def test_the_image_reaches_half_a_pixel_beyond_its_outer_pixel_centres():
+def test_image_extends_half_a_pixel_beyond_its_outer_pixel_centres():
     uv = np.array(
         [
             [-0.5, -0.5],
@@ -503,7 +503,7 @@ def test_the_image_reaches_half_a_pixel_beyond_its_outer_pixel_centres():
     assert points_on_image(uv, (640, 480)).tolist() == [True, True] + [False] * 5
 
 
-def test_phantom_is_sorted_and_found_by_id():
+def test_phantom_is_sorted_and_looked_up_by_id():
     phantom = some_phantom()
     assert phantom.target_id.tolist() == [3, 4, 5, 9]
     np.testing.assert_array_equal(phantom.sd_mm, [0.3, 0.4, 0.5, 0.9])
@@ -514,7 +514,7 @@ def test_phantom_is_sorted_and_found_by_id():
 
 
 @pytest.mark.parametrize(
-    'changes, said',
+    'changes, message',
     [
         ({'target_id': [1, 2, 3, 1]}, 'target 1 is given twice'),
         ({'target_id': [1, 2, 3]}, '3 target ids, but coordinates of shape'),
@@ -529,10 +529,10 @@ def test_phantom_is_sorted_and_found_by_id():
         ),
     ],
 )
-def test_a_wrong_phantom_is_refused(changes, said):
+def test_invalid_phantom_is_rejected(changes, message):
     good = {'target_id': [1, 2, 3, 4], 'xyz_mm': np.zeros((4, 3)), 'sd_mm': np.full(4, 0.1)}
     Phantom(**good)
-    with pytest.raises(DataError, match=said):
+    with pytest.raises(DataError, match=message):
         Phantom(**{**good, **changes})
 
 

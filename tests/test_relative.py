@@ -1,6 +1,4 @@
-"""The relative orientation of two fluoroscopes in one adjustment, by finite differences and dense
-matrices.
-"""
+"""Relative orientation constraints against finite differences and dense matrices."""
 
 from dataclasses import replace
 
@@ -40,9 +38,9 @@ from fluoro_calib_ros.photogrammetry.rotations import (
 
 POSE = RelativePose(matrix_from_vector([0.03, -1.19, -0.02]), np.array([-1300.0, 30.0, 980.0]))
 SHAPES = [
-    dict(exposures=4, targets=40),
-    dict(exposures=12, targets=20),
-]  # points, exposures eliminated
+    dict(exposures=4, targets=40),  # eliminates the points
+    dict(exposures=12, targets=20),  # eliminates the exposures
+]
 SOFT = (0.5, 2e-4)
 
 
@@ -53,8 +51,9 @@ def one_thread():
 
 
 def rigid_network(exposures=4, targets=30, sd=SOFT, seed=0, alone=1, nu=np.inf, length_mm=None):
-    """A joint Network of two fluoroscopes of one rigid rig, its last exposures `alone` unpaired,
-    and the truth.
+    """Joint Network of two fluoroscopes of a rigid rig, and its true Parameters.
+
+    The last `alone` exposures are not paired.
     """
     network, truth = rigs.small_network(exposures, targets, 2, seed=seed, nu=nu, seen=0.9)
     a = np.arange(exposures)
@@ -85,8 +84,9 @@ def disturbed(truth, seed=0):
 
 
 def dense(network, result, factor=1.0):
-    """Dense normal matrix of exposures, points, interior and relative orientations, and
-    derivatives (6k, u) of the constraint by finite differences.
+    """Dense normal matrix (u, u), and derivatives (6k, u) of the constraint by differences.
+
+    Unknowns: exposures, points, interior and relative orientations.
     """
     plain = rigs.dense_normal_matrix(replace(network, relative=()), result, factor)
     u = len(plain)
@@ -247,10 +247,8 @@ def test_gradient_of_the_cost_is_zero_at_the_solution(shape):
 
 
 @pytest.mark.parametrize('shape', SHAPES)
-def test_rigid_is_the_limit_that_a_reparametrisation_gives(shape):
-    """Exposures of b expressed by those of a and the relative orientation: the same to 5e-5 of
-    their sd.
-    """
+def test_rigid_constraint_equals_a_reparametrisation(shape):
+    """Expressing b's exposures by those of a gives the same to 5e-5 standard deviations."""
     network, truth = rigid_network(**shape, sd=(RIGID_SD_MM, RIGID_SD_RAD))
     noise = Noise('gaussian', 0.3)
     result = adjust(network, disturbed(truth), noise=noise)
@@ -292,7 +290,7 @@ def test_rigid_is_the_limit_that_a_reparametrisation_gives(shape):
 
 
 def reparametrisation(plain, parameters, constraint):
-    """Derivatives of all unknowns of a network by those of a rigid one, by finite differences."""
+    """Derivatives of all unknowns by those of a rigid network, by finite differences."""
     u = plain.n_unknowns
     pairs = constraint.pairs
     step = 1e-6
@@ -318,10 +316,8 @@ def reparametrisation(plain, parameters, constraint):
     return out
 
 
-def test_the_constraint_pulls_exposures_together_and_reduces_errors():
-    """The scatter of the relative orientation falls with its standard deviation; its value comes
-    nearer the truth.
-    """
+def test_constraint_reduces_scatter_and_errors():
+    """Scatter and errors of the relative orientation fall with its standard deviation."""
     scatter = []
     error = []
     for sd in ((1e3, 1.0), SOFT, (RIGID_SD_MM, RIGID_SD_RAD)):
@@ -335,7 +331,7 @@ def test_the_constraint_pulls_exposures_together_and_reduces_errors():
 
 
 def test_standard_deviations_against_monte_carlo():
-    """Errors of the relative orientation have the size that its covariance claims."""
+    """Errors of the relative orientation agree with its covariance."""
     squares = []
     for seed in range(40):
         network, truth = rigid_network(5, 40, (RIGID_SD_MM, RIGID_SD_RAD), seed)
@@ -351,7 +347,7 @@ def test_standard_deviations_against_monte_carlo():
     assert np.mean(squares) == pytest.approx(1, abs=0.35)
 
 
-def test_mean_pose_is_not_steered_by_one_pair():
+def test_mean_pose_is_robust_to_one_pair():
     network, truth = rigid_network(7, 20, alone=0)
     position = truth.position_mm.copy()
     position[-1] += 500.0
@@ -369,9 +365,7 @@ def test_mean_pose_is_not_steered_by_one_pair():
 
 
 def test_three_fluoroscopes_share_the_first():
-    """Two constraints, one with fewer pairs than the other: both eliminations agree, and all pairs
-    keep to it.
-    """
+    """Two constraints with different numbers of pairs: both eliminations agree, all pairs fit."""
     network, truth = rigs.small_network(5, 30, 3, seen=0.9)
     a = np.arange(5)
     other = RelativePose(matrix_from_vector([0.02, 0.6, 0.01]), np.array([800.0, -20.0, 250.0]))

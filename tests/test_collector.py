@@ -14,7 +14,7 @@ from fluoro_calib_ros.exposures.collector import (
 )
 from fluoro_calib_ros.exposures.coverage import Coverage
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.exposures.pairing import FramePairer
+from fluoro_calib_ros.exposures.pairing import CompletePairer, PairingOptions
 
 SIZE = (1000, 800)
 MS = 1_000_000
@@ -37,69 +37,78 @@ def pair(number=1, stamp_ms=0.0, shift=0.0, shift_b=None):
 # ---- pairing
 
 
+def completed(pairer, frame):
+    """The exposure that a frame completes, or None."""
+    exposures = pairer.add(frame)
+    assert len(exposures) <= 1
+    return exposures[0] if exposures else None
+
+
 def test_frames_pair_by_number_in_any_order():
-    pairer = FramePairer('ab')
-    assert pairer.add(frame('a', 1, 0)) is None and pairer.add(frame('a', 2, 5)) is None
-    found = pairer.add(frame('b', 2, 900))
+    pairer = CompletePairer('ab')
+    assert (
+        completed(pairer, frame('a', 1, 0)) is None and completed(pairer, frame('a', 2, 5)) is None
+    )
+    found = completed(pairer, frame('b', 2, 900))
     assert (found['a'].stamp_ns, found['b'].stamp_ns) == (5 * MS, 900 * MS)
-    assert pairer.add(frame('b', 1, 901))['a'].number == 1
+    assert completed(pairer, frame('b', 1, 901))['a'].number == 1
     pairer.flush()
     assert pairer.unpaired == {'a': 0, 'b': 0}
 
 
 def test_frames_pair_by_stamp_within_the_tolerance():
     """The nearest partner; the pair is numbered anew, as the frames need not be numbered alike."""
-    pairer = FramePairer('ab', 'stamp', tolerance_ns=2 * MS)
+    pairer = CompletePairer('ab', PairingOptions('stamp', 0.002))
     for number, stamp in ((70, 0), (71, 3), (72, 50)):
-        assert pairer.add(frame('a', number, stamp)) is None
-    found = pairer.add(frame('b', 5, 2.5))
+        assert completed(pairer, frame('a', number, stamp)) is None
+    found = completed(pairer, frame('b', 5, 2.5))
     assert (found['a'].stamp_ns, found['a'].number, found['b'].number) == (3 * MS, 1, 1)
-    assert pairer.add(frame('b', 6, 52.1)) is None, 'beyond the tolerance'
-    assert pairer.add(frame('b', 7, 48.0))['b'].number == 2
+    assert completed(pairer, frame('b', 6, 52.1)) is None, 'beyond the tolerance'
+    assert completed(pairer, frame('b', 7, 48.0))['b'].number == 2
     pairer.flush()
     assert pairer.unpaired == {'a': 1, 'b': 1}
 
 
 def test_only_the_last_frames_wait():
     """What drops out alone is counted, and finds no partner any more."""
-    pairer = FramePairer('ab', waiting=3)
+    pairer = CompletePairer('ab', PairingOptions(waiting=3))
     for number in range(1, 6):
-        assert pairer.add(frame('a', number)) is None
+        assert completed(pairer, frame('a', number)) is None
     assert pairer.unpaired == {'a': 2, 'b': 0}
-    assert pairer.add(frame('b', 2)) is None
-    assert pairer.add(frame('b', 3)) is not None
+    assert completed(pairer, frame('b', 2)) is None
+    assert completed(pairer, frame('b', 3)) is not None
     pairer.flush()
     assert pairer.unpaired == {'a': 4, 'b': 1}
     assert pairer.late == {'a': 0, 'b': 1}
-    assert pairer.add(frame('b', 4)) is None, 'flush gives all up'
+    assert completed(pairer, frame('b', 4)) is None, 'flush gives all up'
 
 
 @pytest.mark.parametrize('by', ['frame_number', 'stamp'])
 def test_frames_of_a_fluoroscope_that_was_started_anew_are_not_late(by):
-    pairer = FramePairer('ab', by, waiting=3)
+    pairer = CompletePairer('ab', PairingOptions(by, waiting=3))
     for number in range(10_000, 10_006):
         pairer.add(frame('a', number, number))
     for number in range(1, 4):
-        assert pairer.add(frame('b', number, number)) is None
-        assert pairer.add(frame('a', number, number)) is not None
+        assert completed(pairer, frame('b', number, number)) is None
+        assert completed(pairer, frame('a', number, number)) is not None
     assert pairer.late == {'a': 0, 'b': 0}
 
 
 def test_a_number_that_comes_again_replaces_the_frame_that_waits():
-    pairer = FramePairer('ab')
+    pairer = CompletePairer('ab')
     pairer.add(frame('a', 1, 0))
     pairer.add(frame('a', 1, 7))
     assert pairer.unpaired == {'a': 1, 'b': 0}
-    assert pairer.add(frame('b', 1))['a'].stamp_ns == 7 * MS
+    assert completed(pairer, frame('b', 1))['a'].stamp_ns == 7 * MS
 
 
 def test_one_fluoroscope_alone_needs_no_partner():
-    assert FramePairer(['a']).add(frame('a', 4))['a'].number == 4
+    assert completed(CompletePairer(['a']), frame('a', 4))['a'].number == 4
 
 
 def test_pairing_of_another_kind_is_refused():
     with pytest.raises(ValueError, match="not 'id'"):
-        FramePairer('ab', 'id')
+        CompletePairer('ab', PairingOptions('id'))
 
 
 # ---- still exposures

@@ -8,7 +8,12 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.exposures.pairing import ExposurePairer, exposure_pairer, recorded_pairer
+from fluoro_calib_ros.exposures.pairing import (
+    PairingOptions,
+    PartialPairer,
+    exposure_pairer,
+    recorded_pairer,
+)
 
 MS = 1_000_000
 BY = ('frame_number', 'stamp')
@@ -115,7 +120,7 @@ def test_random_losses_jitter_and_delays(seed):
     patience = int(rng.integers(24, 40))
     of_each = streams(rng, names, 300, rng.choice([0.0, 0.1, 0.3]))
     frames = merged(rng, of_each, patience // 2)
-    pairer = exposure_pairer(names, BY[seed % 2], 1 * MS, 64, patience)
+    pairer = exposure_pairer(names, PairingOptions(BY[seed % 2], 0.001, 64, patience))
     assert paired(pairer, frames) == expected(of_each)
     assert sum(pairer.late.values()) == 0 and pairer.incomplete == sum(
         len(views) < len(names) for _, views in expected(of_each)
@@ -133,7 +138,7 @@ def test_delays_beyond_the_patience_cost_views_and_nothing_else(seed):
     of_each = streams(rng, 'abc', 300, 0.2)
     frames = merged(rng, of_each)
     whole = dict(expected(of_each))
-    pairer = exposure_pairer('abc', BY[seed % 2], 1 * MS, waiting, patience)
+    pairer = exposure_pairer('abc', PairingOptions(BY[seed % 2], 0.001, waiting, patience))
     found = []
     for f in frames:
         found += [(next(iter(e.values())).row, set(e)) for e in pairer.add(f)]
@@ -150,7 +155,7 @@ def test_delays_beyond_the_patience_cost_views_and_nothing_else(seed):
 
 @pytest.mark.parametrize('by', BY)
 def test_a_lost_view_is_certain_with_the_next_frame(by):
-    pairer = exposure_pairer('abc', by, 1 * MS)
+    pairer = exposure_pairer('abc', PairingOptions(by, 0.001))
     out = [
         [sorted(e) for e in pairer.add(f)]
         for f in (frame('a', 0), frame('b', 0), frame('a', 1), frame('c', 1), frame('b', 1))
@@ -163,10 +168,10 @@ def test_a_silent_fluoroscope_is_waited_for_once_and_taken_up_again(by):
     """Then the others come out with their own last frame; it comes back at their pace, a frame
     late at first.
     """
-    pairer = exposure_pairer('abc', by, 1 * MS, 64, 5)
+    pairer = exposure_pairer('abc', PairingOptions(by, 0.001, 64, 5))
     out = []
     for row in range(20):
-        out.append(sum((paired(pairer, [frame(name, row)], flush=False) for name in 'ab'), []))
+        out.append([e for name in 'ab' for e in paired(pairer, [frame(name, row)], flush=False)])
     assert [len(some) for some in out] == [0] * 5 + [6] + [1] * 14 and pairer.silent == {'c'}
     assert (
         paired(pairer, [frame('c', 19)], flush=False) == []
@@ -183,7 +188,7 @@ def test_a_silent_fluoroscope_is_waited_for_once_and_taken_up_again(by):
 def test_one_that_lags_for_good_stays_out_and_the_others_are_not_delayed():
     """Far behind, or numbered otherwise, before or after: what it sends is counted."""
     for first in (-1000, 1000, 10**6):
-        pairer = exposure_pairer('abc', waiting=8, patience=5)
+        pairer = exposure_pairer('abc', PairingOptions(waiting=8, patience=5))
         out = []
         for row in range(2000, 2100):
             out.append(
@@ -193,7 +198,9 @@ def test_one_that_lags_for_good_stays_out_and_the_others_are_not_delayed():
                     flush=False,
                 )
             )
-        assert sum(out, []) == [(row, {'a', 'b'}) for row in range(2000, 2100)]
+        assert [e for some in out for e in some] == [
+            (row, {'a', 'b'}) for row in range(2000, 2100)
+        ]
         assert all(len(some) == 1 for some in out[6:])
         assert pairer.unpaired['a'] == pairer.unpaired['b'] == 0 and pairer.unpaired['c'] >= 90
 
@@ -202,7 +209,7 @@ def test_one_alone_waits_as_long_as_its_queue():
     """A single view is of no use: it is not given up for patience, and the pair comes out when its
     partner comes.
     """
-    pairer = exposure_pairer('abc', waiting=8, patience=2)
+    pairer = exposure_pairer('abc', PairingOptions(waiting=8, patience=2))
     assert paired(pairer, [frame('a', row) for row in range(10)], flush=False) == []
     assert pairer.unpaired == {'a': 2, 'b': 0, 'c': 0} and not pairer.silent
     assert paired(pairer, [frame('b', row) for row in range(10)], flush=False) == [
@@ -217,7 +224,7 @@ def test_streams_that_begin_anew(count, later):
     """Fluoroscopes started anew, or a recording played again: by number, with stamps that go on or
     fall back.
     """
-    pairer = exposure_pairer('abc', waiting=64)
+    pairer = exposure_pairer('abc', PairingOptions(waiting=64))
     for turn in range(3):
         frames = [
             replace(frame(name, row), stamp_ns=(turn if later else 0) * 10**12 + row * 10**9 // 2)
@@ -228,8 +235,8 @@ def test_streams_that_begin_anew(count, later):
         rows = paired(pairer, frames, flush=False)
         assert rows == [(row, {'a', 'b'} if row == 1 else {'a', 'b', 'c'}) for row in range(count)]
     assert sum(pairer.unpaired.values()) == 0
-    by_stamp = exposure_pairer('abc', 'stamp')
-    for turn in range(2):
+    by_stamp = exposure_pairer('abc', PairingOptions('stamp'))
+    for _ in range(2):
         assert (
             len(
                 paired(
@@ -253,7 +260,7 @@ def test_what_waits_comes_out_when_a_stream_begins_anew():
 
 @pytest.mark.parametrize('by', BY)
 def test_frames_that_come_again_or_out_of_their_order_are_late(by):
-    pairer = exposure_pairer('abc', by, 1 * MS)
+    pairer = exposure_pairer('abc', PairingOptions(by, 0.001))
     frames = [
         frame('a', 5),
         frame('a', 5),
@@ -271,7 +278,7 @@ def test_by_stamp_exposures_are_numbered():
     """And belong together by time, however they are numbered, within the tolerance of the
     earliest.
     """
-    pairer = exposure_pairer('abc', 'stamp', 2 * MS)
+    pairer = exposure_pairer('abc', PairingOptions('stamp', 0.002))
     frames = [
         Frame('b', 70, 1 * MS, 0),
         Frame('a', 5, 0, 0),
@@ -291,8 +298,8 @@ def test_by_stamp_exposures_are_numbered():
 @pytest.mark.parametrize('by', BY)
 def test_two_fluoroscopes_are_paired_as_before(by):
     """Complete or not at all; of what has dropped out the partner is late."""
-    pairer = exposure_pairer('ab', by, 1 * MS, 3, 1)
-    assert not isinstance(pairer, ExposurePairer)
+    pairer = exposure_pairer('ab', PairingOptions(by, 0.001, 3, 1))
+    assert not isinstance(pairer, PartialPairer)
     assert paired(pairer, [frame('a', row) for row in range(5)], flush=False) == []
     assert paired(pairer, [frame('b', row) for row in (1, 4, 2)], flush=False) == [
         (4, {'a', 'b'}),
@@ -309,4 +316,4 @@ def test_two_fluoroscopes_are_paired_as_before(by):
 @pytest.mark.parametrize('names', ['ab', 'abc'])
 def test_pairing_of_another_kind_is_refused_of_any_number(names):
     with pytest.raises(ValueError, match="not 'id'"):
-        exposure_pairer(names, 'id')
+        exposure_pairer(names, PairingOptions('id'))

@@ -14,7 +14,7 @@ from ..errors import DataError
 from ..options import option
 from .coverage import Coverage
 from .frame import Frame
-from .pairing import FramePairer
+from .pairing import CompletePairer, recording_options
 
 MIN_COMMON_TARGETS = 8  # with fewer targets in common two frames cannot be compared
 MAX_RECENT = 1000  # pairs that are remembered
@@ -192,15 +192,14 @@ def collect_recorded(
         Number of frames without partner by fluoroscope.
     """
     still = still or StillOptions()
-    pairer = FramePairer(frames, pair_by, waiting=10**9)
+    pairer = CompletePairer(frames, recording_options(pair_by))
     collector = ExposureCollector(frames, still)
     if mode == 'auto':
         mode = 'still' if any(_is_stream(f, still) for f in frames.values()) else 'all'
     collect = collector.offer if mode == 'still' else collector.take
     recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
     for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):
-        pair = pairer.add(frame)
-        if pair is not None:
+        for pair in pairer.add(frame):
             collect(pair)
     pairer.flush()
     return collector.frames(), dict(pairer.unpaired)

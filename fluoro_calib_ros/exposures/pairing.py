@@ -1,24 +1,47 @@
-"""Pairing: bring together the frames that belong to one exposure.
+"""Pairing: combine the frames of several fluoroscopes that belong to one exposure.
 
-The calibration needs all views of an exposure; for a reconstruction two views of three or more
-suffice.
+A calibration needs all views of an exposure (CompletePairer). For a reconstruction, two views of
+three or more suffice (PartialPairer).
 
-Streams are in order. So a fluoroscope that has delivered a later frame has lost the one before,
-and nothing has to wait for it; only for one that is silent is there a wait, and it is bounded.
+Streams arrive in order. So a fluoroscope that has delivered a later frame has lost the one
+before, and nothing has to wait for it. Only a silent fluoroscope makes the others wait, for a
+limited time.
 """
 
+from __future__ import annotations
+
 from collections import OrderedDict, deque
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, Protocol
 
 from ..options import option
 
 PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # views of an exposure that can be intersected
-# frames of two others for which a silent fluoroscope is waited for: a stall of 32 ms at 1000 Hz
-PATIENCE = 32
-RESTART_NS = (
-    10**9
-)  # a stamp so much before the last one is no frame out of order, but a stream begun anew
+PATIENCE = 32  # frames: a stall of 32 ms at 1000 Hz
+# A stamp that much before the last one starts a new stream; it is no frame out of order.
+RESTART_NS = 1_000_000_000
+UNLIMITED = 10**9  # frames
+
+# Frames by fluoroscope. They are dataclasses with the fields of PairableFrame.
+Exposure = dict[str, Any]
+
+
+class PairableFrame(Protocol):
+    """What the pairing needs to know of a frame; it must be a dataclass, too."""
+
+    @property
+    def fluoroscope(self) -> str:
+        """Name of the fluoroscope."""
+
+    @property
+    def number(self) -> int:
+        """Frame number."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the exposure [ns]."""
 
 
 @dataclass(frozen=True)
@@ -48,284 +71,323 @@ class PairingOptions:
         """The tolerance in nanoseconds."""
         return round(1e9 * self.tolerance_s)
 
+    @property
+    def by_number(self) -> bool:
+        """Whether frames are paired by number. Raises ValueError for an unknown pair_by."""
+        if self.pair_by not in PAIR_BY:
+            raise ValueError(f"pair_by is 'frame_number' or 'stamp', not {self.pair_by!r}")
+        return self.pair_by == 'frame_number'
 
-class FramePairer:
-    """Brings together the frames of the fluoroscopes that belong to one exposure.
 
-    By frame number, or by stamp within tolerance_ns where pair_by is 'stamp'. Of each fluoroscope
-    the last `waiting` frames wait for their partners; a frame that drops out alone is counted as
-    unpaired. A frame that comes after one of its partners has dropped out is late: counted as
-    both, and given up at once.
+class Pairer(Protocol):
+    """Combines frames into exposures.
+
+    Attributes
+    ----------
+    fluoroscopes : tuple of str
+    unpaired : dict of str to int
+        Number of frames that are in no exposure, by fluoroscope.
+    late : dict of str to int
+        Number of those that arrived too late for their exposure.
+    incomplete : int
+        Number of exposures without a frame of every fluoroscope.
+    silent : frozenset of str
+        Fluoroscopes that are no longer waited for.
     """
 
-    def __init__(self, fluoroscopes, pair_by='frame_number', tolerance_ns=2_000_000, waiting=64):
-        if pair_by not in ('frame_number', 'stamp'):
-            raise ValueError(f"pair_by is 'frame_number' or 'stamp', not {pair_by!r}")
+    fluoroscopes: tuple[str, ...]
+    unpaired: dict[str, int]
+    late: dict[str, int]
+    incomplete: int
+    silent: frozenset[str]
+
+    def add(self, frame: PairableFrame) -> Sequence[Exposure]:
+        """Add a frame; returns the exposures that are ready now."""
+
+    def flush(self) -> Sequence[Exposure]:
+        """Stop waiting; returns the exposures that were still waiting for a frame."""
+
+
+def exposure_pairer(fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> Pairer:
+    """Pairer for a reconstruction with these fluoroscopes.
+
+    Of two fluoroscopes no view can be missing, so they are paired as for a calibration. Raises
+    ValueError for an unknown pair_by.
+    """
+    names = tuple(fluoroscopes)
+    if len(names) <= MIN_VIEWS:
+        return CompletePairer(names, options)
+    return PartialPairer(names, options)
+
+
+def recorded_pairer(fluoroscopes: Iterable[str], pair_by: str = 'frame_number') -> Pairer:
+    """Pairer for the reconstruction of a recording, with waiting and patience unlimited."""
+    return exposure_pairer(fluoroscopes, recording_options(pair_by))
+
+
+def recording_options(pair_by: str = 'frame_number') -> PairingOptions:
+    """Options for a recording: all its frames are there, so none has to be given up."""
+    return PairingOptions(pair_by, waiting=UNLIMITED, patience=UNLIMITED)
+
+
+class CompletePairer:
+    """Pairer of exposures with a frame of every fluoroscope.
+
+    Frames belong together by number, or by stamp within the tolerance. Of each fluoroscope the
+    last `waiting` frames wait for their partners; a frame that is displaced counts as unpaired. A
+    frame that arrives after one of its partners was displaced is late: it counts as late and as
+    unpaired. Exposures may be ready in another order than that of their frames.
+
+    Parameters
+    ----------
+    fluoroscopes : iterable of str
+    options : PairingOptions, optional
+
+    Raises
+    ------
+    ValueError
+        For an unknown pair_by.
+    """
+
+    def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
+        options = options or PairingOptions()
         self.fluoroscopes = tuple(fluoroscopes)
-        self.pair_by = pair_by
-        self._tolerance = tolerance_ns
-        self._limit = waiting
-        self._pairs = 0
-        self._waiting = {name: OrderedDict() for name in self.fluoroscopes}
-        self._dropped = dict.fromkeys(self.fluoroscopes)  # key that dropped out last
+        self._by_number = options.by_number
+        self._tolerance = options.tolerance_ns
+        self._max_waiting = options.waiting
+        self._exposures = 0
+        self._waiting: dict[str, OrderedDict[int, Any]] = {
+            name: OrderedDict() for name in self.fluoroscopes
+        }
+        # Key of the last displaced frame.
+        self._displaced: dict[str, int | None] = dict.fromkeys(self.fluoroscopes)
         self.unpaired = dict.fromkeys(self.fluoroscopes, 0)
         self.late = dict.fromkeys(self.fluoroscopes, 0)
+        self.incomplete = 0
+        self.silent: frozenset[str] = frozenset()
 
-    def add(self, frame):
-        """Take a frame; returns {fluoroscope: Frame} once all of an exposure are there, else None.
-
-        Frames need a fluoroscope, a number and a stamp_ns.
-        """
-        waiting = self._waiting[frame.fluoroscope]
-        key = frame.number if self.pair_by == 'frame_number' else frame.stamp_ns
-        if self._is_late(frame.fluoroscope, key):
-            self.late[frame.fluoroscope] += 1
-            self.unpaired[frame.fluoroscope] += 1
-            return None
+    def add(self, frame: PairableFrame) -> Sequence[Exposure]:
+        """Add a frame; returns the exposure that it completes, or none."""
+        name = frame.fluoroscope
+        waiting = self._waiting[name]
+        key = frame.number if self._by_number else frame.stamp_ns
+        if self._is_late(name, key):
+            self.late[name] += 1
+            self.unpaired[name] += 1
+            return ()
         if key in waiting:
-            self.unpaired[frame.fluoroscope] += (
-                1  # the number came again: the older one lost its chance
-            )
+            self.unpaired[name] += 1  # the frame with the same key that is replaced
         waiting[key] = frame
+        exposure = self._complete(key)
+        if exposure is not None:
+            return (exposure,)
+        while len(waiting) > self._max_waiting:
+            self._displaced[name], _ = waiting.popitem(last=False)
+            self.unpaired[name] += 1
+        return ()
+
+    def _complete(self, key: int) -> Exposure | None:
+        """Remove and return the exposure with that key if all its frames are waiting."""
         partners = {name: self._partner(name, key) for name in self.fluoroscopes}
-        if all(p is not None for p in partners.values()):
-            pair = {name: self._waiting[name].pop(p) for name, p in partners.items()}
-            self._pairs += 1
-            # Frames that are paired by stamp need not be numbered alike, or at all: the pair gets
-            # a number.
-            return (
-                pair
-                if self.pair_by == 'frame_number'
-                else {name: replace(frame, number=self._pairs) for name, frame in pair.items()}
-            )
-        while len(waiting) > self._limit:
-            self._dropped[frame.fluoroscope], _ = waiting.popitem(last=False)
-            self.unpaired[frame.fluoroscope] += 1
-        return None
+        exposure = {
+            name: self._waiting[name][partner]
+            for name, partner in partners.items()
+            if partner is not None
+        }
+        if len(exposure) < len(self.fluoroscopes):
+            return None
+        for name, partner in partners.items():
+            if partner is not None:
+                del self._waiting[name][partner]
+        self._exposures += 1
+        return exposure if self._by_number else _renumbered(exposure, self._exposures)
 
-    def _is_late(self, fluoroscope, key):
-        """Whether a frame of that key has a partner that has dropped out already.
+    def _is_late(self, fluoroscope: str, key: int) -> bool:
+        """Whether a partner of the frame with that key was displaced already.
 
-        Keys that lie before all that wait, and not after the one that dropped out last: those of a
-        fluoroscope that has been started anew are further back.
+        This is so for keys before all that are waiting and not after the last displaced one. The
+        keys of a fluoroscope that was restarted are further back.
         """
         for name in self.fluoroscopes:
-            dropped = self._dropped[name]
-            if name == fluoroscope or dropped is None or key > dropped:
+            displaced = self._displaced[name]
+            if name == fluoroscope or displaced is None or key > displaced:
                 continue
-            near = (
-                key >= dropped - self._limit
-                if self.pair_by == 'frame_number'
-                else (key >= dropped - 10**9)
-            )
-            if near and self._partner(name, key) is None:
+            reach = self._max_waiting if self._by_number else RESTART_NS
+            if key >= displaced - reach and self._partner(name, key) is None:
                 return True
         return False
 
-    def _partner(self, name, key):
+    def _partner(self, name: str, key: int) -> int | None:
+        """Key of the waiting frame of a fluoroscope that belongs to a key, or None."""
         waiting = self._waiting[name]
-        if self.pair_by == 'frame_number':
+        if self._by_number:
             return key if key in waiting else None
         nearest = min(waiting, key=lambda stamp: abs(stamp - key), default=None)
-        return nearest if nearest is not None and abs(nearest - key) <= self._tolerance else None
+        if nearest is None or abs(nearest - key) > self._tolerance:
+            return None
+        return nearest
 
-    def flush(self):
-        """Give up all waiting frames; they count as unpaired."""
+    def flush(self) -> Sequence[Exposure]:
+        """Discard all waiting frames, which count as unpaired; returns no exposures."""
         for name, waiting in self._waiting.items():
             self.unpaired[name] += len(waiting)
             waiting.clear()
-
-
-def exposure_pairer(
-    fluoroscopes, pair_by='frame_number', tolerance_ns=2_000_000, waiting=64, patience=PATIENCE
-):
-    """Pairer of the frames of fluoroscopes (names): add(frame) and flush() give the exposures
-    {fluoroscope: frame} that come out by it, unpaired, late {fluoroscope: number of frames},
-    incomplete (number of exposures) and silent (names) tell what was missing. Raises ValueError
-    for another pair_by.
-
-    Of two fluoroscopes no view can be missing: they are paired as for the calibration, and there
-    is no patience.
-    """
-    if len(fluoroscopes) <= MIN_VIEWS:
-        return _CompletePairer(fluoroscopes, pair_by, tolerance_ns, waiting)
-    return ExposurePairer(fluoroscopes, pair_by, tolerance_ns, waiting, patience)
-
-
-def recorded_pairer(fluoroscopes, pair_by='frame_number'):
-    """Pairer of a recording, of which everything is there: nothing drops out, and nobody is given
-    up.
-    """
-    return exposure_pairer(fluoroscopes, pair_by, waiting=10**9, patience=10**9)
-
-
-class _CompletePairer(FramePairer):
-    """FramePairer with the interface of an ExposurePairer."""
-
-    incomplete = 0
-    silent = frozenset()
-
-    def add(self, frame):
-        """Take a frame; returns the exposure that it completes, or none."""
-        pair = super().add(frame)
-        return () if pair is None else (pair,)
-
-    def flush(self):
-        """Give up all waiting frames; returns no exposures."""
-        super().flush()
         return ()
 
 
-class ExposurePairer:
-    """Exposures of three or more fluoroscopes, in order of time, each once, with two views or
-    more.
+class PartialPairer:
+    """Pairer of exposures with frames of two or more of three or more fluoroscopes.
 
-    By frame number, or by stamp where pair_by is 'stamp': all that is within tolerance_ns of the
-    earliest frame. An exposure comes out once every fluoroscope has a frame in it or has delivered
-    a later one. One that has delivered nothing while two others went on by `patience` frames is
-    silent: nothing waits for it until it is there again. Of each fluoroscope at most the last
-    `waiting` frames wait. A frame alone in its exposure is counted as unpaired, one that comes
-    when its exposure is out already, or after a later one of its own stream, as late too. A stream
-    whose frames begin anew releases what waits.
+    Exposures are ready in the order of time, each once. Frames belong together by number, or by
+    stamp: all within the tolerance of the earliest frame. An exposure is ready once every
+    fluoroscope has a frame in it or has delivered a later one. A fluoroscope that has delivered
+    nothing while two others went on by `patience` frames is silent: it is not waited for until it
+    delivers again. Of each fluoroscope at most `waiting` frames wait. A frame alone in its
+    exposure counts as unpaired. One that arrives after its exposure, or after a later one of its
+    own stream, counts as late, too. A stream that starts again releases all waiting frames.
+
+    Parameters
+    ----------
+    fluoroscopes : iterable of str
+    options : PairingOptions, optional
+
+    Raises
+    ------
+    ValueError
+        For an unknown pair_by.
     """
 
-    def __init__(
-        self,
-        fluoroscopes,
-        pair_by='frame_number',
-        tolerance_ns=2_000_000,
-        waiting=64,
-        patience=PATIENCE,
-    ):
-        if pair_by not in ('frame_number', 'stamp'):
-            raise ValueError(f"pair_by is 'frame_number' or 'stamp', not {pair_by!r}")
+    def __init__(self, fluoroscopes: Iterable[str], options: PairingOptions | None = None) -> None:
+        options = options or PairingOptions()
         self.fluoroscopes = tuple(fluoroscopes)
-        self.pair_by = pair_by
-        self._by_number = pair_by == 'frame_number'
-        self._tolerance = 0 if self._by_number else tolerance_ns
-        self._limit = waiting
-        self._patience = patience
+        self._by_number = options.by_number
+        self._tolerance = 0 if self._by_number else options.tolerance_ns
+        self._max_waiting = options.waiting
+        self._patience = options.patience
         self._exposures = 0
         self.unpaired = dict.fromkeys(self.fluoroscopes, 0)
         self.late = dict.fromkeys(self.fluoroscopes, 0)
         self.incomplete = 0
-        self._begin()
+        self._start()
 
-    def _begin(self):
-        self._queues = {name: deque() for name in self.fluoroscopes}  # (key, frame), ascending
-        self._last = dict.fromkeys(self.fluoroscopes)  # key and stamp that came last
-        self._until = dict.fromkeys(
-            self.fluoroscopes, float('-inf')
-        )  # key up to which exposures went without it
-        self._recent = deque(maxlen=self._patience)  # keys of the last exposures
-        self.silent = frozenset()
+    def _start(self) -> None:
+        """Forget the streams, but not the counts."""
+        # Keys, ascending, and frames.
+        self._queues: dict[str, deque[tuple[int, Any]]] = {
+            name: deque() for name in self.fluoroscopes
+        }
+        # Key and stamp of the last frame.
+        self._last: dict[str, tuple[int, int] | None] = dict.fromkeys(self.fluoroscopes)
+        # Key up to which exposures went out without the fluoroscope.
+        self._passed: dict[str, float] = dict.fromkeys(self.fluoroscopes, float('-inf'))
+        self._recent: deque[int] = deque(maxlen=self._patience)  # keys of the last exposures
+        self.silent: frozenset[str] = frozenset()
 
-    def add(self, frame):
-        """Take a frame; returns the exposures that come out by it, [{fluoroscope: Frame}, ...].
-
-        Frames need a fluoroscope, a number and a stamp_ns.
-        """
+    def add(self, frame: PairableFrame) -> list[Exposure]:
+        """Add a frame; returns the exposures that are ready now."""
         name = frame.fluoroscope
-        out = []
+        ready: list[Exposure] = []
         key = frame.number if self._by_number else frame.stamp_ns
         last = self._last[name]
         if last is not None and key <= last[0]:
-            if not self._is_new_stream(key, frame.stamp_ns, *last):
+            if not self._is_restart(key, frame.stamp_ns, *last):
                 self._count_late(name)
-                return out
-            out = self.flush()
+                return ready
+            ready = self.flush()
         self._last[name] = key, frame.stamp_ns
-        if key <= self._until[name]:
+        if key <= self._passed[name]:
             self._count_late(name)
-            # No further behind than can be waited for: so it will be, from now on.
+            # It lags by no more than can be waited for, so from now on it is waited for.
             if name in self.silent and key >= self._recent[0]:
                 self.silent -= {name}
-            return out
-        if name in self.silent:
-            self.silent -= {name}
+            return ready
+        self.silent -= {name}
         queue = self._queues[name]
         queue.append((key, frame))
-        self._release(out)
-        if len(queue) > self._limit:
+        ready += self._release()
+        if len(queue) > self._max_waiting:
             queue.popleft()
             self.unpaired[name] += 1
-            self._release(out)
-        return out
+            ready += self._release()
+        return ready
 
-    def _count_late(self, name):
+    def _count_late(self, name: str) -> None:
         self.late[name] += 1
         self.unpaired[name] += 1
 
-    def _is_new_stream(self, key, stamp_ns, last, last_ns):
-        """Whether a frame that is not after the last one of its stream begins a new one: its
-        number falls back while time goes on, or by more than frames can be out of order.
+    def _is_restart(self, key: int, stamp_ns: int, last: int, last_ns: int) -> bool:
+        """Whether a frame that is not after the last one of its stream starts a new stream.
+
+        Its number falls back while time goes on, or by more than frames can be out of order.
         """
         if not self._by_number:
             return last - key > RESTART_NS
         return key < last and (
-            stamp_ns > last_ns or last_ns - stamp_ns > RESTART_NS or last - key > self._limit
+            stamp_ns > last_ns or last_ns - stamp_ns > RESTART_NS or last - key > self._max_waiting
         )
 
-    def _release(self, out):
-        """Put the exposures into out of which it is certain, or has to do, what belongs to them."""
+    def _release(self) -> list[Exposure]:
+        """Remove the exposures for which there is nothing to wait any more."""
+        ready: list[Exposure] = []
         queues = self._queues
         while True:
             heads = {name: queue[0][0] for name, queue in queues.items() if queue}
             if len(heads) < MIN_VIEWS:
-                return
-            until = min(heads.values()) + self._tolerance
-            there = [name for name, key in heads.items() if key <= until]
-            if len(heads) + len(self.silent) < len(queues) and not self._given_up(heads, there):
-                return
-            self._take(there, until, out)
+                return ready
+            end = min(heads.values()) + self._tolerance
+            names = [name for name, key in heads.items() if key <= end]
+            missing = len(queues) - len(heads) - len(self.silent)
+            if missing > 0 and not self._gives_up(heads, names):
+                return ready
+            ready += self._pop_exposure(names, end)
 
-    def _given_up(self, heads, there):
-        """Whether the fluoroscopes that have nothing waiting have been waited for long enough;
-        they are silent then.
+    def _gives_up(self, heads: dict[str, int], names: list[str]) -> bool:
+        """Whether the fluoroscopes without a waiting frame were waited for long enough.
+
+        They are silent then. heads: key of the first waiting frame by fluoroscope; names: those
+        of the next exposure.
         """
         lengths = sorted(len(queue) for queue in self._queues.values())
-        full = len(there) >= MIN_VIEWS and any(
-            len(self._queues[name]) > self._limit for name in there
-        )
-        if lengths[-MIN_VIEWS] <= self._patience and not full:
+        is_full = any(len(self._queues[name]) > self._max_waiting for name in names)
+        must_release = is_full and len(names) >= MIN_VIEWS
+        if lengths[-MIN_VIEWS] <= self._patience and not must_release:
             return False
         self.silent = frozenset(name for name in self.fluoroscopes if name not in heads)
         return True
 
-    def _take(self, there, until, out):
-        """Take the first frames of the fluoroscopes that are there out of their queues, and into
-        out as an exposure.
+    def _pop_exposure(self, names: list[str], end: int) -> list[Exposure]:
+        """Remove the first frames of these fluoroscopes; returns the exposure, or none.
+
+        end: largest key that belongs to it.
         """
-        frames = {name: self._queues[name].popleft()[1] for name in there}
-        if len(frames) < MIN_VIEWS:
-            self.unpaired[there[0]] += 1
-            return
-        if len(frames) < len(self.fluoroscopes):
+        exposure = {name: self._queues[name].popleft()[1] for name in names}
+        if len(exposure) < MIN_VIEWS:
+            self.unpaired[names[0]] += 1
+            return []
+        if len(exposure) < len(self.fluoroscopes):
             self.incomplete += 1
             for name in self.fluoroscopes:
-                if name not in frames:
-                    self._until[name] = until
+                if name not in exposure:
+                    self._passed[name] = end
         self._exposures += 1
-        self._recent.append(until - self._tolerance)
-        # Frames that are paired by stamp need not be numbered alike, or at all: the exposure gets
-        # a number.
-        out.append(
-            frames
-            if self._by_number
-            else {name: replace(frame, number=self._exposures) for name, frame in frames.items()}
-        )
+        self._recent.append(end - self._tolerance)
+        return [exposure if self._by_number else _renumbered(exposure, self._exposures)]
 
-    def flush(self):
-        """Wait no longer; returns the exposures that come out, [{fluoroscope: Frame}, ...], and
-        begins anew.
-        """
-        out = []
+    def flush(self) -> list[Exposure]:
+        """Stop waiting and start anew; returns the exposures that were waiting."""
+        ready: list[Exposure] = []
         while any(self._queues.values()):
-            until = min(queue[0][0] for queue in self._queues.values() if queue) + self._tolerance
-            self._take(
-                [name for name, queue in self._queues.items() if queue and queue[0][0] <= until],
-                until,
-                out,
-            )
-        self._begin()
-        return out
+            first = min(queue[0][0] for queue in self._queues.values() if queue)
+            end = first + self._tolerance
+            names = [name for name, queue in self._queues.items() if queue and queue[0][0] <= end]
+            ready += self._pop_exposure(names, end)
+        self._start()
+        return ready
+
+
+def _renumbered(exposure: Exposure, number: int) -> Exposure:
+    """The exposure with this frame number.
+
+    Frames that are paired by stamp may be numbered differently, or not at all.
+    """
+    return {name: replace(frame, number=number) for name, frame in exposure.items()}

@@ -12,12 +12,11 @@ from ..drift.clusters import Cluster
 from ..drift.recording_watch import DriftVerdict, RecordingDriftWatch
 from ..errors import DataError
 from ..exposures.frame import Frame
+from ..exposures.pairing import PAIR_BY
 from ..options import option, validate_options
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
-
-PAIR_BY = ('frame_number', 'stamp')
 
 
 @dataclass(frozen=True)

@@ -35,7 +35,7 @@ from ..calibration.self_calibration import Round
 from ..errors import DataError
 from ..exposures.collector import ExposureCollector, StillOptions
 from ..exposures.frame import Frame, validate_frame
-from ..exposures.pairing import FramePairer, PairingOptions
+from ..exposures.pairing import CompletePairer, PairingOptions
 from ..files.calibration import SUFFIX, load_calibrations, save_calibration
 from ..files.phantom import read_phantom
 from ..jobs.calibration import CalibrationOutcome, Rig
@@ -255,7 +255,7 @@ class CalibrationNode(Node):
         )
 
     def _start_collection(self) -> None:
-        self._pairer = FramePairer(self._names, self._pairing.pair_by, self._pairing.tolerance_ns)
+        self._pairer = CompletePairer(self._names, self._pairing)
         self._collector = ExposureCollector(self._names, self._still)
 
     def _calibrations(self) -> dict[str, calibration_result.FluoroscopeCalibration]:
@@ -276,9 +276,9 @@ class CalibrationNode(Node):
         except DataError as error:
             fluoroscope.refusals.refuse(error)
             return
-        pair = None if frame is None else self._pairer.add(frame)
-        if pair is not None:
-            self._collect_pair(pair)
+        if frame is not None:
+            for pair in self._pairer.add(frame):
+                self._collect_pair(pair)
 
     def _validated(self, fluoroscope: _Fluoroscope, message: TargetObservations) -> Frame | None:
         """Return the frame of a message, None where it does not show the phantom.

@@ -158,13 +158,7 @@ class ReconstructionNode(StreamNode):
         """Forget the orientations and start counting from zero."""
         # By calibration ids, the oldest first; replaced as a whole.
         self._rigs: dict[tuple[str | None, ...], _Rig] = {}
-        self._pairer = exposure_pairer(
-            self._names,
-            self._pairing.pair_by,
-            self._pairing.tolerance_ns,
-            self._pairing.waiting,
-            self._pairing.patience,
-        )
+        self._pairer = exposure_pairer(self._names, self._pairing)
         self._received: Counter[str] = Counter()
         self._refusals = RefusalLog('frame', self.limited_logger)
         self._points: Counter[str] = Counter()

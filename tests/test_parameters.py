@@ -1,0 +1,128 @@
+"""Parameters: declared once, and the same in the nodes, in config/ and in docs/."""
+
+import importlib.util
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import rclpy
+import yaml
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.nodes.runtime.errors import StartError
+from fluoro_calib_ros.nodes.runtime.parameters import ParameterGroup, descriptor_of, parameters_of
+from fluoro_calib_ros.options import declared, option
+
+ROOT = Path(__file__).parents[1]
+_spec = importlib.util.spec_from_file_location(
+    'write_parameters', ROOT / 'tools' / 'write_parameters.py'
+)
+write_parameters = importlib.util.module_from_spec(_spec)
+_spec.loader.exec_module(write_parameters)
+
+
+@pytest.mark.parametrize('node', write_parameters.CONFIGURED)
+def test_config_holds_every_parameter_with_its_default(node):
+    config = yaml.safe_load((ROOT / 'config' / 'fluoro_calib.yaml').read_text())
+    values = config[f'/**/{node}']['ros__parameters']
+    expected = {
+        name: list(declaration.default)
+        if isinstance(declaration.default, tuple)
+        else declaration.default
+        for name, declaration in write_parameters.parameters(node).items()
+    }
+    assert values == expected
+    assert all(type(values[name]) is type(expected[name]) for name in expected)
+
+
+def test_config_is_generated_from_the_declarations():
+    """Comments included; `python tools/write_parameters.py` writes it."""
+    assert (ROOT / 'config' / 'fluoro_calib.yaml').read_text() == write_parameters.yaml_text()
+
+
+def test_tables_of_the_docs_are_generated_from_the_declarations():
+    text = (ROOT / 'docs' / 'nodes.md').read_text()
+    assert write_parameters.docs_text(text) == text
+
+
+def test_parameters_of_the_calibration_are_its_options():
+    """Choices, range and description are those of the command line."""
+    parameters = write_parameters.parameters('calibration_node')
+    options = declared(CalibrationOptions)
+    for name in ('model', 'interior', 'loss', 'max_iterations', 'relative_orientation', 'datum'):
+        assert parameters[name] == options[name]
+
+
+@pytest.mark.parametrize('node', write_parameters.NODES)
+def test_every_parameter_is_described(node):
+    for declaration in write_parameters.parameters(node).values():
+        descriptor = descriptor_of(declaration)
+        assert declaration.description in descriptor.description and descriptor.read_only
+        number = isinstance(declaration.default, (int, float)) and not isinstance(
+            declaration.default, bool
+        )
+        assert bool(descriptor.integer_range or descriptor.floating_point_range) == number
+        assert all(choice in descriptor.additional_constraints for choice in declaration.choices)
+
+
+# ---- declaring them
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a test."""
+
+    length_m: float = option(1.0, 'length', minimum=0.0, maximum=10.0, unit='m')
+    count: int = option(2, 'count', minimum=1)
+    kind: str = option('a', 'kind', choices=('a', 'b'))
+    names: tuple[str, ...] = option(('x',), 'names')
+
+    def __post_init__(self) -> None:
+        if self.count == 13:
+            raise ValueError('count: 13 brings bad luck')
+
+
+GROUP = ParameterGroup(
+    Options, {'length_m': 'length', 'count': 'count', 'kind': 'kind', 'names': 'names'}
+)
+
+
+@pytest.fixture
+def make_node():
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context)
+    nodes = []
+
+    def make(**values):
+        overrides = [Parameter(name, value=value) for name, value in values.items()]
+        nodes.append(Node('test', context=context, parameter_overrides=overrides))
+        return nodes[-1]
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_a_group_becomes_an_options_object(make_node):
+    assert GROUP.declare(make_node()) == Options()
+    values = GROUP.declare(make_node(length=2.5, count=3, kind='b', names=['y', 'z']))
+    assert values == Options(2.5, 3, 'b', ('y', 'z'))
+    assert list(parameters_of([GROUP])) == ['length', 'count', 'kind', 'names']
+
+
+@pytest.mark.parametrize(
+    'values, sentence',
+    [
+        ({'length': 11.0}, 'parameter length: '),
+        ({'length': 1}, 'parameter length: '),  # an integer, not 1.0
+        ({'count': 0}, 'parameter count: '),
+        ({'count': 13}, 'parameter count: 13 brings bad luck'),
+        ({'kind': 'c'}, "parameter kind is one of a, b, not 'c'"),
+    ],
+)
+def test_invalid_values_name_the_parameter(make_node, values, sentence):
+    with pytest.raises(StartError, match=f'^{sentence}'):
+        GROUP.declare(make_node(**values))

@@ -22,7 +22,7 @@ from fluoro_calib_ros.calibration.rig_orientation import (
     orientation_of_capture,
     orientation_of_exposures,
 )
-from fluoro_calib_ros.distortion.grid import OUTSIDE
+from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.drift.clusters import Cluster
 from fluoro_calib_ros.drift.observations import EpipolarObservations, PointObservations
 from fluoro_calib_ros.drift.options import DriftOptions
@@ -175,7 +175,7 @@ def blocks(scene_, rng, first, count, drift=None):
                 )
             found = scene_.calibrations[name].correct(uv.reshape(-1, 2), np.zeros(uv[..., 0].size))
             # What lies beyond the calibrated area is not looked at, as by watch_exposure.
-            inside = np.where(found.status[:, None] == OUTSIDE, np.nan, found.uv)
+            inside = np.where(found.status[:, None] == CorrectionStatus.OUTSIDE, np.nan, found.uv)
             seen[name] = uv.reshape(-1, 2)
             corrected[name] = inside
             systematic[name] = found.sigma

@@ -17,7 +17,7 @@ from threadpoolctl import threadpool_limits
 from fluoro_calib_ros.calibration.calibrate import SEEN_FOR_NOISE, calibrate, held_corrections
 from fluoro_calib_ros.calibration.initial_network import measured_network
 from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.self_calibration import start_noise
+from fluoro_calib_ros.calibration.robust_adjustment import start_noise
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import points_on_image
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust

@@ -1,6 +1,6 @@
 """Calibrate the recorded rig in bags/, validate the calibration and save it.
 
-    python examples/calibrate_bag.py [OUT]
+python examples/calibrate_bag.py [OUT]
 """
 
 import sys

@@ -1,6 +1,6 @@
 """Simulate a rig, calibrate it, and test the calibration on exposures that it has not seen.
 
-    python examples/test_a_calibration.py [FOLDER]
+python examples/test_a_calibration.py [FOLDER]
 """
 
 import sys

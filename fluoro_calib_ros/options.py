@@ -7,7 +7,7 @@ config/ and docs/ are made from `declared`, or tested against it.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable
+from collections.abc import Callable, Collection, Iterable
 from typing import Any
 
 _KEY = 'option'
@@ -76,16 +76,20 @@ def option(
     default: Any,
     description: str,
     *,
-    choices: Iterable[str] = (),
+    choices: Iterable[str] | Callable[[], Iterable[str]] = (),
     minimum: float | None = None,
     maximum: float | None = None,
     unit: str = '',
     length: int | None = None,
 ) -> Any:
-    """Declare a field of an options dataclass; see `Option` for the arguments."""
+    """Declare a field of an options dataclass; see `Option` for the arguments.
+
+    choices may be a function, which is called whenever the options are declared: a registry that
+    grows is then always up to date.
+    """
     declaration = {
         'description': description,
-        'choices': tuple(choices),
+        'choices': choices,
         'minimum': minimum,
         'maximum': maximum,
         'unit': unit,
@@ -96,14 +100,21 @@ def option(
 
 def declared(options: type | object) -> dict[str, Option]:
     """Return the options that a dataclass declares, by name, in the order of declaration."""
-    return {
-        field.name: Option(field.name, field.default, **field.metadata[_KEY])
-        for field in dataclasses.fields(options)  # type: ignore[arg-type]
-        if _KEY in field.metadata
-    }
+    out = {}
+    for field in dataclasses.fields(options):  # type: ignore[arg-type]
+        if _KEY in field.metadata:
+            declaration = dict(field.metadata[_KEY])
+            choices = declaration['choices']
+            declaration['choices'] = tuple(choices() if callable(choices) else choices)
+            out[field.name] = Option(field.name, field.default, **declaration)
+    return out
 
 
-def validate_options(options: object) -> None:
-    """Raise ValueError for the first option of an instance with a value it cannot have."""
+def validate_options(options: object, except_for: Collection[str] = ()) -> None:
+    """Raise ValueError for the first option of an instance with a value it cannot have.
+
+    except_for: names of options that are validated elsewhere.
+    """
     for name, one in declared(options).items():
-        one.validate(getattr(options, name))
+        if name not in except_for:
+            one.validate(getattr(options, name))

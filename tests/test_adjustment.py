@@ -8,7 +8,7 @@ import rigs
 from scipy import optimize
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.self_calibration import adjusted_with_precision
+from fluoro_calib_ros.calibration.robust_adjustment import adjusted_with_precision
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.photogrammetry.adjustment import (
     SolverOptions,

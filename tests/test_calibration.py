@@ -18,9 +18,10 @@ from fluoro_calib_ros.calibration.calibrate import (
 )
 from fluoro_calib_ros.calibration.initial_network import measured_network, nominal_interior
 from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.result import INVALID, OK, OUTSIDE, digest_of_sources
+from fluoro_calib_ros.calibration.result import digest_of_sources
 from fluoro_calib_ros.calibration.self_calibration import self_calibrate
 from fluoro_calib_ros.distortion.gauge import gauge_basis, gauge_coefficients
+from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.photogrammetry.rotations import (
     matrix_from_quaternion,
@@ -28,6 +29,8 @@ from fluoro_calib_ros.photogrammetry.rotations import (
     rotation_angle,
 )
 from fluoro_calib_ros.simulation.rig import seen_beads, simulate_exposures, virtual_rig
+
+OK, OUTSIDE, INVALID = CorrectionStatus
 
 PHANTOM = rigs.rig().phantom
 NOISE_PX = 0.25

@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 from rigs import run
 
-from fluoro_calib_ros.calibration.result import OUTSIDE
 from fluoro_calib_ros.cli import COMMANDS, main
+from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.files.calibration import load_calibration
 from fluoro_calib_ros.jobs.dataset import write_bag
 
@@ -365,7 +365,9 @@ def test_correct_takes_the_distortion_off(rig, result, tmp_path, capsys):
         assert all(g == {key: r[key] for key in g} for g, r in mine)
         wanted = calibration.correct(uv)
         assert np.array_equal(corrected, wanted.uv)
-        assert [r['status'] == 'OUTSIDE' for _, r in mine] == (wanted.status == OUTSIDE).tolist()
+        assert [r['status'] == 'OUTSIDE' for _, r in mine] == (
+            wanted.status == CorrectionStatus.OUTSIDE
+        ).tolist()
 
 
 # ---- what users get wrong

@@ -14,15 +14,12 @@ from scipy.special import gamma, kv
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
+from fluoro_calib_ros.calibration.combined_adjustment import calibrate_by_adjustment
 from fluoro_calib_ros.calibration.initial_network import measured_network
-from fluoro_calib_ros.calibration.model_choice import better_kind
-from fluoro_calib_ros.calibration.self_calibration import (
-    CalibrationOptions,
-    _adjust_as_a_whole,
-    adjusted_with_precision,
-    start_noise,
-)
-from fluoro_calib_ros.distortion.models import CorrectionModel
+from fluoro_calib_ros.calibration.model_choice import better_model
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.robust_adjustment import adjusted_with_precision, start_noise
+from fluoro_calib_ros.distortion.estimation import AdjustmentProblem
 from fluoro_calib_ros.distortion.priors import (
     Prior,
     gauge_precision,
@@ -30,6 +27,7 @@ from fluoro_calib_ros.distortion.priors import (
     spectral_density,
     starting_prior,
 )
+from fluoro_calib_ros.distortion.registry import MODELS, create_model
 from fluoro_calib_ros.distortion.series import (
     SD_GRID,
     Functions,
@@ -155,7 +153,7 @@ def test_standard_deviation_over_the_image_is_that_of_the_coefficients():
 def test_a_model_with_a_series_knows_what_lies_outside():
     functions = Functions(SIZE, 3)
     uv = pixels(size=(500, 500))
-    model = CorrectionModel(
+    model = create_model(
         'collocation',
         0,
         uv,
@@ -164,9 +162,12 @@ def test_a_model_with_a_series_knows_what_lies_outside():
     )
     found = model.evaluate(np.array([[250.0, 250.0], [900.0, 700.0]]))
     assert list(found.outside) == [False, True] and found.sd == pytest.approx(0.1)
-    for kind, series in (('collocation', None), ('local_linear', model.series)):
-        with pytest.raises(ValueError, match='do not go together'):
-            CorrectionModel(kind, 6, uv, uv, series=series)
+    for kind, series, message in (
+        ('collocation', None, 'collocation needs a series'),
+        ('local_linear', model.series, 'local_linear has no series'),
+    ):
+        with pytest.raises(ValueError, match=message):
+            create_model(kind, 6, uv, uv, series=series)
 
 
 # ---- signal and trend
@@ -420,7 +421,9 @@ def whole(rig, model, count=10, seed=1):
         np.zeros_like(measured.network.uv),
         start_noise('student_t'),
     )
-    return _adjust_as_a_whole(measured, before, CalibrationOptions(model), None, None)
+    problem = AdjustmentProblem(measured.network, measured.image_size, before, False)
+    terms = MODELS[model].adjusted_terms(problem)
+    return calibrate_by_adjustment(measured, before, MODELS[model], terms, 60), terms
 
 
 @pytest.mark.long
@@ -433,12 +436,12 @@ def test_stepwise_takes_the_terms_that_are_there():
         return DistortionField(np.array([511.5, 511.5]), 9.5, np.zeros(2), 2.0, np.zeros((0, 5)))
 
     _, state = whole(rig_with(smooth), 'parametric')
-    names = {name for name, there in zip(state.names, state.chosen[0]) if there}
+    names = {name for name, there in zip(state.names, state.selected[0]) if there}
     assert {'radial 1', 'spiral 1'} <= names and len(names) <= 4
     _, state = whole(
         rig_with(lambda field: replace(smooth(field), pincushion=0.0, spiral=0.0)), 'parametric'
     )
-    assert state.chosen[0].sum() <= 1
+    assert state.selected[0].sum() <= 1
 
 
 @pytest.mark.long
@@ -447,11 +450,11 @@ def test_auto_takes_collocation_unless_held_out_exposures_speak_against_it():
     better.
     """
     run, state = whole(virtual_rig(1), 'collocation', 15)
-    assert better_kind(run, state) is None
+    assert better_model(run, state) is None
     squares = np.floor(run.measured.network.uv / 80).sum(axis=1) % 2
     steps = np.where(squares[:, None] == 0, 1.0, -1.0) * [1.0, 0.7]
     stepped = replace(run, after=replace(run.after, residuals=run.after.residuals + steps))
-    assert better_kind(stepped, state) in ('local_linear', 'knn')
+    assert better_model(stepped, state) in ('local_linear', 'knn')
 
 
 @pytest.mark.long

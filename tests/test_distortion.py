@@ -9,17 +9,16 @@ from scipy.spatial import ConvexHull, Delaunay
 from sklearn.model_selection import GridSearchCV, GroupKFold, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
-from fluoro_calib_ros.distortion.cross_validation import (
-    CrossValidation,
-    NearestTable,
-    candidate_k,
-    exposure_folds,
-)
+from fluoro_calib_ros.distortion.cross_validation import CrossValidation
+from fluoro_calib_ros.distortion.estimation import TrainingPoints, exposure_folds
 from fluoro_calib_ros.distortion.gauge import gauge_basis, gauge_coefficients
-from fluoro_calib_ros.distortion.models import CorrectionModel, no_correction
-from fluoro_calib_ros.distortion.regressor import Regressor
-from fluoro_calib_ros.distortion.smoothers import Neighbourhoods
-from fluoro_calib_ros.distortion.trend import DEGREE, Trend, least_squares_map
+from fluoro_calib_ros.distortion.knn import KnnModel
+from fluoro_calib_ros.distortion.local_linear import LocalLinearModel
+from fluoro_calib_ros.distortion.neighbour_regression import NeighbourRegression
+from fluoro_calib_ros.distortion.neighbours import Neighbourhoods, NeighbourTable
+from fluoro_calib_ros.distortion.none import no_correction
+from fluoro_calib_ros.distortion.registry import MODELS, create_model
+from fluoro_calib_ros.distortion.trend import Trend, least_squares_map
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.noise import INLIER_Q
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
@@ -64,7 +63,7 @@ def test_knn_equals_scikit_learn(k):
     query = pixels()
     theirs = KNeighborsRegressor(k).fit(uv, duv).predict(query)
     np.testing.assert_allclose(
-        CorrectionModel('knn', k, uv, duv).predict(query), theirs, rtol=0, atol=1e-12
+        create_model('knn', k, uv, duv).predict(query), theirs, rtol=0, atol=1e-12
     )
 
 
@@ -91,7 +90,7 @@ def test_local_linear_equals_a_weighted_least_squares_plane_for_each_pixel(k):
         at_query = np.linalg.pinv(weight[:, None] * a)[0] * weight
         expected[row] += at_query @ left[near]
         norms2[row] = np.sum(at_query**2)
-    model = CorrectionModel('local_linear', k, uv, duv, noise_px=2.0)
+    model = create_model('local_linear', k, uv, duv, noise_px=2.0)
     # The ridge that keeps collinear neighbours harmless is a millionth of the weights.
     wide = k > 6  # five points determine a plane, and sometimes badly
     error = np.abs(model.predict(query) - expected).max(axis=1)
@@ -108,7 +107,7 @@ def test_local_planes_reproduce_planes_also_beyond_the_rim(k):
     uv, _ = training()
     query = np.concatenate([pixels(100), [[-40.0, -40.0], [700.0, 500.0]]])
     order = np.argsort(np.linalg.norm(uv[None] - query[:, None], axis=2), axis=1)[:, :k]
-    weights = Neighbourhoods(uv[order], query).weights('local_linear', k)
+    weights = LocalLinearModel.weights(Neighbourhoods(uv[order], query), k)
     np.testing.assert_allclose(weights.sum(axis=1), 1, rtol=1e-9)
     reach = np.linalg.norm(uv[order[:, -1]] - query, axis=1)
     plane = np.einsum('nk,nkc->nc', weights, uv[order])
@@ -131,14 +130,14 @@ def test_local_linear_reproduces_cubic_polynomials():
 
     query = np.concatenate([pixels(300), [[-60.0, -60.0], [760.0, 520.0]]])
     for k in (6, 25, 300):
-        model = CorrectionModel('local_linear', k, uv, field(uv))
+        model = create_model('local_linear', k, uv, field(uv))
         np.testing.assert_allclose(model.predict(query), field(query), rtol=0, atol=1e-9)
 
 
 def test_knn_has_no_trend_and_local_linear_a_cubic_one():
     """A mean of neighbours is the paper's model: nothing is added to it."""
-    assert 'knn' not in DEGREE and len(Trend('knn', training()[0])) == 0
-    assert len(Trend('local_linear', training()[0])) == 10
+    assert KnnModel.trend_degree is None and len(Trend(None, training()[0])) == 0
+    assert len(Trend(LocalLinearModel.trend_degree, training()[0])) == 10
     assert least_squares_map(np.zeros((5, 0))).shape == (0, 5)
 
 
@@ -148,7 +147,7 @@ def test_local_linear_beats_the_mean_at_the_rim():
     corner = np.array([[0.0, 0.0], [639.0, 479.0], [0.0, 479.0], [639.0, 0.0]])
     error = {
         kind: np.abs(
-            CorrectionModel(kind, 20, uv, duv).predict(corner) - 5 * np.sin(corner / 90)
+            create_model(kind, 20, uv, duv).predict(corner) - 5 * np.sin(corner / 90)
         ).mean()
         for kind in ('knn', 'local_linear')
     }
@@ -165,35 +164,35 @@ def test_no_correction_corrects_nothing_and_knows_no_outside():
     [
         (
             ('spline', 5, np.zeros((9, 2)), np.zeros((9, 2))),
-            "one of none, knn, local_linear, parametric, hybrid, collocation, not 'spline'",
+            "one of none, knn, local_linear, parametric, hybrid, collocation, lookup, not 'spline'",
         ),
         (
             ('knn', 10, np.zeros((9, 2)), np.zeros((9, 2))),
-            'knn with k = 10 cannot be had from 9 training points',
+            'knn with k = 10 is not possible with 9 training points',
         ),
-        (('knn', 0, np.zeros((9, 2)), np.zeros((9, 2))), 'knn with k = 0 cannot be had'),
+        (('knn', 0, np.zeros((9, 2)), np.zeros((9, 2))), 'knn with k = 0 is not possible'),
         (
             ('local_linear', 5, np.zeros((9, 2)), np.zeros((9, 2))),
-            'local_linear with k = 5 cannot be had',
+            'local_linear with k = 5 is not possible',
         ),
         (
             ('knn', 1, np.zeros((0, 2)), np.zeros((0, 2))),
-            'k = 1 cannot be had from 0 training points',
+            'k = 1 is not possible with 0 training points',
         ),
         (('knn', 2, np.zeros((9, 2)), np.zeros((8, 2))), '9 training points, but 8 corrections'),
         (('knn', 2, np.full((9, 2), np.nan), np.zeros((9, 2))), 'is not a number'),
         (('knn', 2, np.zeros((9, 2)), np.full((9, 2), np.inf)), 'is not a number'),
     ],
 )
-def test_a_model_that_cannot_be_had_is_refused(arguments, said):
+def test_an_impossible_model_is_refused(arguments, said):
     with pytest.raises(ValueError, match=said):
-        CorrectionModel(*arguments)
+        create_model(*arguments)
 
 
 def test_outside_is_what_lies_beyond_the_convex_hull():
     rng = np.random.default_rng(4)
     uv = rng.normal([320, 240], 60, (300, 2))
-    model = CorrectionModel('knn', 3, uv, np.zeros((300, 2)))
+    model = create_model('knn', 3, uv, np.zeros((300, 2)))
     query = pixels()
     wanted = Delaunay(uv).find_simplex(query) < 0
     assert 100 < wanted.sum() < len(query) - 100
@@ -205,7 +204,7 @@ def test_outside_is_what_lies_beyond_the_convex_hull():
 def test_training_points_on_a_line_enclose_nothing():
     """Everything is outside, and predictions stay finite."""
     line = np.column_stack([np.linspace(0, 600, 80), np.linspace(0, 400, 80)])
-    model = CorrectionModel('local_linear', 12, line, np.sin(line / 50))
+    model = create_model('local_linear', 12, line, np.sin(line / 50))
     found = model.evaluate(pixels(100))
     assert found.outside.all() and np.isfinite(found.duv).all() and np.isfinite(found.sd).all()
 
@@ -220,15 +219,15 @@ def test_standard_deviations_against_monte_carlo(kind, k):
     rng = np.random.default_rng(6)
     found = np.array(
         [
-            CorrectionModel(kind, k, uv, duv + rng.normal(0, 0.3, duv.shape)).predict(query)
+            create_model(kind, k, uv, duv + rng.normal(0, 0.3, duv.shape)).predict(query)
             for _ in range(300)
         ]
     )
     scatter = np.sqrt(found.var(axis=0).mean(axis=1))
-    sd = CorrectionModel(kind, k, uv, duv, noise_px=0.3).evaluate(query).sd
+    sd = create_model(kind, k, uv, duv, noise_px=0.3).evaluate(query).sd
     assert np.mean(scatter / sd) == pytest.approx(1, abs=0.03)
     np.testing.assert_allclose(scatter / sd, 1, atol=0.15)
-    with_bias = CorrectionModel(kind, k, uv, duv, noise_px=0.3, bias_px=0.4).evaluate(query).sd
+    with_bias = create_model(kind, k, uv, duv, noise_px=0.3, bias_px=0.4).evaluate(query).sd
     np.testing.assert_allclose(with_bias, np.hypot(sd, 0.4), rtol=1e-12)
 
 
@@ -244,7 +243,7 @@ def test_scores_of_knn_equal_a_loop_with_scikit_learn(weighted):
     exposure = np.sort(rng.integers(0, 12, 300))
     fold = exposure_folds(exposure, 5)
     candidates = np.arange(1, 30)
-    scores = CrossValidation('knn', uv, fold, candidates).scores(duv, information)
+    scores = CrossValidation(KnnModel, uv, fold, candidates).scores(duv, information)
     for k, score in zip(candidates, scores):
         total = 0.0
         for f in range(5):
@@ -275,7 +274,7 @@ def test_k_of_knn_is_that_of_grid_search():
         scoring=scorer,
     )
     search.fit(uv, duv)
-    scores = CrossValidation('knn', uv, fold, candidates).scores(
+    scores = CrossValidation(KnnModel, uv, fold, candidates).scores(
         duv, np.tile(np.eye(2), (300, 1, 1))
     )
     np.testing.assert_allclose(scores / 6, -search.cv_results_['mean_test_score'], rtol=1e-10)
@@ -290,14 +289,14 @@ def test_scores_of_local_linear_equal_a_loop_with_models():
     information = random_information(rng, 300)
     fold = exposure_folds(np.repeat(np.arange(15), 20), 5)
     candidates = [10, 24, 60]
-    validation = CrossValidation('local_linear', uv, fold, candidates)
+    validation = CrossValidation(LocalLinearModel, uv, fold, candidates)
     held_out = np.empty((3, 300, 2))
     for f in range(5):
         out = fold == f
         for number, k in enumerate(candidates):
-            held_out[number, out] = CorrectionModel(
-                'local_linear', k, uv[~out], duv[~out]
-            ).predict(uv[out])
+            held_out[number, out] = create_model('local_linear', k, uv[~out], duv[~out]).predict(
+                uv[out]
+            )
     np.testing.assert_allclose(validation.predictions(duv), held_out, rtol=0, atol=1e-8)
     np.testing.assert_allclose(validation.predictions_for(24, duv), held_out[1], rtol=0, atol=1e-8)
     error = duv - held_out
@@ -320,19 +319,19 @@ def test_folds_hold_whole_exposures():
 
 
 def test_candidates_stay_within_what_the_training_points_allow():
-    assert candidate_k('knn', 2000).tolist() == list(range(3, 101))
-    assert candidate_k('knn', 50).tolist() == list(range(3, 21))
-    steps = candidate_k('local_linear', 2000)
+    assert KnnModel.candidate_k(2000).tolist() == list(range(3, 101))
+    assert KnnModel.candidate_k(50).tolist() == list(range(3, 21))
+    steps = LocalLinearModel.candidate_k(2000)
     assert steps[0] == 10 and 300 < steps[-1] <= 400 and (np.diff(steps) > 0).all()
-    assert candidate_k('local_linear', 20).tolist() == [8]
+    assert LocalLinearModel.candidate_k(20).tolist() == [8]
     # A fold may leave fewer points than a candidate asks for: that one is not tried.
     uv, _ = training(30)
-    assert CrossValidation('knn', uv, np.arange(30) % 2, [5, 15, 16]).candidates.tolist() == [
+    assert CrossValidation(KnnModel, uv, np.arange(30) % 2, [5, 15, 16]).candidates.tolist() == [
         5,
         15,
     ]
     with pytest.raises(ValueError, match='too few for a cross-validation'):
-        CrossValidation('knn', uv, np.arange(30) % 2, [16])
+        CrossValidation(KnnModel, uv, np.arange(30) % 2, [16])
 
 
 # ---- gauge
@@ -383,10 +382,15 @@ def test_the_gauge_is_what_a_change_of_orientation_does_to_the_image():
 # ---- the regression step
 
 
+def regression_of(kind, uv, exposure, interior_held=False, k=None):
+    """The regression step of a neighbour model."""
+    return NeighbourRegression(MODELS[kind], TrainingPoints(uv, exposure, SIZE, interior_held), k)
+
+
 def regressor_and_values(kind='local_linear', interior_held=False, k=None, n=600):
     uv, duv = training(n)
     exposure = np.repeat(np.arange(15), n // 15)
-    return Regressor(kind, uv, exposure, interior_held, k), duv
+    return regression_of(kind, uv, exposure, interior_held, k), duv
 
 
 def chosen(kind='local_linear', interior_held=False, k=None):
@@ -405,12 +409,14 @@ def test_the_regressor_smooths_as_its_model_predicts(kind):
     regressor, values = chosen(kind)
     inside = regressor.inliers
     np.testing.assert_array_equal(inside, np.arange(600) % 30 != 0)
-    plain = CorrectionModel(kind, regressor.k, regressor.uv[inside], values[inside])
+    plain = create_model(kind, regressor.k, regressor.points.uv[inside], values[inside])
     np.testing.assert_allclose(
-        regressor.smooth(values), plain.predict(regressor.uv), rtol=0, atol=1e-9
+        regressor.smooth(values), plain.predict(regressor.points.uv), rtol=0, atol=1e-9
     )
     np.testing.assert_allclose(
-        regressor.model(values).predict(regressor.uv), plain.predict(regressor.uv), atol=1e-9
+        regressor.model(values).predict(regressor.points.uv),
+        plain.predict(regressor.points.uv),
+        atol=1e-9,
     )
     assert np.abs(regressor.smooth(values)).max() < 10
 
@@ -419,10 +425,10 @@ def test_the_chosen_k_has_the_smallest_score():
     regressor, values = chosen('knn')
     inside = regressor.inliers
     validation = CrossValidation(
-        'knn',
-        regressor.uv[inside],
-        exposure_folds(regressor.exposure[inside]),
-        candidate_k('knn', int(inside.sum())),
+        KnnModel,
+        regressor.points.uv[inside],
+        exposure_folds(regressor.points.exposure[inside]),
+        KnnModel.candidate_k(int(inside.sum())),
     )
     scores = validation.scores(values[inside], np.tile(np.eye(2), (int(inside.sum()), 1, 1)))
     assert regressor.k == validation.candidates[np.argmin(scores)] and regressor.changed
@@ -465,7 +471,7 @@ def test_the_fitted_correction_is_made_orthogonal_to_the_gauge(kind, interior_he
     size = [
         np.abs(
             gauge_coefficients(
-                regressor.uv[inside], regressor.smooth(v)[inside], interior, interior_held
+                regressor.points.uv[inside], regressor.smooth(v)[inside], interior, interior_held
             )
         ).max()
         for v in (values, regressor.without_gauge(values, interior))
@@ -480,7 +486,7 @@ def test_a_held_interior_orientation_leaves_the_scale_to_the_correction():
     interior = np.array([320.0, 240.0, 2000.0])
     for held, part in ((True, 1.0), (False, 0.0)):
         regressor, _ = chosen(interior_held=held)
-        scale = 0.01 * (regressor.uv - interior[:2])
+        scale = 0.01 * (regressor.points.uv - interior[:2])
         kept = regressor.smooth(regressor.without_gauge(scale, interior))
         np.testing.assert_allclose(
             kept - kept.mean(axis=0), part * (scale - scale.mean(axis=0)), atol=0.05
@@ -497,7 +503,7 @@ def test_noise_and_bias_of_a_model_are_estimated(kind):
     exposure = np.repeat(np.arange(15), 100)
     information = np.tile(np.eye(2), (1500, 1, 1))
     q = np.zeros(1500)
-    regressor = Regressor(kind, uv, exposure, False, 40)
+    regressor = regression_of(kind, uv, exposure, False, 40)
     flat = rng.normal(0, 0.3, uv.shape)
     regressor.choose(flat, q, information)
     model = regressor.model(flat)
@@ -509,7 +515,7 @@ def test_noise_and_bias_of_a_model_are_estimated(kind):
 
 def test_a_model_equals_its_copy_with_other_quality_figures():
     """replace() keeps the training points: predictions stay, standard deviations scale."""
-    model = CorrectionModel('local_linear', 20, *training(), noise_px=0.1)
+    model = create_model('local_linear', 20, *training(), noise_px=0.1)
     twice = replace(model, noise_px=0.2)
     query = pixels(50)
     np.testing.assert_array_equal(twice.predict(query), model.predict(query))
@@ -517,12 +523,12 @@ def test_a_model_equals_its_copy_with_other_quality_figures():
 
 
 def test_neighbours_among_changing_points_are_those_of_a_search():
-    """NearestTable: the nearest allowed, in order, also where most are not allowed, and after a
+    """NeighbourTable: the nearest allowed, in order, also where most are not allowed, and after a
     restriction.
     """
     uv, _ = training(400)
     rng = np.random.default_rng(14)
-    table = NearestTable(uv, 12)
+    table = NeighbourTable(uv, 12)
     for share in (1.0, 0.8, 0.1):
         allowed = rng.random(400) < share
         rows = rng.permutation(400)[:90]
@@ -537,9 +543,9 @@ def test_neighbours_among_changing_points_are_those_of_a_search():
     np.testing.assert_array_equal(smaller.nearest(np.arange(kept.sum()), all_of_it, 30), near)
 
 
-def test_a_wanted_k_that_cannot_be_had_is_refused():
+def test_an_impossible_k_is_refused():
     for kind, k in (('local_linear', 5), ('knn', 581)):
         with pytest.raises(
-            ValueError, match=f'{kind} with k = {k} cannot be had from 580 inliers'
+            ValueError, match=f'{kind} with k = {k} is not possible with 580 inliers'
         ):
             chosen(kind, k=k)

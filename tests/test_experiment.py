@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
-from fluoro_calib_ros.distortion.models import no_correction
+from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.simulation.distortion import random_field
 
 sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed

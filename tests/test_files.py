@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
-from fluoro_calib_ros.distortion.models import CorrectionModel, no_correction
+from fluoro_calib_ros.distortion.none import no_correction
+from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
@@ -71,7 +72,7 @@ def some_calibration(name='a', n=400, **changes):
     rng = np.random.default_rng(5)
     uv = rng.uniform(50, 900, (n, 2))
     model = (
-        CorrectionModel('local_linear', 20, uv, np.sin(uv / 200) * 5, 0.08, 0.01)
+        create_model('local_linear', 20, uv, np.sin(uv / 200) * 5, 0.08, 0.01)
         if n
         else no_correction()
     )

@@ -12,11 +12,15 @@ import pytest
 import rigs
 from scipy.spatial import Delaunay
 
-from fluoro_calib_ros.calibration.result import INVALID, OK, OUTSIDE
-from fluoro_calib_ros.distortion import grid as grid_module
-from fluoro_calib_ros.distortion.grid import CHUNK, LIMIT_PX, CorrectionGrid
-from fluoro_calib_ros.distortion.models import CorrectionModel, no_correction
+from fluoro_calib_ros.distortion import grid_cells
+from fluoro_calib_ros.distortion.grid import CHUNK, DIVIDED, CorrectionGrid
+from fluoro_calib_ros.distortion.grid_errors import LIMIT_PX
+from fluoro_calib_ros.distortion.none import no_correction
+from fluoro_calib_ros.distortion.registry import create_model
+from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.exposures.frame import points_on_image
+
+OK, OUTSIDE, INVALID = CorrectionStatus
 
 pytestmark = pytest.mark.long
 
@@ -114,7 +118,7 @@ def test_nearest_neighbours_are_answered_from_within_their_cell():
     """
     calibration = calibration_of('knn')
     grid = calibration.grid
-    assert grid.cell_px == min(grid_module.CELL_PX)
+    assert grid.cell_px == min(grid_cells.CELL_PX)
     uv = any_pixels(grid)
     corners = np.array([calibration.model.predict(c) for c in corners_of(grid, uv)])
     duv, sd, _ = looked_up(grid, uv)
@@ -154,7 +158,7 @@ def test_corners_have_the_models_neighbours_however_training_points_lie(kind, k,
         duv = np.repeat(duv[:60], k + 1, axis=0)
     if points == 'beside':
         uv = uv * 0.2
-    model = CorrectionModel(kind, k, uv, duv, noise_px=0.2)
+    model = create_model(kind, k, uv, duv, noise_px=0.2)
     grid = CorrectionGrid(model, SIZE)
     corner = np.stack(np.meshgrid(*grid.nodes), axis=2).reshape(-1, 2)
     exact = model.evaluate(corner)
@@ -172,7 +176,7 @@ def test_corners_have_the_models_neighbours_however_training_points_lie(kind, k,
 def test_a_grid_that_does_not_reach_the_accuracy_says_so():
     """Rough values, few neighbours: no cell is small enough."""
     uv, duv = training(noise=3.0)
-    model = CorrectionModel('local_linear', 6, uv, duv)
+    model = create_model('local_linear', 6, uv, duv)
     grid = CorrectionGrid(model, SIZE)
     inside = looked_up(grid, any_pixels(grid))[2] == OK
     found = difference(grid, model, any_pixels(grid))
@@ -186,10 +190,10 @@ def test_cells_that_are_not_accurate_enough_are_divided(k, noise, height):
     their parts.
     """
     uv, duv = training(1500, noise=noise, size=(500, 400))
-    model = CorrectionModel('local_linear', k, uv, height * duv)
+    model = create_model('local_linear', k, uv, height * duv)
     grid = CorrectionGrid(model, (500, 400))
     assert 20 < grid.divided < 1000
-    inner = grid._status.reshape(len(grid.nodes[1]) + 1, -1)[1:-1, 1:-1] >= grid_module.DIVIDED
+    inner = grid._status.reshape(len(grid.nodes[1]) + 1, -1)[1:-1, 1:-1] >= DIVIDED
     assert np.count_nonzero(inner) == grid.divided
     j, i = np.nonzero(inner)
     rng = np.random.default_rng(11)
@@ -222,10 +226,10 @@ def test_cells_are_as_large_as_the_accuracy_allows():
 
 def test_a_large_image_gets_larger_cells(monkeypatch):
     uv, duv = training()
-    model = CorrectionModel('local_linear', 40, uv, duv)
+    model = create_model('local_linear', 40, uv, duv)
     found = []
     for memory in (10**9, 300_000, 80_000, 20_000, 3_000):
-        monkeypatch.setattr(grid_module, 'MEMORY', memory)
+        monkeypatch.setattr(grid_cells, 'MAX_TABLE_BYTES', memory)
         grid = CorrectionGrid(model, SIZE)
         found.append(grid.cell_px)
         assert difference(grid, model, any_pixels(grid)).max() <= 1.6 * max(
@@ -237,7 +241,7 @@ def test_a_large_image_gets_larger_cells(monkeypatch):
 @pytest.mark.parametrize('size', [(1, 1), (3, 2), (17, 33), (130, 7), (121, 94)])
 def test_images_of_any_size(size):
     """Cells are from edge to edge, whatever is left over by their size."""
-    model = CorrectionModel('local_linear', 40, *training())
+    model = create_model('local_linear', 40, *training())
     grid = CorrectionGrid(model, size)
     uv = any_pixels(grid, 800)
     assert (looked_up(grid, uv)[2] != INVALID).all()
@@ -273,7 +277,7 @@ def test_ok_is_a_promise_and_outside_begins_less_than_a_cell_before(kind):
 def test_outside_against_a_triangulation():
     rng = np.random.default_rng(4)
     uv = rng.normal([60, 45], 12, (200, 2))
-    grid = CorrectionGrid(CorrectionModel('knn', 3, uv, np.zeros((200, 2))), SIZE)
+    grid = CorrectionGrid(create_model('knn', 3, uv, np.zeros((200, 2))), SIZE)
     query = any_pixels(grid)
     inside = np.array([Delaunay(uv).find_simplex(c) >= 0 for c in corners_of(grid, query)]).all(
         axis=0
@@ -287,7 +291,7 @@ def test_outside_against_a_triangulation():
 
 def test_training_points_on_a_line_enclose_nothing():
     line = np.column_stack([np.linspace(0, 110, 80), np.linspace(0, 80, 80)])
-    grid = CorrectionGrid(CorrectionModel('local_linear', 12, line, np.sin(line / 50)), SIZE)
+    grid = CorrectionGrid(create_model('local_linear', 12, line, np.sin(line / 50)), SIZE)
     duv, sd, status = looked_up(grid, any_pixels(grid))
     assert (status == OUTSIDE).all() and np.isfinite(duv).all() and np.isfinite(sd).all()
     assert grid.error_px == 0, 'of no cell'

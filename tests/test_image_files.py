@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import rigs
 
-from fluoro_calib_ros.distortion.models import CorrectionModel
+from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.files import image_files as images
 from fluoro_calib_ros.files import tiff
@@ -44,7 +44,7 @@ def a_calibration(name):
         -1, 2
     )
     x = (uv - 0.5 * np.array(SIZE)) / 64
-    model = CorrectionModel(
+    model = create_model(
         'local_linear', 6, uv, 4 * x * (x**2).sum(axis=1, keepdims=True), 0.2, 0.0
     )
     return replace(

@@ -10,8 +10,8 @@ import pytest
 import rigs
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.constraints import paired_exposures, with_constraints
 from fluoro_calib_ros.calibration.initial_network import measured_network
-from fluoro_calib_ros.calibration.joint import constrained, pairs_of
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.errors import DataError
@@ -71,11 +71,11 @@ def test_separate_calibrations_have_no_relative_orientation():
 def test_exposures_are_paired_by_number():
     frames = {'a': FRAMES['a'], 'b': [replace(f, number=f.number + 2) for f in FRAMES['b']]}
     measured = measured_network(frames, PHANTOM)
-    pairs = pairs_of(measured, 1)
+    pairs = paired_exposures(measured, 1)
     assert [(measured.frames[i].number, measured.frames[j].number) for i, j in pairs] == [
         (n, n) for n in range(3, 7)
     ]
-    network = constrained(measured, CalibrationOptions(relative_orientation='soft')).network
+    network = with_constraints(measured, CalibrationOptions(relative_orientation='soft')).network
     assert len(network.relative[0].pairs) == 4 and network.relative[0].sd_mm == 0.5
     other = {'a': FRAMES['a'], 'b': [replace(f, number=f.number + 100) for f in FRAMES['b']]}
     with pytest.raises(DataError, match='fluoroscopes a and b: 0 exposures have the same number'):

@@ -13,7 +13,7 @@ import pytest
 import rigs
 from sensor_msgs.msg import Image
 
-from fluoro_calib_ros.distortion.models import CorrectionModel
+from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
@@ -35,7 +35,7 @@ def calibration():
     uv = np.stack(np.meshgrid(*(np.linspace(-0.5, s - 0.5, 8) for s in SIZE)), axis=-1).reshape(
         -1, 2
     )
-    model = CorrectionModel('local_linear', 6, uv, np.ones_like(uv), 0.2, 0.0)
+    model = create_model('local_linear', 6, uv, np.ones_like(uv), 0.2, 0.0)
     return replace(
         rigs.calibrated('a', 5, model='none').calibrations['a'],
         fluoroscope='a',

@@ -19,7 +19,7 @@ from fluoro_calib_ros.calibration.rig_orientation import (
     phantom_of,
     standing_frames,
 )
-from fluoro_calib_ros.distortion.models import no_correction
+from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom

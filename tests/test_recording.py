@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rigs import calibrated, run
 
-from fluoro_calib_ros.distortion.models import no_correction
+from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.drift.clusters import parse_clusters
 from fluoro_calib_ros.drift.options import DriftOptions
 from fluoro_calib_ros.drift.recording_watch import RecordingDriftWatch

@@ -11,11 +11,13 @@ import pytest
 import rigs
 from scipy.ndimage import map_coordinates
 
-from fluoro_calib_ros.calibration.result import INVALID, OK, OUTSIDE
-from fluoro_calib_ros.distortion.models import CorrectionModel
+from fluoro_calib_ros.distortion.registry import create_model
+from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector
 from fluoro_calib_ros.simulation.bead_images import BEAD_PX, background, bead_image
+
+OK, OUTSIDE, INVALID = CorrectionStatus
 
 SIZE = (1024, 1024)
 DEPTHS = (np.uint8, np.uint16)
@@ -40,7 +42,7 @@ def with_model(model, size):
 
 def model_of(uv, duv, kind='local_linear', k=6):
     """A CorrectionModel of training points and corrections (n, 2) [px]."""
-    return CorrectionModel(
+    return create_model(
         kind, k, np.asarray(uv, dtype=float), np.asarray(duv, dtype=float), 0.2, 0.0
     )
 

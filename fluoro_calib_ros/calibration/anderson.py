@@ -1,6 +1,10 @@
 """Anderson acceleration of a fixed-point iteration (Walker and Ni, SIAM J. Numer. Anal. 49, 2011)."""
 
+from __future__ import annotations
+
 import numpy as np
+
+RELATIVE_RANK = 1e-6  # singular values of the differences below that part of the largest are zero
 
 
 class Anderson:
@@ -9,18 +13,21 @@ class Anderson:
     depth: number of earlier iterates used. The iterates are arrays of one shape.
     """
 
-    def __init__(self, depth=8):
+    def __init__(self, depth: int = 8) -> None:
         self._depth = depth
         self.restart()
 
-    def restart(self):
+    def restart(self) -> None:
         """Forget the earlier iterates: the map has changed."""
-        self._x = []
-        self._f = []
+        self._x: list[np.ndarray] = []
+        self._f: list[np.ndarray] = []
 
-    def next(self, x, f, counted=slice(None)):
-        """Next iterate from the present one x and its image f; counted: entries whose residual is
-        to be small.
+    def next(
+        self, x: np.ndarray, f: np.ndarray, counted: np.ndarray | slice = slice(None)
+    ) -> np.ndarray:
+        """Return the next iterate from the present one x and its image f.
+
+        counted: entries whose residual is minimised.
         """
         self._x = (self._x + [x])[-self._depth - 1 :]
         self._f = (self._f + [f])[-self._depth - 1 :]
@@ -28,8 +35,8 @@ class Anderson:
             return f
         residual = [(b - a)[counted].ravel() for a, b in zip(self._x, self._f)]
         d_residual = np.stack([b - a for a, b in zip(residual, residual[1:])], axis=1)
-        # Columns are scaled and small singular values left out: late differences are nearly
+        # Columns are scaled and small singular values dropped: late differences are nearly
         # parallel.
         scale = np.maximum(np.linalg.norm(d_residual, axis=0), 1e-300)
-        gamma, *_ = np.linalg.lstsq(d_residual / scale, residual[-1], rcond=1e-6)
+        gamma, *_ = np.linalg.lstsq(d_residual / scale, residual[-1], rcond=RELATIVE_RANK)
         return f - sum(g * (b - a) for g, a, b in zip(gamma / scale, self._f, self._f[1:]))

@@ -9,16 +9,14 @@ from threadpoolctl import threadpool_limits
 from ..exposures.frame import validate_frame
 from ..photogrammetry.precision import geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
+from .constraints import relative_orientations
+from .diagnostics import correlations_of, outliers_of
 from .initial_network import measured_network
-from .joint import correlations_of, outliers_of, relative_orientations
 from .options import CalibrationOptions
 from .result import FluoroscopeCalibration, digest_of_sources
-from .self_calibration import (
-    adjusted_with_precision,
-    rmse_of_inliers,
-    self_calibrate,
-    start_noise,
-)
+from .robust_adjustment import adjusted_with_precision, start_noise
+from .rounds import rmse_of_inliers
+from .self_calibration import self_calibrate
 
 # mean number of image points of a target from which an adjustment estimates the noise itself
 SEEN_FOR_NOISE = 3
@@ -334,17 +332,19 @@ def _calibration(run, f, name, options, digest, seconds):
     last = run.history[-1]
     frames = [frame for frame in run.measured.frames if frame.fluoroscope == name]
     numbers = np.array([frame.number for frame in run.measured.frames])
-    trained = (
-        run.trained[rows] if run.models[name].kind != 'none' else np.zeros(len(rows), dtype=bool)
-    )
+    model = run.models[name]
+    if model.keeps_training_points:
+        train_exposure = numbers[run.measured.network.exposure[rows[run.trained[rows]]]]
+    else:
+        train_exposure = np.zeros(len(model.train_uv), dtype=numbers.dtype)
     return FluoroscopeCalibration(
         fluoroscope=name,
         image_size=run.measured.image_size[f],
         interior=run.after.parameters.interior[f],
         interior_covariance=run.precision.interior[f],
         interior_estimated=options.interior == 'estimated',
-        model=run.models[name],
-        train_exposure=numbers[run.measured.network.exposure[rows[trained]]],
+        model=model,
+        train_exposure=train_exposure,
         image_sd=_image_sd(run, rows),
         sigma0=run.after.noise.scale,
         nu=run.after.noise.nu,

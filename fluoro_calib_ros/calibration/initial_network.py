@@ -200,6 +200,3 @@ def _index(frames, fluoroscope, phantom, n_fluoroscopes, interior_free):
         np.full(n_fluoroscopes, bool(interior_free)),
     )
     return network, phantom.target_id[used]
-
-
-__all__ = ['Measured', 'measured_network', 'nominal_interior']

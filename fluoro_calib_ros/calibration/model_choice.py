@@ -1,36 +1,45 @@
-"""Choice of the kind of model by cross-validation, whole exposures held out."""
+"""Automatic choice of the model by cross-validation, whole exposures held out."""
+
+from __future__ import annotations
 
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from ..distortion.cross_validation import CrossValidation, candidate_k, exposure_folds
+from ..distortion.collocation import CollocationTerms
+from ..distortion.cross_validation import CrossValidation
+from ..distortion.estimation import AdjustedTerms, exposure_folds
+from ..distortion.knn import KnnModel
+from ..distortion.local_linear import LocalLinearModel
+from ..distortion.neighbour_model import NeighbourModel
 from ..distortion.series import Functions
 from ..distortion.terms import HIGHEST
+from .rounds import SelfCalibration
 
-# a kind is preferred to collocation where its squared errors are smaller by more than 1 %
-CLEARLY = 0.99
-OTHERS = ('local_linear', 'knn', 'parametric')
-MAX_NEIGHBOURS = {
-    'local_linear': 100,
-    'knn': 40,
-}  # more follow a distortion no closer than collocation does
-# image points of a fluoroscope from which on collocation is taken: no other model gains on it
-# there
+START_MODEL = 'collocation'
+# Another model is preferred where its squared errors are smaller by more than 1 %.
+MAX_RATIO = 0.99
+ALTERNATIVES = ('local_linear', 'knn', 'parametric')
+# Neighbour models with the largest k that is tried: more neighbours follow a distortion no closer
+# than collocation does.
+MAX_NEIGHBOURS: dict[type[NeighbourModel], int] = {LocalLinearModel: 100, KnnModel: 40}
+# With more image points of a fluoroscope no other model was better than collocation.
 MAX_IMAGE_POINTS = 40_000
 
 
-def better_kind(run, state):
-    """The kind of model that predicts held-out exposures clearly better than the collocation of a
-    run, or None.
+def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
+    """Return the model that predicts held-out exposures clearly better than collocation, or None.
 
-    run: SelfCalibration by collocation, state: its Collocation. Compared are the squared errors of
-    predictions of (residual + correction) of the inliers with their robust weights, Eq. 2 of Chow
-    et al. with one variance for all image points, summed over the fluoroscopes.
+    The criterion is the square sum of the errors of predictions of (residual + correction) of the
+    inliers with their robust weights: Eq. 2 of Chow et al. with one variance for all image points,
+    summed over the fluoroscopes.
+
+    run: self-calibration by collocation; terms: its terms.
     """
+    assert isinstance(terms, CollocationTerms)
     network = run.measured.network
     after = run.after
-    scores = dict.fromkeys(('collocation', *OTHERS), 0.0)
-    for f in range(len(run.measured.fluoroscopes)):
+    scores = dict.fromkeys((START_MODEL, *ALTERNATIVES), 0.0)
+    for f, image_size in enumerate(run.measured.image_size):
         rows = network.rows(f)
         rows = rows[after.inliers[rows]]
         if len(rows) > MAX_IMAGE_POINTS:
@@ -38,37 +47,47 @@ def better_kind(run, state):
         uv = network.uv[rows]
         values = (after.residuals + run.correction)[rows]
         weight = after.noise.weight(after.q[rows])
+        weight = weight / (after.noise.scale * network.sigma[rows]) ** 2
         fold = exposure_folds(network.exposure[rows])
-        variance = (after.noise.scale * network.sigma[rows]) ** 2
-        prior = network.additional[f].prior
+        for model_type, max_k in MAX_NEIGHBOURS.items():
+            candidates = model_type.candidate_k(len(uv))
+            validation = CrossValidation(model_type, uv, fold, candidates[candidates <= max_k])
+            information = weight[:, None, None] * np.eye(2)
+            scores[model_type.kind] += float(np.min(validation.scores(values, information)))
         held_out = {
-            'collocation': _held_out(
-                state.functions[f](uv), prior, values, weight / variance, fold
+            START_MODEL: _held_out(
+                terms.functions[f](uv), network.additional[f].prior, values, weight, fold
             ),
             'parametric': _held_out(
-                Functions(run.measured.image_size[f], HIGHEST)(uv),
-                None,
-                values,
-                weight / variance,
-                fold,
+                Functions(image_size, HIGHEST)(uv), None, values, weight, fold
             ),
         }
-        for kind in ('local_linear', 'knn'):
-            candidates = candidate_k(kind, len(uv))
-            validation = CrossValidation(
-                kind, uv, fold, candidates[candidates <= MAX_NEIGHBOURS[kind]]
-            )
-            information = (weight / variance)[:, None, None] * np.eye(2)
-            scores[kind] += float(np.min(validation.scores(values, information)))
         for kind, predicted in held_out.items():
-            scores[kind] += float(np.sum((weight / variance)[:, None] * (values - predicted) ** 2))
-    best = min(OTHERS, key=scores.get)
-    return best if scores[best] < CLEARLY * scores['collocation'] else None
+            scores[kind] += float(np.sum(weight[:, None] * (values - predicted) ** 2))
+    best = min(ALTERNATIVES, key=lambda kind: scores[kind])
+    return best if scores[best] < MAX_RATIO * scores[START_MODEL] else None
 
 
-def _held_out(functions, prior, values, weight, fold):
-    """Predictions (N, 2) of values (N, 2) by functions (N, m) fitted without the own fold; prior
-    (2m, 2m) or None.
+def _held_out(
+    functions: np.ndarray,
+    prior: np.ndarray | None,
+    values: np.ndarray,
+    weight: np.ndarray,
+    fold: np.ndarray,
+) -> np.ndarray:
+    """Predictions (N, 2) of values (N, 2) by functions fitted without the own fold.
+
+    Parameters
+    ----------
+    functions : (N, m) ndarray
+    prior : (2m, 2m) ndarray or None
+        Precision matrix of the coefficients.
+    values : (N, 2) ndarray
+    weight, fold : (N,) ndarray
+
+    Returns
+    -------
+    (N, 2) ndarray
     """
     m = functions.shape[1]
     out = np.empty_like(values)

@@ -2,31 +2,61 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
+from typing import Any
 
-from ..distortion.smoothers import KINDS, SMOOTHERS
+from ..distortion.registry import neighbour_models, selectable_models
+from ..distortion.user_regressor import is_regressor, regressor_name
 from ..options import option, validate_options
 from ..photogrammetry.datum import DATUMS
 from ..photogrammetry.noise import LOSSES
 
-MODELS = ('auto', *KINDS)
+AUTO = 'auto'
 INTERIORS = ('estimated', 'fixed')
 RELATIVE_ORIENTATIONS = ('none', 'soft', 'hard')
+
+
+def model_choices() -> tuple[str, ...]:
+    """Names of the correction models that can be asked for, 'auto' first."""
+    return (AUTO, *selectable_models())
 
 
 @dataclass(frozen=True)
 class CalibrationOptions:
     """Options of a self-calibration.
 
-    With model 'auto' the kind of model is chosen by cross-validation. k is the number of
-    neighbours of a model that has any, None: chosen. tolerance is the relative change of F and G
-    at which the alternation of adjustment and regression ends. relative_orientation constrains
-    fluoroscopes that are adjusted together, 'soft' with standard deviations relative_sd of each
-    component [mm, rad]. interior_sd is that of the start values of xp, yp and c [px], None: they
-    are not known. Raises ValueError for a value that is none of these.
+    Attributes
+    ----------
+    model : str or scikit-learn regressor
+        Correction model; 'auto': chosen by cross-validation. A regressor of the user's own is
+        given as an object (see `distortion.user_regressor.resolve_model`).
+    interior : str
+        'estimated', or 'fixed': held, and learned by the model.
+    loss : str
+        Noise model of the image points.
+    k : int or None
+        Number of neighbours of a model that has any; None: chosen by cross-validation.
+    max_iterations : int
+        Largest number of rounds.
+    tolerance : float
+        Relative change of F and G at which the rounds end.
+    relative_orientation : str
+        Constraint on fluoroscopes that are adjusted together: 'none', 'soft' or 'hard'.
+    relative_sd : (float, float)
+        Standard deviations of each component of a soft one [mm, rad].
+    datum : str
+        'survey': weighted surveyed coordinates; 'inner': a free network.
+    interior_sd : (float, float, float) or None
+        Standard deviations of the start values of xp, yp and c [px]; None: they are not known.
+
+    Raises
+    ------
+    ValueError
+        If a value is not allowed, or two options exclude each other.
     """
 
-    model: str = option('auto', 'correction model', choices=MODELS)
+    model: Any = option(AUTO, 'correction model', choices=model_choices)
     interior: str = option(
         'estimated',
         'interior orientation, estimated, or held and learned by the model',
@@ -36,7 +66,7 @@ class CalibrationOptions:
     k: int | None = option(
         None, 'neighbours of knn, local_linear or hybrid; by default chosen', minimum=1
     )
-    max_iterations: int = option(60, 'most rounds', minimum=1, maximum=10000)
+    max_iterations: int = option(60, 'largest number of rounds', minimum=1, maximum=10000)
     tolerance: float = option(1e-4, 'relative change of F and G at which the rounds end')
     relative_orientation: str = option(
         'none',
@@ -60,9 +90,10 @@ class CalibrationOptions:
     )
 
     def __post_init__(self) -> None:
-        if self.k is not None and self.model not in SMOOTHERS:
+        self._validate_model()
+        if self.k is not None and self.model not in neighbour_models():
             raise ValueError(
-                f'k is a number of neighbours, and the model {self.model} has none to be given'
+                f'k is a number of neighbours, which the model {self.model_name} does not have'
             )
         if self.max_iterations < 1 or not self.tolerance > 0:
             raise ValueError('max_iterations is at least 1 and tolerance above 0')
@@ -75,4 +106,26 @@ class CalibrationOptions:
                     raise ValueError(f'{name} is {size} numbers above 0')
         if self.interior_sd is not None and self.interior == 'fixed':
             raise ValueError('interior_sd goes with an interior orientation that is estimated')
-        validate_options(self)
+        validate_options(self, except_for=() if isinstance(self.model, str) else ('model',))
+
+    def _validate_model(self) -> None:
+        """Raise ValueError for a model that is neither a name of a model nor a regressor."""
+        if isinstance(self.model, str):
+            if ':' in self.model:
+                # A class named in a file, message or parameter would be code from a stranger.
+                raise ValueError(
+                    f'model {self.model!r} names a regressor of the user, which is accepted only '
+                    'on the command line and in Python, not from a file, message or parameter'
+                )
+        elif not is_regressor(self.model):
+            raise ValueError(f'model is a name or a scikit-learn regressor, not {self.model!r}')
+
+    @property
+    def model_name(self) -> str:
+        """Name of the model; of a user's regressor its module and class, 'module:Class'."""
+        return self.model if isinstance(self.model, str) else regressor_name(self.model)
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the options as plain values for a file, a user's regressor by its name."""
+        values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return {**values, 'model': self.model_name}

@@ -6,9 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from ..distortion.grid import INVALID, OK, OUTSIDE, CorrectionGrid
-from ..distortion.models import CorrectionModel
+from ..distortion.base import CorrectionModel
+from ..distortion.grid import CorrectionGrid
 from ..distortion.series import packed
+from ..distortion.status import CorrectionStatus
 from ..exposures.frame import points_on_image
 
 
@@ -121,12 +122,14 @@ class FluoroscopeCalibration:
         out = CorrectedPoints(
             np.full(uv.shape, np.nan),
             np.full(len(uv), np.nan),
-            np.full(len(uv), INVALID, dtype=np.uint8),
+            np.full(len(uv), CorrectionStatus.INVALID, dtype=np.uint8),
         )
         correction = self.model.evaluate(uv[good])
         out.uv[good] = uv[good] - correction.duv
         out.sigma[good] = np.sqrt(np.broadcast_to(sigma, len(uv))[good] ** 2 + correction.sd**2)
-        out.status[good] = np.where(correction.outside, OUTSIDE, OK)
+        out.status[good] = np.where(
+            correction.outside, CorrectionStatus.OUTSIDE, CorrectionStatus.OK
+        )
         return out
 
 
@@ -144,13 +147,3 @@ def digest_of_sources(frames, phantom):
         + phantom.sd_mm.tobytes()
     )
     return digest.hexdigest()
-
-
-__all__ = [
-    'INVALID',
-    'OK',
-    'OUTSIDE',
-    'CorrectedPoints',
-    'FluoroscopeCalibration',
-    'digest_of_sources',
-]

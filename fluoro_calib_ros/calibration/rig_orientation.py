@@ -37,9 +37,9 @@ from ..photogrammetry.relative_orientation import (
 )
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
 from .calibrate import SEEN_FOR_NOISE, held_corrections
+from .constraints import paired_exposures
 from .initial_network import MIN_TARGETS_OF_EXPOSURE, Measured, measured_network
-from .joint import pairs_of
-from .self_calibration import adjusted_with_precision, start_noise
+from .robust_adjustment import adjusted_with_precision, start_noise
 
 # exposures that are used: more tell no more, the interior orientations are what is uncertain then
 MAX_PAIRS = 30
@@ -142,7 +142,7 @@ def orientation_of_exposures(
         growth = np.ones(6 * count)
         used = []
         for b in range(1, count):
-            pairs = pairs_of(held.measured, b)
+            pairs = paired_exposures(held.measured, b)
             if not len(pairs):
                 raise DataError(_unpaired(held.measured.fluoroscopes, b))
             rows = slice(6 * b, 6 * b + 6)
@@ -440,6 +440,3 @@ def _orientation(
         exposures,
         tuple(calibrations[n].frame_id or f'{n}_optical' for n in names),
     )
-
-
-__all__ = ['orientation_of_capture', 'orientation_of_exposures', 'phantom_of', 'standing_frames']

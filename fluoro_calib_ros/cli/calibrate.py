@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
-from ..options import declared
+from ..options import Option, declared
 from .arguments import (
     add_collect,
     add_option,
@@ -32,7 +33,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
     )
     for name, option in declared(CalibrationOptions).items():
-        if name not in INTERNAL:
+        if name == 'model':
+            _add_model(parser, option)
+        elif name not in INTERNAL:
             add_option(parser, option, **_METAVARS.get(name, {}))
     together = parser.add_mutually_exclusive_group()
     together.add_argument(
@@ -54,6 +57,33 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
 
 
+def _add_model(parser: argparse.ArgumentParser, option: Option) -> None:
+    """Add --model: the name of a model, or the user's own regressor."""
+
+    def convert(text: str) -> Any:
+        from ..distortion.user_regressor import resolve_model
+
+        if ':' not in text:
+            if text in option.choices:
+                return text
+            raise argparse.ArgumentTypeError(
+                f'invalid choice: {text!r} (choose from {", ".join(option.choices)})'
+            )
+        try:
+            return resolve_model(text)
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(str(error)) from None
+
+    parser.add_argument(
+        '--model',
+        type=convert,
+        default=option.default,
+        metavar=f'{{{",".join(option.choices)},MODULE:CLASS}}',
+        help=f'{option.description}, or the class of a scikit-learn regressor '
+        f'(default: {option.default})',
+    )
+
+
 _METAVARS = {
     'relative_sd': {'metavar': 'MM,RAD'},
     'interior_sd': {'metavar': 'XP,YP,C'},
@@ -64,10 +94,11 @@ _METAVARS = {
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
     """Call error with a sentence where arguments do not go together."""
-    from ..distortion.smoothers import SMOOTHERS
+    from ..distortion.registry import neighbour_models
 
-    if arguments.k and arguments.model not in SMOOTHERS:
-        error(f'--k is a number of neighbours, it needs --model {", ".join(SMOOTHERS)}')
+    models = neighbour_models()
+    if arguments.k and arguments.model not in models:
+        error(f'--k is a number of neighbours, it needs --model {", ".join(models)}')
     if arguments.relative_orientation != 'none' and not arguments.joint:
         error('--relative-orientation needs --joint: the fluoroscopes in one adjustment')
     if arguments.interior_sd and (

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ..calibration.self_calibration import Round
+    from ..calibration.rounds import Round
 
 
 def print_result(arguments: Any, document: Mapping[str, Any], text: str) -> None:

@@ -1,142 +1,113 @@
 """Choice of k by cross-validation with whole exposures held out (Eq. 2 of Chow et al.)."""
 
-import numpy as np
-from scipy.spatial import cKDTree
+from __future__ import annotations
 
-from .smoothers import MIN_K, Neighbourhoods
+from collections.abc import Iterable
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .neighbour_model import NeighbourModel
+from .neighbours import Neighbourhoods, NeighbourTable
 from .trend import Trend, least_squares_map
 
-FOLDS = 10
-CACHE = 12_000_000  # weights kept between rounds
-
-
-def candidate_k(kind, count):
-    """Values of k that are tried for count training points: all to 100 for knn, in steps of a
-    quarter else.
-    """
-    largest = max(MIN_K[kind], min(int(count * 0.4), 100 if kind == 'knn' else 400))
-    if kind == 'knn':
-        return np.arange(min(3, largest), largest + 1)
-    steps = np.round(10 * 1.25 ** np.arange(17)).astype(int)
-    steps = steps[steps <= largest]
-    return steps if len(steps) else np.array([largest])
-
-
-def exposure_folds(exposure, folds=FOLDS):
-    """Fold (N,) of each image point: the exposures are dealt out in turn."""
-    _, number = np.unique(exposure, return_inverse=True)
-    return number % min(folds, number.max() + 1)
-
-
-class NearestTable:
-    """The nearest among points (N, 2) to each of themselves, in order, for choosing among them
-    again and again.
-
-    count: how many of them will be asked for; a few more are looked up, for those that are not
-    allowed.
-    """
-
-    def __init__(self, uv, count):
-        self._uv = uv
-        _, self._near = cKDTree(uv).query(
-            uv, k=np.arange(1, min(len(uv), int(1.3 * count) + 30) + 1)
-        )
-
-    def nearest(self, rows, allowed, count):
-        """The count nearest allowed (N, True or False) points (n, count) of the points rows (n,),
-        in order.
-        """
-        near = self._near[rows]
-        good = allowed[near]
-        rank = np.cumsum(good, axis=1)
-        out = np.empty((len(rows), count), dtype=np.intp)
-        taken = good & (rank <= count)
-        full = rank[:, -1] >= count
-        out[full] = near[full][taken[full]].reshape(-1, count)
-        if not full.all():
-            # Near a border of the image, or where a whole exposure is held out: search once more.
-            points = np.flatnonzero(allowed)
-            _, found = cKDTree(self._uv[points]).query(
-                self._uv[rows[~full]], k=np.arange(1, count + 1)
-            )
-            out[~full] = points[found]
-        return out
-
-    def restricted(self, kept):
-        """The table of the points kept (N, True or False) alone, numbered anew."""
-        other = NearestTable.__new__(NearestTable)
-        other._uv = self._uv[kept]
-        number = np.cumsum(kept) - 1
-        count = int(np.min(np.sum(kept[self._near[kept]], axis=1)))
-        other._near = number[self.nearest(np.flatnonzero(kept), kept, count)]
-        return other
+MAX_CACHED_WEIGHTS = 12_000_000  # weights that are stored between rounds
 
 
 class CrossValidation:
-    """Cross-validation of one kind of model over training points that stay where they are.
+    """Cross-validation of a neighbour model over training points that do not move.
 
-    uv (N, 2) [px]; fold (N,) fold of each point; candidates: values of k, ascending; near: a
-    NearestTable of uv where there is one already. Neighbours are looked up once, and weights kept
-    while they are few: between the rounds only the values change. Raises ValueError for too few
-    points.
+    Neighbours are looked up once, and their weights stored as long as they are few: between the
+    rounds of a self-calibration only the values change.
+
+    Parameters
+    ----------
+    model_type : type of NeighbourModel
+    uv : (N, 2) ndarray
+        Training pixels.
+    fold : (N,) ndarray of int
+        Fold of each training point.
+    candidates : (K,) array_like of int
+        Values of k, ascending.
+    near : NeighbourTable, optional
+        Table of uv, where there is one already.
+
+    Raises
+    ------
+    ValueError
+        If there are too few points for the smallest candidate.
     """
 
-    def __init__(self, kind, uv, fold, candidates, near=None):
+    def __init__(
+        self,
+        model_type: type[NeighbourModel],
+        uv: np.ndarray,
+        fold: np.ndarray,
+        candidates: ArrayLike,
+        near: NeighbourTable | None = None,
+    ) -> None:
         folds = [np.flatnonzero(fold == f) for f in np.unique(fold)]
         trains = [np.flatnonzero(fold != f) for f in np.unique(fold)]
         candidates = np.asarray(candidates)
-        self.kind = kind
+        self.model_type = model_type
         self.candidates = candidates[candidates <= min(len(train) for train in trains)]
         if not len(self.candidates):
             raise ValueError(
-                f'{len(uv)} image points are too few for a cross-validation of {kind}'
+                f'{len(uv)} image points are too few for a cross-validation of {model_type.kind}'
             )
         self._index = np.empty((len(uv), self.candidates[-1]), dtype=np.intp)
         self._trend = []
-        near = NearestTable(uv, self.candidates[-1]) if near is None else near
-        basis = Trend(kind, uv).basis(uv)
+        near = NeighbourTable(uv, self.candidates[-1]) if near is None else near
+        basis = Trend(model_type.trend_degree, uv).basis(uv)
         for held_out, train in zip(folds, trains):
             allowed = np.ones(len(uv), dtype=bool)
             allowed[held_out] = False
             self._index[held_out] = near.nearest(held_out, allowed, self.candidates[-1])
             self._trend.append((held_out, train, least_squares_map(basis[train])))
-        self._basis, self._near = basis, Neighbourhoods(uv[self._index], uv)
-        keep = len(uv) * int(np.sum(self.candidates)) <= CACHE and kind != 'knn'
-        self._weights = [self._near.weights(kind, k) for k in self.candidates] if keep else None
+        self._basis = basis
+        self._near = Neighbourhoods(uv[self._index], uv)
+        few = len(uv) * int(np.sum(self.candidates)) <= MAX_CACHED_WEIGHTS
+        cached = few and not model_type.equal_weights
+        self._weights = list(self._all_weights()) if cached else None
 
-    def _neighbour_values(self, values):
-        """Values less trend at the neighbours, (2, N, K), and the trend (N, 2), both without the
-        own fold.
-        """
+    def _all_weights(self) -> Iterable[np.ndarray]:
+        """Weights (N, k) for every candidate k."""
+        return (self.model_type.weights(self._near, k) for k in self.candidates)
+
+    def _neighbour_values(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Values less trend at the neighbours (2, N, K), and trend (N, 2), of the other folds."""
         near = np.empty((2,) + self._index.shape)
         trend = np.zeros_like(values)
         for held_out, train, fit in self._trend:
             coefficients = fit @ values[train]
-            left = (values - self._basis @ coefficients).T
-            near[:, held_out] = left[:, self._index[held_out]]
+            remainder = (values - self._basis @ coefficients).T
+            near[:, held_out] = remainder[:, self._index[held_out]]
             trend[held_out] = self._basis[held_out] @ coefficients
         return near, trend
 
-    def predictions(self, values):
-        """Held-out predictions (K, N, 2) for every candidate, of values (N, 2) at the training
-        points.
-        """
+    def predictions(self, values: np.ndarray) -> np.ndarray:
+        """Held-out predictions (K, N, 2) of values (N, 2), for every candidate."""
         near, trend = self._neighbour_values(values)
-        if self.kind == 'knn':
-            # A running mean gives all k at once.
+        if self.model_type.equal_weights:
             sums = np.cumsum(near, axis=2)[:, :, self.candidates - 1]
             return trend + (sums / self.candidates).transpose(2, 1, 0)
-        weights = self._weights or (self._near.weights(self.kind, k) for k in self.candidates)
+        weights = self._weights or self._all_weights()
         return np.stack(
             [trend + np.einsum('nk,cnk->nc', w, near[:, :, : w.shape[1]]) for w in weights]
         )
 
-    def predictions_for(self, k, values):
-        """Held-out predictions (N, 2) with k neighbours, of values (N, 2) at the training points."""
+    def predictions_for(self, k: int, values: np.ndarray) -> np.ndarray:
+        """Held-out predictions (N, 2) of values (N, 2) with k neighbours."""
         near, trend = self._neighbour_values(values)
-        return trend + np.einsum('nk,cnk->nc', self._near.weights(self.kind, k), near[:, :, :k])
+        weights = self.model_type.weights(self._near, k)
+        return trend + np.einsum('nk,cnk->nc', weights, near[:, :, :k])
 
-    def scores(self, values, information):
-        """G (K,) for every candidate: squared errors weighted with information (N, 2, 2) = C_r^-1."""
+    def scores(self, values: np.ndarray, information: np.ndarray) -> np.ndarray:
+        """G (K,) for every candidate: squared errors weighted by information (N, 2, 2) = C_r^-1."""
         error = values - self.predictions(values)
-        return np.sum((error[:, :, None, :] @ information)[:, :, 0] * error, axis=(1, 2))
+        return weighted_square_sum(error, information)
+
+
+def weighted_square_sum(error: np.ndarray, information: np.ndarray) -> np.ndarray:
+    """Sums (K,) of e^T W e over errors e (K, N, 2) with weights W (N, 2, 2)."""
+    return np.sum((error[:, :, None, :] @ information)[:, :, 0] * error, axis=(1, 2))

@@ -1,45 +1,56 @@
-"""Corrections as a series of functions of the observed pixel: polynomials and, for ripples,
-products of sines.
+"""Corrections as a series of functions of the observed pixel: polynomials and products of sines.
 
-A polynomial is enough for what bends over the whole image. What is left is a signal with a
-covariance function; on a rectangle somewhat larger than the image it is a series of sines, whose
-coefficients are independent and have the spectral density of the covariance function as their
-variance (Solin and Saerkkae, "Hilbert space methods for reduced-rank Gaussian process regression",
-Statistics and Computing 30, 2020).
+Polynomials describe what bends over the whole image. What they leave is a signal with a covariance
+function. On a rectangle somewhat larger than the image such a signal is a series of sines with
+independent coefficients, whose variance is the spectral density of the covariance function (Solin
+and Saerkkae, "Hilbert space methods for reduced-rank Gaussian process regression", Statistics and
+Computing 30, 2020).
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
-MARGIN = 1.3  # the rectangle of the sines over the image: they vanish at its border
-# of a series that is read
-MAX_DEGREE = 15
+MARGIN = 1.3  # size of the rectangle of the sines, which vanish at its border, over the image
+MAX_DEGREE = 15  # of a series that is read
 MAX_MODES = 100
-SD_GRID = 33  # values of the standard deviation across the image, between which it is interpolated
+SD_GRID = 33  # nodes of the standard deviation along each side of the image
+PREDICTION_CHUNK = 20_000  # pixels for which a series is evaluated at once
 
 
 @dataclass(frozen=True)
 class Functions:
-    """The functions of a series for an image of image_size (width, height) [px].
+    """The functions of a series for an image.
 
-    degree of the polynomials, -1: none; modes: sines along the longer side of the image, 0: none.
-    Coordinates are those from the middle of the image over half its longer side.
+    Their coordinates are relative to the centre of the image, in units of half its longer side.
+
+    Attributes
+    ----------
+    image_size : (int, int)
+        Width and height [px].
+    degree : int
+        Highest degree of the polynomials; -1: there are none.
+    modes : int
+        Number of sines along the longer side of the image; 0: there are none.
     """
 
-    image_size: tuple
+    image_size: tuple[int, int]
     degree: int
     modes: int = 0
 
     @cached_property
-    def powers(self):
+    def powers(self) -> list[tuple[int, int]]:
         """Exponents (i, j) of the polynomials x^i y^j."""
         return [(i, j) for i in range(self.degree + 1) for j in range(self.degree + 1 - i)]
 
     @cached_property
-    def _sines(self):
+    def _sines(self) -> np.ndarray:
         """Numbers (s, 2) of the half waves along u and v."""
         extent = MARGIN * np.asarray(self.image_size) / max(self.image_size)
         i, j = np.meshgrid(
@@ -49,34 +60,33 @@ class Functions:
         return np.stack([i[keep], j[keep]], axis=1)
 
     @cached_property
-    def frequency(self):
+    def frequency(self) -> np.ndarray:
         """Angular frequencies (s,) [1/px] of the sines."""
         return np.linalg.norm(np.pi * self._sines / (MARGIN * np.asarray(self.image_size)), axis=1)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self.powers) + len(self._sines)
 
-    def taken_over(self, other, coefficients):
-        """Coefficients (2m,) for these functions from those for others; zero for functions the
-        others lack.
-        """
-        number = {
-            tuple(key): k
-            for k, key in enumerate([*other.powers, *(('sine', *pair) for pair in other._sines)])
-        }
-        mine = [
-            number.get(tuple(key), -1)
-            for key in [*self.powers, *(('sine', *pair) for pair in self._sines)]
-        ]
-        return np.where(np.asarray(mine) >= 0, coefficients.reshape(2, -1)[:, mine], 0.0).ravel()
+    def converted(self, other: Functions, coefficients: np.ndarray) -> np.ndarray:
+        """Coefficients (2m,) for these functions from those for others.
 
-    def _coordinates(self, uv):
+        A function that the others lack gets the coefficient 0.
+        """
+        number = {key: column for column, key in enumerate(other._keys())}
+        mine = np.asarray([number.get(key, -1) for key in self._keys()])
+        return np.where(mine >= 0, coefficients.reshape(2, -1)[:, mine], 0.0).ravel()
+
+    def _keys(self) -> list[tuple]:
+        """What tells each function from the others, in their order."""
+        return [*self.powers, *(('sine', int(i), int(j)) for i, j in self._sines)]
+
+    def _coordinates(self, uv: ArrayLike) -> np.ndarray:
         return (
             (np.asarray(uv, dtype=float) - (np.asarray(self.image_size) - 1) / 2)
             / (max(self.image_size) / 2)
         ).T
 
-    def __call__(self, uv):
+    def __call__(self, uv: ArrayLike) -> np.ndarray:
         """Values (n, m) at pixels uv (n, 2): the polynomials, then the sines."""
         x, y = self._coordinates(uv)
         out = np.empty((len(x), len(self)))
@@ -85,34 +95,43 @@ class Functions:
             np.multiply(of_x[:, i], of_y[:, j], out=out[:, column])
         if self.modes:
             half = MARGIN * np.asarray(self.image_size) / 2
-            waves = [
-                np.sin(
-                    np.arange(1, self.modes + 1)
-                    * (np.pi / 2 / extent * (a[:, None] * max(self.image_size) / 2 + extent))
-                )
-                / np.sqrt(extent)
-                for a, extent in zip((x, y), half)
-            ]
+            waves = [self._waves(a, extent) for a, extent in zip((x, y), half)]
             i, j = self._sines.T - 1
             np.multiply(waves[0][:, i], waves[1][:, j], out=out[:, len(self.powers) :])
         return out
 
+    def _waves(self, coordinate: np.ndarray, extent: float) -> np.ndarray:
+        """Sines (n, modes) along one axis; extent: half the side of their rectangle [px]."""
+        place = coordinate[:, None] * max(self.image_size) / 2 + extent
+        return np.sin(np.arange(1, self.modes + 1) * (np.pi / 2 / extent * place)) / np.sqrt(
+            extent
+        )
+
 
 @dataclass(frozen=True)
 class Series:
-    """A correction: functions with coefficients (2, m), and sd (33, 33) [px] of the correction
-    over the image.
+    """A correction that is a sum of functions.
+
+    functions; coefficients (2, m) [px] for u and v; sd (33, 33): standard deviation of the
+    correction [px], on a regular grid from edge to edge of the image.
     """
 
     functions: Functions
     coefficients: np.ndarray
     sd: np.ndarray
 
-    def predict(self, uv):
+    def predict(self, uv: ArrayLike) -> np.ndarray:
         """Corrections (n, 2) [px] at pixels uv (n, 2)."""
         return self.functions(uv) @ self.coefficients.T
 
-    def sd_at(self, uv):
+    def predict_in_chunks(self, uv: np.ndarray) -> np.ndarray:
+        """Corrections (n, 2) [px] at many pixels uv (n, 2), with bounded memory."""
+        starts = range(0, len(uv), PREDICTION_CHUNK)
+        return np.concatenate(
+            [self.predict(uv[i : i + PREDICTION_CHUNK]) for i in starts] or [np.zeros((0, 2))]
+        )
+
+    def sd_at(self, uv: ArrayLike) -> np.ndarray:
         """Standard deviations (n,) [px] of the corrections at pixels uv (n, 2), interpolated."""
         place = (
             (np.asarray(uv, dtype=float) + 0.5)
@@ -122,46 +141,67 @@ class Series:
         return map_coordinates(self.sd, place[:, ::-1].T, order=1, mode='nearest')
 
 
-def packed(series):
-    """Degree, modes, coefficients (2, m) and sd (33, 33) of a Series as they are sent and saved;
-    -1 and 0, and empty arrays, of None.
+def packed(series: Series | None) -> tuple[int, int, np.ndarray, np.ndarray]:
+    """Return degree, modes, coefficients (2, m) and sd (33, 33), as they are sent and saved.
+
+    No series gives -1, 0 and empty arrays.
     """
     if series is None:
         return -1, 0, np.zeros((2, 0)), np.zeros((0, 0))
     return series.functions.degree, series.functions.modes, series.coefficients, series.sd
 
 
-def unpacked(image_size, degree, modes, coefficients, sd):
-    """The Series, or None, of what packed has made of it. Raises ValueError where the parts do not
-    fit together.
+def unpacked(
+    image_size: tuple[int, int],
+    degree: int,
+    modes: int,
+    coefficients: ArrayLike,
+    sd: ArrayLike,
+) -> Series | None:
+    """Return the Series, or None, from which `packed` made the arguments.
+
+    Raises ValueError if the parts do not belong together.
     """
-    coefficients, sd = (np.ascontiguousarray(a, dtype=float) for a in (coefficients, sd))
+    coefficients = np.ascontiguousarray(coefficients, dtype=float)
+    sd = np.ascontiguousarray(sd, dtype=float)
     if degree == -1 and not modes and not coefficients.size:
         return None
     if not (0 <= degree <= MAX_DEGREE and 0 <= modes <= MAX_MODES):
         raise ValueError(f'a series of degree {degree} with {modes} modes is unknown')
-    functions = Functions(tuple(int(s) for s in image_size), int(degree), int(modes))
+    width, height = image_size
+    functions = Functions((int(width), int(height)), int(degree), int(modes))
     if coefficients.shape != (2, len(functions)) or sd.shape != (SD_GRID, SD_GRID):
         raise ValueError(
-            f'a series of degree {degree} with {modes} modes has 2 x {len(functions)} coefficients and '
-            f'{SD_GRID} x {SD_GRID} standard deviations, not {coefficients.shape} and {sd.shape}'
+            f'a series of degree {degree} with {modes} modes has 2 x {len(functions)} '
+            f'coefficients and {SD_GRID} x {SD_GRID} standard deviations, '
+            f'not {coefficients.shape} and {sd.shape}'
         )
     if not (np.isfinite(coefficients).all() and np.isfinite(sd).all()):
-        raise ValueError('a coefficient of the series, or a standard deviation, is not a number')
+        raise ValueError('a coefficient or a standard deviation of the series is not a number')
     return Series(functions, coefficients, sd)
 
 
-def sd_grid_pixels(image_size):
-    """Pixels (33 * 33, 2) at which the standard deviation of a series is given, row by row, from
-    edge to edge.
-    """
+def series_from_arrays(image_size: tuple[int, int], content: dict[str, Any]) -> Series | None:
+    """Return the Series, or None, of `CorrectionModel.to_arrays`. Raises ValueError."""
+    return unpacked(
+        image_size,
+        content['series_degree'],
+        content['series_modes'],
+        content['series_coefficients'],
+        content['series_sd'],
+    )
+
+
+def sd_grid_pixels(image_size: tuple[int, int]) -> np.ndarray:
+    """Pixels (33 * 33, 2) of the standard deviations of a series, row by row, edge to edge."""
     u, v = (np.linspace(-0.5, size - 0.5, SD_GRID) for size in image_size)
     return np.stack([a.ravel() for a in np.meshgrid(u, v)], axis=1)
 
 
-def sd_over_image(functions, covariance):
-    """Standard deviations (33, 33) [px] of a series from the covariance (2m, 2m) of its
-    coefficients, u first.
+def sd_over_image(functions: Functions, covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations (33, 33) [px] of a series.
+
+    covariance (2m, 2m) of its coefficients, those of u first.
     """
     values = functions(sd_grid_pixels(functions.image_size))
     m = len(functions)

@@ -1,23 +1,18 @@
-"""Polynomial trend of a distortion.
+"""Polynomial trend of a distortion, fitted to the training corrections."""
 
-A local plane flattens what bends within its reach, and in the alternation with the adjustment the
-flattened part is not won back: orientations and object points absorb it. Pincushion, S-shape and
-spiral bend over the whole image and are cubic polynomials to first order (Gronenschild, Medical
-Physics 24, 1997), so their polynomial is fitted first, and the local planes to what is left.
-"""
+from __future__ import annotations
 
 import numpy as np
-
-DEGREE = {'local_linear': 3}  # of the polynomial of each kind of model; None: there is none
+from numpy.typing import ArrayLike
 
 
 class Trend:
-    """Polynomials in two variables up to a degree, centred and scaled by the training pixels uv
-    (N, 2).
+    """Polynomials in two variables, centred and scaled by the training pixels.
+
+    degree: the highest, None: there are no polynomials; uv (N, 2): training pixels.
     """
 
-    def __init__(self, kind, uv):
-        degree = DEGREE.get(kind)
+    def __init__(self, degree: int | None, uv: np.ndarray) -> None:
         self._powers = (
             []
             if degree is None
@@ -26,15 +21,15 @@ class Trend:
         self._centre = uv.mean(axis=0) if len(uv) else np.zeros(2)
         self._scale = max(float(np.max(np.abs(uv - self._centre), initial=0.0)), 1.0)
 
-    def __len__(self):
+    def __len__(self) -> int:
         return len(self._powers)
 
-    def basis(self, uv):
+    def basis(self, uv: ArrayLike) -> np.ndarray:
         """Values (n, p) of the polynomials at pixels uv (n, 2)."""
         x, y = ((np.asarray(uv) - self._centre) / self._scale).T
         out = np.empty((len(x), len(self._powers)))
         for column, (i, j) in enumerate(self._powers):
-            # Each is an earlier one times x or y.
+            # Each polynomial is an earlier one times x or y.
             if i:
                 np.multiply(out[:, self._powers.index((i - 1, j))], x, out=out[:, column])
             elif j:
@@ -44,8 +39,6 @@ class Trend:
         return out
 
 
-def least_squares_map(basis):
-    """Matrix (p, N) that turns values at N points into the coefficients of basis (N, p) that fit
-    them best.
-    """
+def least_squares_map(basis: np.ndarray) -> np.ndarray:
+    """Matrix (p, N) from values at N points to the least-squares coefficients of basis (N, p)."""
     return np.linalg.pinv(basis) if basis.shape[1] else np.zeros((0, len(basis)))

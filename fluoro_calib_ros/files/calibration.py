@@ -5,8 +5,8 @@ import os
 import numpy as np
 
 from ..calibration.result import FluoroscopeCalibration
-from ..distortion.models import CorrectionModel
-from ..distortion.series import packed, unpacked
+from ..distortion.registry import model_from_arrays
+from ..distortion.series import packed
 from ..errors import DataError
 from .access import check_safe_name, make_folder, os_error_reason
 from .arrays import Field, array_of, read_arrays, values_of, write_arrays
@@ -50,14 +50,12 @@ FIELDS = {
     'source_digest': Field('text'),
 }
 _SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
+# Array of the file: entry of CorrectionModel.to_arrays.
 _OF_MODEL = {
     'model_kind': 'kind',
     'model_k': 'k',
-    'train_uv': 'train_uv',
-    'train_duv': 'train_duv',
-    'noise_px': 'noise_px',
-    'bias_px': 'bias_px',
-}  # array: attribute of the CorrectionModel
+    **{name: name for name in ('train_uv', 'train_duv', 'noise_px', 'bias_px', *_SERIES)},
+}
 
 
 def calibration_path(directory, fluoroscope):
@@ -87,8 +85,9 @@ def checked_arrays(where, calibration):
     """The arrays {name: array} of a FluoroscopeCalibration. Raises DataError, beginning with
     where, for one that holds what a calibration cannot hold, such as NaN.
     """
+    model = calibration.model.to_arrays()
     arrays = {
-        name: array_of(where, name, _value_of(calibration, name), field)
+        name: array_of(where, name, _value_of(calibration, model, name), field)
         for name, field in FIELDS.items()
     }
     _check_lengths(where, arrays)
@@ -137,11 +136,9 @@ def load_calibrations(directory):
     return out
 
 
-def _value_of(calibration, name):
-    if name in _SERIES:
-        return packed(calibration.model.series)[_SERIES.index(name)]
+def _value_of(calibration, model, name):
     if name in _OF_MODEL:
-        return getattr(calibration.model, _OF_MODEL[name])
+        return model[_OF_MODEL[name]]
     if name == 'train_exposure' and not len(calibration.train_exposure):
         return np.zeros(0, dtype=np.int64)  # an empty list would be one of floats
     return getattr(calibration, name)
@@ -159,11 +156,10 @@ def _calibration(path, arrays):
     identity = values.pop('calibration_id')
     values['image_size'] = tuple(values['image_size'].tolist())
     check_safe_name(values['fluoroscope'], path)
-    model = {_OF_MODEL[name]: values.pop(name) for name in _OF_MODEL}
-    series = [values.pop(name) for name in _SERIES]
+    content = {entry: values.pop(name) for name, entry in _OF_MODEL.items()}
     try:
-        model['series'] = unpacked(values['image_size'], *series)
-        calibration = FluoroscopeCalibration(model=CorrectionModel(**model), **values)
+        model = model_from_arrays(content, values['image_size'])
+        calibration = FluoroscopeCalibration(model=model, **values)
     except ValueError as error:
         raise DataError(f'{path}: {error}') from None
     if calibration.calibration_id != identity:

@@ -37,12 +37,14 @@ def write_sources(directory: str | os.PathLike[str], request: CalibrationRequest
     try:
         (directory / RESULT).unlink(missing_ok=True)
     except OSError as error:
-        raise DataError(f'{directory / RESULT}: cannot be deleted ({os_error_reason(error)})') from None
+        raise DataError(
+            f'{directory / RESULT}: cannot be deleted ({os_error_reason(error)})'
+        ) from None
     write_observations_csv(directory / OBSERVATIONS, request.frames)
     write_phantom(directory / PHANTOM, request.phantom)
     document = {
         'format_version': VERSION,
-        'options': dataclasses.asdict(request.options),
+        'options': request.options.to_document(),
         'joint': bool(request.joint),
         'principal_distance': request.principal_distance,
     }

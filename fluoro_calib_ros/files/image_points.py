@@ -4,12 +4,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..calibration.result import INVALID, CorrectedPoints
+from ..calibration.result import CorrectedPoints
+from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 from .atomic import atomic_file
 from .csv_table import cell_of, read_blocks, write_rows
 
-STATUS = ('OK', 'OUTSIDE', 'INVALID')  # text of each status
+STATUS = tuple(status.name for status in CorrectionStatus)
 ADDED = ('u_corrected', 'v_corrected', 'sigma', 'status')
 
 
@@ -101,7 +102,7 @@ def correct_points(points, calibrations):
     out = CorrectedPoints(
         np.full(points.uv.shape, np.nan),
         np.full(len(names), np.nan),
-        np.full(len(names), INVALID, dtype=np.uint8),
+        np.full(len(names), CorrectionStatus.INVALID, dtype=np.uint8),
     )
     for name in np.unique(names):
         rows = np.flatnonzero(names == name)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
-from ..calibration.self_calibration import Round
+from ..calibration.rounds import Round
 from ..drift.recording_watch import DriftVerdict
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix

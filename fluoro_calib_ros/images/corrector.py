@@ -11,7 +11,7 @@ observed image lies. What is left for a frame is one remap of OpenCV.
 import cv2
 import numpy as np
 
-from ..distortion.grid import INVALID, OUTSIDE
+from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 
 INTERPOLATIONS = {'linear': cv2.INTER_LINEAR, 'cubic': cv2.INTER_CUBIC}
@@ -55,7 +55,7 @@ class ImageCorrector:
         self.interpolation = interpolation
         self.border = border
         self.source, self.status = _sources(calibration.grid, self.image_size)
-        self.mask = self.status != INVALID
+        self.mask = self.status != CorrectionStatus.INVALID
         self._empty = np.flatnonzero(~self.mask)
         high = np.array(self.image_size, dtype=np.float32)[:, None, None] - 1
         # A source in the outer half of a pixel at the rim has that pixel's value.
@@ -137,8 +137,8 @@ def _sources(grid, image_size):
         source[:, rows] = observed.reshape(2, -1, width)
         status[rows] = state.reshape(-1, width)
     folded = _folded(source)
-    status[folded] = INVALID
-    source[:, status == INVALID] = np.nan
+    status[folded] = CorrectionStatus.INVALID
+    source[:, status == CorrectionStatus.INVALID] = np.nan
     return source, status
 
 
@@ -163,7 +163,7 @@ def _iterated(grid, wanted):
             break
     (du, dv, _), status = grid.look_up(*observed)  # off the image it is INVALID
     error = np.abs(observed - (du, dv) - wanted).max(axis=0)
-    status[~(error <= LIMIT_PX)] = INVALID
+    status[~(error <= LIMIT_PX)] = CorrectionStatus.INVALID
     return observed, status
 
 
@@ -194,6 +194,3 @@ def _for_cubic(at):
 
 def _size(size):
     return f'{size[0]} x {size[1]}'
-
-
-__all__ = ['INTERPOLATIONS', 'INVALID', 'LIMIT_PX', 'OUTSIDE', 'ImageCorrector']

@@ -13,7 +13,7 @@ from ..calibration.calibrate import CalibrationResult, calibrate
 from ..calibration.request import CalibrationRequest
 from ..calibration.result import FluoroscopeCalibration
 from ..calibration.rig_orientation import orientation_of_exposures
-from ..calibration.self_calibration import Round
+from ..calibration.rounds import Round
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..photogrammetry.rig_orientation import RigOrientation

@@ -31,7 +31,7 @@ from ..calibration import result as calibration_result
 from ..calibration.initial_network import MIN_TARGETS_OF_EXPOSURE
 from ..calibration.options import CalibrationOptions
 from ..calibration.request import CalibrationRequest
-from ..calibration.self_calibration import Round
+from ..calibration.rounds import Round
 from ..errors import DataError
 from ..exposures.collector import ExposureCollector, StillOptions
 from ..exposures.frame import Frame, validate_frame

@@ -11,7 +11,7 @@ from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from sensor_msgs.msg import CameraInfo
 
 from ..calibration.result import FluoroscopeCalibration
-from ..distortion.grid import INVALID
+from ..distortion.status import CorrectionStatus
 from .correcting_node import CorrectingNode, Stream
 from .frame_validation import OBSERVED_REFUSALS, FrameValidator
 from .messages.camera_info import message_of_corrected_stream
@@ -140,7 +140,7 @@ class CorrectionNode(CorrectingNode):
         )
         stream.count_corrected(info)
         status = corrected[-1]
-        if not len(status) or status.max() == INVALID:
+        if not len(status) or status.max() == CorrectionStatus.INVALID:
             self._note_invalid_points(stream, frame, status)
 
     @staticmethod
@@ -152,7 +152,7 @@ class CorrectionNode(CorrectingNode):
         if not len(status):
             stream.refusals.note(f'{where}: the frame is empty, it has no targets')
             return
-        invalid = np.flatnonzero(status == INVALID)
+        invalid = np.flatnonzero(status == CorrectionStatus.INVALID)
         stream.invalid_points += len(invalid)
         number = np.frombuffer(frame.target_id, np.uint32)[invalid[0]]
         stream.refusals.note(

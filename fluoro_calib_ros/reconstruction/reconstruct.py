@@ -12,7 +12,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..calibration.result import OUTSIDE, FluoroscopeCalibration
+from ..calibration.result import FluoroscopeCalibration
+from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 from ..exposures.frame import Frame, image_size_error, repeated_target_error
 from ..exposures.pairing import recorded_pairer
@@ -154,7 +155,7 @@ def _corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> Correc
         frame.uv[:, 0], frame.uv[:, 1], frame.sigma
     )
     uv = np.stack([u, v], axis=1)
-    return CorrectedView(frame.target_id, uv, sigma, correction_sd, status == OUTSIDE)
+    return CorrectedView(frame.target_id, uv, sigma, correction_sd, status == CorrectionStatus.OUTSIDE)
 
 
 def reconstruct_recording(

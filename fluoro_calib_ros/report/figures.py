@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.ticker import LogLocator
 
-from ..calibration.self_calibration import SETTLED_PX
+from ..calibration.rounds import SETTLED_PX
 from ..files.access import check_safe_name, make_folder
 from ..files.atomic import write_bytes
 from ..photogrammetry.noise import MIN_REDUNDANCY

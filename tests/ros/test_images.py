@@ -14,7 +14,7 @@ from lifecycle_msgs.srv import ChangeState
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from fluoro_calib_ros.distortion.models import no_correction
+from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.files.calibration import load_calibrations
 from fluoro_calib_ros.images.codec import decode, encode
 from fluoro_calib_ros.images.corrector import ImageCorrector

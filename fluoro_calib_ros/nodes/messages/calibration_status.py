@@ -9,7 +9,7 @@ from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import CalibrationStatus
 
 from ...calibration.result import FluoroscopeCalibration
-from ...calibration.self_calibration import Round
+from ...calibration.rounds import Round
 
 
 @dataclass(frozen=True)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from fluoro_calib_msgs.msg import FluoroscopeCalibration
 
 from ...calibration import result as calibration_result
-from ...distortion.models import CorrectionModel
-from ...distortion.series import SD_GRID, Series, packed, unpacked
+from ...distortion.base import CorrectionModel
+from ...distortion.registry import model_from_arrays
+from ...distortion.series import SD_GRID
 from ...errors import DataError
 from ...files.calibration import checked_arrays
 from .fields import (
@@ -84,18 +87,20 @@ def calibration_from_message(
 
 def _set_model(message: FluoroscopeCalibration, model: CorrectionModel) -> None:
     """Fill in the correction model."""
-    message.model_kind = model.kind
-    message.k = model.k
-    message.model_noise = model.noise_px
-    message.model_bias = model.bias_px
-    message.train_u = float64_field(model.train_uv[:, 0])
-    message.train_v = float64_field(model.train_uv[:, 1])
-    message.train_du = float64_field(model.train_duv[:, 0])
-    message.train_dv = float64_field(model.train_duv[:, 1])
-    message.series_degree, message.series_modes, coefficients, sd = packed(model.series)
-    message.series_u = float64_field(coefficients[0])
-    message.series_v = float64_field(coefficients[1])
-    message.series_sd = float64_field(sd)
+    content = model.to_arrays()
+    message.model_kind = content['kind']
+    message.k = content['k']
+    message.model_noise = content['noise_px']
+    message.model_bias = content['bias_px']
+    message.train_u = float64_field(content['train_uv'][:, 0])
+    message.train_v = float64_field(content['train_uv'][:, 1])
+    message.train_du = float64_field(content['train_duv'][:, 0])
+    message.train_dv = float64_field(content['train_duv'][:, 1])
+    message.series_degree = content['series_degree']
+    message.series_modes = content['series_modes']
+    message.series_u = float64_field(content['series_coefficients'][0])
+    message.series_v = float64_field(content['series_coefficients'][1])
+    message.series_sd = float64_field(content['series_sd'])
 
 
 def _model_of(message: FluoroscopeCalibration, where: str) -> CorrectionModel:
@@ -109,29 +114,28 @@ def _model_of(message: FluoroscopeCalibration, where: str) -> CorrectionModel:
             f'{where}: its training points have different numbers of coordinates and corrections'
         )
     try:
-        return CorrectionModel(
-            message.model_kind,
-            message.k,
-            np.stack(train[:2], axis=1),
-            np.stack(train[2:], axis=1),
-            message.model_noise,
-            message.model_bias,
-            _series_of(message),
-        )
+        content = {
+            'kind': message.model_kind,
+            'k': message.k,
+            'train_uv': np.stack(train[:2], axis=1),
+            'train_duv': np.stack(train[2:], axis=1),
+            'noise_px': message.model_noise,
+            'bias_px': message.model_bias,
+            **_series_content(message),
+        }
+        return model_from_arrays(content, (message.image_width, message.image_height))
     except ValueError as error:
         raise DataError(f'{where}: {error}') from None
 
 
-def _series_of(message: FluoroscopeCalibration) -> Series | None:
-    """Return the series of a message, None where it has none. Raises ValueError."""
+def _series_content(message: FluoroscopeCalibration) -> dict[str, Any]:
+    """Return the series of a message as `CorrectionModel.to_arrays` has it. Raises ValueError."""
     if len(message.series_u) != len(message.series_v):
         raise ValueError('its series has different numbers of coefficients in u and in v')
     sd = np.array(message.series_sd)
-    sd = sd.reshape(SD_GRID, SD_GRID) if len(sd) == SD_GRID**2 else sd[None]
-    return unpacked(
-        (message.image_width, message.image_height),
-        message.series_degree,
-        message.series_modes,
-        np.array([message.series_u, message.series_v]),
-        sd,
-    )
+    return {
+        'series_degree': message.series_degree,
+        'series_modes': message.series_modes,
+        'series_coefficients': np.array([message.series_u, message.series_v]),
+        'series_sd': sd.reshape(SD_GRID, SD_GRID) if len(sd) == SD_GRID**2 else sd[None],
+    }

@@ -12,7 +12,7 @@ from fluoro_calib_msgs.action import SelfCalibrate
 from ...calibration.calibrate import CalibrationResult
 from ...calibration.options import CalibrationOptions
 from ...calibration.result import FluoroscopeCalibration
-from ...calibration.self_calibration import Round
+from ...calibration.rounds import Round
 from ...validation.verdict import Validation
 
 Request = Any  # Calibrate.Request or SelfCalibrate.Goal

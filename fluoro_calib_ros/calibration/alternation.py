@@ -1,0 +1,234 @@
+"""Self-calibration by adjustment and regression in turn (section 3.1 of Chow et al.).
+
+One round: a correction model is fitted to (residual + present correction) of the inliers, its k
+chosen by cross-validation; then the network is adjusted with that correction held. The rounds are
+a fixed-point iteration of the values the model is fitted to, and Anderson acceleration shortens
+it. Model and adjustment of a round belong together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..distortion.base import CorrectionModel
+from ..distortion.estimation import AdjustedTerms, RegressionStep
+from ..errors import DataError
+from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.elimination import factorize
+from ..photogrammetry.network import Network
+from ..photogrammetry.noise import Noise
+from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
+from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.precision import (
+    Precision,
+    covariance_blocks,
+    residual_covariance,
+)
+from .anderson import Anderson
+from .initial_network import Measured
+from .options import CalibrationOptions
+from .robust_adjustment import SINGULAR, adjusted_with_precision, with_zero_additional
+from .rounds import History, Round, SelfCalibration
+
+ROUND_TOLERANCE = 1e-4  # decrease of F that a round may leave to the next: a hundredth of a sigma
+
+
+class Regressions:
+    """The regression steps of all fluoroscopes of a network, as one smoother of values (N, 2).
+
+    steps {fluoroscope: RegressionStep}, in the order of the network.
+    """
+
+    def __init__(self, measured: Measured, steps: Mapping[str, RegressionStep]) -> None:
+        self.steps = dict(steps)
+        self._rows = {name: measured.network.rows(f) for f, name in enumerate(self.steps)}
+
+    @property
+    def iterate(self) -> bool:
+        """Whether more than one round can make a difference."""
+        return any(step.iterates for step in self.steps.values())
+
+    @property
+    def k(self) -> dict[str, int]:
+        """Number of neighbours by fluoroscope."""
+        return {name: step.k for name, step in self.steps.items()}
+
+    def choose(
+        self, values: np.ndarray, q: np.ndarray, information: np.ndarray
+    ) -> tuple[float, bool]:
+        """Update inliers and k of all fluoroscopes; return G and whether any of them changed.
+
+        Raises DataError where a fluoroscope has too few inliers.
+        """
+        for name, rows in self._rows.items():
+            try:
+                self.steps[name].choose(values[rows], q[rows], information[rows])
+            except ValueError as error:
+                raise DataError(f'fluoroscope {name}: {error}') from None
+        score = sum(step.score for step in self.steps.values())
+        return score, any(step.changed for step in self.steps.values())
+
+    def inliers(self) -> np.ndarray:
+        """True (N,) for the image points to which the models are fitted."""
+        out = np.zeros(sum(len(rows) for rows in self._rows.values()), dtype=bool)
+        for name, rows in self._rows.items():
+            out[rows] = self.steps[name].inliers
+        return out
+
+    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> np.ndarray:
+        """Values (N, 2) with a fitted correction that is orthogonal to the gauge."""
+        out = values.copy()
+        for f, (name, rows) in enumerate(self._rows.items()):
+            out[rows] = self.steps[name].without_gauge(values[rows], interior[f])
+        return out
+
+    def smooth(self, values: np.ndarray) -> np.ndarray:
+        """Fitted corrections (N, 2) of values (N, 2)."""
+        out = np.zeros_like(values)
+        for name, rows in self._rows.items():
+            out[rows] = self.steps[name].smooth(values[rows])
+        return out
+
+    def models(
+        self,
+        values: np.ndarray,
+        terms: AdjustedTerms | None,
+        after: Adjustment,
+        precise: Precision,
+    ) -> dict[str, CorrectionModel]:
+        """Models of values (N, 2) by fluoroscope, with their terms from the last adjustment."""
+        out = {}
+        for f, (name, rows) in enumerate(self._rows.items()):
+            series = (
+                None
+                if terms is None
+                else terms.series(f, after.parameters.additional[f], precise.additional[f])
+            )
+            out[name] = self.steps[name].model(values[rows], series)
+        return out
+
+
+@dataclass
+class _Iterate:
+    """State of the iteration: values to be fitted, adjustment and noise of the last round."""
+
+    values: np.ndarray
+    information: np.ndarray
+    after: Adjustment
+    noise: Noise
+
+
+def calibrate_by_regression(
+    measured: Measured,
+    before: Adjustment,
+    options: CalibrationOptions,
+    terms: AdjustedTerms | None,
+    regressions: Regressions,
+    progress: Callable[[Round], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> SelfCalibration:
+    """Self-calibrate by adjustment and regression in turn.
+
+    Parameters
+    ----------
+    measured : Measured
+    before : Adjustment
+        Adjustment without correction.
+    options : CalibrationOptions
+    terms : AdjustedTerms or None
+        Terms of the correction that are estimated in the adjustments.
+    regressions : Regressions
+        What fits the rest of the correction.
+    progress : callable, optional
+        Called with the Round after every round.
+    raise_if_cancelled : callable, optional
+        Called before every step of an adjustment; may raise to stop.
+
+    Returns
+    -------
+    SelfCalibration
+
+    Raises
+    ------
+    DataError
+        If there are too few inliers, or the exposures do not determine the unknowns.
+    """
+    network = measured.network
+    after = before
+    if terms is not None:
+        network = terms.with_additional(network)
+        after = with_zero_additional(before, terms.zeros())
+    history = History(measured, progress)
+    acceleration = Anderson()
+    information = _information(network, after, np.zeros_like(network.uv))[0]
+    state = _Iterate(before.residuals, information, after, before.noise)
+    converged = False
+    for iteration in range(1, options.max_iterations + 1):
+        g_cost, changed = regressions.choose(state.values, state.after.q, state.information)
+        if changed:
+            acceleration.restart()
+        values = regressions.without_gauge(state.values, state.after.parameters.interior)
+        correction = regressions.smooth(values)
+        after = adjust(
+            network,
+            state.after.parameters,
+            correction,
+            state.noise,
+            SolverOptions(ROUND_TOLERANCE),
+            raise_if_cancelled,
+        )
+        information, noise = _information(network, after, correction)
+        image = regressions.without_gauge(after.residuals + correction, after.parameters.interior)
+        core = regressions.inliers()
+        change = float(np.sqrt(np.mean((regressions.smooth(image) - correction)[core] ** 2)))
+        history.add(after, g_cost, regressions.k, change)
+        state = _Iterate(values, information, after, noise)
+        steady = abs(noise.scale - after.noise.scale) <= SETTLED * noise.scale
+        settled = not changed and steady and history.has_settled(options.tolerance)
+        if settled or not regressions.iterate:
+            converged = after.converged
+            break
+        if iteration < options.max_iterations:
+            # Outliers follow the acceleration, but do not steer it.
+            state.values = acceleration.next(values, image, core)
+    # The correction of the last round stays; its adjustment is completed here.
+    after, precise = adjusted_with_precision(
+        network,
+        after.parameters,
+        correction,
+        noise,
+        raise_if_cancelled=raise_if_cancelled,
+        noise_held=True,
+    )
+    return SelfCalibration(
+        replace(measured, network=network),
+        before,
+        after,
+        precise,
+        correction + network.additional_correction(after.parameters),
+        regressions.inliers(),
+        regressions.models(state.values, terms, after, precise),
+        tuple(history.rounds),
+        converged,
+    )
+
+
+def _information(
+    network: Network, adjustment: Adjustment, correction: np.ndarray
+) -> tuple[np.ndarray, Noise]:
+    """C_r^-1 (N, 2, 2) [1/px^2] of the residuals, and the noise model that they show.
+
+    Raises DataError where the normal matrix is singular.
+    """
+    try:
+        matrix = factorize(
+            network, normal_equations(network, adjustment.parameters, correction, adjustment.noise)
+        )
+    except np.linalg.LinAlgError:
+        raise DataError(SINGULAR) from None
+    blocks = covariance_blocks(matrix)
+    information = np.linalg.inv(residual_covariance(network, adjustment, blocks))
+    return information, estimate_noise(network, adjustment, blocks)

@@ -1,0 +1,182 @@
+"""Self-calibration with the distortion among the unknowns of the adjustment.
+
+In the alternation of Chow et al. the orientations and object points take up part of the distortion
+before the regressor sees it. Here all are adjusted together. What is still renewed between
+adjustments is the noise model, and what the terms of the distortion assume: the prior of a signal,
+or which terms there are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from ..distortion.base import CorrectionModel
+from ..distortion.estimation import AdjustedTerms, require_training
+from ..errors import DataError
+from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.elimination import factorize
+from ..photogrammetry.network import Network
+from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
+from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.precision import covariance_blocks, precision
+from .initial_network import Measured
+from .robust_adjustment import ADVICE, with_zero_additional
+from .rounds import History, Round, SelfCalibration
+
+FINAL_TOLERANCE = 1e-5  # decrease of F that the last adjustment may leave
+
+
+def calibrate_by_adjustment(
+    measured: Measured,
+    before: Adjustment,
+    model_type: type[CorrectionModel],
+    terms: AdjustedTerms,
+    max_rounds: int,
+    progress: Callable[[Round], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> SelfCalibration:
+    """Self-calibrate with the model among the unknowns.
+
+    Parameters
+    ----------
+    measured : Measured
+    before : Adjustment
+        Adjustment without correction.
+    model_type : type of CorrectionModel
+        A model that is a series.
+    terms : AdjustedTerms
+        Terms of that model for the network of measured.
+    max_rounds : int
+    progress : callable, optional
+        Called with the Round after every adjustment.
+    raise_if_cancelled : callable, optional
+        Called before every step of an adjustment; may raise to stop.
+
+    Returns
+    -------
+    SelfCalibration
+
+    Raises
+    ------
+    DataError
+        If there are too few inliers, or the exposures do not determine the unknowns.
+    """
+    history = History(measured, progress)
+
+    def report(adjustment: Adjustment, change: float) -> None:
+        _require_inliers(measured, adjustment)
+        square = float(np.sum(adjustment.q[adjustment.inliers]))
+        history.add(adjustment, square, dict.fromkeys(measured.fluoroscopes, 0), change)
+
+    try:
+        network, after, converged = adjust_with_terms(
+            measured.network, before, terms, max_rounds, report, raise_if_cancelled
+        )
+        precise = precision(network, after)
+    except np.linalg.LinAlgError:
+        raise DataError(
+            'the exposures do not determine orientation and distortion: '
+            f'the normal matrix is singular; {ADVICE}'
+        ) from None
+    correction = network.additional_correction(after.parameters)
+    models = {}
+    for f, name in enumerate(measured.fluoroscopes):
+        rows = network.rows(f)
+        rows = rows[after.inliers[rows]]
+        models[name] = model_type(
+            0,
+            network.uv[rows],
+            (after.residuals + correction)[rows],
+            series=terms.series(f, after.parameters.additional[f], precise.additional[f]),
+        )
+    return SelfCalibration(
+        replace(measured, network=network),
+        before,
+        after,
+        precise,
+        correction,
+        after.inliers,
+        models,
+        tuple(history.rounds),
+        converged,
+    )
+
+
+def _require_inliers(measured: Measured, adjustment: Adjustment) -> None:
+    """Raise DataError where a fluoroscope has too few inliers for a correction model."""
+    for f, name in enumerate(measured.fluoroscopes):
+        try:
+            require_training(int(adjustment.inliers[measured.network.rows(f)].sum()))
+        except ValueError as error:
+            raise DataError(f'fluoroscope {name}: {error}') from None
+
+
+def adjust_with_terms(
+    plain: Network,
+    before: Adjustment,
+    terms: AdjustedTerms,
+    max_rounds: int,
+    report: Callable[[Adjustment, float], None],
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> tuple[Network, Adjustment, bool]:
+    """Adjust a network together with terms of its distortion.
+
+    Parameters
+    ----------
+    plain : Network
+        Network without additional parameters.
+    before : Adjustment
+        Adjustment without correction.
+    terms : AdjustedTerms
+    max_rounds : int
+    report : callable
+        Called with every Adjustment and the RMS change of the correction [px].
+    raise_if_cancelled : callable, optional
+        Called before every step of an adjustment; may raise to stop.
+
+    Returns
+    -------
+    network : Network
+        With the terms as additional parameters.
+    adjustment : Adjustment
+    converged : bool
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        If the network does not determine the unknowns.
+    """
+    correction = np.zeros_like(plain.uv)
+    zero = correction
+    parameters = with_zero_additional(before, terms.zeros()).parameters
+    noise = before.noise
+    converged = False
+    for number in range(max_rounds):
+        network = terms.with_additional(plain)
+        final = converged or number == max_rounds - 1
+        result = adjust(
+            network,
+            parameters,
+            zero,
+            noise,
+            SolverOptions(FINAL_TOLERANCE if final else terms.intermediate_tolerance),
+            raise_if_cancelled,
+        )
+        last = correction
+        correction = network.additional_correction(result.parameters)
+        report(result, float(np.sqrt(np.mean((correction - last) ** 2))))
+        if final:
+            break
+        factor = noise.information_factor(result.q)
+        matrix = factorize(
+            network, normal_equations(network, result.parameters, zero, noise, factor)
+        )
+        renewed = estimate_noise(network, result, covariance_blocks(matrix))
+        converged, coefficients = terms.renew(network, matrix, result)
+        converged &= abs(renewed.scale - noise.scale) <= SETTLED * noise.scale
+        parameters = replace(result.parameters, additional=coefficients)
+        noise = renewed
+    return network, result, bool(converged and result.converged)

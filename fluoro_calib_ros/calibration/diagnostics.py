@@ -1,0 +1,86 @@
+"""Diagnostics of a self-calibration: undetermined unknowns, correlations and outliers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from ..errors import DataError
+from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.diagnosis import (
+    describe_directions,
+    high_correlations,
+    undetermined_directions,
+    undetermined_interiors,
+)
+from ..photogrammetry.outliers import find_outliers
+from ..photogrammetry.precision import Precision
+from .initial_network import Measured
+from .rounds import SelfCalibration
+
+
+def undetermined_unknowns(measured: Measured) -> str:
+    """Return a sentence on the unknowns that a network leaves undetermined at its start values.
+
+    It is empty where there are none.
+    """
+    found = undetermined_directions(
+        measured.network, measured.start, measured.fluoroscopes, _exposure_numbers(measured)
+    )
+    if not found:
+        return ''
+    return (
+        f'the exposures do not determine the unknowns: {describe_directions(found)}; '
+        'add exposures with the phantom turned and moved, with more targets'
+    )
+
+
+def raise_if_undetermined(measured: Measured, adjustment: Adjustment, precise: Precision) -> None:
+    """Raise DataError, one sentence a fluoroscope, for undetermined interior orientations."""
+    scale = adjustment.noise.scale
+    found = undetermined_interiors(
+        measured.network, adjustment.parameters, precise, measured.fluoroscopes, scale
+    )
+    if found:
+        raise DataError('. '.join(found))
+
+
+def correlations_of(run: SelfCalibration) -> tuple[tuple[str, str, float], ...]:
+    """High correlations between unknowns of a self-calibration: ((name, name, value), ...)."""
+    return high_correlations(
+        run.measured.network,
+        run.after.parameters,
+        run.precision,
+        run.measured.fluoroscopes,
+        _exposure_numbers(run.measured),
+    )
+
+
+def outliers_of(run: SelfCalibration) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Outliers of a self-calibration: image points and targets, with their test statistics."""
+    measured = run.measured
+    found = find_outliers(measured.network, run.after, run.precision)
+    exposures = measured.network.exposure[found.image_point]
+    points = [
+        {
+            'fluoroscope': measured.frames[j].fluoroscope,
+            'exposure': measured.frames[j].number,
+            'target_id': int(measured.target_id[measured.network.point[row]]),
+            'value': float(value),
+            'critical': found.critical_image,
+        }
+        for row, j, value in zip(found.image_point, exposures, found.value)
+    ]
+    targets = [
+        {
+            'target_id': int(measured.target_id[row]),
+            'offset_mm': offset,
+            'value': float(value),
+            'critical': found.critical_target,
+        }
+        for row, offset, value in zip(found.target, found.offset_mm, found.target_value)
+    ]
+    return points, targets
+
+
+def _exposure_numbers(measured: Measured) -> list[int]:
+    return [frame.number for frame in measured.frames]

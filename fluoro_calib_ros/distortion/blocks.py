@@ -1,0 +1,67 @@
+"""Predictions of a neighbour model at very many pixels, block by block.
+
+All pixels of a block have their k nearest training points among those within r + 2e of its centre,
+where r is the distance of the k-th nearest from the centre and e half the diagonal (triangle
+inequality). So one search serves some 200 pixels, and every call of numpy takes some ten
+microseconds: a stream in the same process is not delayed.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .neighbour_model import NeighbourModel
+
+BLOCK = 200  # pixels of a block
+MAX_BLOCK_PX = 64.0  # its largest side, for pixels that are far apart
+BLOCKS_PER_QUERY = 32
+
+
+def smooth_in_blocks(
+    model: NeighbourModel, uv: np.ndarray, duv: np.ndarray, norm2: np.ndarray
+) -> None:
+    """Write the neighbours' part of the correction at pixels uv (n, 2) to duv and norm2.
+
+    Parameters
+    ----------
+    model : NeighbourModel
+    uv : (n, 2) ndarray
+        Pixels.
+    duv : (2 or more, n) ndarray
+        Its first two rows receive the corrections [px].
+    norm2 : (n,) ndarray
+        Receives the squared norms of the weights.
+    """
+    blocks = _blocks(uv)
+    for start in range(0, len(blocks), BLOCKS_PER_QUERY):
+        some = blocks[start : start + BLOCKS_PER_QUERY]
+        low = np.array([np.min(uv[block], axis=0) for block in some])
+        high = np.array([np.max(uv[block], axis=0) for block in some])
+        centre = (low + high) / 2
+        diagonal = np.linalg.norm(high - low, axis=1)
+        kth = model.tree.query(centre, k=[model.k])[0][:, 0]
+        found = model.tree.query_ball_point(centre, (kth + diagonal) * (1 + 1e-9) + 1e-9)
+        for block, near in zip(some, found):
+            weights = model.weights_of_candidates(model.train_uv[near], uv[block], model.k)
+            for axis, remainder in enumerate(model.remainder[near].T):
+                duv[axis, block] = np.einsum('nk,k->n', weights, remainder)
+            norm2[block] = np.einsum('nk,nk->n', weights, weights)
+
+
+def _blocks(uv: np.ndarray) -> list[np.ndarray]:
+    """Rows of pixels uv (n, 2) that are close together, about BLOCK of them each."""
+    low = uv.min(axis=0)
+    high = uv.max(axis=0)
+    side = min(MAX_BLOCK_PX, np.sqrt(BLOCK * np.prod(high - low + 1) / len(uv)))
+    column, row = ((uv - low) / side).astype(np.intp).T
+    block = row * (column.max() + 1) + column
+    order = np.argsort(block, kind='stable')
+    border = np.flatnonzero(np.diff(block[order])) + 1
+    return [
+        part[i : i + 2 * BLOCK]
+        for part in np.split(order, border)
+        for i in range(0, len(part), 2 * BLOCK)
+    ]

@@ -1,0 +1,144 @@
+"""The model `collocation`: trend and signal estimated in the adjustment.
+
+Least-squares collocation (Moritz, "Advanced Physical Geodesy", 1980): the distortion is a cubic
+trend plus a random field, both among the unknowns of the adjustment, with priors that are
+estimated from the observations (see `priors`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..photogrammetry.additional_parameters import AdditionalParameters
+from ..photogrammetry.precision import information_of_additional
+from .estimation import AdjustedTerms, AdjustmentProblem
+from .priors import Prior, gauge_precision, most_likely_prior, prior_precision, starting_prior
+from .series import MARGIN, Functions, Series, sd_over_image
+from .series_model import SeriesModel
+
+if TYPE_CHECKING:
+    from ..photogrammetry.adjustment import Adjustment
+    from ..photogrammetry.elimination import FactorizedNormalMatrix
+    from ..photogrammetry.network import Network
+
+TREND_DEGREE = 3  # pincushion, S-shape and spiral are cubic to first order (Gronenschild 1997)
+START_MODES = 18  # half waves along the image, until the correlation length is known
+MIN_MODES = 10
+MAX_MODES = 24  # the time grows with the sixth power, the accuracy hardly
+# Correlation length times frequency above which a Matern signal has less than 1e-4 of its spectral
+# density.
+CUT_OFF = 8.0
+SETTLED_PRIOR = 0.15  # change of the logarithms of the prior that changes no correction visibly
+MIN_START_SD_PX = 0.1
+
+
+class CollocationModel(SeriesModel):
+    """Cubic polynomials and a random field of sines, estimated in the adjustment."""
+
+    kind = 'collocation'
+    description = 'cubic trend and random field in the adjustment'
+
+    @classmethod
+    def adjusted_terms(cls, problem: AdjustmentProblem) -> AdjustedTerms:
+        """Trend and signal."""
+        return CollocationTerms(problem)
+
+
+class CollocationTerms(AdjustedTerms):
+    """Trend and signal of all fluoroscopes of a network, and their priors.
+
+    modes: number of sines along the image to start with; 0: there is no signal.
+    """
+
+    intermediate_tolerance = 1.0  # noise and prior still change
+
+    def __init__(self, problem: AdjustmentProblem, modes: int = START_MODES) -> None:
+        before = problem.before
+        self.network = problem.network
+        self.interior_held = problem.interior_held
+        self.sizes = problem.image_sizes
+        self.interior = before.parameters.interior
+        self.functions: list[Functions] = []
+        self.priors: list[Prior] = []
+        self.gauges: list[np.ndarray] = []
+        self.values: list[np.ndarray] = []
+        self._modes_fitted = False
+        for f, size in enumerate(self.sizes):
+            rows = self.network.rows(f)
+            core = before.residuals[rows][before.inliers[rows]]
+            self._set_functions(f, Functions(size, TREND_DEGREE, modes))
+            sd = max(float(np.sqrt(np.mean(core**2))), MIN_START_SD_PX)
+            self.priors.append(starting_prior(self.functions[f], sd))
+
+    def _set_functions(self, f: int, functions: Functions) -> None:
+        """Use these functions for fluoroscope f."""
+        self.functions[f : f + 1] = [functions]
+        self.values[f : f + 1] = [functions(self.network.uv[self.network.rows(f)])]
+        self.gauges[f : f + 1] = [self._gauge(f)]
+
+    def _gauge(self, f: int) -> np.ndarray:
+        uv = self.network.uv[self.network.rows(f)]
+        return gauge_precision(self.values[f], uv, self.interior[f], self.interior_held)
+
+    def with_additional(self, network: Network) -> Network:
+        """Return the network with the terms under their present priors."""
+        additional = tuple(
+            AdditionalParameters(values, prior_precision(functions, prior) + gauge)
+            for values, functions, prior, gauge in zip(
+                self.values, self.functions, self.priors, self.gauges
+            )
+        )
+        return replace(network, additional=additional)
+
+    def zeros(self) -> tuple[np.ndarray, ...]:
+        """Coefficients of no correction, by fluoroscope."""
+        return tuple(np.zeros(2 * len(functions)) for functions in self.functions)
+
+    def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
+        """Return the series of fluoroscope f.
+
+        coefficients (2m,), those of u first, and their covariance (2m, 2m).
+        """
+        functions = self.functions[f]
+        return Series(functions, coefficients.reshape(2, -1), sd_over_image(functions, covariance))
+
+    def renew(
+        self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
+    ) -> tuple[bool, tuple[np.ndarray, ...]]:
+        """Renew priors and gauges at a solution, and the first time the number of modes.
+
+        Returns whether the priors have settled, and the coefficients with which to continue.
+        """
+        settled = True
+        coefficients = adjustment.parameters.additional
+        self.interior = adjustment.parameters.interior
+        for f, functions in enumerate(self.functions):
+            last = self.priors[f]
+            present = network.additional[f].prior
+            information = information_of_additional(matrix, f) - present
+            right = (information + present) @ coefficients[f]
+            now = most_likely_prior(functions, information, right, self.gauges[f], last)
+            self.priors[f] = now
+            self.gauges[f] = self._gauge(f)
+            change = abs(np.log(now.sd / last.sd)) + abs(np.log(now.reach / last.reach))
+            settled &= change < SETTLED_PRIOR
+        if self._modes_fitted:
+            return settled, coefficients
+        self._modes_fitted = True
+        return False, self._fit_modes(coefficients)
+
+    def _fit_modes(self, coefficients: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+        """Use as many modes as the correlation length of each signal needs.
+
+        Returns the coefficients for them.
+        """
+        out = []
+        for f, (functions, prior) in enumerate(zip(self.functions, self.priors)):
+            wanted = np.ceil(CUT_OFF / prior.reach * MARGIN * max(self.sizes[f]) / np.pi)
+            modes = int(np.clip(wanted, MIN_MODES, MAX_MODES))
+            self._set_functions(f, Functions(self.sizes[f], TREND_DEGREE, modes))
+            out.append(self.functions[f].converted(functions, coefficients[f]))
+        return tuple(out)

@@ -1,0 +1,236 @@
+"""How a self-calibration obtains a correction model: terms in the adjustment, and regression."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Protocol
+
+import numpy as np
+
+from ..photogrammetry.noise import INLIER_Q
+
+if TYPE_CHECKING:
+    from ..photogrammetry.adjustment import Adjustment
+    from ..photogrammetry.elimination import FactorizedNormalMatrix
+    from ..photogrammetry.network import Network
+    from .base import CorrectionModel
+    from .series import Series
+
+MIN_TRAINING = 60  # inliers of a fluoroscope that a correction model needs
+# An inlier becomes an outlier above STAY_IN times the limit (five sigma of each coordinate), an
+# outlier an inlier below half of it.
+STAY_IN = 1.5
+FOLDS = 10  # of the cross-validation
+
+
+@dataclass(frozen=True)
+class AdjustmentProblem:
+    """A network whose adjustment is to estimate terms of the correction.
+
+    Attributes
+    ----------
+    network : Network
+        Network without additional parameters.
+    image_sizes : sequence of (int, int)
+        Width and height [px] of the image of each fluoroscope.
+    before : Adjustment
+        Adjustment of the network without correction.
+    interior_held : bool
+        True where the interior orientation is not estimated.
+    """
+
+    network: Network
+    image_sizes: Sequence[tuple[int, int]]
+    before: Adjustment
+    interior_held: bool
+
+
+@dataclass(frozen=True)
+class TrainingPoints:
+    """Image points of one fluoroscope to whose residuals a model is fitted.
+
+    Attributes
+    ----------
+    uv : (N, 2) ndarray
+        Observed pixels; they do not change between rounds.
+    exposure : (N,) ndarray of int
+        Exposure of each image point.
+    image_size : (int, int)
+        Width and height of the image [px].
+    interior_held : bool
+        True where the interior orientation is not estimated, which makes the gauge smaller.
+    trend : (N, m) ndarray or None
+        Functions whose coefficients are estimated in the adjustment, the same for u and v; the
+        correction is then kept orthogonal to all of them instead of the gauge.
+    """
+
+    uv: np.ndarray
+    exposure: np.ndarray
+    image_size: tuple[int, int]
+    interior_held: bool
+    trend: np.ndarray | None = None
+
+
+class AdjustedTerms(ABC):
+    """Terms of the correction, of all fluoroscopes of a network, that the adjustment estimates.
+
+    Attributes
+    ----------
+    intermediate_tolerance : float
+        Decrease of the cost at which an adjustment before the last may stop.
+    values : list of ndarray
+        Functions at the image points of each fluoroscope, (N, m) or (N, 2, p).
+    """
+
+    intermediate_tolerance: float
+    values: list[np.ndarray]
+
+    @abstractmethod
+    def with_additional(self, network: Network) -> Network:
+        """Return the network with the terms as additional parameters."""
+
+    @abstractmethod
+    def zeros(self) -> tuple[np.ndarray, ...]:
+        """Coefficients of no correction, by fluoroscope."""
+
+    @abstractmethod
+    def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
+        """Return the series of fluoroscope f from its coefficients (p,) and their covariance."""
+
+    @abstractmethod
+    def renew(
+        self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
+    ) -> tuple[bool, tuple[np.ndarray, ...]]:
+        """Renew what the terms assume, from the solved normal matrix of an adjustment.
+
+        Returns whether nothing changed, and the coefficients with which to continue.
+        """
+
+
+class RegressionStep(ABC):
+    """Correction model of one fluoroscope through the rounds of a self-calibration.
+
+    Attributes
+    ----------
+    k : int
+        Number of neighbours chosen; 0 for a model without.
+    score : float
+        G, weighted square sum of the errors of cross-validation.
+    inliers : (N,) ndarray of bool
+        Image points to which the model is fitted.
+    changed : bool
+        Whether inliers or k differ from the last round.
+    iterates : bool
+        Whether a second round can give another correction than the first.
+    """
+
+    iterates = True
+
+    def __init__(self, points: TrainingPoints) -> None:
+        self.points = points
+        self.k = 0
+        self.score = 0.0
+        self.changed = False
+        self.inliers: np.ndarray | None = None
+
+    @abstractmethod
+    def choose(self, values: np.ndarray, q: np.ndarray, information: np.ndarray) -> None:
+        """Update the inliers, and choose k by its score.
+
+        Parameters
+        ----------
+        values : (N, 2) ndarray
+            Values to which the model is fitted [px].
+        q : (N,) ndarray
+            Normalised squared residuals.
+        information : (N, 2, 2) ndarray
+            Inverse of the residual covariance C_r [1/px^2].
+
+        Raises
+        ------
+        ValueError
+            If there are too few inliers.
+        """
+
+    @abstractmethod
+    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> np.ndarray:
+        """Change values (N, 2) so that their fitted correction is orthogonal to the gauge."""
+
+    @abstractmethod
+    def smooth(self, values: np.ndarray) -> np.ndarray:
+        """Fit values (N, 2) [px] at the inliers; return the corrections (N, 2) at all points."""
+
+    @abstractmethod
+    def model(self, values: np.ndarray, series: Series | None = None) -> CorrectionModel:
+        """Return the correction model of values (N, 2) with its noise and bias.
+
+        series: terms that were estimated in the adjustment and are not in the values.
+        """
+
+    def _updated_inliers(self, q: np.ndarray) -> np.ndarray:
+        """Inliers (N,) by normalised squared residuals q (N,); sets `changed`.
+
+        The limit depends on the last state: a point that moves about it would otherwise start the
+        neighbour search and the acceleration anew in every round.
+        """
+        inliers = q <= INLIER_Q
+        if self.inliers is not None:
+            inliers = np.where(self.inliers, q <= STAY_IN * INLIER_Q, q <= INLIER_Q / 2)
+        self.changed = self.inliers is None or not np.array_equal(inliers, self.inliers)
+        return inliers
+
+
+class NoRegression(RegressionStep):
+    """The regression step of the model that corrects nothing."""
+
+    iterates = False
+
+    def choose(self, values: np.ndarray, q: np.ndarray, information: np.ndarray) -> None:
+        """Update the inliers and sum up their weighted residuals."""
+        self.inliers = self._updated_inliers(q)
+        inside = values[self.inliers]
+        self.score = float(np.einsum('na,nab,nb', inside, information[self.inliers], inside))
+
+    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> np.ndarray:
+        """Return the values."""
+        return values
+
+    def smooth(self, values: np.ndarray) -> np.ndarray:
+        """Return zeros (N, 2)."""
+        return np.zeros_like(values)
+
+    def model(self, values: np.ndarray, series: Series | None = None) -> CorrectionModel:
+        """Return the model that corrects nothing."""
+        from .none import no_correction
+
+        return no_correction()
+
+
+class ModelSource(Protocol):
+    """What a self-calibration is given: a class of models, or the regressor of a user."""
+
+    kind: str
+
+    def adjusted_terms(self, problem: AdjustmentProblem) -> AdjustedTerms | None:
+        """Terms of the model that are unknowns of the adjustment."""
+        ...
+
+    def regression(self, points: TrainingPoints, k: int | None) -> RegressionStep | None:
+        """Regression of the residuals between adjustments."""
+        ...
+
+
+def require_training(count: int) -> None:
+    """Raise ValueError where count inliers are too few for a correction model."""
+    if count < MIN_TRAINING:
+        raise ValueError(
+            f'{count} inliers are too few for the correction model, {MIN_TRAINING} are needed'
+        )
+
+
+def exposure_folds(exposure: np.ndarray, folds: int = FOLDS) -> np.ndarray:
+    """Fold (N,) of each image point: the exposures (N,) are dealt out in turn."""
+    _, number = np.unique(exposure, return_inverse=True)
+    return number % min(folds, number.max() + 1)

@@ -1,0 +1,213 @@
+"""The cells of a lookup grid: their size, the exact values at their corners, their coefficients.
+
+The cells are as large as LIMIT_PX of `grid_errors` allows. The few in which that is not accurate
+enough, as neighbour models have kinks, are divided once more and have rows in a second table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .base import BULK_CHUNK, CorrectionModel, Smoothness
+from .grid_errors import TARGET_PX, errors_of_finer_grid, errors_where_curved
+
+CELL_PX = (8, 4, 2)  # sizes of cells that are tried
+MAX_SHARE_DIVIDED = 0.01  # of cells, so that not all of them have to be smaller
+MAX_DIVIDED = 2500
+MAX_PARTS = 16  # of a divided cell along a side
+MAX_TABLE_BYTES = 128_000_000
+COEFFICIENTS = 12  # of a cell: 1, u, v, u v, each for du, dv and the standard deviation
+
+Nodes = tuple[np.ndarray, np.ndarray]  # columns (w,) and rows (h,) [px] of the corners of cells
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells of a lookup grid.
+
+    Attributes
+    ----------
+    nodes : (w,) ndarray, (h,) ndarray
+        Columns and rows [px] of their corners.
+    values : (3, h, w) ndarray
+        du, dv and standard deviation [px] there.
+    errors : (2, h - 1, w - 1) ndarray
+        Errors [px] of correction and standard deviation in the cells; NaN where not measured.
+    outside : (h - 1, w - 1) ndarray of bool
+        True for cells with a corner beyond the calibrated area.
+    """
+
+    nodes: Nodes
+    values: np.ndarray
+    errors: np.ndarray
+    outside: np.ndarray
+
+
+@dataclass(frozen=True)
+class DividedCells:
+    """Cells that are divided further, as they are not accurate enough.
+
+    Attributes
+    ----------
+    row, column : (d,) ndarray of int
+        Their place among the cells.
+    parts : (d,) ndarray of int
+        Number of parts along a side.
+    first : (d,) ndarray of int
+        Row of the first part in the table.
+    table : (p, 12) ndarray
+        Coefficients of all parts.
+    """
+
+    row: np.ndarray
+    column: np.ndarray
+    parts: np.ndarray
+    first: np.ndarray
+    table: np.ndarray
+
+
+def build_cells(model: CorrectionModel, image_size: tuple[int, int]) -> Cells:
+    """Return the cells of an image (width, height) [px] for a model."""
+    nodes, values, errors = _nodes_and_values(model, image_size)
+    return Cells(nodes, values, errors, _outside(model, nodes))
+
+
+def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
+    """Divide the cells with the largest errors; None where all are accurate enough."""
+    error = cells.errors[0]
+    inaccurate = np.flatnonzero(error > TARGET_PX)
+    worst_first = np.argsort(-error.ravel()[inaccurate], kind='stable')
+    inaccurate = np.sort(inaccurate[worst_first[:MAX_DIVIDED]])
+    if not len(inaccurate):
+        return None
+    j, i = np.unravel_index(inaccurate, error.shape)
+    columns, rows = cells.nodes
+    # At a kink the error is proportional to the side of a cell; one more halving for what the
+    # measured points do not show.
+    halvings = 1 + np.ceil(np.log2(error[j, i] / TARGET_PX))
+    parts = np.minimum(2 ** halvings.astype(np.intp), MAX_PARTS)
+    part_nodes = [
+        (
+            np.linspace(columns[x], columns[x + 1], n + 1),
+            np.linspace(rows[y], rows[y + 1], n + 1),
+        )
+        for x, y, n in zip(i, j, parts)
+    ]
+    exact = model.evaluate_in_bulk(np.concatenate([_pixels(nodes) for nodes in part_nodes]))
+    values = np.split(exact, np.cumsum((parts + 1) ** 2)[:-1], axis=1)
+    first = np.concatenate([[0], np.cumsum(parts**2)[:-1]])
+    table = aligned_array((int(np.sum(parts**2)), COEFFICIENTS))
+    for nodes, n, start, of_cell in zip(part_nodes, parts, first, values):
+        write_coefficients(
+            nodes,
+            of_cell.reshape(3, n + 1, n + 1),
+            table[start : start + n * n].reshape(n, n, COEFFICIENTS),
+        )
+    return DividedCells(j, i, parts, first, table)
+
+
+def write_coefficients(nodes: Nodes, values: np.ndarray, out: np.ndarray) -> None:
+    """Write the coefficients of bilinear interpolation in cells to out (h - 1, w - 1, 12).
+
+    nodes: columns (w,) and rows (h,) [px] of the corners; values (3, h, w) there. The coefficients
+    are those of 1, u, v and u v, each for du, dv and the standard deviation.
+    """
+    columns, rows = nodes
+    x = columns[:-1]
+    y = rows[:-1, None]
+    width = np.diff(columns)
+    height = np.diff(rows)[:, None]
+    corner = values[:, :-1, :-1]
+    of_x = (values[:, :-1, 1:] - corner) / width
+    of_y = (values[:, 1:, :-1] - corner) / height
+    of_xy = ((values[:, 1:, 1:] - values[:, 1:, :-1]) / width - of_x) / height
+    for k in range(3):
+        a = corner[k]
+        b = of_x[k]
+        c = of_y[k]
+        d = of_xy[k]
+        out[:, :, k] = a - b * x - (c - d * x) * y
+        out[:, :, 3 + k] = b - d * y
+        out[:, :, 6 + k] = c - d * x
+        out[:, :, 9 + k] = d
+
+
+def aligned_array(shape: tuple[int, ...]) -> np.ndarray:
+    """Uninitialised floats that begin with a cache line, so that a row is in few of them."""
+    size = int(np.prod(shape))
+    memory = np.empty(size + 8)
+    start = -memory.ctypes.data % 64 // 8
+    return memory[start : start + size].reshape(shape)
+
+
+def _nodes_and_values(
+    model: CorrectionModel, image_size: tuple[int, int]
+) -> tuple[Nodes, np.ndarray, np.ndarray]:
+    """Nodes of the cell size that is chosen, values (3, h, w) there, and errors of the cells."""
+    sizes = _cell_sizes(model.smoothness, image_size)
+    nodes = _nodes(image_size, sizes[0], 1)
+    values = None
+    for number in range(len(sizes) - 1):
+        finer = _nodes(image_size, sizes[0], 2 ** (number + 1))
+        finer_values = _exact_values(model, finer)
+        values = finer_values[:, ::2, ::2]
+        errors = errors_of_finer_grid(finer_values)
+        if np.mean(errors[0] > TARGET_PX) <= MAX_SHARE_DIVIDED:
+            return nodes, values, errors
+        nodes = finer
+        values = finer_values
+    if values is None:
+        values = _exact_values(model, nodes)
+    return nodes, values, errors_where_curved(model, nodes, values)
+
+
+def _cell_sizes(smoothness: Smoothness, image_size: tuple[int, int]) -> list[float]:
+    """Sizes of cells [px] to try, each half the one before."""
+    area = image_size[0] * image_size[1]
+    bytes_of_cell = COEFFICIENTS * 8
+    sizes = [size for size in CELL_PX if area / size**2 * bytes_of_cell <= MAX_TABLE_BYTES]
+    if not sizes:
+        return [2 ** np.ceil(np.log2(area * bytes_of_cell / MAX_TABLE_BYTES) / 2)]
+    if smoothness is Smoothness.STEPPED:
+        return sizes[-1:]  # small cells blur the steps less
+    if smoothness is Smoothness.KINKED:
+        return sizes[-2:]  # larger cells are never accurate enough
+    return sizes
+
+
+def _nodes(image_size: tuple[int, int], size: float, parts: int) -> Nodes:
+    """Corners of cells from edge to edge of an image: 1/parts of cells of at most size [px]."""
+    width, height = image_size
+    return _axis_nodes(width, size, parts), _axis_nodes(height, size, parts)
+
+
+def _axis_nodes(length: int, size: float, parts: int) -> np.ndarray:
+    return np.linspace(-0.5, length - 0.5, parts * max(1, int(np.ceil(length / size))) + 1)
+
+
+def _pixels(nodes: Nodes) -> np.ndarray:
+    """Pixels (h * w, 2) of nodes, row by row."""
+    columns, rows = nodes
+    return np.stack([np.tile(columns, len(rows)), np.repeat(rows, len(columns))], axis=1)
+
+
+def _exact_values(model: CorrectionModel, nodes: Nodes) -> np.ndarray:
+    """du, dv and standard deviation (3, h, w) [px] of the model at nodes."""
+    columns, rows = nodes
+    return model.evaluate_in_bulk(_pixels(nodes)).reshape(3, len(rows), len(columns))
+
+
+def _outside(model: CorrectionModel, nodes: Nodes) -> np.ndarray:
+    """True (h - 1, w - 1) for cells with a corner beyond the calibrated area.
+
+    All other cells are wholly inside, as the area is convex.
+    """
+    columns, rows = nodes
+    step = max(1, BULK_CHUNK // len(columns))
+    parts = [
+        model.outside(_pixels((columns, rows[i : i + step]))) for i in range(0, len(rows), step)
+    ]
+    node = np.concatenate(parts).reshape(len(rows), len(columns))
+    return node[:-1, :-1] | node[:-1, 1:] | node[1:, :-1] | node[1:, 1:]

@@ -113,7 +113,7 @@ def adjustment_section():
         'free, because COLMAP does not support surveyed coordinates with standard deviations. The '
         'costs are the negative log-likelihoods of the image points.',
         adjustments.HEADER,
-        [adjustments.beside_colmap(size) for size in adjustments.SIZES],
+        [adjustments.compare_with_colmap(size) for size in adjustments.SIZES],
     )
 
 

@@ -1,6 +1,6 @@
-"""One adjustment of many image points, ours beside COLMAP's: the same problem, start values and
-cost.
-"""
+"""One adjustment of many image points by ours and by COLMAP: same problem, start and cost."""
+
+from typing import Any
 
 import numpy as np
 
@@ -17,8 +17,8 @@ from .timing import timed
 
 NOISE = Noise('student_t', 0.25, 5.0)
 SIZES = (15, 150)  # exposures
-HELD_EVERY = 10  # object point: the datum that COLMAP can express
-# Ceres stops at this relative decrease of its cost, which is then equal to ours in ten digits.
+HELD_EVERY = 10  # every tenth object point is held: a datum that COLMAP can express
+# Ceres stops at this relative decrease of its cost. It then equals ours to ten digits.
 STOP = {
     'function_tolerance': 1e-11,
     'gradient_tolerance': 0.0,
@@ -27,9 +27,10 @@ STOP = {
 }
 
 
-def large_network(exposures, seed=0):
-    """Network and disturbed start values: every bead of the virtual rig in every exposure,
-    Student-t noise.
+def large_network(exposures: int, seed: int = 0) -> tuple[Network, Parameters]:
+    """Network with every bead of the virtual rig in every exposure, and disturbed start values.
+
+    The noise is Student-t.
     """
     rng = np.random.default_rng([seed, exposures])
     rig = virtual_rig(1)
@@ -52,7 +53,7 @@ def large_network(exposures, seed=0):
         rig.phantom.sd_mm,
         np.array([True]),
     )
-    # About as far off as resections of bent images are.
+    # Errors of the size of resections of distorted images.
     turn = matrix_from_vector(rng.normal(0, 2e-3, position.shape))
     start = Parameters(
         fluoroscope.interior[None] + [[5.0, -5.0, 40.0]],
@@ -63,14 +64,14 @@ def large_network(exposures, seed=0):
     return network, start
 
 
-def beside_colmap(exposures, repeats=3):
-    """Row: seconds and cost of an adjustment with the noise held, ours and COLMAP's."""
+def compare_with_colmap(exposures: int, repeats: int = 3) -> list[str]:
+    """Table row: time and cost of an adjustment, ours and COLMAP's."""
     network, start = large_network(exposures)
     held = np.arange(len(network.survey_mm)) % HELD_EVERY == 0
     network = with_datum(network, held)
     ours, seconds = timed(lambda: adjust(network, start, None, NOISE), repeats)
 
-    def colmap():
+    def colmap() -> tuple[ColmapAdjustment, Any]:
         peer = ColmapAdjustment(network, start, NOISE, held, STOP)
         return peer, peer.solve()
 

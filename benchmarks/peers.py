@@ -1,12 +1,13 @@
-"""The adjustment and the self-calibration done with other people's programs, to be compared with
-ours.
+"""Adjustment and self-calibration with independent programs, for comparison.
 
 COLMAP's bundle adjuster (pycolmap, Ceres) with a Cauchy loss of scale b = sigma sqrt(nu) minimises
-b^2/2 sum ln(1 + |r|^2 / b^2): the negative log-likelihood of the bivariate Student-t but for its
-constant and the factor (nu + 2) / b^2. Its pixel centres lie at 0.5, ours at integers.
+b^2/2 sum ln(1 + |r|^2 / b^2): the negative log-likelihood of the bivariate Student-t, except for
+its constant and the factor (nu + 2) / b^2. Its pixel centres are at 0.5, ours at integers.
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -15,23 +16,24 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from fluoro_calib_ros.distortion.gauge import gauge_basis
 from fluoro_calib_ros.photogrammetry.collinearity import project
+from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.noise import INLIER_Q, Noise
 from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 
 from .timing import timed
 
 PIXEL_CENTRE = 0.5
-# as a constant and as a free point of the same program: held, and not
+# Standard deviations of the survey that stand for COLMAP's constant points and free points.
 HELD_SD_MM = 1e-6
 LOOSE_SD_MM = 1e6
-# Ceres stops at the first that holds: nothing but rounding.
+# Ceres stops at the first criterion that is met: here, at rounding errors.
 TIGHT = {
     'function_tolerance': 0.0,
     'gradient_tolerance': 1e-10,
     'parameter_tolerance': 1e-14,
     'max_num_iterations': 500,
 }
-# Within the loop the next round does what is left.
+# Within the loop, the next round continues the adjustment.
 LOOP = {
     'function_tolerance': 1e-8,
     'gradient_tolerance': 0.0,
@@ -41,21 +43,20 @@ LOOP = {
 CANDIDATES = tuple(range(3, 50))  # values of k of Chow et al.
 
 
-def with_datum(network, held):
-    """The network with the object points held (n, True or False) fixed to their survey and the
-    others free.
+def with_datum(network: Network, held: np.ndarray) -> Network:
+    """The network with object points fixed to their survey where `held` (n,), and free elsewhere.
 
-    COLMAP knows constant points and free ones, not surveyed coordinates with their standard
+    COLMAP supports constant and free points, but not surveyed coordinates with standard
     deviations.
     """
     return replace(network, survey_sd_mm=np.where(held, HELD_SD_MM, LOOSE_SD_MM))
 
 
-def seen_in(network, start, least):
-    """The network and its start values without the object points that fewer than least exposures
-    show.
-    """
-    kept = np.bincount(network.point, minlength=len(network.survey_mm)) >= least
+def drop_rarely_seen_points(
+    network: Network, start: Parameters, min_exposures: int
+) -> tuple[Network, Parameters]:
+    """Network and start values without object points seen in fewer than min_exposures."""
+    kept = np.bincount(network.point, minlength=len(network.survey_mm)) >= min_exposures
     rows = kept[network.point]
     number = np.cumsum(kept) - 1
     network = replace(
@@ -71,21 +72,38 @@ def seen_in(network, start, least):
 
 
 class ColmapAdjustment:
-    """The adjustment of a network of one fluoroscope, a-priori sigma one, by COLMAP's bundle
-    adjuster.
+    """Adjustment of a network of one fluoroscope by COLMAP's bundle adjuster.
 
-    held (n,) True for object points that stay at their survey; noise: Student-t, held; tolerances:
-    options of the Ceres solver. solve() may be called again after moved observations: it starts
-    where it ended.
+    solve() may be called again after the observations changed: it continues where it ended.
+
+    Parameters
+    ----------
+    network : Network
+        One fluoroscope; sigma of all image points is one.
+    start : Parameters
+        Start values.
+    noise : Noise
+        Student-t noise model; not estimated.
+    held : (n,) ndarray of bool
+        Object points that stay at their survey.
+    tolerances : mapping, optional
+        Options of the Ceres solver.
     """
 
-    def __init__(self, network, start, noise, held, tolerances=None):
+    def __init__(
+        self,
+        network: Network,
+        start: Parameters,
+        noise: Noise,
+        held: np.ndarray,
+        tolerances: Mapping[str, float] | None = None,
+    ) -> None:
         if (
             network.n_fluoroscopes != 1
             or noise.loss != 'student_t'
             or not np.all(network.sigma == 1)
         ):
-            raise ValueError('one fluoroscope, Student-t and the same sigma for all image points')
+            raise ValueError('COLMAP needs one fluoroscope, Student-t noise and sigma one')
         self._network = network
         self._noise = noise
         self._held = held
@@ -99,37 +117,35 @@ class ColmapAdjustment:
             self._config.set_constant_cam_intrinsics(1)
         self._options = _options(noise, tolerances or {})
 
-    def observe(self, uv):
+    def observe(self, uv: np.ndarray) -> None:
         """Replace the observed pixels (N, 2), in the order of the network."""
         rows = iter((np.asarray(uv) + PIXEL_CENTRE).tolist())
         for image in range(1, len(self._network.fluoroscope) + 1):
             for point in self._reconstruction.image(image).points2D:
                 point.xy = next(rows)
 
-    def set_noise(self, noise):
+    def set_noise(self, noise: Noise) -> None:
         """Replace the noise model."""
         self._noise = noise
         self._options.ceres.loss_function_scale = noise.scale * np.sqrt(noise.nu)
 
-    def solve(self):
-        """Adjust. Returns the summary of Ceres."""
+    def solve(self) -> Any:
+        """Adjust, and return the summary of Ceres."""
         self._adjuster = pycolmap.create_default_ceres_bundle_adjuster(
             self._options, self._config, self._reconstruction
         )
         return self._adjuster.solve().ceres_summary
 
-    def cost(self, summary):
-        """F of the image points at the solution, as ours counts it: with the constant of the
-        distribution.
-        """
+    def cost(self, summary: Any) -> float:
+        """F of the image points at the solution, with the constant of the distribution."""
         noise = self._noise
         factor = (noise.nu + 2) / (noise.nu * noise.scale**2)
         return factor * summary.final_cost + len(self._network.uv) * np.log(
             2 * np.pi * noise.scale**2
         )
 
-    def parameters(self):
-        """Parameters at the present state."""
+    def parameters(self) -> Parameters:
+        """Present parameters."""
         f, cx, cy = self._reconstruction.camera(1).params
         poses = [
             self._reconstruction.image(i).cam_from_world()
@@ -144,24 +160,22 @@ class ColmapAdjustment:
             np.array([[cx - PIXEL_CENTRE, cy - PIXEL_CENTRE, f]]), rotation, position, points
         )
 
-    def interior_covariance(self):
-        """Covariance (3, 3) [px^2] of xp, yp, c: inverse of the weighted normal matrix, after
-        solve().
-        """
+    def interior_covariance(self) -> np.ndarray:
+        """Covariance (3, 3) [px^2] of xp, yp, c from the weighted normal matrix, after solve()."""
         options = pycolmap.BACovarianceOptions()
         options.params = pycolmap.BACovarianceOptionsParams.ALL
         options.damping = 0.0
         found = pycolmap.estimate_ba_covariance(options, self._reconstruction, self._adjuster)
-        order = [1, 2, 0]  # of f, cx, cy
+        order = [1, 2, 0]  # COLMAP's order is f, cx, cy
         covariance = found.get_other_params_cov(self._reconstruction.camera(1).params)[
             np.ix_(order, order)
         ]
-        # Ceres weights with 1/(1 + |r|^2/b^2), the likelihood with (nu + 2)/b^2 times that.
+        # Ceres weights by 1/(1 + |r|^2/b^2), the likelihood by (nu + 2)/b^2 times that.
         return covariance * self._noise.nu * self._noise.scale**2 / (self._noise.nu + 2)
 
 
-def _options(noise, tolerances):
-    """CalibrationOptions of COLMAP's bundle adjuster: everything refined, one thread."""
+def _options(noise: Noise, tolerances: Mapping[str, float]) -> Any:
+    """Options of COLMAP's bundle adjuster: everything is refined, on one thread."""
     options = pycolmap.BundleAdjustmentOptions()
     options.refine_principal_point = True
     options.print_summary = False
@@ -173,10 +187,8 @@ def _options(noise, tolerances):
     return options
 
 
-def _reconstruction(network, start, held):
-    """COLMAP's reconstruction with camera 1, images from 1 and points from 1 in the order of the
-    network.
-    """
+def _reconstruction(network: Network, start: Parameters, held: np.ndarray) -> Any:
+    """COLMAP's reconstruction with camera 1, and images and points numbered from 1 in order."""
     xp, yp, c = start.interior[0]
     size = np.ceil(network.uv.max(axis=0)).astype(int) + 1
     out = pycolmap.Reconstruction()
@@ -218,8 +230,20 @@ def _reconstruction(network, start, held):
 
 @dataclass(frozen=True)
 class PeerCalibration:
-    """Result of the loop: interior (3,) [px], k, rounds, converged, RMSE (2,) [px] of the
-    residuals of the inliers, and the part of the time that the grid searches took [s].
+    """Result of the loop.
+
+    Attributes
+    ----------
+    interior : (3,) ndarray
+        xp, yp, c [px].
+    k : int
+        Number of neighbours.
+    rounds : int
+    converged : bool
+    rmse : (2,) ndarray
+        RMSE of the inlier residuals [px].
+    search_seconds : float
+        Time of the grid searches.
     """
 
     interior: np.ndarray
@@ -230,16 +254,21 @@ class PeerCalibration:
     search_seconds: float
 
 
-def self_calibrate_with_peers(network, start, folds=10, rounds=30, settled_px=2e-3):
-    """The loop of Chow et al. of COLMAP's bundle adjustment and scikit-learn's grid search of k
-    nearest neighbours.
+def self_calibrate_with_peers(
+    network: Network,
+    start: Parameters,
+    folds: int = 10,
+    rounds: int = 30,
+    settled_px: float = 2e-3,
+) -> PeerCalibration:
+    """The loop of Chow et al. made of COLMAP's bundle adjuster and scikit-learn's grid search.
 
-    What does not change is built once: the reconstruction, which every adjustment starts from as
-    the last one left it, and the folds. Object points that less than three exposures show, and
-    every tenth, are the datum. It ends as ours does, when the next round would change the
-    correction by less than settled_px, or after rounds.
+    What does not change is built once: the reconstruction, which each adjustment continues from,
+    and the folds. The datum are object points seen in less than three exposures, and every tenth.
+    As ours, the loop ends when the next round would change the correction by less than settled_px,
+    or after `rounds`.
     """
-    network, start = seen_in(network, start, 2)
+    network, start = drop_rarely_seen_points(network, start, 2)
     held = (np.arange(len(network.survey_mm)) % 10 == 0) | (np.bincount(network.point) < 3)
     fold = network.exposure % min(folds, len(network.fluoroscope))
     noise = Noise('student_t', 1.0, 5.0)
@@ -256,9 +285,8 @@ def self_calibrate_with_peers(network, start, folds=10, rounds=30, settled_px=2e
         parameters = colmap.parameters()
         residuals = network.uv - correction - project(*parameters.per_image_point(network))
         squared = np.sum(residuals**2, axis=1)
-        noise = replace(
-            noise, scale=float(np.sqrt(np.median(squared) / (2 * np.log(2))))
-        )  # median of chi-square
+        # The median of chi-square with two degrees of freedom is 2 ln 2.
+        noise = replace(noise, scale=float(np.sqrt(np.median(squared) / (2 * np.log(2)))))
         inliers = squared <= INLIER_Q * noise.scale**2
         search = GridSearchCV(
             KNeighborsRegressor(),
@@ -289,10 +317,10 @@ def self_calibrate_with_peers(network, start, folds=10, rounds=30, settled_px=2e
     )
 
 
-def _without_gauge(uv, fitted, inliers, interior):
-    """The fitted correction (N, 2) less its part that a change of the orientation makes: else c
-    drifts away.
-    """
+def _without_gauge(
+    uv: np.ndarray, fitted: np.ndarray, inliers: np.ndarray, interior: np.ndarray
+) -> np.ndarray:
+    """The fitted correction (N, 2) without its gauge part; otherwise c would drift."""
     basis = gauge_basis(uv, interior)
     part, *_ = np.linalg.lstsq(
         basis[inliers].reshape(-1, basis.shape[2]), fitted[inliers].ravel(), rcond=None

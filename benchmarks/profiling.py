@@ -1,7 +1,8 @@
-"""Where the time of a self-calibration goes."""
+"""Profile of a self-calibration."""
 
 import cProfile
 import pstats
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import fluoro_calib_ros
@@ -10,16 +11,15 @@ PACKAGE = Path(fluoro_calib_ros.__file__).parent
 HEADER = ['function', 'calls', 'cumulative', 'share', 'own']
 
 
-def rows(function, count=12):
-    """Rows of the functions with the largest cumulative times of a call that are the program's."""
+def rows(function: Callable[[], object], count: int = 12) -> Iterator[list[str]]:
+    """Table rows of the package's functions with the largest cumulative times during a call."""
     profile = cProfile.Profile()
     profile.runcall(function)
-    stats = pstats.Stats(
-        profile
-    ).stats  # (file, line, name) -> calls, ..., own, cumulative, callers
+    # (file, line, name) -> (primitive calls, calls, own time, cumulative time, callers)
+    stats = pstats.Stats(profile).stats  # type: ignore[attr-defined]
     total = max(cumulative for _, _, _, cumulative, _ in stats.values())
     ranked = sorted(stats.items(), key=lambda item: -item[1][3])
-    named = [(_name(key), *value[1:4]) for key, value in ranked]
+    named = [(_qualified_name(key), *value[1:4]) for key, value in ranked]
     for name, calls, own, cumulative in [row for row in named if row[0]][:count]:
         yield [
             f'`{name}`',
@@ -30,10 +30,10 @@ def rows(function, count=12):
         ]
 
 
-def _name(key):
-    """Module and name of a function of the program without its folders, '' for all others."""
+def _qualified_name(key: tuple[str, int, str]) -> str:
+    """Module and name of a function of the package; an empty string for all others."""
     file, _, name = key
     path = Path(file)
     if PACKAGE not in path.parents or name.startswith('<'):
         return ''
-    return '.'.join(path.relative_to(PACKAGE).with_suffix('').parts + (name,))
+    return '.'.join((*path.relative_to(PACKAGE).with_suffix('').parts, name))

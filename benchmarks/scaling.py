@@ -1,12 +1,14 @@
-"""Time and memory of an adjustment by its number of exposures, each in a process of its own.
+"""Time and memory of an adjustment by number of exposures, each size in its own process.
 
-python -m benchmarks.scaling 300      one size: prints a line of JSON
+python -m benchmarks.scaling 300      one size; prints one line of JSON
 """
 
 import json
 import subprocess
 import sys
+from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from threadpoolctl import threadpool_limits
 
@@ -29,9 +31,9 @@ HEADER = [
 ]
 
 
-def peak_gib():
+def peak_gib() -> float:
     """Largest resident size of this process so far [GiB]."""
-    # The ru_maxrss of getrusage starts with that of the parent, which is larger than the small
+    # ru_maxrss of getrusage starts at that of the parent process, which is larger than the small
     # sizes here.
     status = dict(
         line.split(':', 1) for line in Path('/proc/self/status').read_text().splitlines()
@@ -39,7 +41,7 @@ def peak_gib():
     return int(status['VmHWM'].split()[0]) / 2**20
 
 
-def measure(exposures):
+def measure(exposures: int) -> dict[str, Any]:
     """Figures of one adjustment from disturbed start values in this process."""
     network, start = large_network(exposures)
     before = peak_gib()
@@ -58,8 +60,8 @@ def measure(exposures):
     }
 
 
-def measure_afresh(exposures):
-    """The same in a fresh process, whose memory is that of this adjustment alone."""
+def measure_in_new_process(exposures: int) -> dict[str, Any]:
+    """The same in a new process, so that its memory is that of this adjustment."""
     done = subprocess.run(
         [sys.executable, '-m', 'benchmarks.scaling', str(exposures)],
         stdout=subprocess.PIPE,
@@ -69,10 +71,10 @@ def measure_afresh(exposures):
     return json.loads(done.stdout)
 
 
-def rows(sizes=SIZES):
-    """Rows of the table for all sizes."""
+def rows(sizes: Sequence[int] = SIZES) -> Iterator[list[str]]:
+    """Table rows of all sizes."""
     for size in sizes:
-        f = measure_afresh(size)
+        f = measure_in_new_process(size)
         step = f['seconds'] / f['steps']
         yield [
             f'{size} x {f["targets"]}',

@@ -1,15 +1,18 @@
-"""Wall times, and tables of them."""
+"""Wall times, and Markdown tables of them."""
 
 import textwrap
 import time
+from collections.abc import Callable, Iterable, Sequence
+from typing import TypeVar
 
 import numpy as np
 
+T = TypeVar('T')
 
-def timed(function, repeats=1):
+
+def timed(function: Callable[[], T], repeats: int = 1) -> tuple[T, float]:
     """Result of the last of repeated calls, and the median of their wall times [s]."""
     times = []
-    result = None
     for _ in range(repeats):
         began = time.perf_counter()
         result = function()
@@ -17,13 +20,13 @@ def timed(function, repeats=1):
     return result, float(np.median(times))
 
 
-def table(header, rows):
-    """A Markdown table; cells of the first column stand left, others right."""
+def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A Markdown table with its first column left-aligned and the others right-aligned."""
     lines = [header, ['---'] + ['---:'] * (len(header) - 1), *rows]
     return '\n'.join('| ' + ' | '.join(line) + ' |' for line in lines)
 
 
-def section(title, text, header, rows):
+def section(title: str, text: str, header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """A section of the report: title, a paragraph and a table."""
-    filled = textwrap.fill(text, 118, break_on_hyphens=False)
-    return f'## {title}\n\n{filled}\n\n{table(header, rows)}'
+    paragraph = textwrap.fill(text, 118, break_on_hyphens=False)
+    return f'## {title}\n\n{paragraph}\n\n{table(header, rows)}'

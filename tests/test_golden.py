@@ -21,7 +21,7 @@ from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
 
 sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed
-from benchmarks.peers import TIGHT, ColmapAdjustment, seen_in, with_datum
+from benchmarks.peers import TIGHT, ColmapAdjustment, drop_rarely_seen_points, with_datum
 
 pytestmark = pytest.mark.long
 
@@ -30,7 +30,7 @@ def small_problem():
     """Network, start values and noise: six exposures of about thirty targets, heavy tails."""
     network, truth = small_network(6, 40, noise_px=0.3, nu=4.0, seed=2, seen=0.8)
     network = replace(network, sigma=np.ones(len(network.uv)))
-    return *seen_in(network, disturbed(truth, degrees=0.2, mm=2.0), 2), Noise(
+    return *drop_rarely_seen_points(network, disturbed(truth, degrees=0.2, mm=2.0), 2), Noise(
         'student_t', 0.4, 4.0
     )
 
@@ -45,7 +45,9 @@ def real_problem():
         for frame, uv in zip(exposures.frames['a'], exposures.undistorted['a'])
     ]
     measured = measured_network({'a': frames}, rig.phantom)
-    return *seen_in(measured.network, measured.start, 2), Noise('student_t', 0.22, 5.0)
+    return *drop_rarely_seen_points(measured.network, measured.start, 2), Noise(
+        'student_t', 0.22, 5.0
+    )
 
 
 def all_held(network):

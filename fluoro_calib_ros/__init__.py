@@ -44,6 +44,7 @@ __all__ = [
     'read_request',
     'read_source',
     'reconstruct',
+    'run_calibration',
     'save_orientation',
     'save_outcome',
     'save_result',

@@ -22,9 +22,9 @@ from .files.calibration_sources import read_sources as read_request
 from .files.phantom import read_phantom
 from .files.reconstructed_points import write_reconstruction
 from .files.rig_orientation import load_orientation, save_orientation
-from .jobs import calibration as _calibration
 from .jobs.adjustment import adjust
-from .jobs.calibration import CalibrationOutcome, Progress
+from .jobs.calibration import CalibrationOutcome
+from .jobs.calibration import run as run_calibration
 from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
 from .jobs.result_folder import save_outcome, save_result
@@ -60,6 +60,7 @@ __all__ = [
     'read_request',
     'read_source',
     'reconstruct',
+    'run_calibration',
     'save_orientation',
     'save_outcome',
     'save_result',
@@ -77,7 +78,7 @@ def calibrate(
     joint: bool = False,
     principal_distance: float | None = None,
     validated: bool = False,
-    progress: Progress | None = None,
+    force: bool = False,
 ) -> CalibrationOutcome:
     """Self-calibrate fluoroscopes, and orient the rig.
 
@@ -95,8 +96,8 @@ def calibrate(
     validated : bool
         Whether the calibration is validated with its own exposures, which takes some six times as
         long.
-    progress : callable, optional
-        Called with the names of the fluoroscopes and the Round after every round.
+    force : bool
+        Whether to calibrate also input that cannot be right, such as another phantom.
 
     Returns
     -------
@@ -106,14 +107,14 @@ def calibrate(
     Raises
     ------
     DataError
-        For observations that do not suffice: one sentence with place and cause.
+        For observations that do not suffice or cannot be right: place and cause in a sentence.
     ValueError
         For options that contradict each other.
     """
     request = CalibrationRequest(
         frames, phantom, options or CalibrationOptions(), joint, principal_distance
     )
-    return _calibration.run(request, validate=validated, progress=progress)
+    return run_calibration(request, validate=validated, force=force)
 
 
 def correct(

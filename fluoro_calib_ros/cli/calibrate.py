@@ -53,6 +53,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_collect(parser)
     parser.add_argument(
+        '--force',
+        action='store_true',
+        help='calibrate also input that cannot be right, such as another phantom, and write the '
+        'impossible result, with the reasons in result.json',
+    )
+    parser.add_argument(
         '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
     )
 
@@ -136,7 +142,7 @@ def run(arguments: argparse.Namespace) -> None:
     request = CalibrationRequest(
         recording.frames, phantom, options, arguments.joint, arguments.principal_distance
     )
-    outcome = calibration.run(request, progress=print_round)
+    outcome = calibration.run(request, force=arguments.force, progress=print_round)
     save_outcome(arguments.out, outcome)
     if arguments.figures:
         from ..report.figures import write_figures
@@ -146,4 +152,7 @@ def run(arguments: argparse.Namespace) -> None:
         print_note(f'no orientation of the rig: {outcome.orientation_note}')
     for sentence in outcome.result.left_out:
         print_note(f'not used: {sentence}')
-    print_result(arguments, result_document(outcome.result), summary_table(outcome.result))
+    for sentence in outcome.doubts:
+        print_note(f'this cannot be right: {sentence}')
+    document = {**result_document(outcome.result), 'doubts': list(outcome.doubts)}
+    print_result(arguments, document, summary_table(outcome.result))

@@ -10,13 +10,17 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 from ..calibration.calibrate import CalibrationResult, calibrate
+from ..calibration.initial_network import MIN_EXPOSURES
 from ..calibration.request import CalibrationRequest
 from ..calibration.result import FluoroscopeCalibration
 from ..calibration.rig_orientation import orientation_of_exposures
 from ..calibration.rounds import Round
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, validate_frame
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..validation.inputs import copied_exposures, find_wrong_input
+from ..validation.plausibility import implausible
+from ..validation.rigidity import contradiction
 from ..validation.verdict import Validation, validate_or_report
 
 Progress = Callable[[str, Round], None]
@@ -57,6 +61,8 @@ class CalibrationOutcome:
     orientation_note : str
     validation : Validation or None
         None where no validation was requested.
+    doubts : tuple of str
+        Why the calibration cannot be right; not empty only where it was forced.
     """
 
     request: CalibrationRequest
@@ -65,6 +71,7 @@ class CalibrationOutcome:
     orientation: RigOrientation | None = None
     orientation_note: str = ''
     validation: Validation | None = None
+    doubts: tuple[str, ...] = ()
 
     @property
     def calibrations(self) -> dict[str, FluoroscopeCalibration]:
@@ -80,17 +87,23 @@ def run(
     request: CalibrationRequest,
     *,
     validate: bool = False,
+    force: bool = False,
     rig: Rig | None = None,
     progress: Progress | None = None,
     raise_if_cancelled: Cancellation | None = None,
 ) -> CalibrationOutcome:
     """Self-calibrate the fluoroscopes of a request, and orient the rig.
 
+    Exposures that repeat an earlier one are left out.
+
     Parameters
     ----------
     request : CalibrationRequest
     validate : bool
         Whether the calibration is validated with its own exposures.
+    force : bool
+        Whether to calibrate input that cannot be right, and return a result that is impossible;
+        the outcome then holds the doubts.
     rig : Rig, optional
         Further fluoroscopes of the rig.
     progress : callable, optional
@@ -105,10 +118,15 @@ def run(
     Raises
     ------
     DataError
-        For observations that do not suffice.
+        For observations that do not suffice, that cannot be of the phantom, or that lead to an
+        impossible result.
     ValueError
         For options that contradict each other.
     """
+    request, copies = _without_copies(request)
+    doubts = list(find_wrong_input(_valid(request), request.phantom).values())
+    if doubts and not force:
+        raise DataError('. '.join(doubts))
     result = calibrate(
         request.frames,
         request.phantom,
@@ -118,6 +136,10 @@ def run(
         progress,
         raise_if_cancelled,
     )
+    result = replace(result, left_out=(*copies, *result.left_out))
+    doubts += implausible(request, result)
+    if doubts and not force:
+        raise DataError('. '.join(doubts))
     rig = rig or Rig()
     orientation, note = _orientation(request, result, rig)
     validation = None
@@ -125,7 +147,42 @@ def run(
         validation = validate_or_report(
             request, result.calibrations, raise_if_cancelled=raise_if_cancelled
         )
-    return CalibrationOutcome(request, result, rig, orientation, note, validation)
+    return CalibrationOutcome(request, result, rig, orientation, note, validation, tuple(doubts))
+
+
+def _without_copies(request: CalibrationRequest) -> tuple[CalibrationRequest, list[str]]:
+    """Return the request without repeated exposures, and a sentence for each of these."""
+    sentences = []
+    frames = {}
+    for name, exposures in request.frames.items():
+        copies = copied_exposures(exposures)
+        numbers = {copy.number for copy, _ in copies}
+        frames[name] = [frame for frame in exposures if frame.number not in numbers]
+        if copies and len(frames[name]) < MIN_EXPOSURES:
+            raise DataError(
+                f'fluoroscope {name}: {len(copies)} of {len(exposures)} exposures repeat the '
+                f'image points of another one, {MIN_EXPOSURES} different exposures are needed'
+            )
+        sentences += [
+            f'fluoroscope {name}, exposure {copy.number}: the image points are those of exposure '
+            f'{original.number}'
+            for copy, original in copies
+        ]
+    return (replace(request, frames=frames) if sentences else request), sentences
+
+
+def _valid(request: CalibrationRequest) -> dict[str, list[Frame]]:
+    """Return the frames that are valid on their own; the calibration reports the others."""
+    out: dict[str, list[Frame]] = {}
+    for name, exposures in request.frames.items():
+        out[name] = []
+        for frame in exposures:
+            try:
+                validate_frame(frame)
+            except DataError:
+                continue
+            out[name].append(frame)
+    return out
 
 
 def _orientation(
@@ -137,6 +194,14 @@ def _orientation(
     names = [name for name in rig.fluoroscopes or calibrations if name in calibrations]
     if len(names) < 2:
         return None, 'a single fluoroscope is calibrated'
+    calibrated = [name for name in names if name in result.fluoroscopes]
+    for name in calibrated[1:]:
+        first = calibrated[0]
+        sentence = contradiction(
+            (first, name), result.fluoroscopes[first], result.fluoroscopes[name]
+        )
+        if sentence:
+            return None, sentence
     try:
         orientation = orientation_of_exposures(
             {name: frames[name] for name in names},

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from ..calibration.calibrate import CalibrationResult
@@ -49,7 +49,7 @@ def save_outcome(
         Where a file cannot be written.
     """
     directory = Path(directory)
-    save_result(directory, outcome.result)
+    save_result(directory, outcome.result, outcome.doubts)
     write_sources(directory, outcome.request)
     saved = saved_orientation(directory)
     orientation = kept_orientation(present or saved, outcome.orientation, outcome.calibrations)
@@ -60,12 +60,17 @@ def save_outcome(
     return orientation
 
 
-def save_result(directory: str | os.PathLike[str], result: CalibrationResult) -> None:
-    """Write calibrations and result.json of a calibration or adjustment. Raises DataError."""
+def save_result(
+    directory: str | os.PathLike[str], result: CalibrationResult, doubts: Sequence[str] = ()
+) -> None:
+    """Write calibrations and result.json of a calibration or adjustment.
+
+    doubts are the reasons why a forced calibration cannot be right. Raises DataError.
+    """
     directory = Path(directory)
     for calibration in result.calibrations.values():
         save_calibration(directory, calibration)
-    write_result(directory / RESULT, result_document(result))
+    write_result(directory / RESULT, {**result_document(result), 'doubts': list(doubts)})
 
 
 def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | None:

@@ -1,0 +1,206 @@
+"""Find input that cannot be right before it is calibrated, and say what is wrong with it.
+
+Each exposure is compared with the phantom by a robust direct linear transformation, which knows
+neither the interior orientation nor the pose and follows a part of the distortion: with the right
+phantom and ids its median residual is a few pixels, also with 40 % false matches or strong
+distortion. Where it is not, the ways in which files are confused are tried in turn: ids that are
+off by one or reversed. A projection matrix of a mirrored image fits as well as the right one, but
+puts all targets behind the source (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004,
+21.1: a reflection changes the sign of the depth).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import DataError
+from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
+from ..photogrammetry.resection import decompose, robust_dlt
+
+MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
+FIT = 0.004  # median residual over the longer side of the image of ids that are certainly right
+MISFIT = 0.03  # median residual over the longer side of the image from which nothing fits
+BETTER = 0.35  # median residual of other ids over that of the given ones from which they are right
+GOOD_MISFIT = 0.01  # median residual over the longer side of the image of ids that are right
+DISTANCES_MM = (200.0, 10_000.0)  # of the source from the phantom
+UNITS_MM = {'cm': 10.0, 'inches': 25.4, 'm': 1000.0}
+MIN_REACH = 0.6  # of the image points over the image, to the right and down
+MIN_SHARE = 0.5  # of the targets that other ids must have on the phantom
+SAME_PX = 1e-6  # image points of two exposures that agree so closely are copies
+MIN_COMMON = 8  # targets in two exposures that are compared
+COPIED = 0.9  # share of common image points that are the same in a copied exposure
+
+Relabel = Callable[[np.ndarray, Phantom], np.ndarray]
+
+_MIRRORED = (
+    'the image is mirrored: v must run down and u to the right, and neither they nor the axes of '
+    'the phantom may be interchanged'
+)
+# Sentence and ids of the ways in which ids are confused.
+CONFUSIONS: tuple[tuple[str, Relabel], ...] = (
+    ('the target ids are too large by 1', lambda ids, phantom: ids - 1),
+    ('the target ids are too small by 1', lambda ids, phantom: ids + 1),
+    (
+        'the target ids run in the opposite order',
+        lambda ids, phantom: phantom.target_id[0] + phantom.target_id[-1] - ids,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well an exposure fits the phantom.
+
+    misfit_px is the median residual of the robust direct linear transformation, depth the sign of
+    the depth of the targets: -1 where they lie behind the source; distance_mm is that of the
+    source from their middle.
+    """
+
+    misfit_px: float
+    depth: int
+    distance_mm: float
+
+
+def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: np.ndarray) -> Fit | None:
+    """Fit an exposure, with target_id (n,) for its ids, to the phantom.
+
+    Returns None where too few targets are on the phantom, or where they lie in one plane.
+    """
+    rows = phantom.index(target_id)
+    on_phantom = rows >= 0
+    if np.mean(on_phantom) < MIN_SHARE:
+        return None
+    xyz = phantom.xyz_mm[rows[on_phantom]]
+    uv = np.asarray(frame.uv, dtype=float)[on_phantom]
+    try:
+        with np.errstate(all='ignore'):
+            projection = robust_dlt(xyz, uv)
+            image = xyz @ projection[:, :3].T + projection[:, 3]
+            residual = np.linalg.norm(image[:, :2] / image[:, 2:] - uv, axis=1)
+            _, rotation, source = decompose(projection)
+    except (DataError, np.linalg.LinAlgError):
+        return None
+    depth = ((xyz - source) @ rotation.T)[:, 2]
+    if not np.isfinite(residual).all() or not np.isfinite(depth).all():
+        return None
+    distance = float(np.linalg.norm(source - xyz.mean(axis=0)))
+    return Fit(float(np.median(residual)), -1 if np.median(depth) < 0 else 1, distance)
+
+
+def find_wrong_input(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> dict[str, str]:
+    """Return a sentence for every fluoroscope whose exposures cannot be of the phantom as given.
+
+    frames are exposures by fluoroscope, valid on their own. Those with the most targets are tested
+    first, and the others only where these raise suspicion; a cause is named where most of all
+    exposures have one. A few wrong exposures are left to the calibration, which leaves them out.
+    """
+    out = {}
+    for name, exposures in frames.items():
+        sentence = wrong_image_size(exposures) or _wrong_exposures(exposures, phantom)
+        if sentence:
+            out[name] = f'fluoroscope {name}: {sentence}'
+    return out
+
+
+def _wrong_exposures(exposures: Sequence[Frame], phantom: Phantom) -> str:
+    """Return the cause that most exposures have in common, '' where most have none."""
+    ordered = sorted(exposures, key=lambda f: -len(f.target_id))
+    causes = [_cause(frame, phantom) for frame in ordered[:MAX_TESTED]]
+    if 2 * sum(map(bool, causes)) <= len(causes):
+        return ''
+    causes += [_cause(frame, phantom) for frame in ordered[MAX_TESTED:]]
+    named = [cause for cause in causes if cause]
+    return max(set(named), key=named.count) if 2 * len(named) > len(causes) else ''
+
+
+def wrong_image_size(exposures: Sequence[Frame]) -> str:
+    """Return a sentence where the image points fill only the upper left part of the image."""
+    if not exposures:
+        return ''
+    reach = np.max([np.max(frame.uv, axis=0) for frame in exposures], axis=0)
+    width, height = exposures[0].image_size
+    if not (reach < MIN_REACH * np.array([width, height])).all():
+        return ''
+    return (
+        f'the image points reach only to u = {reach[0]:.0f}, v = {reach[1]:.0f} of an image of '
+        f'{width} x {height} px: the image size is wrong, or the phantom covers one corner only'
+    )
+
+
+def wrong_unit(distance_mm: float, phantom: Phantom) -> str:
+    """Return a sentence where the source is so near or so far that the unit must be wrong."""
+    low, high = DISTANCES_MM
+    if low <= distance_mm <= high:
+        return ''
+    units = [unit for unit, mm in UNITS_MM.items() if low <= distance_mm * mm <= high]
+    extent = float(np.linalg.norm(np.ptp(phantom.xyz_mm, axis=0)))
+    return (
+        f'the coordinates of the phantom are not in mm{_in(units)}: it would be {extent:.3g} mm '
+        f'large and {distance_mm:.3g} mm from the source'
+    )
+
+
+def _in(units: Sequence[str]) -> str:
+    return f', but perhaps in {" or ".join(units)}' if units else ''
+
+
+def _cause(frame: Frame, phantom: Phantom) -> str:
+    """Return what is wrong with an exposure, '' where nothing is known to be."""
+    ids = np.asarray(frame.target_id, dtype=np.int64)
+    side = max(frame.image_size)
+    given = fit_to_phantom(frame, phantom, ids)
+    if given is None:
+        return ''
+    if given.misfit_px < FIT * side:
+        return _MIRRORED if given.depth < 0 else _unit_cause(phantom, given)
+    for sentence, relabel in CONFUSIONS:
+        other = fit_to_phantom(frame, phantom, relabel(ids, phantom))
+        if (
+            other is not None
+            and other.misfit_px < BETTER * given.misfit_px
+            and other.misfit_px < GOOD_MISFIT * side
+        ):
+            return f'{sentence}: with the right ones the image points fit the phantom'
+    if given.misfit_px > MISFIT * side:
+        return (
+            'the image points do not fit the phantom: this is another phantom, or the target ids '
+            'are wrong'
+        )
+    if given.depth < 0:
+        return _MIRRORED
+    return _unit_cause(phantom, given)
+
+
+def _unit_cause(phantom: Phantom, fit: Fit) -> str:
+    """Return the sentence on the unit, the same for all exposures: that of a rounded distance."""
+    digits = -int(np.floor(np.log10(max(fit.distance_mm, 1e-300))))
+    return wrong_unit(round(fit.distance_mm, digits), phantom)
+
+
+def copied_exposures(exposures: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
+    """Return the exposures of a fluoroscope that repeat an earlier one, each with that one.
+
+    Copies have the same image points to the last digit; exposures of a standing phantom differ by
+    their noise.
+    """
+    out = []
+    kept: list[Frame] = []
+    for frame in sorted(exposures, key=lambda f: f.number):
+        original = next((other for other in kept if _is_copy(frame, other)), None)
+        if original is None:
+            kept.append(frame)
+        else:
+            out.append((frame, original))
+    return out
+
+
+def _is_copy(frame: Frame, other: Frame) -> bool:
+    _, one, two = np.intersect1d(frame.target_id, other.target_id, return_indices=True)
+    if len(one) < MIN_COMMON:
+        return False
+    distance = np.abs(np.asarray(frame.uv)[one] - np.asarray(other.uv)[two]).max(axis=1)
+    return bool(np.mean(distance <= SAME_PX) >= COPIED)

@@ -1,0 +1,260 @@
+"""Input that cannot be right is refused with its cause, before and after the calibration.
+
+The table is the contract: kind of wrong input, and the sentence that a user reads. What is right
+but difficult must pass.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rigs import exposures, rig, run
+
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.files.observations import write_observations_csv
+from fluoro_calib_ros.files.phantom import write_phantom
+from fluoro_calib_ros.jobs import calibration
+from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.validation.inputs import copied_exposures, find_wrong_input
+from fluoro_calib_ros.validation.plausibility import implausible
+
+FAST = CalibrationOptions(model='none')
+PHANTOM = rig().phantom
+
+
+def frames(count=6, **options):
+    """Exposures of fluoroscope a."""
+    if options:
+        return simulate_exposures(rig(), count, 1, **options).frames['a']
+    return exposures()['a'][:count]
+
+
+def relabelled(relabel):
+    """The exposures with other ids, those that the phantom does not have left out."""
+    out = []
+    for frame in frames():
+        ids = relabel(frame.target_id)
+        known = PHANTOM.index(ids) >= 0
+        out.append(replace(frame, target_id=ids[known], uv=frame.uv[known]))
+    return out
+
+
+def shuffled(share):
+    """The exposures with a share of their ids interchanged."""
+
+    def relabel(ids):
+        rng = np.random.default_rng(len(ids))
+        rows = rng.permutation(len(ids))[: round(share * len(ids))]
+        out = ids.copy()
+        out[rows] = out[rng.permutation(rows)]
+        return out
+
+    return relabelled(relabel)
+
+
+def mapped(change, image_size=(1024, 1024)):
+    """The exposures with other image points."""
+    return [replace(f, uv=change(f.uv), image_size=image_size) for f in frames()]
+
+
+def scaled(factor):
+    """The phantom in another unit."""
+    return Phantom(PHANTOM.target_id, factor * PHANTOM.xyz_mm, factor * PHANTOM.sd_mm)
+
+
+def other_phantom(seed=2):
+    """Another phantom with the same ids."""
+    other = virtual_rig(seed).phantom
+    return Phantom(PHANTOM.target_id, other.xyz_mm, PHANTOM.sd_mm)
+
+
+def permuted_axes():
+    """The phantom with x and y interchanged: a mirror image of it."""
+    return Phantom(PHANTOM.target_id, PHANTOM.xyz_mm[:, [1, 0, 2]], PHANTOM.sd_mm)
+
+
+MIRRORED = 'the image is mirrored'
+NO_FIT = 'the image points do not fit the phantom: this is another phantom, or the target ids'
+WRONG = {
+    'another phantom': (frames, other_phantom, NO_FIT),
+    'a third phantom': (frames, lambda: other_phantom(3), NO_FIT),
+    'ids too large by 1': (
+        lambda: relabelled(lambda ids: ids + 1),
+        None,
+        'the target ids are too large by 1',
+    ),
+    'ids too small by 1': (
+        lambda: relabelled(lambda ids: ids - 1),
+        None,
+        'the target ids are too small by 1',
+    ),
+    'ids reversed': (
+        lambda: relabelled(lambda ids: 504 - ids),
+        None,
+        'the target ids run in the opposite order',
+    ),
+    'ids shifted by a face': (lambda: relabelled(lambda ids: (ids + 125) % 503 + 1), None, NO_FIT),
+    '70 % of the ids shuffled': (lambda: shuffled(0.7), None, NO_FIT),
+    'all ids shuffled': (lambda: shuffled(1.0), None, NO_FIT),
+    'u runs to the left': (
+        lambda: mapped(lambda uv: np.column_stack([1023 - uv[:, 0], uv[:, 1]])),
+        None,
+        MIRRORED,
+    ),
+    'v runs up': (
+        lambda: mapped(lambda uv: np.column_stack([uv[:, 0], 1023 - uv[:, 1]])),
+        None,
+        MIRRORED,
+    ),
+    'u and v interchanged': (lambda: mapped(lambda uv: uv[:, ::-1].copy()), None, MIRRORED),
+    'x and y of the phantom interchanged': (frames, permuted_axes, MIRRORED),
+    'z of the phantom upside down': (
+        frames,
+        lambda: Phantom(PHANTOM.target_id, PHANTOM.xyz_mm * (1, 1, -1), PHANTOM.sd_mm),
+        MIRRORED,
+    ),
+    'phantom in cm': (frames, lambda: scaled(0.1), 'not in mm, but perhaps in cm'),
+    'phantom in m': (frames, lambda: scaled(0.001), 'not in mm, but perhaps in m'),
+    'phantom in inches': (
+        frames,
+        lambda: scaled(1 / 25.4),
+        'not in mm, but perhaps in cm or inch',
+    ),
+    'phantom in micrometres': (frames, lambda: scaled(1000.0), 'not in mm'),
+    'image size twice the true one': (
+        lambda: mapped(lambda uv: uv, (2048, 2048)),
+        None,
+        'of an image of 2048 x 2048 px: the image size is wrong',
+    ),
+    'image points of half the resolution': (
+        lambda: mapped(lambda uv: uv / 2),
+        None,
+        'of an image of 1024 x 1024 px: the image size is wrong',
+    ),
+    'one exposure again and again': (
+        lambda: [replace(frames()[0], number=i) for i in range(6)],
+        None,
+        '5 of 6 exposures repeat the image points of another one',
+    ),
+    'two exposures in turn': (
+        lambda: [replace(frames()[i % 2], number=i) for i in range(6)],
+        None,
+        '4 of 6 exposures repeat the image points of another one',
+    ),
+    'most exposures of another phantom': (
+        lambda: (
+            frames()[:2]
+            + [
+                replace(f, number=f.number + 100)
+                for f in simulate_exposures(virtual_rig(2), 4, 9).frames['a']
+            ]
+        ),
+        None,
+        NO_FIT,
+    ),
+}
+
+
+@pytest.mark.parametrize('kind', WRONG)
+def test_wrong_input_is_refused_with_its_cause(kind):
+    make_frames, make_phantom, sentence = WRONG[kind]
+    phantom = PHANTOM if make_phantom is None else make_phantom()
+    with pytest.raises(DataError, match='^fluoroscope a: ') as error:
+        calibration.run(CalibrationRequest({'a': make_frames()}, phantom, FAST))
+    assert sentence in str(error.value)
+
+
+def barrel(uv, strength_px):
+    """Another distortion than that of the simulation: a radial barrel."""
+    x = (uv - 511.5) / 512
+    return uv - strength_px * x * np.sum(x * x, axis=1, keepdims=True)
+
+
+RIGHT = {
+    'ordinary': frames,
+    '40 % false matches nearby': lambda: frames(false_matches=0.4),
+    '40 % of the ids shuffled': lambda: shuffled(0.4),
+    'noise of 1 px': lambda: frames(noise_px=1.0),
+    'barrel of 60 px': lambda: mapped(lambda uv: barrel(uv, 60.0)),
+    'turned by 180 degrees': lambda: mapped(lambda uv: 1023 - uv),
+    'turned by 90 degrees': lambda: mapped(
+        lambda uv: np.column_stack([1023 - uv[:, 1], uv[:, 0]])
+    ),
+    'whole pixels': lambda: mapped(np.round),
+    'few targets': lambda: frames(matched=(20, 25)),
+}
+
+
+@pytest.mark.parametrize('kind', RIGHT)
+def test_difficult_input_is_not_accused(kind):
+    assert find_wrong_input({'a': RIGHT[kind]()}, PHANTOM) == {}
+    assert copied_exposures(RIGHT[kind]()) == []
+
+
+@pytest.mark.parametrize('seed', range(10))
+def test_no_random_rig_with_strong_distortion_is_accused(seed):
+    strong = virtual_rig(seed, 2.0)
+    assert find_wrong_input(simulate_exposures(strong, 5, seed).frames, strong.phantom) == {}
+
+
+def test_a_few_wrong_exposures_are_left_out_and_named():
+    wrong = simulate_exposures(virtual_rig(2), 2, 9).frames['a']
+    mixed = frames(8) + [replace(f, number=f.number + 100) for f in wrong]
+    mixed.append(replace(frames()[0], number=200))
+    outcome = calibration.run(CalibrationRequest({'a': mixed}, PHANTOM, FAST))
+    assert [e.exposure for e in outcome.result.fluoroscopes['a'].exposures] == list(range(1, 9))
+    assert len(outcome.result.left_out) == 3
+    assert 'exposure 200: the image points are those of exposure 1' in outcome.result.left_out[0]
+
+
+def test_an_impossible_result_is_refused_unless_it_is_forced():
+    """Every bead is labelled as one nearby: a half fits by chance, and the rest bends the result."""
+    request = CalibrationRequest({'a': frames(10, false_matches=0.45)}, PHANTOM, FAST)
+    with pytest.raises(DataError, match='fluoroscope a: the residuals are too large: RMSE'):
+        calibration.run(request)
+    outcome = calibration.run(request, force=True)
+    assert len(outcome.doubts) == 1
+    assert list(outcome.doubts) == implausible(request, outcome.result)
+
+
+def test_frames_that_do_not_belong_together_give_no_orientation():
+    """Fluoroscope b is one exposure behind a: both are calibrated well, the rig is not rigid."""
+    seen = {n: list(f[:8]) for n, f in exposures().items()}
+    seen['b'] = [replace(f, number=f.number + 1) for f in seen['b']]
+    outcome = calibration.run(CalibrationRequest(seen, PHANTOM, FAST))
+    assert outcome.orientation is None
+    assert (
+        'the exposures of fluoroscopes a and b contradict each other' in outcome.orientation_note
+    )
+    seen = {n: f[:8] for n, f in exposures().items()}
+    assert calibration.run(CalibrationRequest(seen, PHANTOM, FAST)).orientation is not None
+
+
+def test_the_command_refuses_wrong_input_and_writes_it_only_when_forced(tmp_path, capsys):
+    write_observations_csv(tmp_path / 'observations.csv', {'a': relabelled(lambda ids: ids + 1)})
+    write_phantom(tmp_path / 'phantom.csv', PHANTOM)
+    arguments = (
+        'calibrate',
+        tmp_path / 'observations.csv',
+        '--image-size',
+        '1024x1024',
+        '--phantom',
+        tmp_path / 'phantom.csv',
+        '--model',
+        'none',
+        '--out',
+        tmp_path / 'result',
+    )
+    assert run(*arguments) == 1
+    said = capsys.readouterr().err
+    assert said.startswith(
+        'fluoro-calib calibrate: fluoroscope a: the target ids are too large by 1'
+    )
+    assert said.count('\n') == 1
+    assert not (tmp_path / 'result').exists()
+    assert run(*arguments, '--force') == 0
+    assert 'this cannot be right: fluoroscope a: ' in capsys.readouterr().err
+    assert '"doubts": [\n    "fluoroscope a: ' in (tmp_path / 'result' / 'result.json').read_text()

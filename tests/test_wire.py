@@ -1,5 +1,6 @@
-"""The bytes of observations, beside the serialization of rclpy."""
+"""The bytes of stream messages, against the serialization of rclpy and of rosbags."""
 
+import contextlib
 from array import array
 from types import SimpleNamespace
 
@@ -10,6 +11,7 @@ from fluoro_calib_msgs.msg import CorrectedObservations, ReconstructedPoints, Ta
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
+from fluoro_calib_ros.bags.definitions import typestore
 from fluoro_calib_ros.nodes.messages.corrected_observations import (
     decode_corrected_observations,
     encode_corrected_observations,
@@ -23,6 +25,10 @@ from fluoro_calib_ros.nodes.messages.reconstructed_points import (
 from fluoro_calib_ros.nodes.messages.target_observations import decode_target_observations
 from fluoro_calib_ros.reconstruction.intersection import IntersectedPoints
 
+OBSERVED, CORRECTED, POINTS = (
+    f'fluoro_calib_msgs/msg/{name}'
+    for name in ('TargetObservations', 'CorrectedObservations', 'ReconstructedPoints')
+)
 SIZES = [
     (n, frame_id, sigma)
     for n in (0, 1, 2, 3, 30, 2028)
@@ -80,8 +86,8 @@ def test_observations_are_read_as_rclpy_reads_them(n, frame_id, sigma):
         assert np.array_equal(values, getattr(message, name)) and values.flags.aligned
 
 
-def test_observations_of_which_some_are_missing_are_read():
-    """An empty sequence is not aligned, what comes behind it is."""
+def test_observations_with_empty_arrays_are_read():
+    """An empty sequence is not aligned, but what follows it is."""
     for lengths in ((0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (2, 1, 0), (0, 3, 3)):
         for ids in (0, 1, 2):
             message = TargetObservations(target_id=uint32_field(range(ids)))
@@ -132,11 +138,8 @@ def test_corrected_observations_are_read_as_rclpy_writes_them(n, frame_id, _):
         assert np.array_equal(getattr(found, name), values, equal_nan=True)
 
 
-@pytest.mark.parametrize('n', [0, 1, 2, 3, 4, 5, 30])
-@pytest.mark.parametrize(
-    'frame_id, ids', [('rig', ('a-1', 'b-2')), ('a_optical', ('a-12', 'b-123', 'c')), ('', ())]
-)
-def test_points_are_written_as_rclpy_reads_them(n, frame_id, ids):
+def points_content(n, frame_id, ids):
+    """Content of a ReconstructedPoints message of n points."""
     rng = np.random.default_rng(n)
     rays = rng.integers(0, 3, n)
     points = IntersectedPoints(
@@ -149,7 +152,7 @@ def test_points_are_written_as_rclpy_reads_them(n, frame_id, ids):
         rng.integers(0, 5, n).astype(np.uint8),
         rays - 1,
     )
-    content = PointsContent(
+    return PointsContent(
         1_700_000_000_123_456_789,
         4_000_000_000,
         'rig-60b34b648ddef0f3',
@@ -157,9 +160,17 @@ def test_points_are_written_as_rclpy_reads_them(n, frame_id, ids):
         rng.integers(0, 2**32, n, dtype=np.uint32),
         points,
     )
+
+
+@pytest.mark.parametrize('n', [0, 1, 2, 3, 4, 5, 30])
+@pytest.mark.parametrize(
+    'frame_id, ids', [('rig', ('a-1', 'b-2')), ('a_optical', ('a-12', 'b-123', 'c')), ('', ())]
+)
+def test_points_are_written_as_rclpy_reads_them(n, frame_id, ids):
+    content = points_content(n, frame_id, ids)
     expected = message_from_points(content)
     found = deserialize_message(encode_reconstructed_points(content), ReconstructedPoints)
-    assert found == expected and list(found.rays) == rays.tolist()
+    assert found == expected and list(found.rays) == content.points.rays.tolist()
     assert deserialize_message(serialize_message(expected), ReconstructedPoints) == found
 
 
@@ -173,7 +184,7 @@ READERS = [
 
 
 @pytest.mark.parametrize('read, data', READERS)
-def test_a_message_that_was_cut_off_is_none(read, data):
+def test_a_truncated_message_is_refused(read, data):
     data = data()
     for length in range(len(data)):
         with pytest.raises(ValueError):
@@ -181,22 +192,20 @@ def test_a_message_that_was_cut_off_is_none(read, data):
 
 
 @pytest.mark.parametrize('read, data', READERS)
-def test_damaged_bytes_never_do_worse_than_be_refused(read, data):
+def test_damaged_bytes_raise_nothing_but_value_error(read, data):
     rng = np.random.default_rng(1)
     data = data()
     for _ in range(3000):
         damaged = bytearray(data)
         for place in rng.integers(0, len(data) if rng.random() < 0.5 else 100, 3):
             damaged[place] = rng.choice([0, 1, 127, 128, 255, rng.integers(256)])
-        try:
+        with contextlib.suppress(ValueError):
             read(bytes(damaged))
-        except ValueError:
-            pass
 
 
 @pytest.mark.parametrize('read, data', READERS)
 def test_big_endian_messages_are_read_too(read, data):
-    """A message of empty sequences, written by hand in the other order of bytes."""
+    """A message of empty sequences, written by hand in big-endian order."""
     count = 3 if read is decode_target_observations else 0
     numbers = (
         [(1, 4), (2, 4), (2, 4), (0x61000000, 4), (7, 4)]
@@ -209,3 +218,55 @@ def test_big_endian_messages_are_read_too(read, data):
     found = read(b'\0\0\0\0' + body)
     assert (found.sec, found.nanosec, found.frame_id, found.frame_number) == (1, 2, 'a', 7)
     assert not len(found.u) and not len(found.target_id)
+
+
+# ---- against the typestore of rosbags
+
+
+@pytest.mark.parametrize('n, frame_id, sigma', SIZES)
+def test_observations_of_rosbags_are_read(n, frame_id, sigma):
+    source = observed(n, frame_id, sigma)
+    types = typestore().types
+    stamp = types['builtin_interfaces/msg/Time'](-5, 4_000_000_000)
+    message = types[OBSERVED](
+        types['std_msgs/msg/Header'](stamp, frame_id),
+        source.frame_number,
+        source.image_width,
+        source.image_height,
+        *(np.array(getattr(source, name)) for name in ('target_id', 'u', 'v', 'sigma')),
+    )
+    found = decode_target_observations(bytes(typestore().serialize_cdr(message, OBSERVED)))
+    assert (found.sec, found.nanosec) == (-5, 4_000_000_000)
+    assert (found.frame_id, found.frame_number) == (frame_id, message.frame_number)
+    assert found.image_size == (message.image_width, message.image_height)
+    assert found.target_id == message.target_id.tobytes()
+    for name in 'u', 'v', 'sigma':
+        assert np.array_equal(getattr(found, name), getattr(message, name))
+
+
+@pytest.mark.parametrize('n, frame_id, sigma', SIZES)
+def test_corrected_observations_go_to_rosbags_and_back(n, frame_id, sigma):
+    source = decode_target_observations(serialize_message(observed(n, frame_id, sigma)))
+    arrays = corrected(n)
+    data = encode_corrected_observations(source, 'a-2802e916511fc237', arrays)
+    message = typestore().deserialize_cdr(data, CORRECTED)
+    assert (message.header.frame_id, message.calibration_id) == (frame_id, 'a-2802e916511fc237')
+    assert (message.header.stamp.sec, message.frame_number) == (-5, 4_000_000_000)
+    assert message.target_id.tobytes() == source.target_id
+    again = decode_corrected_observations(bytes(typestore().serialize_cdr(message, CORRECTED)))
+    for name, values in zip(('u', 'v', 'sigma', 'correction_sd', 'status'), arrays):
+        assert np.array_equal(getattr(message, name), values, equal_nan=True)
+        assert np.array_equal(getattr(again, name), values, equal_nan=True)
+    assert again.target_id.tobytes() == source.target_id
+
+
+@pytest.mark.parametrize('n', [0, 1, 2, 3, 4, 5, 30])
+@pytest.mark.parametrize('ids', [('a-1', 'b-2'), ('a-12', 'b-123', 'c'), ()])
+def test_points_are_read_by_rosbags(n, ids):
+    content = points_content(n, 'a_optical', ids)
+    found = typestore().deserialize_cdr(encode_reconstructed_points(content), POINTS)
+    expected = message_from_points(content)
+    assert found.header.frame_id == 'a_optical' and found.frame_number == 4_000_000_000
+    assert found.orientation_id == content.orientation_id and list(found.calibration_id) == [*ids]
+    for name in ('target_id', 'x', 'y', 'z', 'cov_xx', 'cov_yz', 'residual', 'rays', 'status'):
+        assert np.array_equal(getattr(found, name), getattr(expected, name)), name

@@ -1,0 +1,126 @@
+"""Messages of other programs, and bugs that a message brings to light: neither ends a node."""
+
+import time
+from dataclasses import replace
+
+import pytest
+from fluoro_calib_msgs.msg import TargetObservations
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.node import Node
+from rclpy.qos import ReliabilityPolicy
+from ros_graph import DEADLINE, NAMES, value_of
+from sensor_msgs.msg import CameraInfo
+
+from fluoro_calib_ros.nodes.correction_node import CorrectionNode
+from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
+from fluoro_calib_ros.nodes.runtime import diagnostics
+from fluoro_calib_ros.nodes.runtime.qos import latched_qos, observations_qos
+
+
+def test_camera_info_without_image_size_is_ignored(graph, by_command, tracking):
+    """As the driver of an uncalibrated camera publishes it, on a topic of the same name."""
+    client = graph.client
+    foreign = client.create_publisher(CameraInfo, 'a/camera_info', latched_qos())
+    foreign.publish(CameraInfo())
+    nodes = graph.whole_chain(by_command[0])
+    node = nodes['reconstruction_node']
+    points = client.listen('reconstruction/points_with_covariance')
+    client.wait_until(
+        lambda: (
+            client.count_publishers('reconstruction/points_with_covariance')
+            and foreign.get_subscription_count()
+        ),
+        what='the reconstruction node',
+    )
+    client.wait_until_known_to('reconstruction_node')
+    foreign.publish(CameraInfo(width=1024))
+    client.wait_until(lambda: '1024 x 0 px' in node.log, what='the warning')
+    for row in range(3):
+        for name in NAMES:
+            client.publish(replace(tracking[name][row], number=row))
+    client.wait_until(lambda: len(points) == 3, what='the points')
+    client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: value_of(s, 'exposures reconstructed') == '3',
+        'reconstruction',
+    )
+    client.destroy_publisher(foreign)
+    assert node.running and 'a/camera_info: the image size is 0 x 0 px' in node.log
+    assert 'Traceback' not in node.log and node.end() == 0
+
+
+@pytest.mark.parametrize('end', ['publisher', 'subscription'])
+def test_qos_override_of_one_topic_leaves_the_others_alone(graph, end):
+    client = graph.client
+    topic = {'publisher': 'corrected_observations', 'subscription': 'target_observations'}[end]
+    full_name = f'{graph.namespace}/a/{topic}'
+    graph.start(
+        'correction_node',
+        {
+            f'qos_overrides.{full_name}.{end}.reliability': 'best_effort',
+            f'qos_overrides.{full_name}.{end}.depth': 7,
+        },
+        wait=False,
+    )
+
+    def reliability(get, name, other):
+        ends = get(f'{graph.namespace}/{name}/{other}')
+        found = {e.qos_profile.reliability for e in ends if e.node_name == 'correction_node'}
+        return found.pop() if found else None
+
+    def outputs(name):
+        return reliability(client.get_publishers_info_by_topic, name, 'corrected_observations')
+
+    def inputs(name):
+        return reliability(client.get_subscriptions_info_by_topic, name, 'target_observations')
+
+    client.wait_until(lambda: all(outputs(n) and inputs(n) for n in NAMES), what='the node')
+    found = {(kind, n): get(n) for kind, get in (('out', outputs), ('in', inputs)) for n in NAMES}
+    changed = ('out' if end == 'publisher' else 'in', 'a')
+    expected = dict.fromkeys(found, ReliabilityPolicy.RELIABLE)
+    expected[changed] = ReliabilityPolicy.BEST_EFFORT
+    assert found == expected
+
+
+def test_an_exception_in_a_callback_costs_one_frame(ros, monkeypatch, tracking):
+    """A bug: the frame is lost, counted and reported, and the node goes on."""
+    original = CorrectionNode._on_frame
+
+    def with_bug(self, name, frame, info):
+        if frame.frame_number == 13:
+            raise IndexError('thirteen')
+        original(self, name, frame, info)
+
+    monkeypatch.setattr(CorrectionNode, '_on_frame', with_bug)
+    node = CorrectionNode()
+    client = Node('client')
+    try:
+        for transition in (node.trigger_configure, node.trigger_activate):
+            assert transition() == TransitionCallbackReturn.SUCCESS
+        output = client.create_publisher(
+            TargetObservations, 'a/target_observations', observations_qos()
+        )
+        stream = node.streams['a']
+        wait_until(lambda: output.get_subscription_count())
+        time.sleep(0.3)  # until the reader knows the publisher, too
+        for number in (12, 13, 14):
+            output.publish(message_from_frame(replace(tracking['a'][0], number=number)))
+        wait_until(lambda: stream.waiting + stream.refusals.failures == 3)
+        assert (stream.received, stream.waiting, stream.refusals.failures) == (2, 2, 1)
+        a, b = node.diagnose()
+        assert a.level == diagnostics.ERROR and b.level == diagnostics.WARN
+        assert a.message == (
+            '1 frames lost by internal errors: topic a/target_observations: IndexError: thirteen'
+        )
+        assert a.values['frames lost by internal errors'] == 1 and not node.failed
+    finally:
+        node.stop()
+        node.destroy_node()
+        client.destroy_node()
+
+
+def wait_until(condition):
+    end = time.monotonic() + DEADLINE
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.01)

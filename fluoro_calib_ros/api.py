@@ -31,7 +31,8 @@ from .jobs.result_folder import save_outcome, save_result
 from .jobs.simulation import SimulationOptions, simulate
 from .jobs.sources import Recording, read_calibrations, read_source
 from .photogrammetry.rig_orientation import RigOrientation
-from .validation.verdict import Validation, validate
+from .validation.check import Validation
+from .validation.verdict import validate
 
 __all__ = [
     'CalibrationOptions',

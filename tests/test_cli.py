@@ -462,7 +462,7 @@ def test_a_bag_without_observations_is_refused(rig, tmp_path, capsys):
         ('7,1,2,nan,0.1', 'row 9: z'),
         ('7,1,2,3,0', 'row 9: sd'),
         ('7,1,2,3', 'row 9: 4 columns'),
-        ('1,1,2,3,0.1', 'row 9: target 1 is there already, in row 2'),
+        ('1,1,2,3,0.1', 'row 9: target 1 is already given in row 2'),
         ('-7,1,2,3,0.1', 'row 9: target_id'),
     ],
 )

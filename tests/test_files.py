@@ -22,7 +22,7 @@ from fluoro_calib_ros.files.calibration import (
     save_calibration,
 )
 from fluoro_calib_ros.files.image_points import correct_points, read_points, write_points
-from fluoro_calib_ros.files.json_file import read_result, write_result
+from fluoro_calib_ros.files.json_file import read_json, write_json
 from fluoro_calib_ros.files.observations import read_observations_csv, write_observations_csv
 from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
 
@@ -112,7 +112,7 @@ READERS = {
     'observations': lambda path: read_observations_csv(path, SIZE),
     'calibration': load_calibration,
     'points': read_points,
-    'result': read_result,
+    'result': read_json,
 }
 
 
@@ -212,7 +212,7 @@ def test_phantom_as_a_spreadsheet_gives_it(tmp_path):
         ('-5,1,2,3,0.1', "row 6: target_id is '-5', not between 0 and 4294967295"),
         ('99999999999999999999,1,2,3,0.1', 'not between 0 and 4294967295'),
         ('5,1,2,3,0', "row 6: sd is '0', not above 0"),
-        ('3,1,2,3,0.1', 'row 6: target 3 is there already, in row 5'),
+        ('3,1,2,3,0.1', 'row 6: target 3 is already given in row 5'),
         ('5,1,2,3', 'row 6: 4 columns, but the header has 5'),
         ('5,1,2,3,0.1,7', 'row 6: 6 columns, but the header has 5'),
         ('5,1,"2,3,0.1', 'row 6: this is not CSV'),
@@ -294,7 +294,7 @@ def test_observations_need_the_image_size(tmp_path):
         ('a,0,3,1,-inf,', "row 4: v is '-inf', not a finite number"),
         ('a,x,3,1,2,', "row 4: exposure is 'x', not a whole number"),
         ('a,0,3,1024,2,', 'row 4: the point (1024, 2) is off the image of 1024 x 960 px'),
-        ('a,0,1,1,2,', 'row 4: target 1 of fluoroscope a, exposure 0 is there already, in row 2'),
+        ('a,0,1,1,2,', 'row 4: target 1 of fluoroscope a, exposure 0 is already given in row 2'),
         ('a,0,3,1,2,0.5', 'sigma of target 1 of fluoroscope a, exposure 0 is empty'),
         ('a,1,3,1,2,0', "row 4: sigma is '0', not a finite number above 0"),
         ('a,1,3,1,2,nan', "row 4: sigma is 'nan', not a finite number above 0"),
@@ -566,8 +566,8 @@ def test_results_round_trip_and_have_no_nan(tmp_path):
         'none': None,
         'text': 'Größe',
     }
-    write_result(tmp_path / 'result.json', result)
-    again = read_result(str(tmp_path / 'result.json'))
+    write_json(tmp_path / 'result.json', result)
+    again = read_json(str(tmp_path / 'result.json'))
     assert again == {
         'a': 1 / 3,
         'n': 5,
@@ -584,7 +584,7 @@ def test_results_round_trip_and_have_no_nan(tmp_path):
 
 def test_a_damaged_result_names_its_row(tmp_path):
     assert 'row 2: this is not JSON' in message_of(
-        read_result, text_file(tmp_path, 'r.json', '{"a": 1,\n b}')
+        read_json, text_file(tmp_path, 'r.json', '{"a": 1,\n b}')
     )
-    assert 'no object' in message_of(read_result, text_file(tmp_path, 'r.json', '[1]'))
-    assert 'nested' in message_of(read_result, text_file(tmp_path, 'r.json', '[' * 100_000))
+    assert 'no object' in message_of(read_json, text_file(tmp_path, 'r.json', '[1]'))
+    assert 'nested' in message_of(read_json, text_file(tmp_path, 'r.json', '[' * 100_000))

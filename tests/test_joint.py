@@ -15,7 +15,7 @@ from fluoro_calib_ros.calibration.initial_network import measured_network
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.files.json_file import result_text
+from fluoro_calib_ros.files.json_file import json_text
 from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.phantom import write_phantom
 from fluoro_calib_ros.files.result_document import result_document
@@ -51,7 +51,7 @@ def test_the_result_tells_the_relative_orientation(jobs):
         )  # as far as the gauge of the correction goes
         assert np.linalg.norm(document['translation_mm']) == pytest.approx(length, abs=2)
         assert np.all(np.array(document['sd_mm']) > 0) and np.all(np.array(document['sd_rad']) > 0)
-        json.loads(result_text(result_document(jobs[way])))
+        json.loads(json_text(result_document(jobs[way])))
     assert np.all(found['hard']['sd_mm'] < found['none']['sd_mm'])
     assert np.all(found['hard']['scatter_mm'] < 1e-4) and np.all(
         found['none']['scatter_mm'] > 0.01

@@ -21,24 +21,19 @@ from fluoro_calib_ros.files.calibration_sources import (
     write_sources,
 )
 from fluoro_calib_ros.report.verdict import verdict_text
-from fluoro_calib_ros.validation.bead_check import Beads, distances, intersect
+from fluoro_calib_ros.validation.bead_intersection import Beads, distances, intersect
+from fluoro_calib_ros.validation.beads import FALSE_ALARM as BEADS_FALSE_ALARM
+from fluoro_calib_ros.validation.beads import compare_with_survey
+from fluoro_calib_ros.validation.check import Check, Validation, verdict_of
 from fluoro_calib_ros.validation.field_comparison import difference, orientation_fields, place_name
 from fluoro_calib_ros.validation.residual_tests import (
-    ALARM,
+    FALSE_ALARM,
     Residuals,
+    change_of_trend,
     common_trend,
-    moved,
     residuals_of,
 )
-from fluoro_calib_ros.validation.verdict import (
-    BEADS_ALARM,
-    Check,
-    Validation,
-    bead_checks,
-    validate,
-    validate_or_report,
-    verdict_of,
-)
+from fluoro_calib_ros.validation.verdict import validate, validate_or_report
 
 pytestmark = pytest.mark.long
 
@@ -241,11 +236,13 @@ def test_white_residuals_are_called_so_as_often_as_is_said():
     alarms = np.zeros(4)
     for seed in range(100):
         residuals = noise(seed, trend=of_exposure)
-        for i, trend in enumerate((common_trend(residuals, SIZE), moved(residuals, SIZE))):
+        for i, trend in enumerate(
+            (common_trend(residuals, SIZE), change_of_trend(residuals, SIZE))
+        ):
             alarms[2 * i] += trend.size > trend.limit
             alarms[2 * i + 1] += trend.cell_size > trend.cell_limit
     # 100 draws at a rate of 0.2 %: four or more come once in 100,000 tests.
-    assert ALARM == 2e-3 and alarms.max() <= 3
+    assert FALSE_ALARM == 2e-3 and alarms.max() <= 3
 
 
 def test_a_trend_is_found_with_its_size_and_place():
@@ -259,11 +256,16 @@ def test_a_trend_is_found_with_its_size_and_place():
     found = common_trend(noise(1, trend=trend), SIZE)
     assert found.size > found.limit and found.cell_size > found.cell_limit
     assert np.linalg.norm(found.place - (700, 200)) < 100 and abs(found.cell_size - 0.45) < 0.15
-    assert moved(noise(1, trend=trend), SIZE).size <= moved(noise(1, trend=trend), SIZE).limit
+    assert (
+        change_of_trend(noise(1, trend=trend), SIZE).size
+        <= change_of_trend(noise(1, trend=trend), SIZE).limit
+    )
 
 
 def test_a_change_is_found_with_its_size():
-    found = moved(noise(2, trend=lambda uv, e: (e >= 6)[:, None] * (0.2, 0.0) - 0.1), SIZE)
+    found = change_of_trend(
+        noise(2, trend=lambda uv, e: (e >= 6)[:, None] * (0.2, 0.0) - 0.1), SIZE
+    )
     assert found.size > found.limit and abs(found.size - 0.2 / np.sqrt(2)) < 0.05
 
 
@@ -299,7 +301,7 @@ def test_a_bead_with_a_wrong_survey_is_named_with_its_size():
     phantom, wrong = phantom_with_a_wrong_bead()
     frames = {'a': exposures()['a']}
     job = calibrate(frames, phantom, CalibrationOptions(max_iterations=6, **LOCAL))
-    beads, dist = bead_checks(
+    beads, dist = compare_with_survey(
         intersect(adjust_with_calibrations(frames, phantom, job.calibrations), frames, phantom)
     )
     assert beads.passed is False and f'the survey of bead {wrong} is wrong by ' in beads.sentence
@@ -317,7 +319,7 @@ def test_beads_from_images_keep_to_their_covariance():
         'na,nab,nb->n', beads.xyz_mm - true, np.linalg.inv(beads.covariance), beads.xyz_mm - true
     )
     assert 2.0 < np.mean(error) < 4.0
-    assert all(check.passed for check in bead_checks(beads)) and BEADS_ALARM < 0.01
+    assert all(check.passed for check in compare_with_survey(beads)) and BEADS_FALSE_ALARM < 0.01
 
 
 def test_distances_tell_scale_and_precision():
@@ -340,7 +342,7 @@ def test_distances_tell_scale_and_precision():
         straight.rmse_mm == pytest.approx(found.expected_mm, rel=0.1)
         and found.rmse_mm > straight.rmse_mm
     )
-    assert bead_checks(replace(beads, survey_sd_mm=np.full(n, 0.02)))[1].passed is False
+    assert compare_with_survey(replace(beads, survey_sd_mm=np.full(n, 0.02)))[1].passed is False
 
 
 def test_few_beads_cannot_tell():
@@ -352,7 +354,7 @@ def test_few_beads_cannot_tell():
         np.zeros((2, 3)),
         np.ones(2),
     )
-    assert [check.passed for check in bead_checks(none)] == [None, None]
+    assert [check.passed for check in compare_with_survey(none)] == [None, None]
 
 
 # ---- files, text and command

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def print_result(arguments: Any, document: Mapping[str, Any], text: str) -> None:
     """Print a result: as JSON with --json, else as text for people."""
     if arguments.json:
-        from ..files.json_file import result_text
+        from ..files.json_file import json_text
 
-        text = result_text(document)
+        text = json_text(document)
     print(text.rstrip('\n'))
 
 

@@ -1,4 +1,6 @@
-"""Reading a whole file, and names that are safe as file names."""
+"""Reading of whole files, folders, and names that are safe as file names."""
+
+from __future__ import annotations
 
 import os
 import re
@@ -7,17 +9,18 @@ from ..errors import DataError
 
 _SAFE_NAME = re.compile(r'[A-Za-z0-9_-]{1,100}')
 
+PathLike = str | os.PathLike[str]
 
-def os_error_reason(error):
-    """The cause of an OSError, in a few words."""
+
+def os_error_reason(error: OSError) -> str:
+    """Return the reason of an OSError in a few words, in lower case."""
     return (error.strerror or type(error).__name__).lower()
 
 
-def read_bytes(path):
-    """Content of the file path.
+def read_bytes(path: PathLike) -> bytes:
+    """Return the content of a file.
 
-    Raises DataError where there is no such file, where it is a folder, where it cannot be read or
-    is empty.
+    Raises DataError for a file that does not exist, cannot be read or is empty, and for a folder.
     """
     try:
         with open(path, 'rb') as file:
@@ -26,17 +29,19 @@ def read_bytes(path):
         raise DataError(f'{path}: there is no such file') from None
     except IsADirectoryError:
         raise DataError(f'{path}: this is a folder, not a file') from None
-    except (OSError, ValueError) as error:  # ValueError: a NUL byte in the name
-        cause = os_error_reason(error) if isinstance(error, OSError) else error
-        raise DataError(f'{path}: cannot be read ({cause})') from None
+    except OSError as error:
+        raise DataError(f'{path}: cannot be read ({os_error_reason(error)})') from None
+    except ValueError as error:  # a NUL byte in the name
+        raise DataError(f'{path}: cannot be read ({error})') from None
     if not content:
         raise DataError(f'{path}: the file is empty')
     return content
 
 
-def read_text(path):
-    """Text of the file path, UTF-8 with or without a byte order mark. Raises DataError, see
-    read_bytes.
+def read_text(path: PathLike) -> str:
+    """Return the text of a UTF-8 file, without its byte order mark.
+
+    Raises DataError as `read_bytes` does, and for a file that is not UTF-8.
     """
     content = read_bytes(path)
     try:
@@ -48,22 +53,25 @@ def read_text(path):
         ) from None
 
 
-def check_safe_name(name, where):
-    """Check that the name of a fluoroscope can be a file name: letters, digits, _ and -. Raises
-    DataError.
+def check_safe_name(name: str, where: object) -> None:
+    """Raise DataError unless the name of a fluoroscope can be part of a file name.
+
+    It may contain letters, digits, _ and -; where begins the message.
     """
     if not _SAFE_NAME.fullmatch(str(name)):
         raise DataError(
-            f'{where}: the fluoroscope is called {name!r}, but a name consists of letters, digits, '
-            f'_ and -, at most 100 of them'
+            f'{where}: the fluoroscope is called {name!r}, but a name consists of letters, '
+            f'digits, _ and -, at most 100 of them'
         )
 
 
-def make_folder(path):
-    """Make the folder path, and those above it, unless it is there. Raises DataError."""
+def make_folder(path: PathLike) -> None:
+    """Create a folder, and those above it, unless it exists. Raises DataError."""
     try:
         os.makedirs(path, exist_ok=True)
     except FileExistsError:
         raise DataError(f'{path}: this is a file, not a folder') from None
     except OSError as error:
-        raise DataError(f'{path}: the folder cannot be made ({os_error_reason(error)})') from None
+        raise DataError(
+            f'{path}: the folder cannot be created ({os_error_reason(error)})'
+        ) from None

@@ -1,25 +1,36 @@
-"""Writing that leaves either the whole new file or the old one, never half of one."""
+"""Writing that leaves either the complete new file or the old one."""
+
+from __future__ import annotations
 
 import os
 import secrets
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import IO, Any
 
 from ..errors import DataError
-from .access import os_error_reason
+from .access import PathLike, os_error_reason
 
 
 @contextmanager
-def atomic_file(path, mode='wb'):
-    """Open path for writing; the content appears under that name only when the block has ended
-    well.
+def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
+    """Open a file for writing that gets its name when the block ends without an error.
 
-    mode 'wb' for bytes or 'w' for UTF-8 text (line ends as written). An exception in the block
-    leaves what was there before. Raises DataError where the file cannot be written.
+    Parameters
+    ----------
+    path : path-like
+    mode : {'wb', 'w'}
+        Bytes, or UTF-8 text without conversion of line ends.
+
+    Raises
+    ------
+    DataError
+        Where the file cannot be written. After any exception an earlier file is unchanged.
     """
-    target = os.path.realpath(path)  # a link stays a link
+    target = os.path.realpath(path)  # a symbolic link remains one
     folder, name = os.path.split(target)
     temporary = os.path.join(folder, f'.{name[:100]}.{secrets.token_hex(8)}.tmp')
-    text = {} if 'b' in mode else {'encoding': 'utf-8', 'newline': ''}
+    text: dict[str, Any] = {} if 'b' in mode else {'encoding': 'utf-8', 'newline': ''}
     try:
         with open(temporary, mode.replace('w', 'x'), **text) as file:
             yield file
@@ -35,19 +46,19 @@ def atomic_file(path, mode='wb'):
         raise
 
 
-def write_bytes(path, content):
-    """Write the bytes content to path as a whole. Raises DataError where it cannot be written."""
+def write_bytes(path: PathLike, content: bytes) -> None:
+    """Write a file of bytes as a whole. Raises DataError where it cannot be written."""
     with atomic_file(path) as file:
         file.write(content)
 
 
-def write_text(path, text):
-    """Write text to path, UTF-8, as a whole. Raises DataError where it cannot be written."""
+def write_text(path: PathLike, text: str) -> None:
+    """Write a file of UTF-8 text as a whole. Raises DataError where it cannot be written."""
     write_bytes(path, text.encode())
 
 
-def sync_folder(folder):
-    """Make the names in a folder survive a power failure, where the system can."""
+def sync_folder(folder: PathLike) -> None:
+    """Make the names in a folder survive a power failure, where the system supports it."""
     with suppress(OSError):
         descriptor = os.open(folder, os.O_RDONLY)
         try:
@@ -56,6 +67,6 @@ def sync_folder(folder):
             os.close(descriptor)
 
 
-def _remove(path):
+def _remove(path: PathLike) -> None:
     with suppress(OSError):
         os.unlink(path)

@@ -17,7 +17,7 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from .access import os_error_reason
 from .atomic import write_text
-from .json_file import plain, read_result, write_result
+from .json_file import read_json, to_json_values, write_json
 from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
 
@@ -48,7 +48,9 @@ def write_sources(directory: str | os.PathLike[str], request: CalibrationRequest
         'joint': bool(request.joint),
         'principal_distance': request.principal_distance,
     }
-    write_text(directory / OPTIONS, json.dumps(plain(document), indent=2, allow_nan=False) + '\n')
+    write_text(
+        directory / OPTIONS, json.dumps(to_json_values(document), indent=2, allow_nan=False) + '\n'
+    )
 
 
 def read_sources(
@@ -130,7 +132,7 @@ def _read_frames(path, calibrations):
 
 def _read_options(path):
     """CalibrationOptions, joint and principal distance of a calibration."""
-    document = read_result(_there(path))
+    document = read_json(_there(path))
     if document.get('format_version') != VERSION:
         raise DataError(
             f'{path}: the file has layout version {document.get("format_version")}, this program knows '
@@ -165,4 +167,4 @@ def validation_document(validation):
 
 def write_validation(directory, validation):
     """Write validation.json into a directory. Raises DataError."""
-    write_result(Path(directory) / RESULT, validation_document(validation))
+    write_json(Path(directory) / RESULT, validation_document(validation))

@@ -1,10 +1,15 @@
-"""CSV tables: columns by name, numbers with the row they stand in."""
+"""CSV tables: columns by name, and errors that name the row."""
+
+from __future__ import annotations
 
 import csv
 import io
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from operator import itemgetter
+from typing import IO, Any, NoReturn
 
 import numpy as np
 
@@ -13,161 +18,183 @@ from .access import read_text
 
 BLOCK = 10_000  # rows converted at a time, to bound the memory
 MAX_ID = 2**32 - 1  # ids and frame numbers are uint32 in the messages
+MAX_HEADER = 200  # characters of a header in a message
+
+PathLike = str | os.PathLike[str]
 
 
 @dataclass(frozen=True)
 class Block:
-    """Some rows of a table: rows, lists of cells; lines, the number of the row in the file
-    (header: 1).
+    """Some rows of a table.
+
+    Attributes
+    ----------
+    path : path-like
+        File, for messages.
+    header : list of str
+        Names of the columns.
+    rows : list of list of str
+    lines : (n,) ndarray of int
+        Number of each row in the file; the header is row 1.
     """
 
-    path: str
-    header: list
-    rows: list
+    path: PathLike
+    header: list[str]
+    rows: list[list[str]]
     lines: np.ndarray
 
-    def __contains__(self, name):
+    def __contains__(self, name: str) -> bool:
         return name in self.header
 
-    def text(self, name):
-        """The cells of a column, without the blanks around them."""
+    def strings(self, name: str) -> list[str]:
+        """Return the cells of a column without surrounding blanks."""
         return list(map(str.strip, map(itemgetter(self.header.index(name)), self.rows)))
 
-    def floats(self, name):
-        """A column (n,) of finite numbers. Raises DataError."""
-        values = self._numbers(name, self.text(name), float, 'a number')
-        self.check(name, np.isfinite(values), 'not a finite number')
+    def floats(self, name: str) -> np.ndarray:
+        """Return a column (n,) of finite numbers. Raises DataError."""
+        values = np.array(self._convert(name, self.strings(name), float, 'a number'))
+        self.require(name, np.isfinite(values), 'not a finite number')
         return values
 
-    def floats_or_nan(self, name):
-        """A column (n,) of numbers in which an empty cell is NaN. Raises DataError for any other
-        text.
-        """
-        return self._numbers(name, [cell or 'nan' for cell in self.text(name)], float, 'a number')
+    def floats_or_nan(self, name: str) -> np.ndarray:
+        """Return a column (n,) of numbers, NaN for an empty cell. Raises DataError."""
+        cells = [cell or 'nan' for cell in self.strings(name)]
+        return np.array(self._convert(name, cells, float, 'a number'))
 
-    def ids(self, name):
-        """A column (n,) of whole numbers from 0 to MAX_ID. Raises DataError."""
-        values = self._numbers(name, self.text(name), int, 'a whole number')
+    def ids(self, name: str) -> np.ndarray:
+        """Return a column (n,) of whole numbers from 0 to MAX_ID. Raises DataError."""
+        values = self._convert(name, self.strings(name), int, 'a whole number')
         if len(values) and not 0 <= min(values) <= max(values) <= MAX_ID:
-            good = np.array([0 <= value <= MAX_ID for value in values])
-            self.check(name, good, f'not between 0 and {MAX_ID}')
+            in_range = np.array([0 <= value <= MAX_ID for value in values])
+            self.require(name, in_range, f'not between 0 and {MAX_ID}')
         return np.array(values, dtype=np.int64)
 
-    def check(self, name, good, cause):
-        """Raise DataError for the first row in which good (n,) is False."""
-        if not np.all(good):
-            self.fail(
-                int(np.argmin(good)),
-                f'{name} is {self.text(name)[int(np.argmin(good))]!r}, {cause}',
-            )
+    def require(self, name: str, valid: np.ndarray, cause: str) -> None:
+        """Raise DataError for the first row of a column that is not valid (n,)."""
+        if not np.all(valid):
+            index = int(np.argmin(valid))
+            self.fail(index, f'{name} is {self.strings(name)[index]!r}, {cause}')
 
-    def fail(self, index, cause):
+    def fail(self, index: int, cause: str) -> NoReturn:
         """Raise DataError for the row with this index in the block."""
         raise DataError(f'{self.path}, row {self.lines[index]}: {cause}')
 
-    def _numbers(self, name, cells, kind, wanted):
+    def _convert(
+        self, name: str, cells: Sequence[str], kind: Callable[[str], Any], expected: str
+    ) -> list[Any]:
         try:
             if '_' in ''.join(cells):  # Python reads 1_0 as 10
                 raise ValueError
-            values = list(map(kind, cells))
+            return list(map(kind, cells))
         except ValueError:
             index = next(i for i, cell in enumerate(cells) if not _is_number(cell, kind))
-            self.fail(index, f'{name} is {cells[index]!r}, not {wanted}')
-        return np.array(values) if kind is float else values
+            self.fail(index, f'{name} is {cells[index]!r}, not {expected}')
 
 
-def read_blocks(path, required):
-    """The rows of a CSV file, as Blocks of at most BLOCK rows.
+def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
+    """Yield the rows of a CSV file as blocks of at most BLOCK rows.
 
-    The header is the first row; columns come in any order, and there may be more than those
-    required. Blank lines and lines that begin with # are skipped. Raises DataError for a file that
-    cannot be read, is empty or no UTF-8 text, has no rows, and for missing or repeated columns or
-    cells.
+    The first row is the header. Columns may have any order, and there may be others besides the
+    required ones. Blank lines and lines that begin with # are skipped. Raises DataError for a file
+    that cannot be read, is empty, is not UTF-8 or has no rows, for missing or repeated columns,
+    and for a row with too few or too many cells.
     """
     text = read_text(path)
-    lines = io.StringIO(text, newline='')
-    if '#' in text:  # a comment becomes a blank line: the numbers of the rows stay
+    lines: Iterable[str] = io.StringIO(text, newline='')
+    if '#' in text:  # a comment becomes a blank line, so that the numbers of the rows remain
         lines = ('\n' if line.lstrip().startswith('#') else line for line in lines)
-    reader = csv.reader(lines, strict=True)
-    line, header = _header(path, reader, required)
-    header = [name.strip() for name in header]
-    _check_header(path, line, header, required)
-    empty = True
-    while True:
-        rows, lines, ended = _next_rows(path, reader)
+    rows_of_file = _RowReader(path, lines)
+    header = rows_of_file.read_header(required)
+    is_empty = True
+    while not rows_of_file.ended:
+        rows, numbers = rows_of_file.read(BLOCK)
         if rows:
-            empty = False
-            _check_widths(path, header, rows, lines)
-            yield Block(path, header, rows, lines)
-        if ended:
-            break
-    if empty:
+            is_empty = False
+            _check_widths(path, header, rows, numbers)
+            yield Block(path, header, rows, numbers)
+    if is_empty:
         raise DataError(f'{path}: the file has a header, but no rows')
 
 
-def write_rows(file, rows):
-    """Write rows of cells to an open text file, as CSV with plain line ends."""
+def write_rows(file: IO[Any], rows: Iterable[Iterable[Any]]) -> None:
+    """Write rows of cells to an open text file as CSV, with line feeds."""
     csv.writer(file, lineterminator='\n').writerows(rows)
 
 
-def cell_of(value):
-    """Text of a float from which the same float is read again; empty for NaN."""
+def format_float(value: float) -> str:
+    """Return a float as text from which the same value is read again, '' for NaN."""
     return '' if np.isnan(value) else repr(float(value))
 
 
-def _next_rows(path, reader, number=BLOCK):
-    """The next rows of a reader that are not blank, their numbers in the file, and whether it has
-    ended.
-    """
-    before = reader.line_num
-    try:
-        rows = list(islice(reader, number))
-    except csv.Error as error:
-        raise DataError(f'{path}, row {reader.line_num}: this is not CSV ({error})') from None
-    ended = len(rows) < number
-    lines = before + 1 + np.arange(len(rows))
-    if reader.line_num - before > len(rows):  # some cells have line ends in them
-        lines[1:] += np.cumsum(
-            [sum(cell.count('\n') for cell in row) for row in rows[:-1]], dtype=int
-        )
-    filled = np.array([len(row) > 1 or bool(row and row[0].strip()) for row in rows], dtype=bool)
-    if not filled.all():
-        rows = [row for row, keep in zip(rows, filled) if keep]
-    return rows, lines[filled], ended
+class _RowReader:
+    """Reads the rows of a CSV file that are not blank, with their numbers in the file."""
+
+    def __init__(self, path: PathLike, lines: Iterable[str]) -> None:
+        self.ended = False
+        self._path = path
+        self._reader = csv.reader(lines, strict=True)
+
+    def read_header(self, required: Sequence[str]) -> list[str]:
+        """Return the column names in the first row that is not blank. Raises DataError."""
+        while not self.ended:
+            rows, lines = self.read(1)
+            if rows:
+                header = [name.strip() for name in rows[0]]
+                _check_header(f'{self._path}, row {lines[0]}', header, required)
+                return header
+        raise DataError(f'{self._path}: the file has no header, {",".join(required)} is expected')
+
+    def read(self, count: int) -> tuple[list[list[str]], np.ndarray]:
+        """Return those of the next `count` rows that are not blank, and their numbers."""
+        before = self._reader.line_num
+        try:
+            rows = list(islice(self._reader, count))
+        except csv.Error as error:
+            raise DataError(
+                f'{self._path}, row {self._reader.line_num}: this is not CSV ({error})'
+            ) from None
+        self.ended = len(rows) < count
+        lines = before + 1 + np.arange(len(rows))
+        if self._reader.line_num - before > len(rows):  # some cells contain line ends
+            line_ends = [sum(cell.count('\n') for cell in row) for row in rows[:-1]]
+            lines[1:] += np.cumsum(line_ends, dtype=int)
+        filled = np.array([not _is_blank(row) for row in rows], dtype=bool)
+        if not filled.all():
+            rows = [row for row, keep in zip(rows, filled) if keep]
+        return rows, lines[filled]
 
 
-def _header(path, reader, required):
-    """Number and cells of the first row that is not blank."""
-    ended = False
-    while not ended:
-        rows, lines, ended = _next_rows(path, reader, 1)
-        if rows:
-            return lines[0], rows[0]
-    raise DataError(f'{path}: the file has no header, {",".join(required)} is expected')
+def _is_blank(row: Sequence[str]) -> bool:
+    return len(row) <= 1 and not (row and row[0].strip())
 
 
-def _check_header(path, line, header, required):
+def _check_header(where: str, header: Sequence[str], required: Sequence[str]) -> None:
+    """Raise DataError for missing and repeated columns; where begins its message."""
     missing = [name for name in required if name not in header]
     if missing:
-        found = ','.join(header)
+        found = ','.join(header)[:MAX_HEADER]
         raise DataError(
-            f'{path}, row {line}: the header has no column {" and no column ".join(missing)}; '
-            f'{",".join(required)} is expected, and {found[:200]!r} is there'
+            f'{where}: the header has no column {" and no column ".join(missing)}; '
+            f'{",".join(required)} is expected, the header is {found!r}'
         )
-    twice = [name for name in header if name and header.count(name) > 1]
-    if twice:
-        raise DataError(f'{path}, row {line}: the header has the column {twice[0]} twice')
+    for name in header:
+        if name and header.count(name) > 1:
+            raise DataError(f'{where}: the header has the column {name} twice')
 
 
-def _check_widths(path, header, rows, lines):
+def _check_widths(
+    path: PathLike, header: Sequence[str], rows: Sequence[Sequence[str]], lines: np.ndarray
+) -> None:
+    """Raise DataError for the first row with too few or too many cells."""
     if set(map(len, rows)) != {len(header)}:
         index = next(i for i, row in enumerate(rows) if len(row) != len(header))
         raise DataError(
-            f'{path}, row {lines[index]}: {len(rows[index])} columns, but the header has {len(header)}'
+            f'{path}, row {lines[index]}: {len(rows[index])} columns, '
+            f'but the header has {len(header)}'
         )
 
 
-def _is_number(cell, kind):
+def _is_number(cell: str, kind: Callable[[str], Any]) -> bool:
     try:
         kind(cell)
     except ValueError:

@@ -8,7 +8,7 @@ from ..calibration.result import CorrectedPoints
 from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 from .atomic import atomic_file
-from .csv_table import cell_of, read_blocks, write_rows
+from .csv_table import format_float, read_blocks, write_rows
 
 STATUS = tuple(status.name for status in CorrectionStatus)
 ADDED = ('u_corrected', 'v_corrected', 'sigma', 'status')
@@ -58,9 +58,9 @@ def read_points(path):
         if 'sigma' in block:
             sigma.append(block.floats_or_nan('sigma'))
             good = np.isnan(sigma[-1]) | (np.isfinite(sigma[-1]) & (sigma[-1] > 0))
-            block.check('sigma', good, 'not a finite number above 0')
+            block.require('sigma', good, 'not a finite number above 0')
         if 'fluoroscope' in block:
-            names += block.text('fluoroscope')
+            names += block.strings('fluoroscope')
     points = PointsFile(
         path,
         header,
@@ -127,7 +127,7 @@ def write_points(path, points, corrected):
         write_rows(
             file,
             (
-                [*row, cell_of(u), cell_of(v), cell_of(sigma), STATUS[status]]
+                [*row, format_float(u), format_float(v), format_float(sigma), STATUS[status]]
                 for row, (u, v), sigma, status in zip(
                     points.rows,
                     corrected.uv.tolist(),

@@ -1,7 +1,12 @@
-"""Results as JSON: result.json of the command line."""
+"""Results as JSON files."""
+
+from __future__ import annotations
 
 import json
 import math
+import os
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -9,43 +14,43 @@ from ..errors import DataError
 from .access import read_text
 from .atomic import write_text
 
-
-def write_result(path, result):
-    """Write the dict result to path as JSON; what is not a finite number becomes null. Raises
-    DataError.
-    """
-    write_text(path, result_text(result))
+PathLike = str | os.PathLike[str]
 
 
-def result_text(result):
-    """The dict result as JSON text: two blanks of indentation, keys in their order, no NaN."""
-    return json.dumps(plain(result), indent=2, allow_nan=False, ensure_ascii=False) + '\n'
+def write_json(path: PathLike, document: Mapping[str, Any]) -> None:
+    """Write a document; numbers that are not finite become null. Raises DataError."""
+    write_text(path, json_text(document))
 
 
-def read_result(path):
-    """The dict in a JSON file. Raises DataError that names the row of what is wrong."""
+def json_text(document: Mapping[str, Any]) -> str:
+    """Return a document as JSON, with an indentation of two blanks and the keys in order."""
+    return (
+        json.dumps(to_json_values(document), indent=2, allow_nan=False, ensure_ascii=False) + '\n'
+    )
+
+
+def read_json(path: PathLike) -> dict[str, Any]:
+    """Read a document. Raises DataError that names the row of a fault."""
     text = read_text(path)
     try:
-        result = json.loads(text)
+        document = json.loads(text)
     except json.JSONDecodeError as error:
         raise DataError(f'{path}, row {error.lineno}: this is not JSON ({error.msg})') from None
     except RecursionError:
         raise DataError(f'{path}: this is not a result, it is nested too deeply') from None
-    if not isinstance(result, dict):
+    if not isinstance(document, dict):
         raise DataError(
-            f'{path}: this is not a result, it holds a {type(result).__name__} and no object'
+            f'{path}: this is not a result, it contains a {type(document).__name__} and no object'
         )
-    return result
+    return document
 
 
-def plain(value):
-    """Value with numpy arrays and numbers as lists and Python numbers, and None for what is not
-    finite.
-    """
-    if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+def to_json_values(value: Any) -> Any:
+    """Return a value with lists for arrays, Python numbers, and None for what is not finite."""
+    if isinstance(value, Mapping):
+        return {str(key): to_json_values(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
+        return [to_json_values(item) for item in value]
     if isinstance(value, (np.ndarray, np.generic)):
-        return plain(value.tolist())
+        return to_json_values(value.tolist())
     return None if isinstance(value, float) and not math.isfinite(value) else value

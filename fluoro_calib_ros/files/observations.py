@@ -1,72 +1,118 @@
 """Observations as CSV: `fluoroscope,exposure,target_id,u,v[,sigma]`, u, v and sigma in pixels."""
 
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields
+from typing import Any
+
 import numpy as np
 
 from ..errors import DataError
-from ..exposures.frame import Frame, points_on_image
+from ..exposures.frame import Frame, first_repeated, is_positive, points_on_image
 from .access import check_safe_name
 from .atomic import atomic_file
-from .csv_table import cell_of, read_blocks, write_rows
+from .csv_table import Block, format_float, read_blocks, write_rows
 
 COLUMNS = ('fluoroscope', 'exposure', 'target_id', 'u', 'v')
 
+PathLike = str | os.PathLike[str]
 
-def read_observations_csv(path, image_size=None):
-    """Frames {fluoroscope: [Frame, ...]} of a CSV file, fluoroscopes by name and exposures by
-    number.
 
-    image_size (width, height) [px] of all fluoroscopes, which the file does not tell. The rows of
-    a frame need not be together. An empty sigma is unknown: in all rows of a frame, or in none.
-    Raises DataError that names the row and the cause: not a number, a point off the image, a
-    target twice in a frame.
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of the file as arrays.
+
+    Attributes
+    ----------
+    code : (n,) ndarray of int
+        Index of the fluoroscope in the order of first occurrence.
+    exposure, target_id : (n,) ndarray of int
+    uv : (n, 2) ndarray
+        [px]
+    sigma : (n,) ndarray
+        [px], NaN where unknown.
+    line : (n,) ndarray of int
+        Number of the row in the file.
+    """
+
+    code: np.ndarray
+    exposure: np.ndarray
+    target_id: np.ndarray
+    uv: np.ndarray
+    sigma: np.ndarray
+    line: np.ndarray
+
+    def __getitem__(self, rows: np.ndarray) -> _Rows:
+        return _Rows(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def read_observations_csv(
+    path: PathLike, image_size: tuple[int, int] | None = None
+) -> dict[str, list[Frame]]:
+    """Read the frames of a CSV file, fluoroscopes by name and exposures by number.
+
+    The rows of a frame may be anywhere in the file. sigma is given for all targets of a frame or
+    for none.
+
+    Parameters
+    ----------
+    path : path-like
+    image_size : (int, int), optional
+        Width and height of the images of all fluoroscopes [px]; required, as the file does not
+        contain it.
+
+    Returns
+    -------
+    dict of str to list of Frame
+
+    Raises
+    ------
+    DataError
+        For text that is not a number, a point off the image, and a target that occurs twice in a
+        frame. The message names the row.
     """
     if image_size is None:
         raise DataError(
-            f'{path}: a CSV file does not tell the size of the image, --image-size WxH is needed'
+            f'{path}: a CSV file does not contain the image size, --image-size WxH is needed'
         )
-    names = {}
-    parts = []
-    for block in read_blocks(path, COLUMNS):
-        parts.append(_numbers_of(block, names, image_size))
-    code, exposure, target, uv, sigma, lines = (np.concatenate(part) for part in zip(*parts))
-    names = list(names)
-    rank = np.argsort(np.argsort(names))  # fluoroscopes by name, whatever comes first in the file
-    order = np.lexsort((exposure, rank[code]))  # stable: within a frame the file's order stays
-    starts = np.flatnonzero(
-        np.diff(code[order], prepend=-1) | np.diff(exposure[order], prepend=-1)
-    )
-    frames = {name: [] for name in sorted(names)}
-    for rows in np.split(order, starts[1:]):
-        frame = _frame(
-            path, names[code[rows[0]]], exposure, target, uv, sigma, lines, rows, image_size
-        )
-        frames[frame.fluoroscope].append(frame)
+    codes: dict[str, int] = {}
+    rows = _concatenate([_parse(block, codes, image_size) for block in read_blocks(path, COLUMNS)])
+    names = list(codes)
+    frames: dict[str, list[Frame]] = {name: [] for name in sorted(names)}
+    for of_frame in _by_frame(rows, names):
+        name = names[of_frame.code[0]]
+        frames[name].append(_frame(path, name, of_frame, image_size))
     return frames
 
 
-def write_observations_csv(path, frames):
-    """Write frames, {fluoroscope: [Frame, ...]} or a sequence of Frames, to a CSV file.
+def write_observations_csv(
+    path: PathLike, frames: Mapping[str, Sequence[Frame]] | Iterable[Frame]
+) -> None:
+    """Write frames, by fluoroscope or as a sequence, to a CSV file.
 
-    The column sigma is there where any frame has it. Raises DataError where the file cannot be
+    The file has a column sigma if any frame has sigma. Raises DataError where it cannot be
     written.
     """
-    if isinstance(frames, dict):
-        frames = [frame for of_one in frames.values() for frame in of_one]
+    if isinstance(frames, Mapping):
+        frames = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
+    frames = list(frames)
     with_sigma = any(frame.sigma is not None for frame in frames)
     with atomic_file(path, 'w') as file:
         write_rows(file, [COLUMNS + ('sigma',) * with_sigma])
         for frame in frames:
             check_safe_name(frame.fluoroscope, path)
-            write_rows(file, _rows_of(frame, with_sigma))
+            write_rows(file, _csv_rows(frame, with_sigma))
 
 
-def _numbers_of(block, names, image_size):
-    """Columns of a block as arrays; names {fluoroscope: code} grows by those it has."""
-    texts = block.text('fluoroscope')
-    for name in dict.fromkeys(texts):
-        if name not in names:
-            check_safe_name(name, f'{block.path}, row {block.lines[texts.index(name)]}')
-            names[name] = len(names)
+def _parse(block: Block, codes: dict[str, int], image_size: tuple[int, int]) -> _Rows:
+    """Return a block of the file as arrays; new fluoroscopes are added to codes."""
+    names = block.strings('fluoroscope')
+    for name in dict.fromkeys(names):
+        if name not in codes:
+            check_safe_name(name, f'{block.path}, row {block.lines[names.index(name)]}')
+            codes[name] = len(codes)
     uv = np.column_stack([block.floats('u'), block.floats('v')])
     on_image = points_on_image(uv, image_size)
     if not on_image.all():
@@ -79,50 +125,68 @@ def _numbers_of(block, names, image_size):
     sigma = np.full(len(uv), np.nan)
     if 'sigma' in block:
         sigma = block.floats_or_nan('sigma')
-        known = np.array([cell != '' for cell in block.text('sigma')])
-        block.check(
-            'sigma', ~known | (np.isfinite(sigma) & (sigma > 0)), 'not a finite number above 0'
-        )
-    code = np.array([names[name] for name in texts])
-    return code, block.ids('exposure'), block.ids('target_id'), uv, sigma, block.lines
+        is_empty = np.array([cell == '' for cell in block.strings('sigma')])
+        block.require('sigma', is_empty | is_positive(sigma), 'not a finite number above 0')
+    code = np.array([codes[name] for name in names])
+    return _Rows(code, block.ids('exposure'), block.ids('target_id'), uv, sigma, block.lines)
 
 
-def _frame(path, name, exposure, target, uv, sigma, lines, rows, image_size):
-    where = f'of fluoroscope {name}, exposure {exposure[rows[0]]}'
-    order = np.argsort(target[rows], kind='stable')
-    twice = np.flatnonzero(np.diff(target[rows][order]) == 0)
-    if len(twice):
-        first = rows[order[twice[0]]]
-        second = rows[order[twice[0] + 1]]
-        raise DataError(
-            f'{path}, row {lines[second]}: target {target[second]} {where} is there already, '
-            f'in row {lines[first]}'
-        )
-    unknown = np.isnan(sigma[rows])
-    if unknown.any() and not unknown.all():
-        row = rows[np.argmax(unknown)]
-        raise DataError(
-            f'{path}, row {lines[row]}: sigma of target {target[row]} {where} is empty, '
-            f'but other targets of this exposure have one'
-        )
-    return Frame(
-        name,
-        int(exposure[rows[0]]),
-        target[rows],
-        uv[rows],
-        tuple(int(s) for s in image_size),
-        None if unknown.all() else sigma[rows],
-        0,
-        f'{name}_optical',
+def _concatenate(parts: Sequence[_Rows]) -> _Rows:
+    return _Rows(
+        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(_Rows))
     )
 
 
-def _rows_of(frame, with_sigma):
-    columns = [
+def _by_frame(rows: _Rows, names: Sequence[str]) -> Iterator[_Rows]:
+    """Yield the rows of each frame, by name of the fluoroscope and number of the exposure.
+
+    Within a frame the order of the file is kept.
+    """
+    rank = np.argsort(np.argsort(names))[rows.code]
+    order = np.lexsort((rows.exposure, rank))
+    ordered = rows[order]
+    new_code = np.diff(ordered.code, prepend=-1)
+    new_exposure = np.diff(ordered.exposure, prepend=-1)
+    starts = np.flatnonzero(new_code | new_exposure)
+    for of_frame in np.split(order, starts[1:]):
+        yield rows[of_frame]
+
+
+def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) -> Frame:
+    """Return the frame of its rows. Raises DataError."""
+    where = f'of fluoroscope {name}, exposure {rows.exposure[0]}'
+    repeated = first_repeated(rows.target_id)
+    if repeated is not None:
+        first, second = repeated
+        raise DataError(
+            f'{path}, row {rows.line[second]}: target {rows.target_id[second]} {where} is already '
+            f'given in row {rows.line[first]}'
+        )
+    unknown = np.isnan(rows.sigma)
+    if unknown.any() and not unknown.all():
+        row = np.argmax(unknown)
+        raise DataError(
+            f'{path}, row {rows.line[row]}: sigma of target {rows.target_id[row]} {where} is '
+            f'empty, but other targets of this exposure have one'
+        )
+    width, height = image_size
+    return Frame(
+        name,
+        int(rows.exposure[0]),
+        rows.target_id,
+        rows.uv,
+        (int(width), int(height)),
+        None if unknown.all() else rows.sigma,
+        frame_id=f'{name}_optical',
+    )
+
+
+def _csv_rows(frame: Frame, with_sigma: bool) -> Iterator[list[Any]]:
+    columns: list[Iterable[Any]] = [
         np.asarray(frame.target_id).tolist(),
-        *(map(repr, np.asarray(c, float).tolist()) for c in frame.uv.T),
+        *(map(repr, np.asarray(column, float).tolist()) for column in frame.uv.T),
     ]
     if with_sigma:
         sigma = np.full(len(frame.target_id), np.nan) if frame.sigma is None else frame.sigma
-        columns.append(map(cell_of, sigma))
+        columns.append(map(format_float, sigma))
     return ([frame.fluoroscope, int(frame.number), *cells] for cells in zip(*columns))

@@ -1,8 +1,13 @@
-"""The phantom's file: `target_id,x,y,z,sd` in millimetres."""
+"""The file of the phantom: CSV `target_id,x,y,z,sd`, in millimetres."""
+
+from __future__ import annotations
+
+import os
 
 import numpy as np
 
 from ..errors import DataError
+from ..exposures.frame import first_repeated
 from ..exposures.phantom import Phantom
 from .atomic import atomic_file
 from .csv_table import read_blocks, write_rows
@@ -10,33 +15,40 @@ from .csv_table import read_blocks, write_rows
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
 
 
-def read_phantom(path):
-    """The Phantom of a CSV file with target_id and x, y, z, sd [mm]; the order of the columns is
-    free.
+def read_phantom(path: str | os.PathLike[str]) -> Phantom:
+    """Read a Phantom from a CSV file with the columns target_id and x, y, z, sd [mm].
 
-    Raises DataError that names the row and the cause.
+    The columns may have any order. Raises DataError that names row and cause.
     """
-    ids = []
-    numbers = []
-    lines = []
+    id_parts = []
+    number_parts = []
+    line_parts = []
     for block in read_blocks(path, COLUMNS):
-        ids.append(block.ids('target_id'))
-        numbers.append(np.column_stack([block.floats(name) for name in COLUMNS[1:]]))
-        block.check('sd', numbers[-1][:, 3] > 0, 'not above 0')
-        lines.append(block.lines)
-    ids = np.concatenate(ids)
-    numbers = np.concatenate(numbers)
-    lines = np.concatenate(lines)
-    _check_unique(path, ids, lines)
+        numbers = np.column_stack([block.floats(name) for name in COLUMNS[1:]])
+        id_parts.append(block.ids('target_id'))
+        block.require('sd', numbers[:, 3] > 0, 'not above 0')
+        number_parts.append(numbers)
+        line_parts.append(block.lines)
+    ids = np.concatenate(id_parts)
+    numbers = np.concatenate(number_parts)
+    repeated = first_repeated(ids)
+    if repeated is not None:
+        lines = np.concatenate(line_parts)
+        first, second = repeated
+        raise DataError(
+            f'{path}, row {lines[second]}: target {ids[second]} is already given in row '
+            f'{lines[first]}'
+        )
     try:
         return Phantom(ids, numbers[:, :3], numbers[:, 3])
     except DataError as error:
         raise DataError(f'{path}: {error}') from None
 
 
-def write_phantom(path, phantom):
-    """Write a Phantom to a CSV file; read_phantom gives the same to the last bit. Raises
-    DataError.
+def write_phantom(path: str | os.PathLike[str], phantom: Phantom) -> None:
+    """Write a Phantom to a CSV file, from which the same values are read again.
+
+    Raises DataError where the file cannot be written.
     """
     with atomic_file(path, 'w') as file:
         write_rows(file, [COLUMNS])
@@ -48,16 +60,4 @@ def write_phantom(path, phantom):
                     phantom.target_id, phantom.xyz_mm.tolist(), phantom.sd_mm.tolist()
                 )
             ),
-        )
-
-
-def _check_unique(path, ids, lines):
-    order = np.argsort(ids, kind='stable')
-    twice = np.flatnonzero(ids[order][1:] == ids[order][:-1])
-    if len(twice):
-        first = order[twice[0]]
-        second = order[twice[0] + 1]
-        raise DataError(
-            f'{path}, row {lines[second]}: target {ids[second]} is there already, '
-            f'in row {lines[first]}'
         )

@@ -18,10 +18,11 @@ from ..calibration.rounds import Round
 from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..validation.check import Validation
 from ..validation.inputs import copied_exposures, find_wrong_input
 from ..validation.plausibility import implausible
 from ..validation.rigidity import contradiction
-from ..validation.verdict import Validation, validate_or_report
+from ..validation.verdict import validate_or_report
 
 Progress = Callable[[str, Round], None]
 Cancellation = Callable[[], None]

@@ -9,7 +9,7 @@ from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..files.access import make_folder
 from ..files.atomic import write_text
-from ..files.json_file import write_result
+from ..files.json_file import write_json
 from ..files.observations import write_observations_csv
 from ..files.phantom import write_phantom
 from ..photogrammetry.rotations import quaternion_from_matrix
@@ -75,7 +75,7 @@ def write_rig(directory, rig, **made_with):
         directory / 'truth' / 'phantom.csv',
         Phantom(rig.phantom.target_id, rig.true_mm, np.full(len(rig.true_mm), TRUE_SD_MM)),
     )
-    write_result(
+    write_json(
         directory / 'truth' / 'rig.json',
         {
             'made_with': made_with,

@@ -11,7 +11,7 @@ from ..calibration.result import FluoroscopeCalibration
 from ..errors import DataError
 from ..files.calibration import save_calibration
 from ..files.calibration_sources import write_sources, write_validation
-from ..files.json_file import write_result
+from ..files.json_file import write_json
 from ..files.result_document import result_document
 from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -70,7 +70,7 @@ def save_result(
     directory = Path(directory)
     for calibration in result.calibrations.values():
         save_calibration(directory, calibration)
-    write_result(directory / RESULT, {**result_document(result), 'doubts': list(doubts)})
+    write_json(directory / RESULT, {**result_document(result), 'doubts': list(doubts)})
 
 
 def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | None:

@@ -1,1 +1,1 @@
-"""Validation: the verdict on a calibration."""
+"""Validation of a calibration with the exposures it was made from."""

@@ -1,0 +1,220 @@
+"""Beads intersected from the images alone, compared with their survey."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.calibrate import CalibrationResult
+from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
+from ..photogrammetry.collinearity import project_with_jacobian
+from ..photogrammetry.noise import INLIER_Q
+from ..photogrammetry.rotations import matrix_from_quaternion
+
+MIN_VIEWS = 3  # that agree: with fewer, a false match could pass for a displaced bead
+STEPS_L1 = 12  # of least absolute lengths
+STEPS_L2 = 6  # of least squares
+MAX_SD_MM = 2.0  # of a bead that counts
+DAMPING = 1e-9  # [1/mm^2]: a bead that is seen once stays where it is along its ray
+
+
+@dataclass(frozen=True)
+class Beads:
+    """Beads intersected from images, and their survey.
+
+    Attributes
+    ----------
+    target_id : (n,) ndarray of int
+    xyz_mm : (n, 3) ndarray
+    covariance : (n, 3, 3) ndarray
+        [mm^2]
+    views : (n,) ndarray of int
+        Number of image points that agree.
+    survey_mm : (n, 3) ndarray
+    survey_sd_mm : (n,) ndarray
+    """
+
+    target_id: np.ndarray
+    xyz_mm: np.ndarray
+    covariance: np.ndarray
+    views: np.ndarray
+    survey_mm: np.ndarray
+    survey_sd_mm: np.ndarray
+
+    def without(self, target_id: np.ndarray) -> Beads:
+        """Return the beads except those with a target id."""
+        keep = ~np.isin(self.target_id, target_id)
+        return Beads(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+    @property
+    def misclosure(self) -> np.ndarray:
+        """Images - survey (n, 3) [mm]."""
+        return self.xyz_mm - self.survey_mm
+
+    @property
+    def total_covariance(self) -> np.ndarray:
+        """Covariance (n, 3, 3) of the misclosures, of images and survey together [mm^2]."""
+        return self.covariance + self.survey_sd_mm[:, None, None] ** 2 * np.eye(3)
+
+    @property
+    def chi2(self) -> np.ndarray:
+        """Squared misclosures (n,), weighted with their covariance; expected: 3."""
+        weight = np.linalg.inv(self.total_covariance)
+        return np.einsum('na,nab,nb->n', self.misclosure, weight, self.misclosure)
+
+
+@dataclass(frozen=True)
+class DistanceComparison:
+    """Distances between beads compared with the survey.
+
+    Attributes
+    ----------
+    rmse_mm, expected_mm : float
+        RMS difference from the survey, and its expectation [mm].
+    scale, scale_sd : float
+        Scale of the images relative to the survey - 1, and its standard deviation.
+    """
+
+    rmse_mm: float
+    expected_mm: float
+    scale: float
+    scale_sd: float
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Image points with the orientation of their exposure.
+
+    Attributes
+    ----------
+    rotation : (n, 3, 3) ndarray
+    position_mm : (n, 3) ndarray
+    interior : (n, 3) ndarray
+        xp, yp, c [px].
+    uv : (n, 2) ndarray
+        Corrected [px].
+    variance : (n,) ndarray
+        Of a coordinate, of observation and correction together [px^2].
+    target_id : (n,) ndarray of int
+    """
+
+    rotation: np.ndarray
+    position_mm: np.ndarray
+    interior: np.ndarray
+    uv: np.ndarray
+    variance: np.ndarray
+    target_id: np.ndarray
+
+
+def intersect(
+    job: CalibrationResult, frames: Mapping[str, Sequence[Frame]], phantom: Phantom
+) -> Beads:
+    """Intersect the beads of an adjustment from the images of all its fluoroscopes.
+
+    The survey only takes part through the orientations, which depend on all beads together. The
+    intersection is robust: least absolute lengths first, then least squares of the image points
+    that agree.
+    """
+    rays = _rays(job, frames)
+    target_id, bead = np.unique(rays.target_id, return_inverse=True)
+    points = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target_id)].copy()
+    for step in range(STEPS_L1 + STEPS_L2):
+        ideal, _, d_point, _ = project_with_jacobian(
+            rays.rotation, rays.position_mm, points[bead], rays.interior
+        )
+        r = rays.uv - ideal
+        q = np.nan_to_num(np.sum(r * r, axis=1) / rays.variance, nan=np.inf)
+        agree = q <= INLIER_Q
+        weight = 1 / np.sqrt(np.maximum(q, 1.0)) if step < STEPS_L1 else agree
+        weight = weight / rays.variance
+        normal = np.zeros((len(points), 3, 3))
+        right = np.zeros((len(points), 3))
+        np.add.at(normal, bead, weight[:, None, None] * (d_point.transpose(0, 2, 1) @ d_point))
+        np.add.at(
+            right, bead, weight[:, None] * np.einsum('nia,ni->na', d_point, np.nan_to_num(r))
+        )
+        normal += DAMPING * np.eye(3)
+        points = points + np.linalg.solve(normal, right[..., None])[..., 0]
+    covariance = np.linalg.inv(normal)
+    views = np.bincount(bead, agree, len(points)).astype(int)
+    seen = np.bincount(bead, minlength=len(points))
+    valid = (views >= MIN_VIEWS) & (2 * views > seen)
+    valid &= np.sqrt(np.trace(covariance, axis1=1, axis2=2)) < MAX_SD_MM
+    row = phantom.index(target_id[valid])
+    return Beads(
+        target_id[valid],
+        points[valid],
+        covariance[valid],
+        views[valid],
+        phantom.xyz_mm[row],
+        phantom.sd_mm[row],
+    )
+
+
+def distances(beads: Beads) -> DistanceComparison:
+    """Compare the distances between all pairs of two or more beads with the survey."""
+    i, j = np.triu_indices(len(beads.target_id), 1)
+    found = beads.xyz_mm[j] - beads.xyz_mm[i]
+    surveyed = beads.survey_mm[j] - beads.survey_mm[i]
+    length = np.linalg.norm(surveyed, axis=1)
+    direction = surveyed / np.maximum(length, 1e-9)[:, None]
+    total = beads.total_covariance
+    variance = _variance_along(direction, total[i]) + _variance_along(direction, total[j])
+    error = np.linalg.norm(found, axis=1) - length
+    scale, scale_sd = _scale(beads)
+    return DistanceComparison(
+        float(np.sqrt(np.mean(error**2))), float(np.sqrt(np.mean(variance))), scale, scale_sd
+    )
+
+
+def _rays(job: CalibrationResult, frames: Mapping[str, Sequence[Frame]]) -> Rays:
+    """Return the image points of all exposures of an adjustment."""
+    parts = []
+    for name, figures in job.fluoroscopes.items():
+        calibration = job.calibrations[name]
+        by_number = {frame.number: frame.sorted() for frame in frames[name]}
+        for e in figures.exposures:
+            frame = by_number[e.exposure]
+            n = len(frame.target_id)
+            correction = calibration.model.evaluate(frame.uv)
+            sigma = calibration.image_sd
+            if frame.sigma is not None:
+                sigma = calibration.sigma0 * frame.sigma
+            parts.append(
+                (
+                    np.broadcast_to(matrix_from_quaternion(e.quaternion_wxyz), (n, 3, 3)),
+                    np.broadcast_to(e.position_mm, (n, 3)),
+                    np.broadcast_to(figures.interior, (n, 3)),
+                    frame.uv - correction.duv,
+                    sigma**2 + correction.sd**2,
+                    frame.target_id,
+                )
+            )
+    return Rays(*(np.concatenate(column) for column in zip(*parts)))
+
+
+def _variance_along(direction: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the variances (n,) along directions (n, 3) of covariances (n, 3, 3)."""
+    return np.einsum('na,nab,nb->n', direction, covariance, direction)
+
+
+def _scale(beads: Beads) -> tuple[float, float]:
+    """Return the scale - 1 of the similarity from survey to images, and its standard deviation."""
+    x = beads.survey_mm - beads.survey_mm.mean(axis=0)
+    design = np.zeros((len(x), 3, 7))
+    design[:, :, :3] = np.eye(3)  # translation
+    design[:, 0, 4] = x[:, 2]  # rotation
+    design[:, 0, 5] = -x[:, 1]
+    design[:, 1, 3] = -x[:, 2]
+    design[:, 1, 5] = x[:, 0]
+    design[:, 2, 3] = x[:, 1]
+    design[:, 2, 4] = -x[:, 0]
+    design[:, :, 6] = x  # scale
+    information = np.linalg.inv(beads.total_covariance)
+    normal = np.einsum('nai,nab,nbj->ij', design, information, design)
+    right = np.einsum('nai,nab,nb->i', design, information, beads.misclosure)
+    covariance = np.linalg.pinv(normal, hermitian=True)
+    return float((covariance @ right)[6]), float(np.sqrt(covariance[6, 6]))

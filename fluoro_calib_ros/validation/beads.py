@@ -1,0 +1,100 @@
+"""Checks 'beads' and 'distances': beads found from the images alone agree with their survey."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.stats import chi2
+
+from .bead_intersection import Beads, distances, intersect
+from .check import Check, Finding, judge, not_made
+from .evidence import Evidence, Subject
+
+MIN_BEADS = 10  # for distances
+MAX_NAMED = 5  # beads in a sentence
+FALSE_ALARM = 2e-3  # chance that any bead of a good phantom is reported
+# For the part of the errors of orientations and calibration that all beads have in common.
+SD_FACTOR = 1.1
+DISTANCES_LIMIT = 1.12  # times the expectation, from simulated rigs: docs/verdict.md
+
+
+def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Compare the beads that all fluoroscopes see with their survey."""
+    found = intersect(evidence.result, evidence.frames, evidence.phantom)
+    has_trend = any(common.is_significant for common in evidence.trends.values())
+    return compare_with_survey(found, has_trend)
+
+
+def compare_with_survey(beads: Beads, has_trend: bool = False) -> list[Check]:
+    """Return the checks 'beads' and 'distances'.
+
+    has_trend says whether the residuals of a fluoroscope have a trend.
+    """
+    count = len(beads.target_id)
+    if count < MIN_BEADS:
+        reason = (
+            f'only {count} beads are seen often enough to be found from the images alone: '
+            'take more exposures'
+        )
+        return [
+            not_made(name, '', f'check {name} could not be made, {reason}')
+            for name in ('beads', 'distances')
+        ]
+    limit = SD_FACTOR**2 * chi2.ppf(1 - FALSE_ALARM / count, 3)
+    order = np.argsort(-beads.chi2)
+    wrong = order[beads.chi2[order] > limit]
+    size = np.linalg.norm(beads.misclosure, axis=1)
+    worst = order[0]
+    sentence = (
+        f'bead {beads.target_id[worst]} lies {size[worst]:.2f} mm from its survey, the worst of '
+        f'{count}'
+    )
+    if len(wrong) and not has_trend:
+        sentence = _wrong_beads(beads.target_id[wrong], size[wrong])
+    finding = Finding(
+        size[worst],
+        size[worst] * np.sqrt(limit / beads.chi2[worst]),
+        'mm',
+        sentence,
+        'survey again, or give a larger sd, and calibrate again',
+    )
+    return [
+        judge('beads', '', finding, has_trend),
+        _check_distances(beads.without(beads.target_id[wrong]), has_trend),
+    ]
+
+
+def _wrong_beads(target_id: np.ndarray, size: np.ndarray) -> str:
+    """Return a sentence that names the beads with a wrong survey and their errors [mm]."""
+    named = ', '.join(
+        f'{target} is wrong by {mm:.1f} mm'
+        for target, mm in zip(target_id[:MAX_NAMED], size[:MAX_NAMED])
+    )
+    further = len(target_id) - MAX_NAMED
+    rest = f', and that of {further} more' if further > 0 else ''
+    return f'the survey of bead {named}{rest}'
+
+
+def _check_distances(beads: Beads, has_trend: bool) -> Check:
+    if len(beads.target_id) < MIN_BEADS:
+        return not_made(
+            'distances',
+            '',
+            'check distances could not be made, too few beads agree with their survey',
+        )
+    found = distances(beads)
+    finding = Finding(
+        found.rmse_mm,
+        DISTANCES_LIMIT * found.expected_mm,
+        'mm',
+        f'distances between beads differ from the survey by {found.rmse_mm:.3f} mm, '
+        f'{found.expected_mm:.3f} mm are expected (scale {1 + found.scale:.6f}, '
+        f'sd {found.scale_sd:.6f})',
+        'the survey is less precise than its sd says, or the calibration is wrong if other checks '
+        'fail too; survey the phantom again, or give a larger sd',
+    )
+    return judge('distances', '', finding, has_trend)
+
+
+BEADS = Subject(check_beads, of_rig=True)

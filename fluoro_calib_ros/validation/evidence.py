@@ -1,0 +1,159 @@
+"""What the checks of a calibration work with."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations, calibrate
+from ..calibration.request import CalibrationRequest
+from ..calibration.result import FluoroscopeCalibration
+from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
+from .check import Check
+from .residual_tests import Residuals, ResidualTrend, common_trend, residuals_of
+
+# The calibration of a part has at most so many rounds: with few exposures it converges slowly, and
+# after these rounds without visible change.
+MAX_ROUNDS = 25
+
+
+@dataclass(frozen=True)
+class CommonTrend:
+    """Trend that the residuals of all exposures of a fluoroscope have in common.
+
+    Attributes
+    ----------
+    inliers : Residuals
+        Those in the core of the noise.
+    trend : ResidualTrend
+    claimed_sd : float
+        Standard deviation that the calibration claims for its correction [px]: an error of this
+        size is no fault.
+    """
+
+    inliers: Residuals
+    trend: ResidualTrend
+    claimed_sd: float
+
+    @property
+    def limit(self) -> float:
+        """Size of a trend [px] that is not significant."""
+        return float(np.hypot(self.trend.limit, self.claimed_sd))
+
+    @property
+    def is_significant(self) -> bool:
+        """Whether the residuals have a trend."""
+        return not self.trend.size <= self.limit
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A calibration, the exposures it was made from, and what a check may do with them.
+
+    Attributes
+    ----------
+    request : CalibrationRequest
+        With the frames that were used only, in the order of their numbers.
+    calibrations : mapping of str to FluoroscopeCalibration
+    result : CalibrationResult
+        Adjustment of the frames with the calibrations held.
+    report_step : callable
+        To be called with the name of a step before every step of a check.
+    raise_if_cancelled : callable or None
+    """
+
+    request: CalibrationRequest
+    calibrations: Mapping[str, FluoroscopeCalibration]
+    result: CalibrationResult
+    report_step: Callable[[str], None]
+    raise_if_cancelled: Callable[[], None] | None = None
+
+    @property
+    def frames(self) -> Mapping[str, Sequence[Frame]]:
+        """Frames by fluoroscope."""
+        return self.request.frames
+
+    @property
+    def phantom(self) -> Phantom:
+        """The survey of the phantom."""
+        return self.request.phantom
+
+    @cached_property
+    def trends(self) -> dict[str, CommonTrend]:
+        """Trends of the residuals by fluoroscope."""
+        return {name: self._common_trend(name) for name in self.frames}
+
+    def _common_trend(self, name: str) -> CommonTrend:
+        calibration = self.calibrations[name]
+        residuals = residuals_of(self.result, name, self.frames[name])
+        inliers = residuals.inliers(calibration.image_sd)
+        claimed = float(np.sqrt(np.mean(calibration.model.evaluate(inliers.uv).sd ** 2)))
+        return CommonTrend(inliers, common_trend(inliers, calibration.image_size), claimed)
+
+    def fewest_exposures(self, names: Sequence[str]) -> int:
+        """Return the number of exposures of the fluoroscope that has the fewest."""
+        return min(len(self.frames[name]) for name in names)
+
+    def part(
+        self, names: Sequence[str], is_chosen: Callable[[int], bool]
+    ) -> dict[str, list[Frame]]:
+        """Return the frames of some fluoroscopes whose position in order is chosen."""
+        return {
+            name: [f for i, f in enumerate(self.frames[name]) if is_chosen(i)] for name in names
+        }
+
+    def calibrate(
+        self, frames: Mapping[str, Sequence[Frame]]
+    ) -> Mapping[str, FluoroscopeCalibration]:
+        """Calibrate with a part of the frames. Raises DataError where they do not suffice."""
+        options = self.request.options
+        distance = self.request.principal_distance
+        if options.interior == 'fixed':  # as in the calibration that is validated
+            distance = float(np.mean([self.calibrations[name].interior[2] for name in frames]))
+        options = replace(options, max_iterations=min(options.max_iterations, MAX_ROUNDS))
+        return calibrate(
+            frames,
+            self.phantom,
+            options,
+            self.request.joint,
+            distance,
+            raise_if_cancelled=self.raise_if_cancelled,
+        ).calibrations
+
+    def adjust(
+        self,
+        frames: Mapping[str, Sequence[Frame]],
+        calibrations: Mapping[str, FluoroscopeCalibration],
+    ) -> CalibrationResult:
+        """Adjust frames with calibrations held. Raises DataError."""
+        return adjust_with_calibrations(
+            frames,
+            self.phantom,
+            calibrations,
+            self.request.options.loss,
+            raise_if_cancelled=self.raise_if_cancelled,
+        )
+
+
+@dataclass(frozen=True)
+class Subject:
+    """A subject of validation: one or more checks that are made together.
+
+    Attributes
+    ----------
+    run : callable
+        Called with the Evidence and the names of the fluoroscopes that are calibrated together;
+        returns their checks. With of_rig it is called once, with all fluoroscopes.
+    steps : int
+        How often run calls `Evidence.report_step`.
+    of_rig : bool
+        Whether the checks are of all fluoroscopes together.
+    """
+
+    run: Callable[[Evidence, Sequence[str]], list[Check]]
+    steps: int = 0
+    of_rig: bool = False

@@ -1,0 +1,61 @@
+"""Check 'halves': two calibrations, each from every other exposure, predict the same."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..calibration.initial_network import MIN_EXPOSURES
+from ..calibration.result import FluoroscopeCalibration
+from ..errors import DataError
+from .check import Check, Finding, judge, more_exposures, too_little_data
+from .evidence import Evidence, Subject
+from .field_comparison import describe_place, difference
+
+NAME = 'halves'
+LIMIT = 1.9  # from simulated rigs: docs/verdict.md, benchmarks/verdict.py
+
+
+def check_halves(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Compare the calibrations of two halves of the exposures, a check for each fluoroscope."""
+    evidence.report_step(f'{"+".join(names)}: two halves')
+    fewest = evidence.fewest_exposures(names)
+    if fewest < 2 * MIN_EXPOSURES:
+        reason = f'{fewest} exposures are too few for two halves of {MIN_EXPOSURES} or more'
+        return [too_little_data(NAME, name, reason, fewest) for name in names]
+    try:
+        even = evidence.calibrate(evidence.part(names, lambda i: i % 2 == 0))
+        odd = evidence.calibrate(evidence.part(names, lambda i: i % 2 == 1))
+    except DataError as error:
+        reason = f'half of the exposures cannot be calibrated ({error})'
+        return [too_little_data(NAME, name, reason, fewest) for name in names]
+    return [_check(name, even[name], odd[name], len(evidence.frames[name])) for name in names]
+
+
+def _check(
+    name: str, one: FluoroscopeCalibration, other: FluoroscopeCalibration, count: int
+) -> Check:
+    found = difference(one, other)
+    if found is None:
+        reason = 'two halves of the exposures cover too little of the image in common'
+        return too_little_data(NAME, name, reason, count)
+    expected = float(np.sqrt(np.mean(found.sd**2)))
+    return judge(
+        NAME,
+        name,
+        Finding(
+            found.normalised,
+            LIMIT,
+            'predicted sd',
+            f'fluoroscope {name}: two halves of the exposures give corrections that differ by '
+            f'{found.rms_px:.2f} px, where {expected:.2f} px is predicted, most at '
+            f'{describe_place(found.worst, one.image_size)}',
+            f'{more_exposures(count)} that show beads there, and see that phantom and fluoroscope '
+            'stand still in each',
+            found.worst,
+        ),
+    )
+
+
+HALVES = Subject(check_halves, steps=1)

@@ -1,0 +1,140 @@
+"""Checks 'held_out' and 'exposures': exposures fit a calibration that has not used them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import DataError
+from .check import GOOD_EXPOSURES, Check, Finding, judge, more_exposures, too_little_data
+from .evidence import Evidence, Subject
+from .residual_tests import residuals_of
+
+NAMES = ('held_out', 'exposures')
+FOLDS = 4
+# Limits from simulated rigs: docs/verdict.md, benchmarks/verdict.py.
+MARGIN = (
+    0.13  # over the expectation, with GOOD_EXPOSURES; it grows as the root of their number falls
+)
+EXPOSURE_LIMIT = 1.6  # times the expectation
+MIN_NOISE = 0.05  # part of the squared residuals in sample that is noise, whatever the trend
+
+
+class ExposureSums(NamedTuple):
+    """Sums of an exposure over its image points.
+
+    Attributes
+    ----------
+    number : int
+        Of the exposure.
+    points : int
+    outside, inside : float
+        Squared residuals [px^2] with a calibration that has not used the exposure, and with one
+        that has. The same exposures are adjusted in the same way, so that the adjustment absorbs
+        the same part of the residuals.
+    predicted : float
+        Predicted variance of the correction [px^2].
+    """
+
+    number: int
+    points: int
+    outside: float
+    inside: float
+    predicted: float
+
+
+def check_held_out(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Compare residuals out of sample with their expectation, two checks a fluoroscope."""
+    fewest = evidence.fewest_exposures(names)
+    folds = min(FOLDS, fewest)
+    sums: dict[str, list[ExposureSums]] = {name: [] for name in names}
+    try:
+        for fold in range(FOLDS):
+            evidence.report_step(
+                f'{"+".join(names)}: held-out exposures, part {fold + 1} of {FOLDS}'
+            )
+            if fold < folds:
+                found = _hold_out(evidence, names, fold, folds)
+                for name in names:
+                    sums[name] += found[name]
+    except DataError as error:
+        reason = f'a part of the exposures cannot be calibrated or adjusted alone ({error})'
+        return [too_little_data(check, name, reason, fewest) for name in names for check in NAMES]
+    return [check for name in names for check in _checks(evidence, name, sums[name])]
+
+
+def _hold_out(
+    evidence: Evidence, names: Sequence[str], fold: int, folds: int
+) -> dict[str, list[ExposureSums]]:
+    """Calibrate without the exposures of a fold; return their sums by fluoroscope."""
+    frames = evidence.part(names, lambda i: i % folds == fold)
+    others = evidence.part(names, lambda i: i % folds != fold)
+    calibrations = evidence.calibrate(others)
+    job_outside = evidence.adjust(frames, calibrations)
+    job_inside = evidence.adjust(frames, {name: evidence.calibrations[name] for name in names})
+    out: dict[str, list[ExposureSums]] = {}
+    for name in names:
+        sd = evidence.calibrations[name].image_sd
+        outside = residuals_of(job_outside, name, frames[name])
+        inside = residuals_of(job_inside, name, frames[name])
+        if not np.array_equal(outside.numbers, inside.numbers):
+            raise DataError(
+                f'fluoroscope {name}: an exposure does not fit a calibration without it'
+            )
+        squared_outside = outside.capped(sd)
+        squared_inside = inside.capped(sd)
+        predicted = 2 * calibrations[name].model.evaluate(outside.uv).sd ** 2
+        out[name] = []
+        for row, number in enumerate(outside.numbers):
+            points = outside.exposure == row
+            out[name].append(
+                ExposureSums(
+                    int(number),
+                    points.sum(),
+                    squared_outside[points].sum(),
+                    squared_inside[points].sum(),
+                    predicted[points].sum(),
+                )
+            )
+    return out
+
+
+def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list[Check]:
+    common = evidence.trends[name]
+    count = len(evidence.frames[name])
+    number, n, outside, inside, predicted = (np.array(column) for column in zip(*sums))
+    # A trend that is left in sample is not noise.
+    noise = np.maximum(inside - 2 * n * common.trend.size**2, MIN_NOISE * inside)
+    value = float(np.sqrt(outside.sum() / (2 * n.sum())))
+    expected = float(np.sqrt((noise + predicted).sum() / (2 * n.sum())))
+    limit = 1 + MARGIN * np.sqrt(GOOD_EXPOSURES / count)
+    held_out = Finding(
+        value,
+        limit * expected,
+        'px',
+        f'fluoroscope {name}: residuals of exposures held out are {value:.3f} px, '
+        f'{expected:.3f} px are expected',
+        f'the calibration does not hold for exposures it has not used; {more_exposures(count)} in '
+        'other poses',
+    )
+    # Where something moved during an exposure, it does not fit in sample either. So the noise of
+    # the others is expected of it.
+    ratio = np.sqrt(outside / (n * np.median(noise / n) + predicted))
+    worst = int(np.argmax(ratio))
+    exposures = Finding(
+        ratio[worst],
+        EXPOSURE_LIMIT,
+        '1',
+        f'fluoroscope {name}: exposure {number[worst]} fits the calibration of the others worst, '
+        f'with {ratio[worst]:.2f} times the expected residuals',
+        'inspect it (phantom or fluoroscope moved, wrong ids), leave it out and calibrate again',
+    )
+    return [
+        judge('held_out', name, held_out, common.is_significant),
+        judge('exposures', name, exposures, common.is_significant),
+    ]
+
+
+HELD_OUT = Subject(check_held_out, steps=FOLDS)

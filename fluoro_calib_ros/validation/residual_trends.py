@@ -1,0 +1,103 @@
+"""Checks 'whiteness', 'worst_area' and 'drift': residuals have no trend, and it did not change."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .check import Check, Finding, judge, more_exposures
+from .evidence import CommonTrend, Evidence, Subject
+from .field_comparison import describe_place
+from .residual_tests import change_of_trend
+
+# Standard deviations of the correction by which the mean residual of an area may be off.
+CLAIMED_SD = 3.0
+
+
+def check_trends(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Test the residuals of all exposures for a common trend, and for a change of it."""
+    checks = []
+    for name in names:
+        common = evidence.trends[name]
+        checks += [
+            _whiteness(evidence, name, common),
+            _worst_area(evidence, name, common),
+            _drift(evidence, name, common),
+        ]
+    return checks
+
+
+def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
+    trend = common.trend
+    kind = evidence.calibrations[name].model.kind
+    where = describe_place(trend.place, evidence.calibrations[name].image_size)
+    return judge(
+        'whiteness',
+        name,
+        Finding(
+            trend.size,
+            common.limit,
+            'px',
+            f'fluoroscope {name}: the residuals have a trend of {trend.size:.2f} px, most at '
+            f'{where}',
+            _advice(evidence.request.options.model, kind, len(evidence.frames[name])),
+            trend.place,
+        ),
+    )
+
+
+def _advice(requested: str, kind: str, count: int) -> str:
+    """Return what to do about a trend: requested is the model option, kind the model in use."""
+    if kind == 'none':
+        return 'calibrate with a correction model (--model auto), it was made without one'
+    other = '' if requested == 'auto' else ', or choose another model (--model auto)'
+    return (
+        f'the correction model {kind} does not follow the distortion there; '
+        f'{more_exposures(count)} that show beads there{other}'
+    )
+
+
+def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
+    trend = common.trend
+    calibration = evidence.calibrations[name]
+    claimed = max(float(calibration.model.evaluate(trend.place[None]).sd[0]), common.claimed_sd)
+    return judge(
+        'worst_area',
+        name,
+        Finding(
+            trend.cell_size,
+            np.hypot(trend.cell_limit, CLAIMED_SD * claimed),
+            'px',
+            f'fluoroscope {name}: the worst mean residual of an area, {trend.cell_size:.2f} px, '
+            f'is at {describe_place(trend.place, calibration.image_size)}',
+            f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose '
+            'another model',
+            trend.place,
+        ),
+    )
+
+
+def _drift(evidence: Evidence, name: str, common: CommonTrend) -> Check:
+    size = evidence.calibrations[name].image_size
+    change = change_of_trend(common.inliers, size)
+    # The whole image decides, unless only the worst area has changed.
+    whole = change.size > change.limit or change.cell_size <= change.cell_limit
+    return judge(
+        'drift',
+        name,
+        Finding(
+            change.size if whole else change.cell_size,
+            change.limit if whole else change.cell_limit,
+            'px',
+            f'fluoroscope {name}: earlier and later exposures differ by {change.size:.2f} px, '
+            f'most at {describe_place(change.place, size)} by {change.cell_size:.2f} px',
+            'the distortion has changed between the exposures; take all of them again in one '
+            'session, with nothing switched, moved or warming up',
+            change.place,
+        ),
+        common.is_significant,
+    )
+
+
+TRENDS = Subject(check_trends)

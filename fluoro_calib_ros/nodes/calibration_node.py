@@ -43,7 +43,7 @@ from ..jobs.result_folder import save_outcome
 from ..jobs.worker_process import run_in_worker_process
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..validation.verdict import Validation
+from ..validation.check import Validation
 from .messages.calibration_status import FluoroscopeProgress, message_from_progress
 from .messages.fluoroscope_calibration import message_from_calibration
 from .messages.self_calibration import (

@@ -13,7 +13,7 @@ from ...calibration.calibrate import CalibrationResult
 from ...calibration.options import CalibrationOptions
 from ...calibration.result import FluoroscopeCalibration
 from ...calibration.rounds import Round
-from ...validation.verdict import Validation
+from ...validation.check import Validation
 
 Request = Any  # Calibrate.Request or SelfCalibrate.Goal
 Result = Any  # Calibrate.Response or SelfCalibrate.Result

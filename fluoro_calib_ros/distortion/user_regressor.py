@@ -10,6 +10,7 @@ the fitted correction on a grid, the model `lookup`.
 from __future__ import annotations
 
 import importlib
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -45,7 +46,7 @@ def resolve_model(name: str) -> Any:
         found = getattr(importlib.import_module(module), attribute)
     except (ImportError, AttributeError, ValueError) as error:
         raise ValueError(f'model {name!r} cannot be imported: {error}') from None
-    if not is_regressor(found) or isinstance(found, type):
+    if not is_regressor(found):
         try:
             found = found()
         except TypeError as error:
@@ -57,6 +58,8 @@ def resolve_model(name: str) -> Any:
 
 def is_regressor(thing: Any) -> bool:
     """Whether an object has the interface of a scikit-learn regressor."""
+    if isinstance(thing, type):
+        return False
     return all(callable(getattr(thing, name, None)) for name in ('fit', 'predict', 'get_params'))
 
 
@@ -95,6 +98,9 @@ class UserRegression(RegressionStep):
         self._nodes = grid_nodes(points.image_size)
         self._interior: np.ndarray | None = None
         self._held_out_error2 = 0.0
+        # The fits of a round: of the values and of the next ones. `model` wants the first again,
+        # with the gauge of its own round.
+        self._last_fits: deque[tuple[np.ndarray, LookupModel]] = deque(maxlen=2)
 
     def choose(self, values: np.ndarray, q: np.ndarray, information: np.ndarray) -> None:
         """Update the inliers; G is that of held-out exposures."""
@@ -122,7 +128,9 @@ class UserRegression(RegressionStep):
 
     def smooth(self, values: np.ndarray) -> np.ndarray:
         """Fit values (N, 2) [px] at the inliers; return the corrections (N, 2) at all points."""
-        return self._lookup(values).predict(self.points.uv)
+        fitted = self._fit(values)
+        self._last_fits.append((values.copy(), fitted))
+        return fitted.predict(self.points.uv)
 
     def model(self, values: np.ndarray, series: Series | None = None) -> LookupModel:
         """Return the lookup grid of the regressor fitted to values (N, 2).
@@ -132,7 +140,8 @@ class UserRegression(RegressionStep):
         (Efron, Journal of the American Statistical Association 81, 1986): by the variance of the
         prediction. Both are estimated so.
         """
-        fitted = self._lookup(values)
+        known = [fit for fitted_to, fit in self._last_fits if np.array_equal(fitted_to, values)]
+        fitted = known[0] if known else self._fit(values)
         error2 = np.mean((values - fitted.predict(self.points.uv))[self.inliers] ** 2)
         noise2 = (error2 + self._held_out_error2) / 2
         prediction2 = max((self._held_out_error2 - error2) / 2, 0.0)
@@ -140,7 +149,7 @@ class UserRegression(RegressionStep):
             0, fitted.train_uv, fitted.train_duv, float(np.sqrt(noise2)), float(prediction2**0.5)
         )
 
-    def _lookup(self, values: np.ndarray) -> LookupModel:
+    def _fit(self, values: np.ndarray) -> LookupModel:
         """Fit values (N, 2) at the inliers; return the correction without gauge, on the grid."""
         from sklearn.base import clone
 

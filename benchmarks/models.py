@@ -1,0 +1,204 @@
+"""Correction models beside regressors of scikit-learn, out of sample, on virtual rigs.
+
+python -m benchmarks.models            the table of docs/models.md
+python -m benchmarks.models --rigs 3   on more rigs
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from sklearn.ensemble import RandomForestRegressor
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.svm import SVR
+
+from fluoro_calib_ros.calibration.calibrate import (
+    CalibrationResult,
+    adjust_with_calibrations,
+    calibrate,
+)
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.distortion.gauge import gauge_basis, gauge_coefficients
+from fluoro_calib_ros.distortion.knn import KnnModel
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.simulation.rig import (
+    SimulatedExposures,
+    VirtualRig,
+    simulate_exposures,
+    virtual_rig,
+)
+
+from .timing import section, timed
+
+TRAIN_EXPOSURES = 15
+TEST_EXPOSURES = 40
+TEST_SEED = 10**6
+MAX_ROUNDS = 15  # of a regressor of scikit-learn: each round costs seven fits
+GRID_PX = 16.0  # spacing of the pixels at which the correction is compared
+NAME = 'a'  # of the fluoroscope
+
+OURS = ('none', 'knn', 'local_linear', 'parametric', 'hybrid', 'collocation')
+THEIRS: dict[str, Callable[[], Any]] = {
+    'RandomForestRegressor(50, min_samples_leaf=3)': lambda: RandomForestRegressor(
+        50, min_samples_leaf=3
+    ),
+    'SVR(C=10, gamma=2, epsilon=0.2)': lambda: SVR(C=10, gamma=2, epsilon=0.2),
+    'GaussianProcessRegressor(25 * RBF(0.3) + WhiteKernel(0.06))': lambda: (
+        GaussianProcessRegressor(
+            ConstantKernel(25.0) * RBF(0.3) + WhiteKernel(0.06), optimizer=None
+        )
+    ),
+}
+HEADER = [
+    'model',
+    'object points [mm]',
+    'ratio to known distortion',
+    'correction [px]',
+    'rounds',
+    'seconds',
+]
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A virtual rig with exposures of one fluoroscope to calibrate and to test with."""
+
+    rig: VirtualRig
+    train: SimulatedExposures
+    test: SimulatedExposures
+
+
+@dataclass(frozen=True)
+class Figures:
+    """What was measured of a model on one rig.
+
+    points_mm: 3-D RMSE of the object points of test exposures, adjusted with the calibration held;
+    ratio to that of known distortion; correction_px: RMS difference of a
+    coordinate from the true distortion over the calibrated area, without the gauge; rounds; converged; seconds of the calibration.
+    """
+
+    points_mm: float
+    ratio: float
+    correction_px: float
+    rounds: int
+    converged: bool
+    seconds: float
+
+
+def make_scene(seed: int) -> Scene:
+    """Return the scene of rig number seed."""
+    rig = virtual_rig(seed)
+    train = simulate_exposures(rig, TRAIN_EXPOSURES, seed)
+    return Scene(rig, train, simulate_exposures(rig, TEST_EXPOSURES, TEST_SEED, first_number=1001))
+
+
+def points_error(scene: Scene, frames: list[Frame], result: CalibrationResult) -> float:
+    """3-D RMSE [mm] of the object points of frames, adjusted with a calibration held."""
+    found = adjust_with_calibrations({NAME: frames}, scene.rig.phantom, result.calibrations)
+    true = scene.rig.true_mm[scene.rig.phantom.index(found.targets.target_id)]
+    return float(np.sqrt(np.mean(np.sum((found.targets.xyz_mm - true) ** 2, axis=1))))
+
+
+def undistorted(exposures: SimulatedExposures) -> list[Frame]:
+    """Frames of exposures as an undistorted image would show them."""
+    pairs = zip(exposures.frames[NAME], exposures.undistorted[NAME])
+    return [replace(frame, uv=uv) for frame, uv in pairs]
+
+
+def known_distortion_error(scene: Scene) -> float:
+    """3-D RMSE [mm] of the object points with the distortion known exactly."""
+    result = calibrate(
+        {NAME: undistorted(scene.train)}, scene.rig.phantom, CalibrationOptions('none')
+    )
+    return points_error(scene, undistorted(scene.test), result)
+
+
+def correction_error(scene: Scene, result: CalibrationResult) -> float:
+    """RMS difference [px] of a coordinate of the correction from the truth, without the gauge."""
+    calibration = result.calibrations[NAME]
+    true = next(f for f in scene.rig.fluoroscopes if f.name == NAME).distortion
+    axes = [np.arange(0.0, size, GRID_PX) for size in calibration.image_size]
+    uv = np.stack(np.meshgrid(*axes), axis=2).reshape(-1, 2)
+    covered = np.concatenate([frame.uv for frame in scene.train.frames[NAME]])
+    uv = uv[~KnnModel(1, covered, np.zeros_like(covered)).outside(uv)]
+    error = calibration.model.predict(uv) - true(uv)
+    basis = gauge_basis(uv, calibration.interior)
+    error -= basis @ gauge_coefficients(uv, error, calibration.interior)
+    return float(np.sqrt(np.mean(error**2)))
+
+
+def measure(scene: Scene, known_mm: float, options: CalibrationOptions) -> Figures:
+    """Return the figures of a model on a scene; known_mm: error with known distortion."""
+    frames = {NAME: scene.train.frames[NAME]}
+    result, seconds = timed(lambda: calibrate(frames, scene.rig.phantom, options))
+    points_mm = points_error(scene, scene.test.frames[NAME], result)
+    return Figures(
+        points_mm,
+        points_mm / known_mm,
+        correction_error(scene, result),
+        len(result.history[NAME]),
+        result.converged,
+        seconds,
+    )
+
+
+def row(name: str, figures: list[Figures]) -> list[str]:
+    """Return the row of a model: means over the rigs."""
+
+    def mean(attribute: str) -> float:
+        return float(np.mean([getattr(one, attribute) for one in figures]))
+
+    stopped = '' if all(one.converged for one in figures) else ', stopped'
+    return [
+        f'`{name}`',
+        f'{mean("points_mm"):.4f}',
+        f'{mean("ratio"):.3f}',
+        f'{mean("correction_px"):.3f}',
+        f'{mean("rounds"):.0f}{stopped}',
+        f'{mean("seconds"):.1f}',
+    ]
+
+
+def models_section(rigs: int = 2) -> str:
+    """Return the section with the table of all models, means over rigs 1 to rigs."""
+    scenes = [make_scene(seed) for seed in range(1, rigs + 1)]
+    known = [known_distortion_error(scene) for scene in scenes]
+    candidates = {name: CalibrationOptions(name) for name in OURS}
+    for name, make in THEIRS.items():
+        candidates[name] = CalibrationOptions(make(), max_iterations=MAX_ROUNDS)
+    rows = []
+    for name, options in candidates.items():
+        pairs = zip(scenes, known)
+        rows.append(row(name, [measure(scene, error, options) for scene, error in pairs]))
+        sys.stderr.write(f'{" | ".join(rows[-1])}\n')
+    return section(
+        'Models beside each other, out of sample',
+        f'Means over {rigs} virtual rigs, one fluoroscope: {TRAIN_EXPOSURES} exposures to '
+        f'calibrate, {TEST_EXPOSURES} others to test. Object points: 3-D RMSE of the test '
+        'exposures, adjusted with the calibration held; with the distortion known exactly it is '
+        f'{np.mean(known):.4f} mm. '
+        'Correction: RMS difference of a coordinate from the true distortion over the calibrated '
+        'area, without what interior and exterior orientation take up. The regressors of '
+        f'scikit-learn are stopped after {MAX_ROUNDS} rounds.',
+        HEADER,
+        rows,
+    )
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Print the table."""
+    parser = argparse.ArgumentParser(
+        prog='python -m benchmarks.models', description=(__doc__ or '').splitlines()[0]
+    )
+    parser.add_argument('--rigs', type=int, default=2, help='number of rigs (default: 2)')
+    sys.stdout.write(models_section(parser.parse_args(arguments).rigs) + '\n')
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,148 @@
+"""The neighbour models as scikit-learn estimators, for pipelines and cross-validation.
+
+A self-calibration does not go through them: it looks up neighbours once for all rounds (see
+`neighbour_regression`). The numbers are the same.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.sparse import issparse
+from scipy.spatial import cKDTree
+from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.neighbors import KNeighborsRegressor
+from sklearn.preprocessing import PolynomialFeatures
+from sklearn.utils import Tags
+from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
+
+from .neighbours import RIDGE
+
+MIN_BANDWIDTH = 1e-6  # of coincident neighbours
+
+
+class KnnRegressor(KNeighborsRegressor):
+    """KNeighborsRegressor with a faster neighbour search and with sample weights.
+
+    The parameters are those of scikit-learn. The search of scipy is used where it gives the same
+    neighbours: for dense samples, uniform weights and Euclidean distances. Sample weights weight
+    the mean of the neighbours; a sample of weight 0 is left out.
+    """
+
+    def fit(
+        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
+    ) -> KnnRegressor:
+        """Fit to samples X (N, d) with targets y (N,) or (N, outputs)."""
+        self.sample_weight_ = None
+        if sample_weight is not None:
+            X, y = validate_data(self, X, y, multi_output=True, accept_sparse='csr')
+            weight = _check_sample_weight(sample_weight, X)
+            positive = weight > 0
+            X = X[positive]
+            y = y[positive]
+            self.sample_weight_ = weight[positive]
+        super().fit(X, y)
+        fast = self.weights == 'uniform' and self.effective_metric_ == 'euclidean'
+        self._scipy_tree = None if issparse(X) or not fast else cKDTree(self._fit_X)
+        return self
+
+    def predict(self, X: ArrayLike) -> np.ndarray:
+        """Predict the targets of samples X (n, d)."""
+        if getattr(self, '_scipy_tree', None) is None or self.n_neighbors > self.n_samples_fit_:
+            return super().predict(X)
+        X = validate_data(self, X, reset=False, dtype=float)
+        _, index = self._scipy_tree.query(X, k=np.arange(1, self.n_neighbors + 1))
+        values = self._y[:, None] if self._y.ndim == 1 else self._y
+        if self.sample_weight_ is None:
+            predicted = np.mean(values[index], axis=1)
+        else:
+            weight = self.sample_weight_[index][:, :, None]
+            predicted = np.sum(weight * values[index], axis=1) / np.sum(weight, axis=1)
+        return predicted[:, 0] if self._y.ndim == 1 else predicted
+
+
+class LocalLinearRegressor(RegressorMixin, BaseEstimator):
+    """The model `local_linear`: a polynomial trend, and planes fitted to the nearest remainders.
+
+    Parameters
+    ----------
+    n_neighbors : int
+        Number of neighbours; at most the number of samples is used.
+    trend_degree : int or None
+        Degree of the trend; None: there is none, as in the model `hybrid`.
+    """
+
+    def __init__(self, n_neighbors: int = 30, trend_degree: int | None = 3) -> None:
+        self.n_neighbors = n_neighbors
+        self.trend_degree = trend_degree
+
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.target_tags.multi_output = True
+        return tags
+
+    def fit(
+        self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
+    ) -> LocalLinearRegressor:
+        """Fit to samples X (N, d) with targets y (N,) or (N, outputs).
+
+        Sample weights weight the fits of trend and planes; a sample of weight 0 is left out.
+        """
+        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        if self.n_neighbors < 1:
+            raise ValueError(f'n_neighbors is at least 1, not {self.n_neighbors}')
+        weight = np.ones(len(X))
+        if sample_weight is not None:
+            weight = _check_sample_weight(sample_weight, X, dtype=np.float64)
+        positive = weight > 0
+        X = X[positive]
+        self._single_output = y.ndim == 1
+        y = y[positive].reshape(len(X), -1).astype(np.float64)
+        self._weight = weight[positive]
+        self._centre = X.mean(axis=0)
+        self._scale = max(float(np.max(np.abs(X - self._centre))), 1e-300)
+        basis = self._basis(X)
+        root = np.sqrt(self._weight)[:, None]
+        self.trend_coefficients_ = np.linalg.pinv(root * basis) @ (root * y)
+        self._remainder = y - basis @ self.trend_coefficients_
+        self._tree = cKDTree(X)
+        self.n_neighbors_ = min(self.n_neighbors, len(X))
+        return self
+
+    def predict(self, X: ArrayLike) -> np.ndarray:
+        """Predict the targets of samples X (n, d)."""
+        check_is_fitted(self)
+        X = validate_data(self, X, reset=False, dtype=np.float64)
+        distance, index = self._tree.query(X, k=np.arange(1, self.n_neighbors_ + 1))
+        bandwidth = np.maximum(distance[:, -1:], MIN_BANDWIDTH)
+        kernel = (1 - (distance / bandwidth) ** 3) ** 3
+        kernel[kernel.sum(axis=1) <= 1e-9] = 1.0  # all neighbours at one distance
+        kernel *= self._weight[index]
+        offset = (self._tree.data[index] - X[:, None]) / bandwidth[:, :, None]
+        weights = _plane_weights(offset, kernel)
+        predicted = self._basis(X) @ self.trend_coefficients_
+        predicted += np.einsum('nk,nko->no', weights, self._remainder[index])
+        return predicted[:, 0] if self._single_output else predicted
+
+    def _basis(self, X: np.ndarray) -> np.ndarray:
+        """Values (n, p) of the polynomials of the trend."""
+        if self.trend_degree is None:
+            return np.zeros((len(X), 0))
+        return PolynomialFeatures(self.trend_degree).fit_transform(
+            (X - self._centre) / self._scale
+        )
+
+
+def _plane_weights(offset: np.ndarray, kernel: np.ndarray) -> np.ndarray:
+    """Weights (n, k) that evaluate at 0 the plane fitted at offset (n, k, d) with kernel (n, k).
+
+    The offsets are in units of the bandwidth, to which the ridge of the slopes is relative.
+    """
+    design = np.concatenate([np.ones((*kernel.shape, 1)), offset], axis=2)
+    weighted = kernel[:, :, None] * design
+    moments = weighted.transpose(0, 2, 1) @ design
+    slopes = np.arange(1, design.shape[2])
+    moments[:, slopes, slopes] += RIDGE * kernel.sum(axis=1)[:, None]
+    at_origin = np.zeros((len(kernel), design.shape[2], 1))
+    at_origin[:, 0] = 1.0
+    return (weighted @ np.linalg.solve(moments, at_origin))[:, :, 0]

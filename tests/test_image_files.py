@@ -16,17 +16,19 @@ import rigs
 
 from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.files import image_files as images
 from fluoro_calib_ros.files import tiff
 from fluoro_calib_ros.files.calibration import save_calibration
-from fluoro_calib_ros.files.image_files import IMAGES, correct_images
+from fluoro_calib_ros.files.image_files import correct_images
+from fluoro_calib_ros.files.image_formats import IMAGE_SUFFIXES
+from fluoro_calib_ros.files.image_reading import ImageSource
+from fluoro_calib_ros.files.image_writing import write_video
 from fluoro_calib_ros.images.codec import decode, encode
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.simulation.bead_images import bead_image
 
 SIZE = (128, 96)
 BEADS = [[30.2, 20.9], [60.5, 50.1], [100.0, 80.4], [20.3, 75.7]]
-LOSSLESS = [e for e in IMAGES if e not in ('.jpg', '.jpeg')]
+LOSSLESS = [e for e in IMAGE_SUFFIXES if e not in ('.jpg', '.jpeg')]
 
 
 def image_of(number=0, dtype=np.uint8):
@@ -139,7 +141,7 @@ def test_image_file(one, corrector, tmp_path, capfd, ending, dtype):
 def test_formats_are_those_of_the_names(one, corrector, tmp_path):
     """From any to any; jpg loses little."""
     (tmp_path / 'in.bmp').write_bytes(encode(image_of(), '.bmp'))
-    for ending in IMAGES:
+    for ending in IMAGE_SUFFIXES:
         out = tmp_path / f'out{ending}'
         assert correct(tmp_path / 'in.bmp', one, out) == 0
         got = decode(out.read_bytes()).astype(float)
@@ -161,7 +163,7 @@ def test_cubic_is_another_image(one, corrector, tmp_path):
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 def test_stack(one, corrector, tmp_path, monkeypatch, dtype):
     """Page by page, however many are read at once."""
-    monkeypatch.setattr('fluoro_calib_ros.files.image_files.AT_ONCE', 3 * 128 * 96)
+    monkeypatch.setattr('fluoro_calib_ros.files.image_reading.MAX_BATCH_BYTES', 3 * 128 * 96)
     pages = stack_of(8, dtype)
     assert cv2.imwritemulti(str(tmp_path / 'in.tif'), pages)
     assert correct(tmp_path / 'in.tif', one, tmp_path / 'out.tiff') == 0
@@ -178,11 +180,8 @@ def test_tiff_with_large_offsets(tmp_path, monkeypatch, large, order):
     if large:
         monkeypatch.setattr(tiff, 'CLASSIC_BYTES', 0)
     pages = stack_of(3, np.uint16)
-    with open(tmp_path / 'x.tif', 'wb') as file:
-        writer = tiff.TiffWriter(file, 3, pages[0].nbytes)
-        for page in pages:
-            writer.write(page)
-    content = (tmp_path / 'x.tif').read_bytes()
+    content = tiff_of(pages)
+    (tmp_path / 'x.tif').write_bytes(content)
     assert struct.unpack('<H', content[2:4])[0] == (43 if large else 42)
     assert tiff.count_pages(tmp_path / 'x.tif') == 3
     ok, got = cv2.imreadmulti(str(tmp_path / 'x.tif'), flags=cv2.IMREAD_UNCHANGED)
@@ -305,6 +304,26 @@ def said(capfd, *arguments):
     return err
 
 
+def tiff_of(pages):
+    """Bytes of a stack as it is written here."""
+    file = io.BytesIO()
+    with tiff.StackWriter(file, len(pages), pages[0].nbytes) as writer:
+        for page in pages:
+            writer.write(page)
+    return file.getvalue()
+
+
+def in_a_circle(content):
+    """A TIFF file whose last page is followed by its first one."""
+    content = bytearray(content)
+    first = position = struct.unpack_from('<I', content, 4)[0]
+    while position:
+        link = position + 2 + 12 * struct.unpack_from('<H', content, position)[0]
+        position = struct.unpack_from('<I', content, link)[0]
+    content[link : link + 4] = struct.pack('<I', first)
+    return bytes(content)
+
+
 def flipped(content):
     content = bytearray(content)
     content[len(content) // 2] ^= 0x55
@@ -313,6 +332,7 @@ def flipped(content):
 
 PNG = encode(image_of(), '.png')
 TIF = cv2.imencodemulti('.tif', stack_of(4, np.uint16))[1].tobytes()
+PLAIN_TIF = tiff_of(stack_of(4, np.uint16))
 COLOUR = cv2.imencode('.png', np.stack([image_of(), image_of(1), image_of(2)], axis=-1))[
     1
 ].tobytes()
@@ -327,6 +347,9 @@ BAD = {  # file: content, what is said
     'cut.pgm': (encode(image_of(), '.pgm')[:-200], 'damaged'),
     'cut.tif': (TIF[: len(TIF) * 2 // 3], 'it is cut off or damaged'),
     'cut_little.tif': (TIF[:-5], 'page 4 of 4 is damaged or cut off'),
+    'cut_plain.tif': (PLAIN_TIF[: len(PLAIN_TIF) * 2 // 3], 'it is cut off or damaged'),
+    'cut_plain_little.tif': (PLAIN_TIF[:-5], 'page 4 of 4 is damaged or cut off'),
+    'circle.tif': (in_a_circle(PLAIN_TIF), 'it is cut off or damaged'),
     'head.tif': (TIF[:3], 'this is no TIFF file'),
     'text.tif': (b'this is text', 'this is no TIFF file'),
     'text.avi': (b'this is text', 'no video that can be read'),
@@ -400,10 +423,10 @@ def test_outputs_that_cannot_be(one, both, tmp_path, capfd):
         (eight, 'folder', 'this is a folder'),
         (deep, 'x.jpg', '16 bits cannot be written as jpg'),
         (deep, 'x.bmp', '16 bits cannot be written as bmp'),
-        (stack, 'x.png', 'a stack cannot be written as .png, take tif, tiff'),
+        (stack, 'x.png', 'a stack cannot be written as .png, use tif, tiff'),
         (stack, 'x.avi', 'a stack cannot be written as .avi'),
-        (video, 'x.mp4', '16 bits cannot be written as mp4, take avi or mkv'),
-        (video, 'x.png', 'a video cannot be written as .png, take tif, tiff, avi, mkv, mp4'),
+        (video, 'x.mp4', '16 bits cannot be written as mp4, use avi or mkv'),
+        (video, 'x.png', 'a video cannot be written as .png, use tif, tiff, avi, mkv, mp4'),
         (tmp_path / 'empty', 'x', 'there are no images in this folder'),
         (tmp_path / 'nothing.png', 'x.png', 'there is no such file'),
         (tmp_path / 'nothing.avi', 'x.avi', 'there is no such file'),
@@ -460,5 +483,6 @@ def test_odd_sizes_of_videos(tmp_path):
     cv2.imwritemulti(str(tmp_path / 'x.tif'), [image_of()[:95]] * 2)
     with pytest.raises(DataError, match='a stack cannot be'):
         correct_images(tmp_path / 'x.tif', tmp_path / 'x.avi', ImageCorrector(calibration))
-    with pytest.raises(DataError, match='128 x 95 px, both have to be even'):
-        images._write_video(tmp_path / 'x.avi', 1, 25.0, iter([('x', image_of()[:95])]), None)
+    with pytest.raises(DataError, match='128 x 95 px, both must be even'):
+        odd = ImageSource('video', 1, iter([('x', image_of()[:95])]), 25.0)
+        write_video(tmp_path / 'x.avi', odd, lambda *_: None)

@@ -54,19 +54,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Correct image points or images. Raises DataError."""
-    from ..files.image_files import IMAGES, VIDEOS, ending_of, is_images
+    from ..files.image_formats import (
+        IMAGE_SUFFIXES,
+        VIDEO_CODECS,
+        is_image_source,
+        listed,
+        suffix_of,
+    )
     from ..jobs.sources import read_calibrations
 
     names = None if arguments.fluoroscope is None else [arguments.fluoroscope]
     calibrations = read_calibrations(arguments.calibration, names)
-    if is_images(arguments.source):
+    if is_image_source(arguments.source):
         _correct_images(arguments, calibrations)
-    elif ending_of(arguments.source) in POINTS or not arguments.source.exists():
+    elif suffix_of(arguments.source) in POINTS or not arguments.source.exists():
         _correct_points(arguments, calibrations)  # reports a missing file
     else:
-        known = ', '.join(ending[1:] for ending in ('.csv', *IMAGES, *VIDEOS))
+        known = listed(('.csv', *IMAGE_SUFFIXES, *VIDEO_CODECS))
         raise DataError(
-            f'{arguments.source}: files with the ending {ending_of(arguments.source)} cannot be '
+            f'{arguments.source}: files with the ending {suffix_of(arguments.source)} cannot be '
             f'read, only {known} and folders of images'
         )
 

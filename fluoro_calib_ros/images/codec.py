@@ -1,4 +1,6 @@
-"""Grey images in the formats of image files, in memory: what is damaged is told, not shown half."""
+"""Grey images in the formats of image files, in memory. Damaged files are refused."""
+
+from __future__ import annotations
 
 import zlib
 
@@ -7,42 +9,40 @@ import numpy as np
 
 from ..errors import DataError
 
-PNG = b'\x89PNG\r\n\x1a\n'
-# of compression: higher ones take several times as long for a few per cent of an image with noise
-PNG_LEVEL = 1
+PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
+# Higher levels take several times as long and save a few per cent of an image with noise.
+PNG_COMPRESSION = 1
+EIGHT_BIT_SUFFIXES = ('.jpg', '.jpeg', '.bmp')
 
-# What is wrong is told by who decodes, in one sentence: OpenCV's own lines beside it would be a
-# second one.
+# The caller reports errors in one sentence; OpenCV would print lines of its own.
 cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 
 
-def decode(content):
-    """Grey image (h, w) uint8 or uint16 of the bytes of an image file: PNG, JPEG, TIFF (its first
-    page), BMP, PGM.
+def decode(content: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
+    """Grey image (h, w) of uint8 or uint16 from the bytes of an image file.
 
-    An image with colours that are all the same is grey. Raises DataError where content is no
-    image, is damaged or cut off, as far as its format tells: PNG has checksums, the others tell
-    where they end.
+    The formats are PNG, JPEG, TIFF (the first page), BMP and PGM. An image whose colours are all
+    equal is grey. Raises DataError if the content is no image, is damaged or is cut off, as far
+    as its format shows it: PNG has checksums, the others an end.
     """
-    content = np.frombuffer(content, dtype=np.uint8)
-    if not len(content):
+    data = np.frombuffer(content, dtype=np.uint8)
+    if not len(data):
         raise DataError('the image is empty, it has no data')
-    if content[: len(PNG)].tobytes() == PNG:
-        _check_png(memoryview(content))
+    if data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE:
+        _check_png(memoryview(data))
     try:
-        image = cv2.imdecode(content, cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:
         image = None
     if image is None:
         raise DataError('this is no image that can be decoded, or it is damaged')
-    return grey(image)
+    return as_grey(image)
 
 
-def grey(image):
-    """Image (h, w) of an image (h, w) or (h, w, channels) uint8 or uint16 whose colours are all
-    the same.
+def as_grey(image: np.ndarray) -> np.ndarray:
+    """Grey image (h, w) from an image (h, w) or (h, w, channels) with equal colours.
 
-    Raises DataError where they are not, or where the pixels are of another type.
+    Raises DataError if the colours differ, or if the pixels are not uint8 or uint16.
     """
     if image.dtype not in (np.uint8, np.uint16):
         raise DataError(f'the image has pixels of {image.dtype}, not of 8 or 16 bits')
@@ -51,43 +51,39 @@ def grey(image):
     first = image[:, :, 0]
     if image.shape[2] >= 3 and not all(np.array_equal(first, image[:, :, k]) for k in (1, 2)):
         raise DataError(
-            'this is a colour image, it has to be made grey before: which of its colours are X-rays is not '
-            'known here'
+            'this is a colour image, convert it to grey first: it is not known which of its '
+            'colours show X-rays'
         )
     return np.ascontiguousarray(first)
 
 
-def encode(image, ending, quality=95):
-    """Bytes of an image file of image (h, w) uint8 or uint16: ending such as '.png'; quality of
-    JPEG, 1 to 100.
+def encode(image: np.ndarray, suffix: str, quality: int = 95) -> bytes:
+    """Bytes of an image file of an image (h, w) of uint8 or uint16.
 
-    Raises DataError where the format does not hold that many bits.
+    suffix, such as '.png', is the format; quality, from 1 to 100, is that of JPEG. Raises
+    DataError if the format cannot hold 16 bits.
     """
-    if image.dtype == np.uint16 and ending in EIGHT_BITS:
-        raise DataError(f'an image of 16 bits cannot be written as {ending[1:]}, take png or tif')
-    parameters = {'.png': [cv2.IMWRITE_PNG_COMPRESSION, PNG_LEVEL]}.get(ending, [])
-    if ending in ('.jpg', '.jpeg'):
+    if image.dtype == np.uint16 and suffix in EIGHT_BIT_SUFFIXES:
+        raise DataError(f'an image of 16 bits cannot be written as {suffix[1:]}, use png or tif')
+    parameters: list[int] = []
+    if suffix == '.png':
+        parameters = [cv2.IMWRITE_PNG_COMPRESSION, PNG_COMPRESSION]
+    elif suffix in ('.jpg', '.jpeg'):
         parameters = [cv2.IMWRITE_JPEG_QUALITY, quality]
-    return cv2.imencode(ending, image, parameters)[1].tobytes()
+    return bytes(cv2.imencode(suffix, image, parameters)[1].tobytes())
 
 
-EIGHT_BITS = ('.jpg', '.jpeg', '.bmp')
-
-
-def _check_png(content):
-    """Raise DataError unless all chunks of a PNG are there and have their checksums."""
-    at = len(PNG)
+def _check_png(content: memoryview) -> None:
+    """Raise DataError unless all chunks of a PNG are there, with their checksums."""
+    position = len(PNG_SIGNATURE)
     kind = b''
     while kind != b'IEND':
-        length = int.from_bytes(content[at : at + 4], 'big')
-        chunk = content[at + 4 : at + 8 + length]
-        checksum = content[at + 8 + length : at + 12 + length]
+        length = int.from_bytes(content[position : position + 4], 'big')
+        chunk = content[position + 4 : position + 8 + length]
+        checksum = content[position + 8 + length : position + 12 + length]
         if len(checksum) < 4:
             raise DataError('the PNG image is cut off')
         if zlib.crc32(chunk) != int.from_bytes(checksum, 'big'):
             raise DataError('the PNG image is damaged: a checksum is wrong')
-        at = at + 12 + length
+        position += 12 + length
         kind = bytes(chunk[:4])
-
-
-__all__ = ['decode', 'encode', 'grey']

@@ -1,53 +1,81 @@
-"""The corrected image: the same picture as the observed one, with every pixel where it would be
-without distortion.
+"""The corrected image: the observed picture with every pixel where it would be without distortion.
 
-The correction is a function of the observed pixel; an image is made the other way round, by asking
-for each of its own pixels where that was observed. That is the inverse of undistorted = observed -
-(du, dv)(observed), which has no formula. It is iterated once for every pixel, from the lookup grid
-that corrects points too, so that a bead in a corrected image lies where the corrected bead of the
-observed image lies. What is left for a frame is one remap of OpenCV.
+The correction is a function of the observed pixel, whereas an image needs the inverse: for each of
+its own pixels, the place where it was observed. This inverse of undistorted = observed - (du, dv)
+has no formula. It is iterated once for every pixel, on the lookup grid that also corrects points,
+so that a bead in a corrected image lies where the corrected bead of the observed image lies. Each
+image then takes a single remap of OpenCV.
 """
+
+from __future__ import annotations
+
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
 
+from ..calibration.result import FluoroscopeCalibration
+from ..distortion.grid import CorrectionGrid
 from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 
 INTERPOLATIONS = {'linear': cv2.INTER_LINEAR, 'cubic': cv2.INTER_CUBIC}
-LIMIT_PX = 0.01  # what the source of a pixel, corrected, may differ from that pixel
-STEP_PX = 0.001  # step below which a source is not iterated further
-# steps at most: whole ones, then half ones where those have not settled
-PLAIN = 12
-DAMPED = 60
-ROWS = 16  # that are iterated at once: they fit the cache, and no other thread waits for long
-NOWHERE = -10_000.0  # source of a pixel that has none: far off any image
+LIMIT_PX = 0.01  # largest difference between a pixel and its corrected source
+STEP_PX = 0.001  # a source is no longer iterated below this step
+# Number of steps: full ones, then half ones where those do not converge.
+FULL_STEPS = 12
+HALF_STEPS = 60
+# Rows that are iterated at once: they fit into the cache, and other threads do not wait for long.
+ROWS = 16
+NOWHERE = -10_000.0  # source of a pixel without one: far off any image
 SHARPNESS = -0.75  # of OpenCV's cubic convolution
 MAX_PX = 32_000  # longer side of an image: OpenCV holds whole pixels in 16 bits
 
 
 class ImageCorrector:
-    """Corrects the images of one fluoroscope by a map that is made once.
+    """Corrects the images of one fluoroscope by a map that is built once.
 
-    calibration: its FluoroscopeCalibration; interpolation: 'linear' or 'cubic'; border: grey value
-    where there is nothing to show. source (2, h, w) float32: columns and rows [px] of the observed
-    image at which the pixels of the corrected one are seen, NaN where there is none: off the
-    image, or where the correction folds it. mask (h, w) bool: where there is one. status (h, w)
-    uint8: OK, OUTSIDE of the calibrated area, or INVALID where there is no source. The sources are
-    exact to LIMIT_PX, and OpenCV takes them in steps of 1/32 px, so that an image is within 1/64
-    px of where it should be (cubic: 1/45 px). Any number of threads may share a corrector. Raises
-    DataError where interpolation is none of these.
+    The sources are exact to LIMIT_PX, and OpenCV rounds them to 1/32 px, so that an image is
+    within 1/64 px of where it should be (cubic: 1/45 px). Threads may share a corrector.
+
+    Parameters
+    ----------
+    calibration : FluoroscopeCalibration
+    interpolation : {'linear', 'cubic'}
+    border : int
+        Grey value where nothing was observed.
+
+    Attributes
+    ----------
+    calibration_id : str
+    image_size, shape : tuple of int
+        Width and height, and height and width [px].
+    source : ndarray
+        (2, h, w) of float32, columns and rows of the observed image at which the pixels of the
+        corrected one were seen [px]; NaN where there is none: off the image, or where the
+        correction folds it.
+    mask : ndarray
+        (h, w) of bool, where there is a source.
+    status : ndarray
+        (h, w) of uint8: OK, OUTSIDE of the calibrated area, or INVALID without a source.
+
+    Raises
+    ------
+    DataError
+        For an unknown interpolation, and for an image that is too large.
     """
 
-    def __init__(self, calibration, interpolation='linear', border=0):
+    def __init__(
+        self, calibration: FluoroscopeCalibration, interpolation: str = 'linear', border: int = 0
+    ) -> None:
         if interpolation not in INTERPOLATIONS:
             raise DataError(
                 f'the interpolation is one of {", ".join(INTERPOLATIONS)}, not {interpolation!r}'
             )
         if max(calibration.image_size) > MAX_PX:
             raise DataError(
-                f'an image of {_size(calibration.image_size)} px is too large, its sides may have '
-                f'{MAX_PX} px'
+                f'an image of {_size_text(calibration.image_size)} px is too large, its sides may '
+                f'have {MAX_PX} px'
             )
         self.calibration_id = calibration.calibration_id
         self.image_size = tuple(calibration.image_size)
@@ -58,26 +86,26 @@ class ImageCorrector:
         self.mask = self.status != CorrectionStatus.INVALID
         self._empty = np.flatnonzero(~self.mask)
         high = np.array(self.image_size, dtype=np.float32)[:, None, None] - 1
-        # A source in the outer half of a pixel at the rim has that pixel's value.
-        inside = np.where(self.mask, np.clip(self.source, 0, high), np.float32(NOWHERE))
-        self._map = cv2.convertMaps(
-            *(inside if interpolation == 'linear' else map(_for_cubic, inside)), cv2.CV_16SC2
-        )
+        # A source in the outer half of a pixel at the rim takes the value of that pixel.
+        u, v = np.where(self.mask, np.clip(self.source, 0, high), np.float32(NOWHERE))
+        if interpolation == 'cubic':
+            u = _cubic_coordinates(u)
+            v = _cubic_coordinates(v)
+        self._map = cv2.convertMaps(u, v, cv2.CV_16SC2)
 
-    def correct(self, image, out=None):
-        """The corrected image (h, w), of the type of image (h, w) uint8 or uint16.
+    def correct(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
+        """Correct an image (h, w) of uint8 or uint16; its rows need not be contiguous.
 
-        Rows of image may be longer in memory than they are in the image. out: contiguous array to
-        put it into, of the same shape and type and no part of image. Raises DataError where image
-        is not such an image.
+        out, if given, receives the corrected image; it must be contiguous, have the shape and
+        type of the image, and share no memory with it. Raises DataError for another image or out.
         """
         self.check(image)
         if out is None:
             out = np.empty(self.shape, dtype=image.dtype)
         elif out.shape != self.shape or out.dtype != image.dtype or not out.flags.c_contiguous:
             raise DataError(
-                f'the array for the corrected image has {out.shape} pixels of {out.dtype}, it must be '
-                f'contiguous and have {self.shape} of {image.dtype}'
+                f'the array for the corrected image has {out.shape} pixels of {out.dtype}, it '
+                f'must be contiguous and have {self.shape} of {image.dtype}'
             )
         if self.interpolation == 'linear':
             cv2.remap(
@@ -89,11 +117,11 @@ class ImageCorrector:
                 borderValue=self.border,
             )
         else:
-            self._cubic(image, out)
+            self._remap_cubic(image, out)
         return out
 
-    def check(self, image):
-        """Raise DataError unless image is one that can be corrected."""
+    def check(self, image: np.ndarray) -> None:
+        """Raise DataError unless an image can be corrected."""
         if image.ndim != 2:
             raise DataError(
                 f'the image is not grey, it has {" x ".join(map(str, image.shape))} values'
@@ -102,12 +130,12 @@ class ImageCorrector:
             raise DataError(f'the image has pixels of {image.dtype}, not of 8 or 16 bits')
         if image.shape != self.shape:
             raise DataError(
-                f'the image is {_size(image.shape[::-1])} px, but the calibration is for '
-                f'{_size(self.image_size)} px'
+                f'the image is {_size_text(image.shape[::-1])} px, but the calibration is for '
+                f'{_size_text(self.image_size)} px'
             )
 
-    def _cubic(self, image, out):
-        """What is needed beyond the rim, two pixels, is as the outermost ones are."""
+    def _remap_cubic(self, image: np.ndarray, out: np.ndarray) -> None:
+        """Remap with the two pixels needed beyond the rim equal to the outermost ones."""
         if image.dtype == np.uint8:  # OpenCV is three times as fast with 16 bits
             wide = cv2.remap(
                 image.astype(np.uint16),
@@ -121,76 +149,73 @@ class ImageCorrector:
         out.ravel()[self._empty] = self.border
 
 
-def _sources(grid, image_size):
-    """Observed pixels (2, h, w) float32 of the pixels of the corrected image, NaN where there are
-    none, and their status (h, w) uint8.
-    """
+def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Sources (2, h, w) of float32 and their status (h, w) of uint8, see ImageCorrector."""
     width, height = image_size
     source = np.empty((2, height, width), dtype=np.float32)
     status = np.empty((height, width), dtype=np.uint8)
     for start in range(0, height, ROWS):
         rows = np.arange(start, min(start + ROWS, height))
-        wanted = np.stack([np.tile(np.arange(width), len(rows)), np.repeat(rows, width)]).astype(
-            float
-        )
-        observed, state = _iterated(grid, wanted)
+        u = np.tile(np.arange(width), len(rows))
+        v = np.repeat(rows, width)
+        observed, row_status = _invert_correction(grid, np.stack([u, v]).astype(float))
         source[:, rows] = observed.reshape(2, -1, width)
-        status[rows] = state.reshape(-1, width)
-    folded = _folded(source)
-    status[folded] = CorrectionStatus.INVALID
+        status[rows] = row_status.reshape(-1, width)
+    status[_is_folded(source)] = CorrectionStatus.INVALID
     source[:, status == CorrectionStatus.INVALID] = np.nan
     return source, status
 
 
-def _iterated(grid, wanted):
-    """Observed pixels (2, n) whose corrected ones are wanted (2, n) [px], and their status (n,).
+def _invert_correction(
+    grid: CorrectionGrid, undistorted: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Observed pixels (2, n) of undistorted ones (2, n) [px], and their status (n,).
 
-    observed = wanted + (du, dv)(observed), again and again: each step leaves the part of the error
-    that the correction changes by a pixel, some hundredths. Off the image the correction goes on
-    as it is at the rim, so that a step too far comes back. Where it changes so much that whole
-    steps do not settle, half ones may.
+    The iteration is observed = undistorted + (du, dv)(observed). Each step leaves the fraction of
+    the error by which the correction changes per pixel, some hundredths. Off the image, the
+    correction continues as it is at the rim, so that a step too far comes back. Where it changes
+    so much that full steps do not converge, half steps may.
     """
     low = -0.5
     high = np.array(grid.image_size)[:, None] - 0.5
-    observed = wanted.copy()
-    left = np.arange(wanted.shape[1])
-    for number in range(PLAIN + DAMPED):
-        at = observed[:, left]
-        step = wanted[:, left] + grid.look_up(*np.clip(at, low, high))[0][:2] - at
-        observed[:, left] = at + (step if number < PLAIN else step / 2)
-        left = left[np.abs(step).max(axis=0) > STEP_PX]
-        if not len(left):
+    observed = undistorted.copy()
+    active = np.arange(undistorted.shape[1])
+    for number in range(FULL_STEPS + HALF_STEPS):
+        at = observed[:, active]
+        correction = grid.look_up(*np.clip(at, low, high))[0][:2]
+        step = undistorted[:, active] + correction - at
+        observed[:, active] = at + (step if number < FULL_STEPS else step / 2)
+        active = active[np.abs(step).max(axis=0) > STEP_PX]
+        if not len(active):
             break
     (du, dv, _), status = grid.look_up(*observed)  # off the image it is INVALID
-    error = np.abs(observed - (du, dv) - wanted).max(axis=0)
+    error = np.abs(observed - (du, dv) - undistorted).max(axis=0)
     status[~(error <= LIMIT_PX)] = CorrectionStatus.INVALID
     return observed, status
 
 
-def _folded(source):
-    """True (h, w) for pixels at which the sources (2, h, w) turn round: neighbours are seen
-    mirrored.
-    """
+def _is_folded(source: np.ndarray) -> np.ndarray:
+    """Whether (h, w) the neighbours of a pixel are seen mirrored by the sources (2, h, w)."""
     right = np.diff(source, axis=2)[:, :-1]
     down = np.diff(source, axis=1)[:, :, :-1]
-    turned = right[0] * down[1] - right[1] * down[0] <= 0
-    return np.pad(turned, ((0, 1), (0, 1))) | np.pad(turned, ((1, 0), (1, 0)))
+    folded = right[0] * down[1] - right[1] * down[0] <= 0
+    return np.pad(folded, ((0, 1), (0, 1))) | np.pad(folded, ((1, 0), (1, 0)))
 
 
-def _for_cubic(at):
-    """Coordinates to ask OpenCV's cubic convolution for, to see what is at coordinates at (h, w)
-    [px].
+def _cubic_coordinates(wanted: np.ndarray) -> np.ndarray:
+    """Coordinates at which OpenCV's cubic convolution shows what is at other ones (h, w) [px].
 
-    With its sharpness the first moment of its kernel is not the part of a pixel that it is asked
-    for: a straight ramp, and every blob, would be moved by up to 0.05 px.
+    With its sharpness, the first moment of the kernel is not the fraction of a pixel that it is
+    asked for: a straight ramp, and every blob, would be displaced by up to 0.05 px.
     """
     a = SHARPNESS
     x = np.linspace(0, 1, 1025)
     near = [((a + 2) * d - (a + 3)) * d * d + 1 for d in (x, 1 - x)]
     far = [((a * d - 5 * a) * d + 8 * a) * d - 4 * a for d in (1 + x, 2 - x)]
-    whole = np.floor(at)
-    return (whole + np.interp(at - whole, near[1] + 2 * far[1] - far[0], x)).astype(np.float32)
+    moment = near[1] + 2 * far[1] - far[0]
+    whole = np.floor(wanted)
+    return (whole + np.interp(wanted - whole, moment, x)).astype(np.float32)
 
 
-def _size(size):
+def _size_text(size: Sequence[int]) -> str:
     return f'{size[0]} x {size[1]}'

@@ -1,0 +1,28 @@
+"""The formats of images, stacks and videos, by the suffix of a file name."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable
+from pathlib import Path
+
+STACK_SUFFIXES = ('.tif', '.tiff')
+IMAGE_SUFFIXES = ('.png', *STACK_SUFFIXES, '.jpg', '.jpeg', '.bmp', '.pgm')
+LOSSLESS_CODEC = 'FFV1'
+# Codec by which videos are written. Players know MP4 with lossy codecs only.
+VIDEO_CODECS = {'.avi': LOSSLESS_CODEC, '.mkv': LOSSLESS_CODEC, '.mp4': 'mp4v'}
+
+
+def suffix_of(path: str | os.PathLike[str]) -> str:
+    """Suffix of a path in lower case, with its dot."""
+    return Path(path).suffix.lower()
+
+
+def is_image_source(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is a folder, or a file with the suffix of an image or a video."""
+    return os.path.isdir(path) or suffix_of(path) in (*IMAGE_SUFFIXES, *VIDEO_CODECS)
+
+
+def listed(suffixes: Iterable[str]) -> str:
+    """Suffixes as a text, without their dots."""
+    return ', '.join(suffix[1:] for suffix in suffixes)

@@ -1,3 +1,7 @@
-"""Photogrammetry: collinearity, resection, robust bundle adjustment and precision. Arrays in,
-arrays out.
+"""Photogrammetry: collinearity, resection, robust bundle adjustment, precision and diagnosis.
+
+The functions take and return numpy arrays and frozen dataclasses. A bundle adjustment passes
+through these modules: `network` (data), `unknowns` (layout and values), `normal_equations`,
+`elimination` (solution), `adjustment` (Levenberg-Marquardt), `noise_estimation` (around it),
+`precision`, then `diagnosis` and `outliers`.
 """

@@ -263,7 +263,7 @@ class EliminatePoints(Elimination):
         self.layout = network.layout.without_points
 
     def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
-        """See Elimination."""
+        """Blocks of object points, bordered by exposures and free global unknowns."""
         network = self.network
         m = network.n_exposures
         n = network.n_points
@@ -283,16 +283,16 @@ class EliminatePoints(Elimination):
         return BorderedSystem(equations.pp, border, rest, equations.p, rest_right)
 
     def by_kind(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> ByKind:
-        """See Elimination."""
+        """Values of object points (n, 3, ...) and of the remaining unknowns (q, ...), by kind."""
         exteriors = x_rest[self.layout.blocks].reshape(-1, EXTERIOR_SIZE, *x_rest.shape[1:])
         return ByKind(exteriors, x_blocks, self._globals_of(x_rest))
 
     def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See Elimination."""
+        """The values themselves, and zeros for the remaining unknowns."""
         return values, np.zeros((self.layout.size, values.shape[2]))
 
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
-        """See Elimination."""
+        """Covariances of object points from the blocks, of exposures from the rest."""
         rows = self.layout.block_rows
         ee, gg, eg = self._split_rest(covariance)
         pairs, pg = self._split_border(covariance.border)
@@ -330,7 +330,7 @@ class EliminateExposures(Elimination):
         self.n_places = len(network.relative) + 1
 
     def bordered_system(self, equations: NormalEquations) -> BorderedSystem:
-        """See Elimination."""
+        """Blocks of cells, bordered by object points and free global unknowns."""
         rest = self._rest_matrix(equations.pp, equations.pg, equations)
         if equations.gauge is not None:
             self._fix_gauge(rest, equations.gauge.points)
@@ -375,19 +375,19 @@ class EliminateExposures(Elimination):
         return border.reshape(self.n_cells, EXTERIOR_SIZE * self.n_places, -1)
 
     def by_kind(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> ByKind:
-        """See Elimination."""
+        """Values of the cells (k, s, ...) and of the remaining unknowns (q, ...), by kind."""
         points = x_rest[self.layout.blocks].reshape(-1, POINT_SIZE, *x_rest.shape[1:])
         return ByKind(self._of_exposures(x_blocks), points, self._globals_of(x_rest))
 
     def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """See Elimination."""
+        """Zeros for the cells, and the values in the rows of the object points."""
         columns = values.shape[2]
         rest = np.zeros((self.layout.size, columns))
         rest[self.layout.blocks] = values.reshape(-1, columns)
         return np.zeros((self.n_cells, EXTERIOR_SIZE * self.n_places, columns)), rest
 
     def covariance_blocks(self, covariance: BorderedCovariance) -> CovarianceBlocks:
-        """See Elimination."""
+        """Covariances of exposures from the cells, of object points from the rest."""
         pp, gg, pg = self._split_rest(covariance)
         border = self._of_exposures(covariance.border)
         pairs, eg = self._split_border(border)

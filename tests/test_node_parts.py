@@ -1,6 +1,4 @@
-"""Parts of the nodes that need no graph: images of odd layouts, calibrations that are none, and
-taking them over.
-"""
+"""Parts of the nodes that need no graph: image layouts, invalid calibrations, requests."""
 
 import threading
 from array import array
@@ -66,8 +64,8 @@ def test_rows_of_16_bits_may_begin_at_any_byte(calibration, gap):
     assert np.array_equal(corrector.correct(image), corrector.correct(pixels))
 
 
-def test_names_of_any_length_are_cut_short(calibration):
-    """A sentence goes into the log, and into the diagnostics every second."""
+def test_long_names_are_truncated_in_messages(calibration):
+    """An error message goes into the log, and into the diagnostics every second."""
     width, height = SIZE
     message = Image(width=width, height=height, encoding='x' * 10**6, step=width)
     with pytest.raises(Refused) as refused:
@@ -89,16 +87,14 @@ def test_names_of_any_length_are_cut_short(calibration):
     ids=lambda x: x if isinstance(x, str) else '',
 )
 def test_calibration_with_impossible_numbers_is_refused(calibration, change, said):
-    """What no file can hold comes in by no message either, though its id belongs to it."""
+    """A message is refused for what a file is refused for, although its id matches."""
     message = message_from_calibration(replace(calibration, **change))
     with pytest.raises(DataError, match=f'calibration of fluoroscope a: the array {said}'):
         calibration_from_message(message)
 
 
 class Inbox:
-    """A CalibrationInput of one fluoroscope, with what it has taken and refused; preparing waits for
-    go.
-    """
+    """A CalibrationInput of one fluoroscope that records its calls; preparing waits for .go."""
 
     def __init__(self, fault=None):
         self.taken = []
@@ -140,7 +136,7 @@ class Inbox:
         return calibration.stamp_ns
 
 
-def test_of_a_flood_of_calibrations_one_is_prepared_at_a_time_and_the_last_one_stays(calibration):
+def test_calibrations_are_prepared_one_at_a_time_and_the_last_one_stays(calibration):
     inbox = Inbox()
     for number in range(50):
         inbox.put(message_from_calibration(replace(calibration, stamp_ns=number)))
@@ -156,7 +152,7 @@ def test_of_a_flood_of_calibrations_one_is_prepared_at_a_time_and_the_last_one_s
 
 
 @pytest.mark.parametrize('fault', [MemoryError(), IndexError('of some line')])
-def test_calibration_that_cannot_be_prepared_is_refused_whatever_the_reason(calibration, fault):
+def test_calibration_that_cannot_be_prepared_is_refused(calibration, fault):
     inbox = Inbox(fault)
     inbox.go.set()
     inbox.put(message_from_calibration(calibration))
@@ -214,11 +210,11 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
         (np.inf, 'at most 86400, not inf'),
     ],
 )
-def test_timeout_for_which_nobody_can_wait(seconds, said):
+def test_impossible_timeout_is_refused(seconds, said):
     with pytest.raises(ValueError, match=f'timeout_sec is a time in .*{said}'):
         check_timeout(seconds)
 
 
-def test_home_of_nobody():
-    with pytest.raises(DataError, match='^~nobody_of_that_name/x: there is no such home folder$'):
+def test_unknown_home_folder_is_refused():
+    with pytest.raises(DataError, match=r'^~nobody_of_that_name/x: there is no such home folder$'):
         expand_path('~nobody_of_that_name/x')

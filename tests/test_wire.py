@@ -60,7 +60,7 @@ def corrected(n, seed=0):
 
 
 def message_of(source, calibration_id, arrays):
-    """The CorrectedObservations message as rclpy makes it."""
+    """Return the CorrectedObservations message as rclpy makes it."""
     message = CorrectedObservations(
         header=source.header,
         frame_number=source.frame_number,
@@ -139,7 +139,7 @@ def test_corrected_observations_are_read_as_rclpy_writes_them(n, frame_id, _):
 
 
 def points_content(n, frame_id, ids):
-    """Content of a ReconstructedPoints message of n points."""
+    """Return the content of a ReconstructedPoints message of n points."""
     rng = np.random.default_rng(n)
     rays = rng.integers(0, 3, n)
     points = IntersectedPoints(

@@ -1,6 +1,4 @@
-"""Fixtures of the tests with real nodes: a ROS domain for the session, graphs, and a calibration
-to start from.
-"""
+"""Fixtures of the tests with real nodes: a ROS domain, graphs, and a calibration."""
 
 import shutil
 import subprocess
@@ -19,7 +17,7 @@ def pytest_collection_modifyitems(items):
 
 @pytest.fixture(scope='session')
 def ros(tmp_path_factory):
-    """Rclpy in a ROS domain of this session's own; nodes inherit it by the environment."""
+    """Initialise rclpy in a ROS domain of this session; nodes inherit it by the environment."""
     import rclpy
 
     domain, lock = free_domain()
@@ -53,7 +51,7 @@ def module_graph(ros, request, tmp_path_factory):
 
 @pytest.hookimpl(hookwrapper=True)
 def pytest_runtest_makereport(item):
-    """Show what the nodes said last, and where they were, when a test fails."""
+    """Show the last messages of the nodes, and where their threads are, when a test fails."""
     report = (yield).get_result()
     if report.failed:
         for node in item.listchain():
@@ -65,19 +63,19 @@ def pytest_runtest_makereport(item):
 
 @pytest.fixture(scope='session')
 def exposures():
-    """Frames {fluoroscope: [Frame, ...]} of bags/calibration."""
+    """Frames of bags/calibration by fluoroscope."""
     return read_frames(BAGS / 'calibration').frames
 
 
 @pytest.fixture(scope='session')
 def tracking():
-    """Frames {fluoroscope: [Frame, ...]} of bags/tracking."""
+    """Frames of bags/tracking by fluoroscope."""
     return read_frames(BAGS / 'tracking').frames
 
 
 @pytest.fixture(scope='session')
 def by_command(tmp_path_factory):
-    """Two folders into which the command line has calibrated bags/calibration, one as the other."""
+    """Two folders, each with a calibration of bags/calibration by the command line."""
     folders = [tmp_path_factory.mktemp('by_command') for _ in range(2)]
     commands = [
         subprocess.Popen(
@@ -101,5 +99,5 @@ def by_command(tmp_path_factory):
 
 @pytest.fixture
 def calibrated(by_command, tmp_path):
-    """Folder with a calibration of a and b, of which a test may do what it likes."""
+    """Folder with a calibration of a and b that a test may change."""
     return shutil.copytree(by_command[0], tmp_path / 'calibrated')

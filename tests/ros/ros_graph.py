@@ -1,5 +1,5 @@
-"""Real nodes as processes, and a client that listens, publishes, calls and waits for conditions
-with a deadline.
+"""Real nodes as processes, and a client that publishes, subscribes, calls and waits with a
+deadline.
 """
 
 import fcntl
@@ -80,11 +80,10 @@ SERVICES = {
 
 
 def free_domain():
-    """A ROS domain that nobody on this machine uses, and the open file that keeps it for this
-    session.
-    """
+    """Return an unused ROS domain of this machine, and the open lock file that reserves it."""
     for domain in (1 + (os.getpid() + i) % 100 for i in range(100)):
-        lock = open(Path(tempfile.gettempdir()) / f'fluoro_calib_test_domain_{domain}.lock', 'a')
+        path = Path(tempfile.gettempdir()) / f'fluoro_calib_test_domain_{domain}.lock'
+        lock = open(path, 'a')  # noqa: SIM115 the lock is held by the caller
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # other sessions of these tests
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as port:
@@ -98,13 +97,13 @@ def free_domain():
 
 
 def entry_point(node):
-    """Command that runs a node, or the command line fluoro-calib."""
+    """Return the command that runs a node, or the command line fluoro-calib."""
     module = 'fluoro_calib_ros.cli' if node == 'cli' else f'fluoro_calib_ros.nodes.{node}'
     return [sys.executable, '-m', module]
 
 
 class Process:
-    """A node as a process of its own; what it prints is in .log."""
+    """A node as a process of its own; its output is in .log."""
 
     def __init__(self, command, path):
         self.path = path
@@ -127,7 +126,7 @@ class Process:
         return self._process.poll() is None
 
     def wait(self, seconds=DEADLINE):
-        """Exit status of the process once it has ended."""
+        """Return the exit status of the process once it has ended."""
         return self._process.wait(seconds)
 
     def interrupt(self):
@@ -140,7 +139,7 @@ class Process:
             self.wait()
 
     def end(self, seconds=10.0):
-        """Interrupt the process, and kill it if that is not enough; returns its exit status."""
+        """Interrupt the process, kill it where that fails, and return its exit status."""
         if self.running:
             self.interrupt()
         try:
@@ -162,8 +161,8 @@ class Graph:
         self.client = Client(self.namespace)
 
     def start(self, node, parameters=None, remaps=None, wait=True):
-        """Start a node with {parameter: value} and {from: to}; returns its Process once the client
-        is connected.
+        """Start a node with parameters and remaps; returns its Process once the client is
+        connected.
         """
         number = len(self.processes)
         arguments = ['--ros-args']
@@ -198,8 +197,9 @@ class Graph:
         return nodes
 
     def whole_chain(self, directory, reconstruction=None, **parameters):
-        """Start the three nodes with the calibrations and the orientation of a folder, and wait
-        until points can come out; returns the processes by name.
+        """Start the three nodes with the calibrations and the orientation of a folder.
+
+        Returns the processes by name once points can be reconstructed.
         """
         nodes = {
             **self.both_nodes(directory, **parameters),
@@ -216,9 +216,7 @@ class Graph:
         return nodes
 
     def wait_for_readers(self, count):
-        """Wait until the correction node knows so many readers of every output: what it publishes
-        now reaches them.
-        """
+        """Wait until the correction node has discovered `count` readers of every output."""
         for name in NAMES:
             self.client.wait_for_diagnostics(
                 'correction_node', lambda s: int(value_of(s, 'readers') or 0) >= count, name
@@ -233,8 +231,9 @@ class Graph:
         assert player.wait() == 0, player.log
 
     def last_words(self, end):
-        """(title, text): what the client heard last of every node, and what the nodes printed;
-        where they are to end, with the places where their threads are.
+        """Return (title, text) of the last statuses and of the logs of all nodes.
+
+        end: whether the nodes are aborted, so that their logs show where the threads are.
         """
         for process in self.processes if end else ():
             process.abort()
@@ -254,9 +253,7 @@ class Graph:
 
 
 class Client(Node):
-    """A user of the graph. What comes on a topic is in messages[topic], from the time at which it
-    is listened to.
-    """
+    """A user of the graph; messages[topic] collects the messages since listen(topic)."""
 
     def __init__(self, namespace):
         super().__init__('client', namespace=namespace)
@@ -283,7 +280,7 @@ class Client(Node):
     # -- waiting
 
     def wait_until(self, condition, seconds=DEADLINE, what='the condition'):
-        """Spin until condition() is true; returns its value. Fails when the time is up."""
+        """Spin until condition() is true and return its value; fail when the time is up."""
         end = time.monotonic() + seconds
         self._spinner.spin_once(timeout_sec=0)
         while True:
@@ -294,21 +291,21 @@ class Client(Node):
             self._spinner.spin_once(timeout_sec=0.1)
 
     def publish_in_step(self, messages, came, ahead=OBSERVATION_DEPTH // 4):
-        """Publish (fluoroscope, message) one after the other, never more than so many ahead of
-        came(), the number that has come back or never will: what is lost is then not lost in a
-        queue.
+        """Publish (fluoroscope, message) pairs, never more than `ahead` ahead of came().
+
+        came(): number of messages that were answered or never will be. So none is lost in a queue.
         """
         for number, (name, message) in enumerate(messages):
             self.wait_until(lambda: number - came() < ahead, what='the nodes to keep up')
             self.publish_message(name, message)
 
     def result_of(self, future, seconds=DEADLINE, what='an answer'):
-        """Result of a future."""
+        """Return the result of a future."""
         self.wait_until(future.done, seconds, what)
         return future.result()
 
     def connect(self, node, process):
-        """Wait until everything of a node that has just been started is connected with the client."""
+        """Wait until everything of a node that was just started is connected with the client."""
 
         def connected():
             assert process.running, f'{node} ended: {process.log}'
@@ -328,9 +325,10 @@ class Client(Node):
         self.wait_until_known_to(node)
 
     def wait_until_known_to(self, node):
-        """Wait until a node knows all that the client has made so far: what it publishes before
-        may be lost, and the answers to what it asks. DDS tells of endpoints in the order in which
-        they are made, so that a node which answers a question of the newest knows the others too.
+        """Wait until a node has discovered all endpoints that the client has made so far.
+
+        Until then, messages and answers may be lost. DDS announces endpoints in the order in which
+        they are made: a node that answers a request of the newest client knows the others, too.
         """
         newest = self.create_client(GetParameterTypes, f'{node}/get_parameter_types')
         answers = []
@@ -347,9 +345,7 @@ class Client(Node):
         self.destroy_client(newest)
 
     def subscriptions_matched(self, node):
-        """Whether a node listens to the observations, and what is published now reaches all who
-        listen.
-        """
+        """Return whether a node subscribes to the observations and all subscribers match."""
         for name, output in self._outputs.items():
             readers = self.get_subscriptions_info_by_topic(
                 f'{self.get_namespace()}/{name}/target_observations'
@@ -363,7 +359,7 @@ class Client(Node):
     # -- topics
 
     def listen(self, topic):
-        """Collect the messages of a topic; returns the list they come into."""
+        """Collect the messages of a topic; returns the list that they are appended to."""
         kind, qos = TOPICS[topic.rpartition('/')[2]]
         collected = self.messages[topic] = []
         self.create_subscription(kind, topic, collected.append, qos)
@@ -375,7 +371,7 @@ class Client(Node):
                 self.statuses[status.name.removeprefix(self.get_namespace() + '/')] = status
 
     def status(self, name='a'):
-        """Newest CalibrationStatus of a fluoroscope, None before the first."""
+        """Return the newest CalibrationStatus of a fluoroscope, None before the first."""
         return (
             self.messages[f'{name}/calibration_status'][-1]
             if self.messages[f'{name}/calibration_status']
@@ -383,12 +379,12 @@ class Client(Node):
         )
 
     def wait_for_status(self, condition, name='a', what='a status'):
-        """Newest CalibrationStatus once it fulfils condition(status)."""
+        """Return the newest CalibrationStatus once it fulfils condition(status)."""
         self.wait_until(lambda: self.status(name) and condition(self.status(name)), what=what)
         return self.status(name)
 
     def wait_for_diagnostics(self, node, condition, name='a', what='a diagnostic'):
-        """Newest DiagnosticStatus of a node about a fluoroscope once it fulfils condition(status)."""
+        """Return the newest DiagnosticStatus of a fluoroscope that fulfils condition(status)."""
         key = f'{node}: {name}'
         self.wait_until(
             lambda: key in self.statuses and condition(self.statuses[key]),
@@ -397,18 +393,17 @@ class Client(Node):
         return self.statuses[key]
 
     def publish(self, frame):
-        """Publish a Frame, or a TargetObservations message as it is, of a fluoroscope."""
+        """Publish a Frame."""
         self._outputs[frame.fluoroscope].publish(message_from_frame(frame))
 
     def publish_message(self, name, message):
         self._outputs[name].publish(message)
 
     def stream(self, pairs, rate, answered=None):
-        """Publish pairs of frames at a rate while the client spins, until end_stream(); .published
-        counts them.
+        """Publish pairs of frames at a rate while the client spins, until end_stream().
 
-        answered() pairs have come back: never more than half a queue ahead of them, so that
-        nothing can be lost by design where the machine is too busy for the rate.
+        .published counts them. answered(): number of pairs that have come back; the stream is
+        never more than half a queue ahead of it, so that an overloaded machine loses nothing.
         """
         self.published = 0
 
@@ -429,22 +424,22 @@ class Client(Node):
     # -- services and action
 
     def expect(self, kind, service):
-        """Make the client of a service, before its node is started: see wait_until_known_to()."""
+        """Make the client of a service before its node is started: see wait_until_known_to()."""
         self._callers[service] = self.create_client(kind, service)
 
     def call_async(self, kind, service, **fields):
-        """Future of the answer of a service that was expected."""
+        """Return the future of the answer of an expected service."""
         self.wait_until(self._callers[service].service_is_ready, what=f'the service {service}')
         return self._callers[service].call_async(kind.Request(**fields))
 
     def call(self, kind, service, **fields):
-        """Answer of a service."""
+        """Return the answer of a service."""
         return self.result_of(
             self.call_async(kind, service, **fields), what=f'the answer of {service}'
         )
 
     def goal(self, **fields):
-        """Handle of a goal that has been accepted; its feedback comes into .feedback."""
+        """Return the handle of an accepted goal; its feedback is collected in .feedback."""
         self.feedback = []
         feedback = self.feedback
         handle = self.result_of(
@@ -462,14 +457,12 @@ class Client(Node):
 
 
 def value_of(status, key):
-    """Value of a key of a DiagnosticStatus, '' where there is none."""
+    """Return the value of a key of a DiagnosticStatus, '' without it."""
     return next((v.value for v in status.values if v.key == key), '')
 
 
 def standing(frame, count, first=1, rate=60.0, shift=0.0, noise=0.02, start_ns=10**18):
-    """Frames of a phantom that stands as in frame, in a stream of rate; shift moves it by that
-    many px a frame.
-    """
+    """Return a stream of frames of a standing phantom; shift moves it by that many px a frame."""
     rng = np.random.default_rng(0)
     for i in range(count):
         uv = frame.uv + rng.normal(0, noise, frame.uv.shape) + [shift * i, 0]

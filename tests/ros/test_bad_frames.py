@@ -1,6 +1,4 @@
-"""Frames with wrong content: told in one sentence, counted, and without harm to the frames after
-them.
-"""
+"""Invalid frames are counted, reported in one sentence, and do not affect the next frames."""
 
 import re
 from array import array
@@ -18,7 +16,7 @@ COLLECTS = ('calibration_node',)
 
 
 def put(field, index, value):
-    """A change of one element of an array of a message."""
+    """Return a change of one element of an array of a message."""
 
     def change(message):
         getattr(message, field)[index] = value
@@ -27,7 +25,7 @@ def put(field, index, value):
 
 
 def put_all(**fields):
-    """A change of whole fields of a message."""
+    """Return a change of whole fields of a message."""
 
     def change(message):
         for name, value in fields.items():
@@ -76,10 +74,9 @@ ONE_POINT = {
 
 @pytest.fixture(scope='module')
 def rig(module_graph, by_command, exposures):
-    """Both nodes with a calibration, after all bad frames, each with a good one before and behind
-    it.
+    """Both nodes with a calibration, after all bad frames, each between two good ones.
 
-    graph.bad {fault: frame number}, graph.corrected {frame number: message}.
+    graph.bad: frame number by fault; graph.corrected: message by frame number.
     """
     graph = module_graph
     client = module_graph.client
@@ -146,17 +143,17 @@ def test_bad_frames_are_counted_and_reported(rig):
 
 
 def says(sentence, number):
-    """Whether a sentence names the fluoroscope and the frame."""
+    """Return whether a sentence names the fluoroscope and the frame."""
     return 'fluoroscope a' in sentence and re.search(rf'frame {number}\b', sentence) is not None
 
 
-def test_nodes_have_survived_without_traceback(rig):
+def test_nodes_are_still_running_without_traceback(rig):
     for node in rig.nodes.values():
         assert node.running and 'Traceback' not in node.log
 
 
-def test_other_targets_are_passed_over(rig, tracking):
-    """Markers in motion are no fault: the same stream carries them after the calibration."""
+def test_frames_of_other_targets_are_ignored(rig, tracking):
+    """Markers in motion are no fault: the same stream shows them after the calibration."""
     rig.client.publish(tracking['a'][0])
     status = rig.client.wait_for_status(lambda s: s.frames_received == rig.published + 1)
     assert status.frames_rejected == len(BAD)

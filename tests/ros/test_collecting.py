@@ -1,6 +1,4 @@
-"""Collecting exposures: by capture, by a phantom that stands still, and pairs by number or by
-stamp.
-"""
+"""Collecting exposures: by capture, by a standing phantom, and pairing by number or by stamp."""
 
 from dataclasses import replace
 
@@ -9,11 +7,11 @@ from ros_graph import NAMES, standing
 
 
 def pairs_of(exposures, i=0, count=10**6, **options):
-    """A stream of the phantom as in exposure i, moved by shift px a frame."""
+    """Return a stream of the phantom as in exposure i, moved by shift px a frame."""
     return zip(*(standing(exposures[n][i], count, **options) for n in NAMES))
 
 
-def test_capture_takes_one_exposure_a_call(graph, exposures, tmp_path):
+def test_capture_collects_one_exposure_per_call(graph, exposures, tmp_path):
     client = graph.client
     graph.calibration_node(tmp_path / 'none', collect='request', capture_timeout=0.5)
     answer = client.call(Capture, 'capture')
@@ -64,7 +62,7 @@ def test_capture_needs_all_fluoroscopes_and_a_new_frame(graph, exposures, tmp_pa
     assert not answer.success and answer.message == 'timeout_sec is a time in seconds, not -1.0'
 
 
-def test_standing_phantom_is_one_exposure_and_a_moving_one_none(graph, exposures, tmp_path):
+def test_standing_phantom_gives_one_exposure_and_a_moving_one_none(graph, exposures, tmp_path):
     client = graph.client
     sent = 0
     graph.calibration_node(tmp_path / 'none')
@@ -94,7 +92,7 @@ def test_standing_phantom_is_one_exposure_and_a_moving_one_none(graph, exposures
     assert stream(30, i=1) == 2 and stream(30) == 2, 'stands where it has stood'
 
 
-def test_simulated_phantom_is_collected_by_itself(graph, tmp_path):
+def test_simulated_phantom_is_collected_automatically(graph, tmp_path):
     client = graph.client
     graph.calibration_node(tmp_path / 'none')
     graph.start('simulator_node', {'stand_time': 0.4, 'move_time': 0.4, 'rate': 60.0})

@@ -1,5 +1,5 @@
-"""A stream of which every tenth message is damaged: all good ones come through, the bad ones are
-counted by kind.
+"""A stream in which every tenth message is damaged: all good ones are corrected, the others
+counted.
 """
 
 import itertools
@@ -58,9 +58,7 @@ COUNT = 1600
 
 @pytest.fixture(scope='module')
 def stream(module_graph, by_command, tracking):
-    """1,600 messages of each fluoroscope, every tenth of a damaged in turn in every way, and what
-    came of them.
-    """
+    """1,600 messages of each fluoroscope, every tenth of a damaged in one of several ways."""
     graph = module_graph
     client = module_graph.client
     graph.nodes = graph.whole_chain(by_command[0])
@@ -105,7 +103,7 @@ def message_of(frame, number, kind):
     return message
 
 
-def test_every_good_frame_comes_through_once_and_in_order(stream):
+def test_every_good_frame_is_corrected_once_and_in_order(stream):
     assert [m.frame_number for m in stream.corrected['a']] == stream.good
     assert [m.frame_number for m in stream.corrected['b']] == list(range(COUNT))
     assert [m.frame_number for m in stream.points] == stream.good
@@ -133,12 +131,12 @@ def test_bad_frames_are_counted_by_kind(stream):
     assert value_of(other, 'frames refused') == '0'
 
 
-def test_the_nodes_have_survived_without_traceback(stream):
+def test_nodes_are_still_running_without_traceback(stream):
     for node in stream.nodes.values():
         assert node.running and 'Traceback' not in node.log
 
 
-def test_undecodable_bytes_are_the_message_that_they_were_cut_from(tracking):
-    """The test's own damage is real: rclpy cannot decode it."""
-    with pytest.raises(Exception):
+def test_truncated_bytes_cannot_be_decoded_by_rclpy(tracking):
+    """The damage of this test is real: rclpy cannot decode the bytes."""
+    with pytest.raises(Exception):  # noqa: B017 the type depends on the middleware
         deserialize_message(message_of(tracking['a'][0], 1, 'undecodable'), TargetObservations)

@@ -101,7 +101,7 @@ def test_an_exception_in_a_callback_costs_one_frame(ros, monkeypatch, tracking):
             TargetObservations, 'a/target_observations', observations_qos()
         )
         stream = node.streams['a']
-        wait_until(lambda: output.get_subscription_count())
+        wait_until(output.get_subscription_count)
         time.sleep(0.3)  # until the reader knows the publisher, too
         for number in (12, 13, 14):
             output.publish(message_from_frame(replace(tracking['a'][0], number=number)))

@@ -1,6 +1,4 @@
-"""The image node: images of all kinds come out corrected, wrong ones are told and counted, and
-calibrations change.
-"""
+"""The image node: images of all kinds are corrected, invalid ones counted; calibrations change."""
 
 from array import array
 from dataclasses import replace
@@ -30,12 +28,12 @@ DEPTHS = {'mono8': np.uint8, 'mono16': np.uint16}
 
 @pytest.fixture(scope='module')
 def pictures(exposures):
-    """{encoding: image of the phantom} of fluoroscope a."""
+    """Images of the phantom in fluoroscope a by encoding."""
     return {name: bead_image(exposures['a'][0].uv, SIZE, dtype) for name, dtype in DEPTHS.items()}
 
 
 class Eyes:
-    """What a client sees of the image node, and what it shows to it; topics of fluoroscope a."""
+    """What a client shows to the image node and receives from it, of fluoroscope a."""
 
     def __init__(self, graph):
         self.client = graph.client
@@ -55,7 +53,7 @@ class Eyes:
         )
 
     def connected(self):
-        """Whether the node listens, and is listened to."""
+        """Return whether all topics are connected."""
         return (
             self.raw.get_subscription_count()
             and self.compressed.get_subscription_count()
@@ -63,14 +61,14 @@ class Eyes:
         )
 
     def stamped(self, message):
-        """A message with a stamp of its own, which is returned too."""
+        """Set a unique stamp of a message and return it, too."""
         self.number += 1
         message.header.stamp = stamp_from_nanoseconds(10**18 + self.number)
         message.header.frame_id = 'a_optical'
         return message
 
     def message(self, image, encoding='mono8'):
-        """Image message of an array."""
+        """Return the Image message of an array."""
         return self.stamped(
             Image(
                 height=image.shape[0],
@@ -82,7 +80,7 @@ class Eyes:
         )
 
     def answer(self, publisher, message):
-        """Image and CameraInfo that come out for a message that goes in."""
+        """Return the Image and CameraInfo that answer a message."""
         publisher.publish(message)
         stamp = message.header.stamp
         found = [None, None]
@@ -98,9 +96,7 @@ class Eyes:
         return found
 
     def diagnostics(self, condition, what='a diagnostic'):
-        """{key: value} of the node about fluoroscope a, once its status fulfils condition(values,
-        status).
-        """
+        """Return the values of fluoroscope a once they fulfil condition(values, status)."""
 
         def values(status):
             return {v.key: v.value for v in status.values}
@@ -113,7 +109,7 @@ class Eyes:
 
 
 def pixels_of(message):
-    """Array of an Image message."""
+    """Return the array of an Image message."""
     return np.frombuffer(message.data, DEPTHS[message.encoding]).reshape(
         message.height, message.width
     )
@@ -121,7 +117,7 @@ def pixels_of(message):
 
 @pytest.fixture(scope='module')
 def eyes(module_graph, by_command):
-    """The image node with the calibration that a calibration node has published."""
+    """The image node with a calibration that a calibration node has published."""
     module_graph.calibration_node(by_command[0], wait=False)
     module_graph.client.expect(ChangeState, 'image_node/change_state')
     module_graph.node = module_graph.start('image_node', {'fluoroscopes': '[a]'})
@@ -140,10 +136,8 @@ def eyes(module_graph, by_command):
 
 @pytest.mark.parametrize('encoding', DEPTHS)
 @pytest.mark.parametrize('kind', ['raw', 'padded', 'other end first', 'compressed'])
-def test_image_comes_out_corrected(eyes, pictures, encoding, kind):
-    """Pixel for pixel as ImageCorrector makes it, with the header of the input, and the CameraInfo
-    of the calibration.
-    """
+def test_image_is_corrected_as_by_the_corrector(eyes, pictures, encoding, kind):
+    """The pixels are those of ImageCorrector, the header that of the input."""
     image = pictures[encoding]
     message = eyes.message(image, encoding)
     if kind == 'padded':
@@ -170,8 +164,8 @@ def test_image_comes_out_corrected(eyes, pictures, encoding, kind):
     assert info == wanted and info.k[0] == eyes.calibration.interior[2] and not any(info.d)
 
 
-def test_corrected_images_are_compressed_for_who_listens(eyes, pictures):
-    """And for nobody else: by format and depth of the pixels."""
+def test_images_are_compressed_for_subscribers_only(eyes, pictures):
+    """Only while there are subscribers; by format and depth of the pixels."""
     assert eyes.diagnostics(lambda v, _: True)['images compressed'] == '0'
     small = eyes.small
     eyes.client.create_subscription(
@@ -202,7 +196,7 @@ def test_corrected_images_are_compressed_for_who_listens(eyes, pictures):
 
 
 def changed(**fields):
-    """A change of fields of an Image message."""
+    """Return a change of fields of an Image message."""
 
     def change(message):
         for name, value in fields.items():
@@ -213,7 +207,7 @@ def changed(**fields):
 
 
 def of_array(image):
-    """A PNG of an image."""
+    """Return a PNG of an image."""
     return array('B', cv2.imencode('.png', image)[1].tobytes())
 
 
@@ -269,7 +263,7 @@ BAD_COMPRESSED = {
 
 @pytest.fixture(scope='module')
 def after_bad_ones(eyes):
-    """The eyes after all bad images, each with a good one behind it."""
+    """The eyes after all bad images, each followed by a good one."""
     for change, _, _ in BAD.values():
         message = change(eyes.message(GREY))
         eyes.raw.publish(message)
@@ -289,8 +283,8 @@ def after_bad_ones(eyes):
 
 
 @pytest.mark.parametrize('fault', [*BAD, *BAD_COMPRESSED])
-def test_bad_image_is_told_in_one_sentence(after_bad_ones, fault):
-    _, kind, sentence = {**BAD, **BAD_COMPRESSED}[fault]
+def test_bad_image_is_reported_in_one_sentence(after_bad_ones, fault):
+    _, _, sentence = {**BAD, **BAD_COMPRESSED}[fault]
     lines = [line for line in after_bad_ones.node.log.splitlines() if sentence in line]
     assert lines and all(
         'image refused: fluoroscope a, image of 1000000000.0' in line for line in lines
@@ -312,9 +306,7 @@ def test_bad_images_are_counted_by_kind(after_bad_ones):
 
 
 def test_lifecycle(after_bad_ones, pictures):
-    """Deactivated it takes nothing, cleaned up it has no topics; brought up again it has the
-    latched calibration.
-    """
+    """An inactive node corrects nothing; configured again it receives the latched calibration."""
     eyes = after_bad_ones
     image = pictures['mono8']
 
@@ -343,9 +335,7 @@ def test_lifecycle(after_bad_ones, pictures):
 
 
 def test_calibrations_change_between_two_images(graph, by_command, pictures):
-    """Without one nothing comes out; then every image is corrected wholly with one of them, and a
-    wrong one changes nothing.
-    """
+    """Every image is corrected with one calibration; an invalid calibration changes nothing."""
     graph.start('image_node', {'fluoroscopes': '[a]'})
     eyes = Eyes(graph)
     image = pictures['mono8']
@@ -378,8 +368,8 @@ def test_calibrations_change_between_two_images(graph, by_command, pictures):
     assert came == sorted(came) and set(came) == {0, 1}
 
 
-def test_wrong_parameters(graph):
-    """The node does not start, and says why."""
+def test_invalid_parameters_are_refused(graph):
+    """The node does not start, and gives the reason."""
     wrong = {
         'interpolation': ('nearest', 'parameter interpolation is one of linear, cubic'),
         'inputs': ('none', 'parameter inputs is one of raw, compressed, both'),

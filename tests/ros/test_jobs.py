@@ -1,6 +1,4 @@
-"""A self-calibration beside the stream: nothing stops for it, cancelled or refused it changes
-nothing.
-"""
+"""A self-calibration in parallel to the stream; cancelled or refused it changes nothing."""
 
 import time
 
@@ -14,7 +12,7 @@ REFUSED = 'refused: a self-calibration is already running'
 
 
 class Rig:
-    """Both nodes with a calibration loaded and 15 exposures collected."""
+    """Both nodes with a loaded calibration and 15 collected exposures."""
 
     def __init__(self, graph, folder, exposures):
         self.folder = folder
@@ -54,7 +52,7 @@ class Rig:
         return {n: self.client.messages[f'{n}/{topic}'] for n in NAMES}
 
     def state(self):
-        """All that a job may change: files, and calibrations published."""
+        """Return all that a job may change: files, and published calibrations."""
         files = {path.name: path.read_bytes() for path in self.folder.iterdir()}
         return files, {n: len(m) for n, m in self.messages('calibration').items()}
 
@@ -67,7 +65,7 @@ def rig(module_graph, by_command, exposures, tmp_path_factory):
     return Rig(module_graph, folder, exposures)
 
 
-def test_stream_goes_on_while_a_job_runs(rig, exposures):
+def test_stream_continues_while_a_job_runs(rig, exposures):
     client = rig.client
     rate = 120.0
     received = client.wait_for_status(lambda s: s.exposures == 15).frames_received
@@ -164,7 +162,8 @@ def test_second_request_is_refused_while_one_runs(rig):
         ({'fluoroscopes': ['a', 'z']}, 'fluoroscope z is unknown, there are a, b'),
         (
             {'model': 'spline'},
-            "model is one of auto, none, knn, local_linear, parametric, hybrid, collocation, not 'spline'",
+            'model is one of auto, none, knn, local_linear, parametric, hybrid, collocation, '
+            "not 'spline'",
         ),
         ({'interior': 'free'}, "interior is one of estimated, fixed, not 'free'"),
         ({'loss': 'cauchy'}, "loss is one of student_t, huber, gaussian, not 'cauchy'"),
@@ -175,7 +174,7 @@ def test_second_request_is_refused_while_one_runs(rig):
         ),
     ],
 )
-def test_wrong_request_is_refused_in_a_sentence(rig, request_fields, message):
+def test_invalid_request_is_refused_in_one_sentence(rig, request_fields, message):
     before = rig.state()
     answer = rig.client.call(Calibrate, 'calibrate', **request_fields)
     assert not answer.success and answer.message == message

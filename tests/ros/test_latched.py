@@ -1,6 +1,4 @@
-"""The published calibration: latched, read again after a restart, and taken up by the correction
-in mid-stream.
-"""
+"""The published calibration: latched, loaded after a restart, and used in mid-stream."""
 
 import itertools
 import shutil
@@ -115,5 +113,5 @@ def test_correction_before_and_after_a_calibration_in_mid_stream(
         'no frame lost, none twice, in order'
     )
     ids = [m.calibration_id for m in corrected]
-    assert set(ids) == {first, second} and sum(x != y for x, y in zip(ids, ids[1:])) == 1
+    assert set(ids) == {first, second} and sum(x != y for x, y in itertools.pairwise(ids)) == 1
     assert all(np.isfinite(m.u).all() for m in corrected)

@@ -1,4 +1,4 @@
-"""The lifecycle of the streaming nodes, their parameters, and several rigs side by side."""
+"""The lifecycle of the streaming nodes, their parameters, and two rigs at the same time."""
 
 from dataclasses import replace
 
@@ -19,7 +19,7 @@ NODES = ('correction_node', 'reconstruction_node', 'image_node')
 
 
 def expect(client, node):
-    """Make what asks a node, before it is started."""
+    """Make the service clients of a node before it is started."""
     for kind, service in (
         (ChangeState, 'change_state'),
         (GetState, 'get_state'),
@@ -39,7 +39,7 @@ def state(client, node):
     return client.call(GetState, f'{node}/get_state').current_state.id
 
 
-def test_a_node_takes_frames_when_it_is_active_and_only_then(graph, by_command, tracking):
+def test_node_processes_frames_only_while_active(graph, by_command, tracking):
     client = graph.client
     expect(client, 'correction_node')
     graph.calibration_node(by_command[0])
@@ -104,8 +104,8 @@ def test_shutdown_by_the_lifecycle(graph, by_command):
     assert graph.processes[-1].end() == 0 and 'Traceback' not in graph.processes[-1].log
 
 
-def test_transition_that_fails_says_why_and_changes_nothing(graph):
-    """A wrong quality of service shows only when the topics are made."""
+def test_failed_transition_gives_the_reason_and_changes_nothing(graph):
+    """An invalid quality of service is noticed only when the topics are made."""
     client = graph.client
     topic = f'qos_overrides.{graph.namespace}/a/target_observations.subscription.reliability'
     expect(client, 'correction_node')
@@ -120,8 +120,8 @@ def test_transition_that_fails_says_why_and_changes_nothing(graph):
 
 
 @pytest.mark.parametrize('kind', [CorrectionNode, ImageNode, ReconstructionNode])
-def test_nothing_is_left_of_what_was_taken_down(ros, kind):
-    """However often a manager brings a node up and takes it down."""
+def test_cleanup_destroys_everything(ros, kind):
+    """However often a manager configures and cleans up a node."""
     node = kind()
     try:
         before = len(list(node.publishers))
@@ -148,7 +148,7 @@ def test_nothing_is_left_of_what_was_taken_down(ros, kind):
 
 
 @pytest.mark.parametrize('node', NODES)
-def test_every_parameter_says_what_it_is(graph, node):
+def test_every_parameter_is_described(graph, node):
     client = graph.client
     expect(client, node)
     graph.start(node)
@@ -172,10 +172,8 @@ def test_every_parameter_says_what_it_is(graph, node):
     assert any(n.startswith('qos_overrides.') and n.endswith('.depth') for n in names)
 
 
-def test_two_rigs_side_by_side(ros, request, graph, by_command, tracking, tmp_path):
-    """Two namespaces, one of them with simulated time: what comes to the one does not come to the
-    other.
-    """
+def test_two_rigs_in_parallel(ros, request, graph, by_command, tracking, tmp_path):
+    """Two namespaces, one with simulated time: they do not receive each other's messages."""
     (tmp_path / 'other').mkdir()
     other = Graph(tmp_path / 'other')
     request.node.graphs = [*getattr(request.node, 'graphs', ()), other]

@@ -1,5 +1,5 @@
-"""The orientation of the rig: from a calibration, from a capture of the phantom, and what belongs
-to what.
+"""The orientation of the rig, from a calibration or from a capture, and the calibrations it
+belongs to.
 """
 
 import numpy as np
@@ -11,9 +11,9 @@ from fluoro_calib_ros.files.rig_orientation import load_orientation, orientation
 from fluoro_calib_ros.nodes.messages.rig_orientation import orientation_from_message
 
 
-def test_a_calibration_brings_the_orientation_and_the_stream_goes_on(graph, tmp_path, tracking):
-    """Calibrated in mid-stream, twice: every exposure is reconstructed with the orientation of its
-    calibrations.
+def test_calibration_publishes_an_orientation_in_mid_stream(graph, tmp_path, tracking):
+    """Two calibrations in mid-stream: every exposure is reconstructed with the orientation of its
+    own.
     """
     client = graph.client
     graph.both_nodes(tmp_path, collect='request', model='parametric')
@@ -67,16 +67,14 @@ def test_a_calibration_brings_the_orientation_and_the_stream_goes_on(graph, tmp_
 
 
 def collect(graph, readers=2):
-    """Play the recorded exposures, each taken by the collector as the phantom stands in another
-    pose.
-    """
+    """Play the recorded exposures; the phantom stands in another pose in each."""
     graph.client.call(Reset, 'collect_anew')
     graph.play(BAGS / 'calibration', readers=readers)
     for name in NAMES:
         graph.client.wait_for_status(lambda s: s.exposures == 15, name, 'all exposures')
 
 
-def test_a_capture_puts_the_points_into_the_rig_frame(graph, calibrated, tracking):
+def test_capture_defines_the_rig_frame_of_the_points(graph, calibrated, tracking):
     client = graph.client
     graph.whole_chain(calibrated, rig_frame='lab')
     published = client.listen('rig_orientation')
@@ -123,7 +121,7 @@ def test_a_capture_puts_the_points_into_the_rig_frame(graph, calibrated, trackin
     )  # mm, against the truth itself
 
 
-def test_what_an_orientation_needs_is_said(graph, tmp_path, calibrated):
+def test_refused_orientation_gives_the_reason(graph, tmp_path, calibrated):
     client = graph.client
     graph.calibration_node(tmp_path)
     answer = client.call(Orient, 'orient', timeout_sec=0.2)
@@ -140,7 +138,7 @@ def test_what_an_orientation_needs_is_said(graph, tmp_path, calibrated):
     )
 
 
-def test_exposures_are_collected_anew_on_demand(graph, by_command):
+def test_new_exposures_are_collected_on_request(graph, by_command):
     client = graph.client
     graph.calibration_node(by_command[0], collect='request')
     collect(graph, readers=1)

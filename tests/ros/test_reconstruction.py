@@ -1,6 +1,4 @@
-"""Points in space from two corrected streams: where they are, how good they are said to be, what
-is told of faults.
-"""
+"""Points in space from two corrected streams: accuracy, stated precision, and reported faults."""
 
 import csv
 import subprocess
@@ -20,7 +18,7 @@ FRAMES = 120
 
 @pytest.fixture(scope='module')
 def rig(module_graph, by_command, tracking):
-    """All three nodes, after the first frames of markers in motion have been reconstructed."""
+    """All three nodes, after the first frames of markers in motion."""
     graph = module_graph
     client = module_graph.client
     graph.nodes = graph.whole_chain(by_command[0], {'drift_rate': 1000.0})
@@ -40,9 +38,7 @@ def publish(
     change=lambda frame: frame,
     answer='reconstruction/points_with_covariance',
 ):
-    """Publish frames of both fluoroscopes, in step with the messages on a topic that answer them
-    one by one.
-    """
+    """Publish frames of both fluoroscopes, in step with the messages that answer them."""
     came = client.messages[answer]
     before = len(came)
     messages = [
@@ -53,7 +49,7 @@ def publish(
 
 
 def truth():
-    """{frame: (24, 3) [mm]} of the markers."""
+    """True markers (24, 3) [mm] by frame."""
     out = {}
     with open(BAGS / 'truth' / 'markers.csv', newline='') as file:
         for row in csv.DictReader(file):
@@ -64,7 +60,7 @@ def truth():
 
 
 def coordinates(message):
-    """Points (n, 3) [mm] and their covariances (n, 3, 3) [mm^2]."""
+    """Return points (n, 3) [mm] and their covariances (n, 3, 3) [mm^2]."""
     c = {
         name: np.array(getattr(message, f'cov_{name}'))
         for name in ('xx', 'xy', 'xz', 'yy', 'yz', 'zz')
@@ -78,11 +74,10 @@ def coordinates(message):
 
 
 def turned_onto(points, true):
-    """Errors (n, 3) of points (n, 3) after the rotation and shift that bring them nearest to true,
-    turned back.
+    """Return the errors (n, 3) after the rotation and shift of points that fit best.
 
     The rig frame of a joint calibration is the optical frame of the first fluoroscope, that of the
-    truth another.
+    truth is another one.
     """
     a = points - points.mean(axis=0)
     b = true - true.mean(axis=0)
@@ -91,7 +86,7 @@ def turned_onto(points, true):
     return a - b @ turn.T
 
 
-def test_points_are_where_the_markers_are_and_as_good_as_said(rig):
+def test_points_are_as_accurate_as_stated(rig):
     true = truth()
     found = [coordinates(m) for m in rig.points]
     points, covariance = (np.concatenate(part) for part in zip(*found))
@@ -186,7 +181,7 @@ def test_cloud_and_ellipsoids_are_the_same_points(rig):
     )
 
 
-def test_tf_tells_where_the_sources_are(rig, by_command):
+def test_tf_has_the_positions_of_the_sources(rig, by_command):
     orientation = load_orientation(orientation_path(by_command[0]))
     found = rig.client.wait_until(
         lambda: [
@@ -202,8 +197,8 @@ def test_tf_tells_where_the_sources_are(rig, by_command):
     assert np.allclose([t.x, t.y, t.z], orientation.position_mm[1] / 1000, atol=1e-9)
 
 
-def test_a_false_match_is_rejected_and_the_others_are_not(rig, tracking):
-    """The images of two markers of one view are exchanged: their rays do not meet."""
+def test_only_the_false_match_is_rejected(rig, tracking):
+    """Two markers of one view are exchanged: their rays do not meet."""
 
     def exchanged(frame):
         if frame.fluoroscope == 'a':
@@ -225,7 +220,7 @@ def test_a_false_match_is_rejected_and_the_others_are_not(rig, tracking):
     assert min(np.array(message.residual)[[0, 23]]) > 1.0
 
 
-def test_a_target_in_one_view_alone_is_told(rig, tracking):
+def test_target_in_a_single_view_is_reported(rig, tracking):
     def fewer(frame):
         keep = slice(0, 20) if frame.fluoroscope == 'a' else slice(2, 24)
         return replace(frame, number=90_002, target_id=frame.target_id[keep], uv=frame.uv[keep])
@@ -282,9 +277,7 @@ def test_the_drift_watch_is_in_the_diagnostics(rig):
 
 
 def test_damaged_corrected_frames_are_counted_by_kind(rig, tracking):
-    """Whoever publishes beside the correction node: what does not fit together is left out, the
-    rest goes on.
-    """
+    """Frames of another publisher: invalid ones are refused, the next ones reconstructed."""
     client = rig.client
     output = client.create_publisher(CorrectedObservations, 'a/corrected_observations', 10)
     client.wait_until(lambda: output.get_subscription_count() > 0, what='the reader')

@@ -1,6 +1,4 @@
-"""Streams that come from elsewhere: what is wrong in them is told of the fluoroscope, whatever the
-topic is called.
-"""
+"""Remapped streams: faults are reported with the name of the fluoroscope."""
 
 import pytest
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations

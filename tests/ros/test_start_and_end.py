@@ -1,4 +1,4 @@
-"""Starting and ending of the nodes: a sentence where a node cannot start, and nothing but 0 at an
+"""Start and end of the nodes: one sentence where a node cannot start, exit status 0 at an
 interrupt.
 """
 
@@ -43,7 +43,7 @@ def foreign_bag(folder):
 
 
 def small_bag(folder, type_name='std_msgs/msg/Int64', topic='/x', messages=1, **how):
-    """A bag with one topic, parameters to play it."""
+    """Write a bag with one topic; returns the parameters to play it."""
     with open(folder / 'small.mcap', 'wb') as file:
         writer = Writer(file)
         writer.start('ros2', 'test')
@@ -179,7 +179,7 @@ PHANTOM = {'phantom': BAGS / 'phantom.csv'}
     ],
     ids=lambda value: value.__name__ if callable(value) else None,
 )
-def test_node_that_cannot_start_says_why(graph, tmp_path, node, parameters, sentence):
+def test_node_that_cannot_start_gives_the_reason(graph, tmp_path, node, parameters, sentence):
     parameters = dict(parameters(tmp_path) if callable(parameters) else parameters)
     namespace = {'__ns': parameters.pop('__ns')} if '__ns' in parameters else None
     process = graph.start(node, parameters, namespace, wait=False)
@@ -227,8 +227,8 @@ def test_interrupt_ends_a_running_job_and_a_waiting_capture(graph, exposures, tm
     assert not (tmp_path / 'none').exists()
 
 
-def test_two_rigs_in_namespaces_do_not_meet(graph, exposures, tmp_path):
-    """A node of another namespace gets nothing of this one, remapped it does."""
+def test_namespaces_are_separate(graph, exposures, tmp_path):
+    """A node of another namespace receives nothing of this one, unless it is remapped."""
     client = graph.client
     graph.calibration_node(tmp_path / 'none')
     other = graph.start('correction_node', remaps={'__ns': '/elsewhere'}, wait=False)
@@ -261,8 +261,8 @@ def test_two_rigs_in_namespaces_do_not_meet(graph, exposures, tmp_path):
     assert other.end() == 0 and remapped.end() == 0
 
 
-def test_requests_that_nobody_can_fulfil_are_answered(graph, tmp_path):
-    """Times for which nobody can wait, and homes of nobody: the node says so, and stays."""
+def test_impossible_requests_are_answered(graph, tmp_path):
+    """Impossible timeouts and unknown home folders are refused, and the node goes on."""
     node = graph.calibration_node(tmp_path)
     client = graph.client
     for seconds in (1e300, 1e10):
@@ -284,8 +284,8 @@ def test_requests_that_nobody_can_fulfil_are_answered(graph, tmp_path):
     assert node.end() == 0 and not any(word in node.log for word in TROUBLE), node.log
 
 
-def test_player_latches_what_was_latched(graph, by_command):
-    """A recorded calibration is heard by a node that asks for latched ones."""
+def test_player_latches_recorded_latched_topics(graph, by_command):
+    """A late subscriber receives a recorded latched calibration."""
     from fluoro_calib_ros.bags.qos import PROFILES, to_yaml
 
     calibration = load_calibrations(by_command[0])['a']
@@ -316,7 +316,7 @@ def test_player_latches_what_was_latched(graph, by_command):
 
 
 def test_incompatible_publisher_is_reported(graph, tmp_path):
-    """A best-effort publisher is not heard by a reliable subscription: the diagnostics say so."""
+    """The diagnostics report that a reliable subscription needs a reliable publisher."""
     client = graph.client
     graph.calibration_node(tmp_path)
     graph.start('correction_node')

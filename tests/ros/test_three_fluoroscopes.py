@@ -1,6 +1,4 @@
-"""Three fluoroscopes, live: calibration, orientation, and points where a view is missing, as
-offline.
-"""
+"""Three fluoroscopes, live: calibration, orientation, and points with missing views."""
 
 import csv
 import json
@@ -42,7 +40,7 @@ def a_rig():
 
 
 def standing(of_rig, number, stamp_ns):
-    """A frame of each fluoroscope of the phantom standing in the rig frame."""
+    """Return a frame of each fluoroscope of the phantom standing in the rig frame."""
     rng = np.random.default_rng(number)
     for f in of_rig.fluoroscopes:
         ids, uv = seen_beads(
@@ -69,7 +67,7 @@ def started(graph, folder):
 
 
 def calibrated(graph, of_rig):
-    """Calibrate, and orient by a capture; returns the id of the orientation."""
+    """Calibrate, orient by a capture, and return the id of the orientation."""
     client = graph.client
     for frames in zip(*simulate_exposures(of_rig, POSES, 1).frames.values()):
         for frame in frames:
@@ -99,10 +97,8 @@ def calibrated(graph, of_rig):
     return future.result().orientation_id
 
 
-def begin_anew(graph, node, markers, points):
-    """Have the drift watch begin anew with the orientation, after it has got all that it needs and
-    nothing waits; returns the DiagnosticStatus of then.
-    """
+def restart_drift_watch(graph, node, markers, points):
+    """Restart the drift watch by a new orientation; returns its DiagnosticStatus."""
     client = graph.client
     key = 'reconstruction_node: reconstruction'
     for number in range(2000, NUMBER):
@@ -124,8 +120,10 @@ def begin_anew(graph, node, markers, points):
 
 
 def marker_frames(of_rig):
-    """The tracking, its frames with a shift of 1 px in half of the image of b at the end; and
-    without what c loses: frames at random, and all at the end.
+    """Return the tracking with a drift of b and lost frames of c.
+
+    Half of the image of b is shifted by 1 px at the end. c loses frames at random, and all at the
+    end.
     """
     tracking = simulate_tracking(
         of_rig, FRAMES / RATE_HZ, RATE_HZ, 5, start_ns=START, first_number=NUMBER
@@ -160,9 +158,7 @@ def streamed(client, kept, points):
 
 
 def check_points(messages, tracking, there):
-    """Every exposure once, in order, of the rays that are there; those of three are more exact, as
-    they say.
-    """
+    """Check that every exposure comes once and in order; three rays are more precise than two."""
     assert [m.frame_number for m in messages] == list(range(NUMBER, NUMBER + FRAMES))
     errors = {2: [], 3: []}
     sd = {2: [], 3: []}
@@ -187,9 +183,7 @@ def check_points(messages, tracking, there):
 
 
 def check_mixed(client, last, markers, points):
-    """Views without c, of which one was corrected with another calibration: they are not
-    intersected. What fits is.
-    """
+    """Check that views of calibrations of different orientations are not intersected."""
     before = int(
         value_of(
             client.statuses['reconstruction_node: reconstruction'], 'exposures without orientation'
@@ -236,7 +230,7 @@ def check_mixed(client, last, markers, points):
 
 
 def offline(folder, kept, path):
-    """Rows of points and result of the command line, for a bag of the same frames."""
+    """Return rows of points and the result of the command line for a bag of the same frames."""
     write_bag(path / 'bag', kept)
     command = [
         *entry_point('cli'),
@@ -253,10 +247,8 @@ def offline(folder, kept, path):
         return list(csv.DictReader(file)), result
 
 
-def test_points_come_while_views_are_missing(graph, tmp_path):
-    """Frames of c are lost at random, then it is silent; b drifts meanwhile, and is found as in
-    the recording.
-    """
+def test_points_are_published_while_views_are_missing(graph, tmp_path):
+    """Frames of c are lost at random, then it is silent; the drift of b is found as offline."""
     client = graph.client
     folder = tmp_path / 'calibration'
     of_rig = a_rig()
@@ -266,7 +258,7 @@ def test_points_come_while_views_are_missing(graph, tmp_path):
     node = started(graph, folder)
     oriented = calibrated(graph, of_rig)
     tracking, kept, there = marker_frames(of_rig)
-    before = begin_anew(graph, node, tracking.frames, points)
+    before = restart_drift_watch(graph, node, tracking.frames, points)
     messages = streamed(client, kept, points)
     check_points(messages, tracking, there)
     assert all(m.orientation_id == oriented and len(m.calibration_id) == 3 for m in messages)

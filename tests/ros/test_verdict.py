@@ -1,4 +1,4 @@
-"""The verdict on a calibration in the answer of a job, where it is asked for."""
+"""The verdict on a calibration in the answer of a job that asks for it."""
 
 import json
 
@@ -6,8 +6,8 @@ from fluoro_calib_msgs.srv import Calibrate
 from ros_graph import SUCCEEDED
 
 
-def test_a_job_tells_its_verdict_where_it_is_asked_for(rig):
-    """A model that corrects nothing is published, and its verdict is that it fails, and why."""
+def test_job_reports_the_verdict_on_request(rig):
+    """A model that corrects nothing is published, its verdict is fail, with the reason."""
     client = rig.client
     done = client.result_of(
         client.goal(model='none', fluoroscopes=['b'], validate=True).get_result_async()

@@ -1,6 +1,4 @@
-"""The main job over real nodes: collect the recorded exposures, calibrate, and correct markers in
-motion.
-"""
+"""The main job over real nodes: collect exposures, calibrate, correct markers in motion."""
 
 import csv
 import json
@@ -63,7 +61,7 @@ def by_service(rig):
 
 @pytest.fixture(scope='module')
 def tracked(rig, by_service, tracking):
-    """Corrected messages {fluoroscope: [message, ...]} of bags/tracking."""
+    """Corrected messages of bags/tracking by fluoroscope."""
     client = rig.client
     for name, id in zip(by_service.fluoroscope, by_service.calibration_id):
         client.wait_for_diagnostics(
@@ -166,7 +164,7 @@ def test_every_frame_is_corrected_with_its_header(tracked, tracking, by_service,
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_corrected_markers_are_where_they_are(tracked, tracking, name):
+def test_corrected_markers_match_the_truth(tracked, tracking, name):
     ideal = ideal_pixels(name)
     true = np.concatenate([[ideal[m.frame_number, i] for i in m.target_id] for m in tracked[name]])
     corrected = np.concatenate([np.column_stack([m.u, m.v]) for m in tracked[name]])
@@ -190,7 +188,7 @@ def test_camera_info_of_the_corrected_stream(rig, tracked, by_service, name):
 
 
 def ideal_pixels(name):
-    """{(frame, marker): ideal pixel (2,)} of the markers, from the truth."""
+    """Ideal pixels (2,) of the markers by (frame, marker), from the truth."""
     rig = json.loads((BAGS / 'truth' / 'rig.json').read_text())['fluoroscopes'][name]
     with open(BAGS / 'truth' / 'markers.csv', newline='') as file:
         rows = [
@@ -216,11 +214,10 @@ def ideal_pixels(name):
 
 
 def rmse_after_homography(uv, true):
-    """RMSE [px] of a coordinate of uv (n, 2) against true (n, 2) after the projective map that
-    fits best.
+    """Return the RMSE [px] of uv (n, 2) against true (n, 2) after the best projective map.
 
-    That much a calibration cannot tell: a shift and turn of the sensor, and its scale, belong to
-    the orientation.
+    A calibration cannot determine more: shift, rotation and scale of the sensor belong to the
+    orientation.
     """
     x, y = ((true - 512) / 512).T
     u, v = ((uv - 512) / 512).T

@@ -167,6 +167,78 @@ def test_wrong_input_is_refused_with_its_cause(kind):
     assert sentence in str(error.value)
 
 
+def with_sigma(value):
+    """The exposures with sigma given."""
+    return [replace(f, sigma=np.full(len(f.target_id), value)) for f in frames()]
+
+
+def flattened(count):
+    """The exposures with the image points of some of them on one line."""
+    out = frames()
+    out[:count] = [
+        replace(f, uv=np.column_stack([f.uv[:, 0], np.full(len(f.uv), 500.0)]))
+        for f in out[:count]
+    ]
+    return out
+
+
+def survey(xyz_mm=None, sd_mm=None):
+    """The phantom with other coordinates or standard deviations."""
+    return Phantom(
+        PHANTOM.target_id,
+        PHANTOM.xyz_mm if xyz_mm is None else xyz_mm,
+        PHANTOM.sd_mm if sd_mm is None else np.full(len(PHANTOM.sd_mm), sd_mm),
+    )
+
+
+HOSTILE = {
+    'sigma 1e-300': (lambda: with_sigma(1e-300), survey, 'sigma of target .* is 1e-300 px'),
+    'sigma 1e-9': (lambda: with_sigma(1e-9), survey, 'sigma of target .* is 1e-09 px'),
+    'sigma 1e300': (lambda: with_sigma(1e300), survey, 'sigma of target .* is 1e.300 px'),
+    'survey sd 1e-300': (frames, lambda: survey(sd_mm=1e-300), 'deviation of target 1 is 1e-300'),
+    'survey sd 1e300': (frames, lambda: survey(sd_mm=1e300), 'deviation of target 1 is 1e.300 mm'),
+    'phantom in one place': (frames, lambda: survey(0 * PHANTOM.xyz_mm), 'the same coordinates'),
+    'phantom at 1e300': (frames, lambda: survey(0 * PHANTOM.xyz_mm + 1e300), 'larger than 1e.06'),
+    'phantom far away': (frames, lambda: survey(PHANTOM.xyz_mm + 1e9), 'larger than 1e.06 mm'),
+    'phantom on a line': (
+        frames,
+        lambda: survey(PHANTOM.xyz_mm * [1, 0, 0]),
+        'all targets lie in one plane',
+    ),
+    'all exposures on a line': (
+        lambda: flattened(6),
+        survey,
+        'all image points lie on one line or in one place',
+    ),
+    'all image points in one place': (
+        lambda: mapped(lambda uv: 0 * uv + 512 + 1e-9 * uv),
+        survey,
+        'repeat the image points of another one',
+    ),
+    'eight targets an exposure': (
+        lambda: [replace(f, target_id=f.target_id[:8], uv=f.uv[:8]) for f in frames()],
+        survey,
+        '0 exposures are too few',
+    ),
+}
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('kind', HOSTILE)
+def test_hostile_numbers_end_in_one_sentence(kind):
+    make_frames, make_phantom, sentence = HOSTILE[kind]
+    with pytest.raises(DataError, match=sentence) as error:
+        calibration.run(CalibrationRequest({'a': make_frames()}, make_phantom(), FAST))
+    assert '\n' not in str(error.value)
+
+
+@pytest.mark.filterwarnings('error')
+def test_an_exposure_on_a_line_does_not_spoil_the_others():
+    outcome = calibration.run(CalibrationRequest({'a': flattened(1)}, PHANTOM, FAST))
+    assert len(outcome.result.fluoroscopes['a'].exposures) == 5
+    assert 'exposure 1: all image points lie on one line' in outcome.result.left_out[0]
+
+
 def barrel(uv, strength_px):
     """Another distortion than that of the simulation: a radial barrel."""
     x = (uv - 511.5) / 512

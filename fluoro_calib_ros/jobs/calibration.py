@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from ..calibration.calibrate import CalibrationResult, calibrate
 from ..calibration.initial_network import MIN_EXPOSURES
 from ..calibration.request import CalibrationRequest
@@ -19,7 +21,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..validation.check import Validation
-from ..validation.inputs import copied_exposures, find_wrong_input
+from ..validation.inputs import copied_exposures, find_wrong_input, validate_magnitudes
 from ..validation.plausibility import implausible
 from ..validation.rigidity import contradiction
 from ..validation.verdict import validate_or_report
@@ -124,19 +126,12 @@ def run(
     ValueError
         For options that contradict each other.
     """
+    validate_magnitudes(request.frames, request.phantom)
     request, copies = _without_copies(request)
     doubts = list(find_wrong_input(_valid(request), request.phantom).values())
     if doubts and not force:
         raise DataError('. '.join(doubts))
-    result = calibrate(
-        request.frames,
-        request.phantom,
-        request.options,
-        request.joint,
-        request.principal_distance,
-        progress,
-        raise_if_cancelled,
-    )
+    result = _calibrated(request, progress, raise_if_cancelled)
     result = replace(result, left_out=(*copies, *result.left_out))
     doubts += implausible(request, result)
     if doubts and not force:
@@ -149,6 +144,29 @@ def run(
             request, result.calibrations, raise_if_cancelled=raise_if_cancelled
         )
     return CalibrationOutcome(request, result, rig, orientation, note, validation, tuple(doubts))
+
+
+def _calibrated(
+    request: CalibrationRequest,
+    progress: Progress | None,
+    raise_if_cancelled: Cancellation | None,
+) -> CalibrationResult:
+    """Calibrate; a normal matrix that breaks down is a fault in the data. Raises DataError."""
+    try:
+        return calibrate(
+            request.frames,
+            request.phantom,
+            request.options,
+            request.joint,
+            request.principal_distance,
+            progress,
+            raise_if_cancelled,
+        )
+    except np.linalg.LinAlgError as error:
+        raise DataError(
+            f'the exposures do not determine the calibration: {str(error).lower()}; add exposures '
+            'with the phantom turned and moved, and check target ids and sigma'
+        ) from None
 
 
 def _without_copies(request: CalibrationRequest) -> tuple[CalibrationRequest, list[str]]:

@@ -145,6 +145,9 @@ def robust_dlt(xyz: np.ndarray, uv: np.ndarray, seed: int = 0) -> np.ndarray:
         raise DataError(
             'all targets lie in one plane, from which the principal distance cannot be found'
         )
+    spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
+    if spread[1] <= MIN_FLATNESS * spread[0]:
+        raise DataError('all image points lie on one line or in one place')
     rng = np.random.default_rng(seed)
     samples = np.argsort(rng.random((SAMPLES, len(xyz))), axis=1)[:, :SAMPLE_SIZE]
     candidates = direct_linear_transformation(xyz[samples], uv[samples])

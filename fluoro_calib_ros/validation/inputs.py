@@ -28,6 +28,9 @@ BETTER = 0.35  # median residual of other ids over that of the given ones from w
 GOOD_MISFIT = 0.01  # median residual over the longer side of the image of ids that are right
 DISTANCES_MM = (200.0, 10_000.0)  # of the source from the phantom
 UNITS_MM = {'cm': 10.0, 'inches': 25.4, 'm': 1000.0}
+MAX_COORDINATE_MM = 1e6
+SD_MM = (1e-6, 1e3)  # of surveyed coordinates
+SIGMA_PX = (1e-4, 1e3)  # of image points
 MIN_REACH = 0.6  # of the image points over the image, to the right and down
 MIN_SHARE = 0.5  # of the targets that other ids must have on the phantom
 SAME_PX = 1e-6  # image points of two exposures that agree so closely are copies
@@ -63,6 +66,41 @@ class Fit:
     misfit_px: float
     depth: int
     distance_mm: float
+
+
+def validate_magnitudes(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> None:
+    """Raise DataError for numbers that no measurement has, and that spoil every calculation."""
+    large = np.abs(phantom.xyz_mm).max(axis=1) > MAX_COORDINATE_MM
+    if large.any():
+        raise DataError(
+            f'phantom: the coordinates of target {phantom.target_id[large][0]} are larger than '
+            f'{MAX_COORDINATE_MM:g} mm'
+        )
+    low, high = SD_MM
+    wrong = (phantom.sd_mm < low) | (phantom.sd_mm > high)
+    if wrong.any():
+        raise DataError(
+            f'phantom: the standard deviation of target {phantom.target_id[wrong][0]} is '
+            f'{phantom.sd_mm[wrong][0]:g} mm, between {low:g} and {high:g} mm are plausible'
+        )
+    if np.ptp(phantom.xyz_mm, axis=0).max() <= 0:
+        raise DataError('phantom: all targets have the same coordinates')
+    for frame in (frame for exposures in frames.values() for frame in exposures):
+        _validate_sigma(frame)
+
+
+def _validate_sigma(frame: Frame) -> None:
+    if frame.sigma is None:
+        return
+    low, high = SIGMA_PX
+    sigma = np.asarray(frame.sigma)
+    wrong = (sigma < low) | (sigma > high)
+    if wrong.any():
+        raise DataError(
+            f'fluoroscope {frame.fluoroscope}, exposure {frame.number}: sigma of target '
+            f'{np.asarray(frame.target_id)[wrong][0]} is {sigma[wrong][0]:g} px, between {low:g} '
+            f'and {high:g} px are plausible'
+        )
 
 
 def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: np.ndarray) -> Fit | None:

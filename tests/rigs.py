@@ -1,6 +1,7 @@
 """Shared fixtures: virtual rigs, cached calibrations of them and small networks."""
 
 import functools
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -39,35 +40,37 @@ def calibrated(name='a', count=15, **options):
     )
 
 
-def small_network(
-    exposures=4,
-    targets=30,
-    fluoroscopes=1,
-    noise_px=0.3,
-    nu=np.inf,
-    seed=0,
-    survey_sd_mm=0.1,
-    free=True,
-    seen=0.8,
-):
+@dataclass(frozen=True)
+class NetworkOptions:
+    """Options of small_network: noise, survey, free interiors and share of seen targets."""
+
+    noise_px: float = 0.3
+    nu: float = np.inf
+    survey_sd_mm: float = 0.1
+    free: bool = True
+    seen: float = 0.8
+
+
+def small_network(exposures=4, targets=30, fluoroscopes=1, seed=0, **options):
     """Network and true Parameters: targets in a box of 200 mm, partly seen in each exposure."""
+    options = NetworkOptions(**options)
     rng = np.random.default_rng(seed)
     true_mm = rng.uniform(-100, 100, (targets, 3))
-    survey = true_mm + rng.normal(0, survey_sd_mm, true_mm.shape)
+    survey = true_mm + rng.normal(0, options.survey_sd_mm, true_mm.shape)
     of_exposure = np.repeat(np.arange(fluoroscopes), exposures)
     source = np.array([0.0, -1500.0, 0.0])
     poses = [pose for _ in range(fluoroscopes) for pose in phantom_poses(rng, exposures)]
     rotation = np.array([looking_at_origin(source) @ r for r, _ in poses])
     position = np.array([r.T @ (source - shift) for r, shift in poses])
     interior = np.array([511.5, 505.5, 4000.0]) + rng.normal(0, 10, (fluoroscopes, 3))
-    which = rng.random((len(poses), targets)) < seen
+    which = rng.random((len(poses), targets)) < options.seen
     which[0] |= ~which.any(axis=0)
     exposure, point = np.nonzero(which)
     truth = Parameters(interior, rotation, position, true_mm)
     sigma = rng.choice([1.0, 2.0], len(point))
-    noise = rng.normal(0, noise_px, (len(point), 2))
-    if np.isfinite(nu):
-        noise /= np.sqrt(rng.chisquare(nu, len(point)) / nu)[:, None]
+    noise = rng.normal(0, options.noise_px, (len(point), 2))
+    if np.isfinite(options.nu):
+        noise /= np.sqrt(rng.chisquare(options.nu, len(point)) / options.nu)[:, None]
     network = Network(
         np.zeros((len(point), 2)),
         sigma,
@@ -75,12 +78,11 @@ def small_network(
         point,
         of_exposure,
         survey,
-        np.full(targets, survey_sd_mm),
-        np.full(fluoroscopes, free),
+        np.full(targets, options.survey_sd_mm),
+        np.full(fluoroscopes, options.free),
     )
     uv = project(*truth.per_image_point(network)) + sigma[:, None] * noise
-    object.__setattr__(network, 'uv', uv)
-    return network, truth
+    return replace(network, uv=uv), truth
 
 
 def disturbed(parameters, seed=0, degrees=0.5, mm=5.0):

@@ -185,18 +185,15 @@ class RigOrientation:
         """Orientation of some of the fluoroscopes, in the given order. Raises DataError."""
         indices = [self.index(name) for name in fluoroscopes]
         rows = self.covariance_rows(indices)
-        return RigOrientation(
-            tuple(fluoroscopes),
-            self.interior[indices],
-            self.rotation[indices],
-            self.position_mm[indices],
-            self.covariance[np.ix_(rows, rows)],
-            self.frame_id,
-            self.source,
-            tuple(self.calibration_ids[i] for i in indices),
-            self.stamp_ns,
-            self.exposures,
-            tuple(self.optical_frame_ids[i] for i in indices),
+        return replace(
+            self,
+            fluoroscopes=tuple(fluoroscopes),
+            interior=self.interior[indices],
+            rotation=self.rotation[indices],
+            position_mm=self.position_mm[indices],
+            covariance=self.covariance[np.ix_(rows, rows)],
+            calibration_ids=tuple(self.calibration_ids[i] for i in indices),
+            optical_frame_ids=tuple(self.optical_frame_ids[i] for i in indices),
         )
 
     def check_calibrations(self, calibration_ids: Mapping[str, str]) -> None:

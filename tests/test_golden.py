@@ -14,7 +14,9 @@ from sklearn.neighbors import KNeighborsRegressor
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.initial_network import measured_network
 from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.distortion.cross_validation import CrossValidation, exposure_folds
+from fluoro_calib_ros.distortion.cross_validation import CrossValidation
+from fluoro_calib_ros.distortion.estimation import exposure_folds
+from fluoro_calib_ros.distortion.knn import KnnModel
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.precision import precision
@@ -112,7 +114,7 @@ def test_k_of_a_calibration_equals_grid_search(seed):
         scoring=lambda model, x, y: -np.sum((y - model.predict(x)) ** 2),
     )
     search.fit(uv, values)
-    scores = CrossValidation('knn', uv, fold, candidates).scores(
+    scores = CrossValidation(KnnModel, uv, fold, candidates).scores(
         values, np.tile(np.eye(2), (len(uv), 1, 1))
     )
     np.testing.assert_allclose(

@@ -189,7 +189,7 @@ def test_messages_come_in_time_order_whatever_their_order_in_the_file(tmp_path):
         assert times == sorted(times) and len(times) == 60
     only = list(iterate_messages(path, topics=[TOPIC]))
     assert len(only) == 30 and {message.topic for message in only} == {TOPIC}
-    assert same(frame_from_message(from_cdr(only[3].data, only[3].type), 'a', ''), frames[6])
+    assert same(frame_from_message(from_cdr(only[3].data, only[3].type), 'a'), frames[6])
 
 
 @pytest.mark.parametrize(
@@ -242,7 +242,7 @@ def test_messages_of_rclpy_convert_as_well():
         v=[3.0, 4.0],
         sigma=[],
     )
-    one = frame_from_message(message, 'a', 'here')
+    one = frame_from_message(message, 'a')
     assert (
         one.stamp_ns == 3_000_000_007 and one.uv.tolist() == [[1, 3], [2, 4]] and one.sigma is None
     )

@@ -16,7 +16,7 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.atomic import atomic_file, write_bytes, write_text
 from fluoro_calib_ros.files.calibration import (
-    FIELDS,
+    ARRAYS,
     load_calibration,
     load_calibrations,
     save_calibration,
@@ -369,7 +369,7 @@ def test_the_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
 
 def test_numpy_reads_it_without_pickle_and_the_document_names_every_array(tmp_path):
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
-        assert file.files == ['format_version', *FIELDS]
+        assert file.files == ['format_version', *ARRAYS]
         assert file['format_version'] == 2
         document = open(
             os.path.join(os.path.dirname(__file__), '..', 'docs', 'calibration_file.md')
@@ -417,9 +417,9 @@ class Bomb:
         ({'interior': np.array([1.0, 2.0, 3.0])}, 'does not belong to its calibration_id'),
         (
             {'interior': np.array([Bomb()] * 3, dtype=object)},
-            'the array interior is not one of plain numbers',
+            'the array interior does not contain plain numbers',
         ),
-        ({'format_version': np.array(Bomb(), dtype=object)}, 'not one of plain numbers'),
+        ({'format_version': np.array(Bomb(), dtype=object)}, 'does not contain plain numbers'),
     ],
 )
 def test_a_wrong_calibration_is_refused(tmp_path, arrays, sentence):
@@ -543,7 +543,7 @@ def test_points_of_two_fluoroscopes_with_their_own_sigma(tmp_path):
             "row 3: there is no calibration of fluoroscope 'c', only of a, b",
         ),
         ('u,v\n1,2\n', 'no column fluoroscope, and there are calibrations of a, b'),
-        ('fluoroscope,u,v,status\na,1,2,3\n', 'has a column status already'),
+        ('fluoroscope,u,v,status\na,1,2,3\n', 'already has a column status'),
         ('u\n1\n', 'no column v'),
     ],
 )

@@ -25,7 +25,7 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.calibration import save_calibration
 from fluoro_calib_ros.files.observations import write_observations_csv
-from fluoro_calib_ros.files.rig_orientation import FIELDS, load_orientation, save_orientation
+from fluoro_calib_ros.files.rig_orientation import ARRAYS, load_orientation, save_orientation
 from fluoro_calib_ros.jobs.dataset import write_bag
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.rig_orientation import (
@@ -413,7 +413,7 @@ def test_file_gives_the_same_orientation(tmp_path, found):
         assert np.array_equal(getattr(again, name), getattr(found, name)), name
     assert open(save_orientation(tmp_path, again), 'rb').read() == content
     with np.load(path, allow_pickle=False) as file:
-        assert file.files == ['format_version', *FIELDS] and file['format_version'] == 1
+        assert file.files == ['format_version', *ARRAYS] and file['format_version'] == 1
 
 
 @pytest.mark.parametrize(
@@ -431,7 +431,7 @@ def test_file_gives_the_same_orientation(tmp_path, found):
         ),
         (
             {'interior': np.array([object()], dtype=object)},
-            'the array interior is not one of plain numbers or text',
+            'the array interior does not contain plain numbers or text',
         ),
         (
             {'position_mm': np.zeros((2, 2))},

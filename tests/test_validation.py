@@ -15,11 +15,8 @@ from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
-from fluoro_calib_ros.files.calibration_sources import (
-    read_sources,
-    validation_document,
-    write_sources,
-)
+from fluoro_calib_ros.files.calibration_sources import read_sources, write_sources
+from fluoro_calib_ros.files.validation import validation_document
 from fluoro_calib_ros.report.verdict import verdict_text
 from fluoro_calib_ros.validation.bead_intersection import Beads, distances, intersect
 from fluoro_calib_ros.validation.beads import FALSE_ALARM as BEADS_FALSE_ALARM

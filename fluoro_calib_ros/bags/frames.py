@@ -13,19 +13,17 @@ from .definitions import TARGET_OBSERVATIONS, message_class
 TOPIC_NAME = 'target_observations'
 
 
-def frame_from_message(message: Any, fluoroscope: str, where: str = '') -> Frame:
+def frame_from_message(message: Any, fluoroscope: str) -> Frame:
     """Return the Frame of a TargetObservations message.
 
-    where is the place that the message of an error names. Raises DataError for arrays of
-    different lengths; nothing else is validated.
+    Raises DataError for arrays of different lengths; nothing else is validated.
     """
     try:
         target_id, uv, sigma = stack_image_points(
             message.target_id, message.u, message.v, message.sigma
         )
     except DataError as error:
-        place = f'{where}, ' if where else ''
-        raise DataError(f'{place}frame {message.frame_number}: {error}') from None
+        raise DataError(f'frame {message.frame_number}: {error}') from None
     stamp = message.header.stamp
     return Frame(
         fluoroscope,

@@ -38,8 +38,9 @@ def run(arguments: argparse.Namespace) -> None:
 
     Raises DataError, also for the verdict 'fail', after everything is written.
     """
-    from ..files.calibration_sources import read_sources, validation_document, write_validation
+    from ..files.calibration_sources import read_sources
     from ..files.phantom import read_phantom
+    from ..files.validation import validation_document, write_validation
     from ..jobs.sources import read_calibrations, read_source
     from ..report.verdict import verdict_text
     from ..validation.verdict import validate

@@ -1,72 +1,113 @@
-"""Files of named arrays: zip archives of .npy members as numpy.savez writes them, but checked,
-whole and repeatable.
+"""Files of named arrays: .npz archives as numpy.savez writes them, but validated and repeatable.
 
-Nothing is unpickled. dtype, shape, finiteness and range of every array and the CRC of every member
-are checked when it is read, and the same when it is written; the same arrays give the same bytes.
+Nothing is unpickled. Data type, shape, finiteness and range of every array are validated when it
+is written and when it is read, and so is the CRC of every member. The same arrays give the same
+bytes.
 """
+
+from __future__ import annotations
 
 import io
 import struct
 import zipfile
 import zlib
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from ..errors import DataError
-from .access import read_bytes
+from .access import PathLike, read_bytes
 from .atomic import atomic_file
 
-_DATE = (1980, 1, 1, 0, 0, 0)  # of every member: the same arrays give the same bytes
+_DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same arrays give the same bytes
+_UNIX = 3  # system of every member, for the same reason
 _DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?')}
 
 
 @dataclass(frozen=True)
-class Field:
-    """What an array of the file must be: dtype 'text', 'int', 'float' or 'bool'; shape, a letter
-    for any length; least: smallest value, and special: values besides finite ones ('inf' or 'nan')
-    that it may have.
+class ArraySpec:
+    """Requirements on an array of a file.
+
+    Attributes
+    ----------
+    dtype : {'text', 'int', 'float', 'bool'}
+    shape : tuple
+        A letter stands for any length.
+    minimum : float or None
+    allowed : {'', 'inf', 'nan'}
+        Value that a float array may have besides finite ones.
     """
 
     dtype: str
-    shape: tuple = ()
-    least: float | None = None
-    special: str = ''
+    shape: tuple[int | str, ...] = ()
+    minimum: float | None = None
+    allowed: str = ''
 
 
-def array_of(path, name, value, field):
-    """Value as the array that is written, checked as it will be when it is read. Raises DataError."""
-    array = np.asarray(value)
-    if field.dtype == 'text':
-        return _checked(path, name, array.astype(str), field)
-    if (
-        array.dtype.kind in 'iub' and field.dtype in ('int', 'float')
-    ) or array.dtype.kind == field.dtype[0]:
-        array = array.astype(_DTYPES[field.dtype])
-    return _checked(path, name, np.ascontiguousarray(array).reshape(array.shape), field)
+@dataclass(frozen=True)
+class Layout:
+    """Layout of a file.
 
-
-def write_arrays(path, version, arrays):
-    """Write arrays {name: array} as a file of a layout version. Raises DataError where it cannot
-    be written; a file that was there is then left as it was.
+    Attributes
+    ----------
+    content : str
+        What the file holds, with its article, such as 'a calibration'.
+    arrays : mapping of str to ArraySpec
+    version : int
+        Version that is written.
+    readable : tuple of int
+        Versions that can be read, ascending.
+    defaults : mapping of int to mapping of str to array
+        By older version: values of the arrays that it does not have.
     """
+
+    content: str
+    arrays: Mapping[str, ArraySpec]
+    version: int
+    readable: tuple[int, ...]
+    defaults: Mapping[int, Mapping[str, np.ndarray]] = field(default_factory=dict)
+
+
+def to_arrays(where: object, layout: Layout, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return values as the arrays that a file of this layout contains.
+
+    where begins the message of the DataError that is raised for a value that could not be read
+    again.
+    """
+    return {
+        name: _to_array(where, name, values[name], spec) for name, spec in layout.arrays.items()
+    }
+
+
+def to_values(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return arrays with Python numbers and text in place of arrays without dimensions."""
+    return {name: array.item() if array.ndim == 0 else array for name, array in arrays.items()}
+
+
+def write_arrays(path: PathLike, layout: Layout, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write the arrays that `to_arrays` returned.
+
+    Raises DataError where the file cannot be written; an earlier file is then unchanged.
+    """
+    version = np.array(layout.version, dtype=_DTYPES['int'])
     with atomic_file(path) as file, zipfile.ZipFile(file, 'w', zipfile.ZIP_STORED) as archive:
-        _write_member(archive, 'format_version', np.array(version, dtype=_DTYPES['int']))
+        _write_member(archive, 'format_version', version)
         for name, array in arrays.items():
             _write_member(archive, name, array)
 
 
-def read_arrays(path, fields, readable, what, known=None):
-    """The arrays {name: array} of a file, each as its Field in fields {name: Field} says.
+def read_arrays(path: PathLike, layout: Layout) -> dict[str, np.ndarray]:
+    """Read the arrays of a file.
 
-    readable: versions of the layout; what: what the file is to be, such as 'a calibration'; known
-    {version: {name: array}}: those that an older version does not have. Raises DataError for a
-    file that is none, is damaged, or has a layout this program does not know.
+    Raises DataError for a file of another kind, a damaged one, a version of the layout that is
+    not known, and an array that does not meet its requirements.
     """
     content = read_bytes(path)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            arrays = _read_members(path, archive, fields, readable, what, known or {})
+            arrays = _read_members(path, archive, layout)
     except DataError:
         raise
     except (
@@ -74,92 +115,114 @@ def read_arrays(path, fields, readable, what, known=None):
         zlib.error,
         EOFError,
         OSError,
-        RuntimeError,
-        ValueError,
+        RuntimeError,  # unknown compression
+        ValueError,  # offsets before the file, names that are not text
         struct.error,
     ):
-        # RuntimeError: unknown compression; ValueError: places before the file, names that are no
-        # text
-        raise DataError(f'{path}: this is not {what} file, or it is damaged') from None
-    return {name: _checked(path, name, arrays[name], field) for name, field in fields.items()}
+        raise DataError(f'{path}: this is not {layout.content} file, or it is damaged') from None
+    for name, spec in layout.arrays.items():
+        _validate(path, name, arrays[name], spec)
+    return arrays
 
 
-def values_of(arrays):
-    """The same with numbers and text in place of arrays without dimensions."""
-    return {name: array.item() if array.ndim == 0 else array for name, array in arrays.items()}
+def _to_array(where: object, name: str, value: Any, spec: ArraySpec) -> np.ndarray:
+    array = np.asarray(value)
+    if spec.dtype == 'text':
+        array = array.astype(str)
+    else:
+        is_whole = array.dtype.kind in 'iub' and spec.dtype in ('int', 'float')
+        if is_whole or array.dtype.kind == spec.dtype[0]:
+            array = array.astype(_DTYPES[spec.dtype])
+        array = np.ascontiguousarray(array).reshape(array.shape)
+    _validate(where, name, array, spec)
+    return array
 
 
-def _write_member(archive, name, array):
+def _write_member(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
     info = zipfile.ZipInfo(f'{name}.npy', date_time=_DATE)
-    # the same on every system
-    info.create_system = 3
+    info.create_system = _UNIX
     info.external_attr = 0o644 << 16
     buffer = io.BytesIO()
     np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
     archive.writestr(info, buffer.getvalue())
 
 
-def _read_members(path, archive, fields, readable, what, known):
-    """The arrays of an archive by name, their version checked first; CRC of every member checked."""
-    names = archive.namelist()
-    if 'format_version.npy' not in names:
-        raise DataError(f'{path}: this is not {what} file, it has no array format_version')
+def _read_members(
+    path: PathLike, archive: zipfile.ZipFile, layout: Layout
+) -> dict[str, np.ndarray]:
+    """Return the arrays of an archive; its version is checked first."""
+    members = archive.namelist()
+    version = _read_version(path, archive, layout)
+    defaults = layout.defaults.get(version, {})
+    arrays = {}
+    for name in layout.arrays:
+        if name not in defaults and f'{name}.npy' not in members:
+            noun = layout.content.partition(' ')[2]
+            raise DataError(f'{path}: the {noun} has no array {name}')
+    for name in layout.arrays:
+        arrays[name] = defaults[name] if name in defaults else _read_member(path, archive, name)
+    return arrays
+
+
+def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> int:
+    """Return the version of the layout. Raises DataError for one that is not known."""
+    if 'format_version.npy' not in archive.namelist():
+        raise DataError(
+            f'{path}: this is not {layout.content} file, it has no array format_version'
+        )
     version = _read_member(path, archive, 'format_version')
     if version.shape != () or version.dtype.kind not in 'iu':
         raise DataError(
-            f'{path}: this is not {what} file, its format_version is not a whole number'
+            f'{path}: this is not {layout.content} file, its format_version is not a whole number'
         )
-    if version not in readable:
-        versions = (
-            f'versions {readable[0]} to {readable[-1]}'
-            if len(readable) > 1
-            else f'version {readable[0]}'
-        )
+    if version not in layout.readable:
+        first = layout.readable[0]
+        last = layout.readable[-1]
+        known = f'version {first}' if first == last else f'versions {first} to {last}'
         raise DataError(
-            f'{path}: the file has layout version {int(version)}, this program knows {versions}'
+            f'{path}: the file has layout version {int(version)}, this program knows {known}'
         )
-    known = known.get(int(version), {})
-    missing = [name for name in fields if f'{name}.npy' not in names and name not in known]
-    if missing:
-        raise DataError(f'{path}: the {what.partition(" ")[2]} has no array {missing[0]}')
-    return {
-        name: known[name] if name in known else _read_member(path, archive, name)
-        for name in fields
-    }
+    return int(version)
 
 
-def _read_member(path, archive, name):
+def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndarray:
     content = archive.read(f'{name}.npy')
     try:
         return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
     except (ValueError, EOFError, MemoryError, OverflowError, TypeError, SyntaxError):
         raise DataError(
-            f'{path}: the array {name} is not one of plain numbers or text, '
-            f'and nothing else is read'
+            f'{path}: the array {name} does not contain plain numbers or text, and nothing else '
+            f'is read'
         ) from None
 
 
-def _checked(path, name, array, field):
-    """array, if it is what field says. Raises DataError."""
-    wanted = 'text' if field.dtype == 'text' else _DTYPES[field.dtype]
-    if array.dtype.kind != 'U' if wanted == 'text' else array.dtype != wanted:
-        raise DataError(f'{path}: the array {name} has dtype {array.dtype}, not {wanted}')
-    shape = field.shape
-    if array.ndim != len(shape) or any(
-        want != have and isinstance(want, int) for want, have in zip(shape, array.shape)
+def _validate(where: object, name: str, array: np.ndarray, spec: ArraySpec) -> None:
+    """Raise DataError, beginning with where, for an array that does not meet its requirements."""
+    if spec.dtype == 'text':
+        is_expected = array.dtype.kind == 'U'
+    else:
+        is_expected = array.dtype == _DTYPES[spec.dtype]
+    if not is_expected:
+        expected = _DTYPES.get(spec.dtype, spec.dtype)
+        raise DataError(f'{where}: the array {name} has dtype {array.dtype}, not {expected}')
+    if len(array.shape) != len(spec.shape) or any(
+        isinstance(length, int) and length != actual
+        for length, actual in zip(spec.shape, array.shape)
     ):
-        raise DataError(
-            f'{path}: the array {name} has shape {array.shape}, not ({", ".join(map(str, shape))})'
-        )
-    if field.dtype == 'float':
-        good = np.isfinite(array)
-        good |= {'inf': array == np.inf, 'nan': np.isnan(array), '': False}[field.special]
-        if not good.all():
+        shape = ', '.join(map(str, spec.shape))
+        raise DataError(f'{where}: the array {name} has shape {array.shape}, not ({shape})')
+    if spec.dtype == 'float':
+        valid = np.isfinite(array)
+        if spec.allowed == 'inf':
+            valid = valid | (array == np.inf)
+        elif spec.allowed == 'nan':
+            valid = valid | np.isnan(array)
+        if not valid.all():
             raise DataError(
-                f'{path}: the array {name} holds {array[~good].flat[0]}, which is not a finite number'
+                f'{where}: the array {name} holds {array[~valid].flat[0]}, '
+                f'which is not a finite number'
             )
-    if field.least is not None and (array < field.least).any():
+    if spec.minimum is not None and (array < spec.minimum).any():
         raise DataError(
-            f'{path}: the array {name} holds {array.min()}, which is below {field.least}'
+            f'{where}: the array {name} holds {array.min()}, which is below {spec.minimum}'
         )
-    return array

@@ -1,6 +1,10 @@
-"""The calibration file DIR/<fluoroscope>.calibration.npz, described in docs/calibration_file.md."""
+"""The calibration file DIR/<fluoroscope>.calibration.npz; see docs/calibration_file.md."""
+
+from __future__ import annotations
 
 import os
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 
@@ -8,108 +12,131 @@ from ..calibration.result import FluoroscopeCalibration
 from ..distortion.registry import model_from_arrays
 from ..distortion.series import packed
 from ..errors import DataError
-from .access import check_safe_name, make_folder, os_error_reason
-from .arrays import Field, array_of, read_arrays, values_of, write_arrays
+from .access import PathLike, check_safe_name, make_folder, os_error_reason
+from .arrays import ArraySpec, Layout, read_arrays, to_arrays, to_values, write_arrays
 
-VERSION = 2  # of the layout
-READABLE = (1, 2)  # version 1 knew no series
 SUFFIX = '.calibration.npz'
 
-FIELDS = {
-    'fluoroscope': Field('text'),
-    'calibration_id': Field('text'),
-    'image_size': Field('int', (2,), least=1),
-    'interior': Field('float', (3,)),
-    'interior_covariance': Field('float', (3, 3)),
-    'interior_estimated': Field('bool'),
-    'model_kind': Field('text'),
-    'model_k': Field('int', least=0),
-    'train_uv': Field('float', ('N', 2)),
-    'train_duv': Field('float', ('N', 2)),
-    'train_exposure': Field('int', ('N',), least=0),
-    'noise_px': Field('float', least=0),
-    'bias_px': Field('float', least=0),
-    'series_degree': Field('int', least=-1),
-    'series_modes': Field('int', least=0),
-    'series_coefficients': Field('float', (2, 'M')),
-    'series_sd': Field('float', ('S', 'S'), least=0),
-    'image_sd': Field('float', least=0),
-    'sigma0': Field('float', least=0),
-    'nu': Field('float', least=0, special='inf'),
-    'exposures': Field('int', least=0),
-    'observations': Field('int', least=0),
-    'inliers': Field('int', least=0),
-    'rmse_before': Field('float', (2,), least=0, special='nan'),
-    'rmse_after': Field('float', (2,), least=0, special='nan'),
-    'cost_adjustment': Field('float', special='nan'),
-    'cost_regression': Field('float', special='nan'),
-    'iterations': Field('int', least=0),
-    'converged': Field('bool'),
-    'stamp_ns': Field('int'),
-    'frame_id': Field('text'),
-    'source_digest': Field('text'),
+ARRAYS = {
+    'fluoroscope': ArraySpec('text'),
+    'calibration_id': ArraySpec('text'),
+    'image_size': ArraySpec('int', (2,), minimum=1),
+    'interior': ArraySpec('float', (3,)),
+    'interior_covariance': ArraySpec('float', (3, 3)),
+    'interior_estimated': ArraySpec('bool'),
+    'model_kind': ArraySpec('text'),
+    'model_k': ArraySpec('int', minimum=0),
+    'train_uv': ArraySpec('float', ('N', 2)),
+    'train_duv': ArraySpec('float', ('N', 2)),
+    'train_exposure': ArraySpec('int', ('N',), minimum=0),
+    'noise_px': ArraySpec('float', minimum=0),
+    'bias_px': ArraySpec('float', minimum=0),
+    'series_degree': ArraySpec('int', minimum=-1),
+    'series_modes': ArraySpec('int', minimum=0),
+    'series_coefficients': ArraySpec('float', (2, 'M')),
+    'series_sd': ArraySpec('float', ('S', 'S'), minimum=0),
+    'image_sd': ArraySpec('float', minimum=0),
+    'sigma0': ArraySpec('float', minimum=0),
+    'nu': ArraySpec('float', minimum=0, allowed='inf'),
+    'exposures': ArraySpec('int', minimum=0),
+    'observations': ArraySpec('int', minimum=0),
+    'inliers': ArraySpec('int', minimum=0),
+    'rmse_before': ArraySpec('float', (2,), minimum=0, allowed='nan'),
+    'rmse_after': ArraySpec('float', (2,), minimum=0, allowed='nan'),
+    'cost_adjustment': ArraySpec('float', allowed='nan'),
+    'cost_regression': ArraySpec('float', allowed='nan'),
+    'iterations': ArraySpec('int', minimum=0),
+    'converged': ArraySpec('bool'),
+    'stamp_ns': ArraySpec('int'),
+    'frame_id': ArraySpec('text'),
+    'source_digest': ArraySpec('text'),
 }
 _SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
 # Array of the file: entry of CorrectionModel.to_arrays.
-_OF_MODEL = {
+_MODEL_ENTRIES = {
     'model_kind': 'kind',
     'model_k': 'k',
     **{name: name for name in ('train_uv', 'train_duv', 'noise_px', 'bias_px', *_SERIES)},
 }
+LAYOUT = Layout(
+    'a calibration',
+    ARRAYS,
+    version=2,
+    readable=(1, 2),
+    # Version 1 did not have a series.
+    defaults={1: dict(zip(_SERIES, map(np.asarray, packed(None))))},
+)
 
 
-def calibration_path(directory, fluoroscope):
-    """Path of the calibration file of a fluoroscope in a directory. Raises DataError for an unsafe
-    name.
-    """
+def calibration_path(directory: PathLike, fluoroscope: str) -> str:
+    """Return the path of the calibration file of a fluoroscope. Raises DataError for its name."""
     check_safe_name(fluoroscope, directory)
     return os.path.join(directory, fluoroscope + SUFFIX)
 
 
-def save_calibration(directory, calibration):
-    """Write a FluoroscopeCalibration to directory, which is made where it is missing; returns the
-    path.
+def save_calibration(directory: PathLike, calibration: FluoroscopeCalibration) -> str:
+    """Write a calibration into a folder, which is created where it is missing.
 
-    The same calibration gives the same bytes; its `seconds` are not kept. Raises DataError where
-    it cannot be written or holds something that could not be read again; a file that was there is
-    then left as it was.
+    Returns the path. The same calibration gives the same bytes; its `seconds` are not saved.
+    Raises DataError where the file cannot be written, or could not be read again; an earlier file
+    is then unchanged.
     """
     path = calibration_path(directory, calibration.fluoroscope)
-    arrays = checked_arrays(path, calibration)
+    arrays = validated_arrays(path, calibration)
     make_folder(directory)
-    write_arrays(path, VERSION, arrays)
+    write_arrays(path, LAYOUT, arrays)
     return path
 
 
-def checked_arrays(where, calibration):
-    """The arrays {name: array} of a FluoroscopeCalibration. Raises DataError, beginning with
-    where, for one that holds what a calibration cannot hold, such as NaN.
+def validated_arrays(where: object, calibration: FluoroscopeCalibration) -> dict[str, np.ndarray]:
+    """Return the arrays of a calibration as its file contains them.
+
+    where begins the message of the DataError that is raised for a value that a calibration cannot
+    have, such as NaN.
     """
     model = calibration.model.to_arrays()
-    arrays = {
-        name: array_of(where, name, _value_of(calibration, model, name), field)
-        for name, field in FIELDS.items()
+    values = {
+        name: model[_MODEL_ENTRIES[name]] if name in _MODEL_ENTRIES else getattr(calibration, name)
+        for name in ARRAYS
     }
+    if not len(calibration.train_exposure):
+        values['train_exposure'] = np.zeros(0, dtype=np.int64)  # an empty list would be float
+    arrays = to_arrays(where, LAYOUT, values)
     _check_lengths(where, arrays)
     return arrays
 
 
-def load_calibration(path):
-    """The FluoroscopeCalibration in a file, equal to the saved one to the last bit; its seconds
-    are NaN.
+def load_calibration(path: PathLike) -> FluoroscopeCalibration:
+    """Read a calibration, which is equal to the saved one to the last bit; its seconds are NaN.
 
-    Raises DataError for a file that is no calibration, is damaged, or has a layout this program
-    does not know.
+    Raises DataError for a file that is not a calibration, is damaged, or has a version of the
+    layout that is not known.
     """
-    without_series = dict(zip(_SERIES, map(np.asarray, packed(None))))
-    checked = read_arrays(path, FIELDS, READABLE, 'a calibration', {1: without_series})
-    _check_lengths(path, checked)
-    return _calibration(path, checked)
+    arrays = read_arrays(path, LAYOUT)
+    _check_lengths(path, arrays)
+    values = to_values(arrays)
+    identity = values.pop('calibration_id')
+    width, height = values['image_size'].tolist()
+    values['image_size'] = (width, height)
+    check_safe_name(values['fluoroscope'], path)
+    content = {entry: values.pop(name) for name, entry in _MODEL_ENTRIES.items()}
+    try:
+        model = model_from_arrays(content, values['image_size'])
+        calibration = FluoroscopeCalibration(model=model, **values)
+    except ValueError as error:
+        raise DataError(f'{path}: {error}') from None
+    if calibration.calibration_id != identity:
+        raise DataError(
+            f'{path}: the content does not belong to its calibration_id {identity}, '
+            f'the file was changed'
+        )
+    return calibration
 
 
-def load_calibrations(directory):
-    """All calibrations {fluoroscope: FluoroscopeCalibration} in a directory, by name. Raises
-    DataError, also where there is none.
+def load_calibrations(directory: PathLike) -> dict[str, FluoroscopeCalibration]:
+    """Read all calibrations in a folder, sorted by fluoroscope.
+
+    Raises DataError, also for a folder without calibrations.
     """
     try:
         names = sorted(
@@ -127,44 +154,19 @@ def load_calibrations(directory):
     for name in names:
         path = os.path.join(directory, name)
         calibration = load_calibration(path)
-        if calibration.fluoroscope + SUFFIX != name:
+        expected = calibration.fluoroscope + SUFFIX
+        if name != expected:
             raise DataError(
                 f'{path}: this is the calibration of fluoroscope {calibration.fluoroscope}, '
-                f'its file is called {calibration.fluoroscope + SUFFIX}'
+                f'its file is called {expected}'
             )
         out[calibration.fluoroscope] = calibration
     return out
 
 
-def _value_of(calibration, model, name):
-    if name in _OF_MODEL:
-        return model[_OF_MODEL[name]]
-    if name == 'train_exposure' and not len(calibration.train_exposure):
-        return np.zeros(0, dtype=np.int64)  # an empty list would be one of floats
-    return getattr(calibration, name)
-
-
-def _check_lengths(path, arrays):
+def _check_lengths(where: object, arrays: Mapping[str, Any]) -> None:
+    """Raise DataError for training arrays of different lengths."""
     lengths = {name: len(arrays[name]) for name in ('train_uv', 'train_duv', 'train_exposure')}
     if len(set(lengths.values())) > 1:
-        said = ', '.join(f'{name} {length}' for name, length in lengths.items())
-        raise DataError(f'{path}: the training arrays differ in length ({said})')
-
-
-def _calibration(path, arrays):
-    values = values_of(arrays)
-    identity = values.pop('calibration_id')
-    values['image_size'] = tuple(values['image_size'].tolist())
-    check_safe_name(values['fluoroscope'], path)
-    content = {entry: values.pop(name) for name, entry in _OF_MODEL.items()}
-    try:
-        model = model_from_arrays(content, values['image_size'])
-        calibration = FluoroscopeCalibration(model=model, **values)
-    except ValueError as error:
-        raise DataError(f'{path}: {error}') from None
-    if calibration.calibration_id != identity:
-        raise DataError(
-            f'{path}: the content does not belong to its calibration_id {identity}, '
-            f'the file was changed'
-        )
-    return calibration
+        listed = ', '.join(f'{name} {length}' for name, length in lengths.items())
+        raise DataError(f'{where}: the training arrays differ in length ({listed})')

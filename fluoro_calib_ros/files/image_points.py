@@ -1,103 +1,121 @@
-"""Image points in a CSV file that are corrected and written back with all their other columns."""
+"""Image points in a CSV file, which are corrected and written with all their other columns."""
 
+from __future__ import annotations
+
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from ..calibration.result import CorrectedPoints
+from ..calibration.result import CorrectedPoints, FluoroscopeCalibration
 from ..distortion.status import CorrectionStatus
 from ..errors import DataError
+from ..exposures.frame import is_positive
+from .access import PathLike
 from .atomic import atomic_file
-from .csv_table import format_float, read_blocks, write_rows
+from .csv_table import Block, format_float, read_blocks, write_rows
 
 STATUS = tuple(status.name for status in CorrectionStatus)
-ADDED = ('u_corrected', 'v_corrected', 'sigma', 'status')
+ADDED_COLUMNS = ('u_corrected', 'v_corrected', 'sigma', 'status')
 
 
 @dataclass(frozen=True)
 class PointsFile:
-    """Image points of a CSV file: header and rows as text; lines (n,) numbers of the rows in the
-    file; uv (n, 2) [px], NaN where a cell is empty or nan; sigma (n,) [px], NaN where empty, or
-    None: no such column; fluoroscope (n,) names, or None: no such column.
+    """Image points of a CSV file.
+
+    Attributes
+    ----------
+    path : path-like
+    header : list of str
+    rows : list of list of str
+        All cells as text.
+    lines : (n,) ndarray of int
+        Number of each row in the file.
+    uv : (n, 2) ndarray
+        [px], NaN where a cell is empty or nan.
+    sigma : (n,) ndarray or None
+        [px], NaN where a cell is empty; None without such a column.
+    fluoroscope : (n,) ndarray of str or None
+        None without such a column.
     """
 
-    path: str
-    header: list
-    rows: list
+    path: PathLike
+    header: list[str]
+    rows: list[list[str]]
     lines: np.ndarray
     uv: np.ndarray
     sigma: np.ndarray | None
     fluoroscope: np.ndarray | None
 
-    def added(self):
-        """Names of the columns that write_points adds."""
+    @property
+    def added_columns(self) -> list[str]:
+        """Names of the columns that `write_points` adds."""
         return [
             f'{name}_corrected' if name == 'sigma' and name in self.header else name
-            for name in ADDED
+            for name in ADDED_COLUMNS
         ]
 
 
-def read_points(path):
-    """The PointsFile of a CSV file with u, v [px], perhaps fluoroscope and sigma, and any other
-    columns.
+def read_points(path: PathLike) -> PointsFile:
+    """Read a CSV file with the columns u, v [px], optionally fluoroscope and sigma, and others.
 
-    Raises DataError that names the row and the cause; an empty u or v is none, it is a point
-    without status OK.
+    u and v may be empty; such a point will have the status INVALID. Raises DataError that names
+    row and cause.
     """
-    header = None
-    rows = []
-    lines = []
-    uv = []
-    sigma = []
-    names = []
-    for block in read_blocks(path, ('u', 'v')):
-        header = block.header
-        rows += block.rows
-        lines.append(block.lines)
-        uv.append(np.column_stack([block.floats_or_nan('u'), block.floats_or_nan('v')]))
-        if 'sigma' in block:
-            sigma.append(block.floats_or_nan('sigma'))
-            good = np.isnan(sigma[-1]) | (np.isfinite(sigma[-1]) & (sigma[-1] > 0))
-            block.require('sigma', good, 'not a finite number above 0')
-        if 'fluoroscope' in block:
-            names += block.strings('fluoroscope')
+    blocks = list(read_blocks(path, ('u', 'v')))
+    header = blocks[0].header
     points = PointsFile(
         path,
         header,
-        rows,
-        np.concatenate(lines),
-        np.concatenate(uv),
-        np.concatenate(sigma) if sigma else None,
-        np.array(names) if names else None,
+        [row for block in blocks for row in block.rows],
+        np.concatenate([block.lines for block in blocks]),
+        np.concatenate([_uv(block) for block in blocks]),
+        np.concatenate([_sigma(block) for block in blocks]) if 'sigma' in header else None,
+        np.array([name for block in blocks for name in block.strings('fluoroscope')])
+        if 'fluoroscope' in header
+        else None,
     )
-    taken = [name for name in points.added() if name in header]
-    if taken:
-        raise DataError(
-            f'{path}: the file has a column {taken[0]} already, it would be there twice'
-        )
+    for name in points.added_columns:
+        if name in header:
+            raise DataError(
+                f'{path}: the file already has a column {name}, which would be written twice'
+            )
     return points
 
 
-def correct_points(points, calibrations):
-    """CorrectedPoints of a PointsFile, with calibrations {fluoroscope: FluoroscopeCalibration}.
+def _uv(block: Block) -> np.ndarray:
+    return np.column_stack([block.floats_or_nan('u'), block.floats_or_nan('v')])
 
-    A point without its own sigma has that of the calibration. Raises DataError where a point's
-    fluoroscope has no calibration, or where the file does not tell the fluoroscope and there are
-    several.
+
+def _sigma(block: Block) -> np.ndarray:
+    sigma = block.floats_or_nan('sigma')
+    block.require('sigma', np.isnan(sigma) | is_positive(sigma), 'not a finite number above 0')
+    return sigma
+
+
+def correct_points(
+    points: PointsFile, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> CorrectedPoints:
+    """Correct image points with the calibrations of their fluoroscopes.
+
+    A point without sigma has that of the calibration. Raises DataError for a fluoroscope without
+    calibration, and for a file without the column fluoroscope where there are several
+    calibrations.
     """
     names = points.fluoroscope
     if names is None:
         if len(calibrations) != 1:
             raise DataError(
-                f'{points.path}: the file has no column fluoroscope, and there are calibrations of '
-                f'{", ".join(calibrations)}'
+                f'{points.path}: the file has no column fluoroscope, and there are calibrations '
+                f'of {", ".join(calibrations)}'
             )
         names = np.array([*calibrations] * len(points.uv))
     unknown = np.flatnonzero(~np.isin(names, list(calibrations)))
     if len(unknown):
+        first = unknown[0]
         raise DataError(
-            f'{points.path}, row {points.lines[unknown[0]]}: there is no calibration of fluoroscope '
-            f'{str(names[unknown[0]])!r}, only of {", ".join(calibrations)}'
+            f'{points.path}, row {points.lines[first]}: there is no calibration of fluoroscope '
+            f'{str(names[first])!r}, only of {", ".join(calibrations)}'
         )
     out = CorrectedPoints(
         np.full(points.uv.shape, np.nan),
@@ -117,22 +135,20 @@ def correct_points(points, calibrations):
     return out
 
 
-def write_points(path, points, corrected):
-    """Write a PointsFile with its CorrectedPoints: the rows as they were, and u_corrected,
-    v_corrected [px], sigma [px] (sigma_corrected where there is a sigma already) and status behind
-    them. What is INVALID has empty cells. Raises DataError where the file cannot be written.
+def write_points(path: PathLike, points: PointsFile, corrected: CorrectedPoints) -> None:
+    """Write the rows of a PointsFile with further columns.
+
+    These are u_corrected, v_corrected [px], sigma [px] (sigma_corrected where the file has a
+    sigma) and status. The cells of a point that is INVALID are empty. Raises DataError where the
+    file cannot be written.
     """
+    numbers = np.column_stack([corrected.uv, corrected.sigma]).tolist()
     with atomic_file(path, 'w') as file:
-        write_rows(file, [points.header + points.added()])
+        write_rows(file, [points.header + points.added_columns])
         write_rows(
             file,
             (
-                [*row, format_float(u), format_float(v), format_float(sigma), STATUS[status]]
-                for row, (u, v), sigma, status in zip(
-                    points.rows,
-                    corrected.uv.tolist(),
-                    corrected.sigma.tolist(),
-                    corrected.status.tolist(),
-                )
+                [*row, *map(format_float, values), STATUS[status]]
+                for row, values, status in zip(points.rows, numbers, corrected.status.tolist())
             ),
         )

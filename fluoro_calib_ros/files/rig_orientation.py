@@ -1,67 +1,67 @@
 """The file DIR/rig_orientation.npz, described in docs/orientation_file.md."""
 
+from __future__ import annotations
+
 import os
 
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
-from .access import check_safe_name, make_folder
-from .arrays import Field, array_of, read_arrays, values_of, write_arrays
+from .access import PathLike, check_safe_name, make_folder
+from .arrays import ArraySpec, Layout, read_arrays, to_arrays, to_values, write_arrays
 
-VERSION = 1  # of the layout
-READABLE = (1,)
 NAME = 'rig_orientation.npz'
 
-FIELDS = {
-    'fluoroscope': Field('text', ('F',)),
-    'calibration_id': Field('text', ('F',)),
-    'optical_frame_id': Field('text', ('F',)),
-    'interior': Field('float', ('F', 3)),
-    'rotation': Field('float', ('F', 3, 3)),
-    'position_mm': Field('float', ('F', 3)),
-    'covariance': Field('float', ('N', 'N')),
-    'frame_id': Field('text'),
-    'source': Field('text'),
-    'stamp_ns': Field('int'),
-    'exposures': Field('int', least=0),
-    'orientation_id': Field('text'),
+ARRAYS = {
+    'fluoroscope': ArraySpec('text', ('F',)),
+    'calibration_id': ArraySpec('text', ('F',)),
+    'optical_frame_id': ArraySpec('text', ('F',)),
+    'interior': ArraySpec('float', ('F', 3)),
+    'rotation': ArraySpec('float', ('F', 3, 3)),
+    'position_mm': ArraySpec('float', ('F', 3)),
+    'covariance': ArraySpec('float', ('N', 'N')),
+    'frame_id': ArraySpec('text'),
+    'source': ArraySpec('text'),
+    'stamp_ns': ArraySpec('int'),
+    'exposures': ArraySpec('int', minimum=0),
+    'orientation_id': ArraySpec('text'),
 }
+# Array of the file: attribute of the RigOrientation, where it has another name.
 _ATTRIBUTES = {
     'fluoroscope': 'fluoroscopes',
     'calibration_id': 'calibration_ids',
     'optical_frame_id': 'optical_frame_ids',
-}  # array: attribute of the RigOrientation
+}
+LAYOUT = Layout('a rig orientation', ARRAYS, version=1, readable=(1,))
 
 
-def orientation_path(directory):
-    """Path of the orientation of the rig in a directory."""
+def orientation_path(directory: PathLike) -> str:
+    """Return the path of the orientation of the rig in a folder."""
     return os.path.join(directory, NAME)
 
 
-def save_orientation(directory, orientation):
-    """Write a RigOrientation to directory, which is made where it is missing; returns the path.
+def save_orientation(directory: PathLike, orientation: RigOrientation) -> str:
+    """Write an orientation into a folder, which is created where it is missing.
 
-    The same orientation gives the same bytes. Raises DataError where it cannot be written; a file
-    that was there is then left as it was.
+    Returns the path. The same orientation gives the same bytes. Raises DataError where the file
+    cannot be written; an earlier file is then unchanged.
     """
     path = orientation_path(directory)
     for name in orientation.fluoroscopes:
         check_safe_name(name, path)
-    arrays = {
-        name: array_of(path, name, getattr(orientation, _ATTRIBUTES.get(name, name)), field)
-        for name, field in FIELDS.items()
-    }
+    values = {name: getattr(orientation, _ATTRIBUTES.get(name, name)) for name in ARRAYS}
+    arrays = to_arrays(path, LAYOUT, values)
     make_folder(directory)
-    write_arrays(path, VERSION, arrays)
+    write_arrays(path, LAYOUT, arrays)
     return path
 
 
-def load_orientation(path):
-    """The RigOrientation in a file, equal to the saved one to the last bit.
+def load_orientation(path: PathLike) -> RigOrientation:
+    """Read an orientation, which is equal to the saved one to the last bit.
 
-    Raises DataError for a file that is no orientation of a rig, is damaged, was changed, or has a
-    layout this program does not know.
+    Raises DataError for a file that is not the orientation of a rig, is damaged or was changed, or
+    has a version of the layout that is not known.
     """
-    values = values_of(read_arrays(path, FIELDS, READABLE, 'a rig orientation'))
+    values = to_values(read_arrays(path, LAYOUT))
     identity = values.pop('orientation_id')
     for name in values['fluoroscope'].tolist():
         check_safe_name(name, path)
@@ -73,6 +73,7 @@ def load_orientation(path):
         raise DataError(f'{path}: {error}') from None
     if orientation.orientation_id != identity:
         raise DataError(
-            f'{path}: the content does not belong to its orientation_id {identity}, the file was changed'
+            f'{path}: the content does not belong to its orientation_id {identity}, '
+            f'the file was changed'
         )
     return orientation

@@ -10,10 +10,11 @@ from ..calibration.calibrate import CalibrationResult
 from ..calibration.result import FluoroscopeCalibration
 from ..errors import DataError
 from ..files.calibration import save_calibration
-from ..files.calibration_sources import write_sources, write_validation
+from ..files.calibration_sources import write_sources
 from ..files.json_file import write_json
 from ..files.result_document import result_document
 from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
+from ..files.validation import write_validation
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 

@@ -41,7 +41,7 @@ def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
             'px',
             f'fluoroscope {name}: the residuals have a trend of {trend.size:.2f} px, most at '
             f'{where}',
-            _advice(evidence.request.options.model, kind, len(evidence.frames[name])),
+            _advice(evidence.request.options.model_name, kind, len(evidence.frames[name])),
             trend.place,
         ),
     )

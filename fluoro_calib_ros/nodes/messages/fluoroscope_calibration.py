@@ -12,7 +12,7 @@ from ...distortion.base import CorrectionModel
 from ...distortion.registry import model_from_arrays
 from ...distortion.series import SD_GRID
 from ...errors import DataError
-from ...files.calibration import checked_arrays
+from ...files.calibration import validated_arrays
 from .fields import (
     float64_field,
     nanoseconds_from_stamp,
@@ -81,7 +81,7 @@ def calibration_from_message(
     )
     if calibration.calibration_id != message.calibration_id:
         raise DataError(f'{where}: its content does not match its id {message.calibration_id}')
-    checked_arrays(where, calibration)
+    validated_arrays(where, calibration)
     return calibration
 
 

@@ -23,6 +23,8 @@ from .runtime.parameters import ManagedParameters, ParameterGroup
 from .runtime.qos import latched_qos, observations_qos
 from .runtime.refusals import Refused
 
+# An integer: comparing an array with an enum member takes longer than the rest of the node.
+INVALID = int(CorrectionStatus.INVALID)
 _NODE = ParameterGroup(ManagedParameters)
 PARAMETERS = (_NODE,)
 
@@ -140,7 +142,7 @@ class CorrectionNode(CorrectingNode):
         )
         stream.count_corrected(info)
         status = corrected[-1]
-        if not len(status) or status.max() == CorrectionStatus.INVALID:
+        if not len(status) or status.max() == INVALID:
             self._note_invalid_points(stream, frame, status)
 
     @staticmethod
@@ -152,7 +154,7 @@ class CorrectionNode(CorrectingNode):
         if not len(status):
             stream.refusals.note(f'{where}: the frame is empty, it has no targets')
             return
-        invalid = np.flatnonzero(status == CorrectionStatus.INVALID)
+        invalid = np.flatnonzero(status == INVALID)
         stream.invalid_points += len(invalid)
         number = np.frombuffer(frame.target_id, np.uint32)[invalid[0]]
         stream.refusals.note(

@@ -66,3 +66,8 @@ def test_out_of_sample_test_of_a_calibration(tmp_path):
     said = example('test_a_calibration.py', tmp_path / 'rig').splitlines()
     beads, survey = (float(line.split()[-2]) for line in said)
     assert beads < 0.6 * survey
+
+
+@pytest.mark.long
+def test_own_regressor_is_saved_as_a_lookup_grid(tmp_path):
+    assert example('own_regressor.py', tmp_path / 'result').startswith('lookup: RMSE 0.')

@@ -96,8 +96,9 @@ def validate_corrected(fluoroscope: str, frame: CorrectedFrame) -> None:
     """
     count = len(frame.target_id)
     where = f'fluoroscope {fluoroscope}, frame {frame.frame_number}'
-    arrays = {name: getattr(frame, name) for name in CORRECTED_ARRAYS}
-    if any(len(values) != count for values in arrays.values()):
+    lengths = map(len, (frame.u, frame.v, frame.sigma, frame.correction_sd, frame.status))
+    if set(lengths) != {count}:
+        arrays = {name: getattr(frame, name) for name in CORRECTED_ARRAYS}
         raise Refused('lengths', f'{where}: {length_error(frame.target_id, **arrays)}')
     if len(set(frame.target_id.tolist())) < count:
         raise Refused('repeated target', f'{where}: a target occurs more than once')

@@ -17,7 +17,8 @@ from threadpoolctl import threadpool_limits
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.initial_network import measured_network
 from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 from . import adjustments, profiling, scaling
 from .lookup import lookup_section
@@ -30,7 +31,9 @@ MODELS = ('auto', 'local_linear', 'collocation', 'hybrid', 'parametric', 'knn', 
 def exposures():
     """Virtual rig and 15 exposures of it by fluoroscope a, of about 132 targets each."""
     rig = virtual_rig(1)
-    return rig, {'a': simulate_exposures(rig, 15, 1, matched=(130, 134)).frames['a']}
+    return rig, {
+        'a': simulate_exposures(rig, 15, 1, detection=Detection(beads=(130, 134))).frames['a']
+    }
 
 
 def models():

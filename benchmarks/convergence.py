@@ -14,7 +14,8 @@ from benchmarks.precision import QUANTITIES, errors_of
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 # A mean normalised squared error beyond which an answer is wrong. A single coordinate is off by
 # more than 5 standard deviations once in a million; sources and attitudes of one calibration err
@@ -42,7 +43,7 @@ def outcome(seed):
     case = random_case(seed)
     rig = virtual_rig(seed, case['strength'])
     simulated = simulate_exposures(
-        rig, case['exposures'], seed, false_matches=case['false_matches']
+        rig, case['exposures'], seed, detection=Detection(false_matches=case['false_matches'])
     )
     start = case['off'] * rig.fluoroscopes[0].interior[2]
     try:

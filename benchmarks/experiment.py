@@ -26,7 +26,8 @@ from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.report.figures import relative_costs
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 NOISE_PX = 0.25
 BEFORE = 'before'
@@ -202,7 +203,9 @@ class Scene:
         self._seed = seed
         self._false_matches = false_matches
         self._every = every
-        self.recording = simulate_exposures(self.rig, exposures, seed, NOISE_PX, false_matches)
+        self.recording = simulate_exposures(
+            self.rig, exposures, seed, Detection(NOISE_PX, false_matches)
+        )
         self._tested = {}
 
     def training(self, count, known):
@@ -215,7 +218,7 @@ class Scene:
             ), self.recording
         # Exposures of their own, so that the test is the same for every count.
         own = simulate_exposures(
-            self.rig, count, 1000 * self._seed + count, NOISE_PX, self._false_matches
+            self.rig, count, 1000 * self._seed + count, Detection(NOISE_PX, self._false_matches)
         )
         return self._frames(own, known), own
 

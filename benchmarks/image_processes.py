@@ -28,7 +28,8 @@ from fluoro_calib_ros.nodes.runtime.qos import images_qos
 from fluoro_calib_ros.nodes.runtime.stream_reader import StreamReader
 from fluoro_calib_ros.options import option
 from fluoro_calib_ros.simulation.bead_images import bead_image
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 from .relay import all_fatal
 

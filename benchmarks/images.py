@@ -31,7 +31,8 @@ from scipy.ndimage import map_coordinates
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.simulation.bead_images import bead_image
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 from .timing import table, timed
 

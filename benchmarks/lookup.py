@@ -17,7 +17,8 @@ from threadpoolctl import threadpool_limits
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.distortion.grid import CorrectionGrid
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 from .timing import section, timed
 
@@ -103,7 +104,9 @@ def measure(model):
     """
     rig = virtual_rig(1)
     rng = np.random.default_rng(0)
-    frames = {'a': simulate_exposures(rig, 15, 1, matched=(130, 134)).frames['a']}
+    frames = {
+        'a': simulate_exposures(rig, 15, 1, detection=Detection(beads=(130, 134))).frames['a']
+    }
     calibration = calibrate(frames, rig.phantom, CalibrationOptions(model)).calibrations['a']
     exact = calibration.model
     grid, build_s = timed(lambda: CorrectionGrid(exact, calibration.image_size), 3)

@@ -27,12 +27,9 @@ from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.distortion.gauge import gauge_basis, gauge_coefficients
 from fluoro_calib_ros.distortion.knn import KnnModel
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.simulation.rig import (
-    SimulatedExposures,
-    VirtualRig,
-    simulate_exposures,
-    virtual_rig,
-)
+from fluoro_calib_ros.simulation.exposures import SimulatedExposures, simulate_exposures
+from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.streams import StreamStart
 
 from .timing import section, timed
 
@@ -95,7 +92,11 @@ def make_scene(seed: int) -> Scene:
     """Return the scene of rig number seed."""
     rig = virtual_rig(seed)
     train = simulate_exposures(rig, TRAIN_EXPOSURES, seed)
-    return Scene(rig, train, simulate_exposures(rig, TEST_EXPOSURES, TEST_SEED, first_number=1001))
+    return Scene(
+        rig,
+        train,
+        simulate_exposures(rig, TEST_EXPOSURES, TEST_SEED, start=StreamStart(number=1001)),
+    )
 
 
 def points_error(scene: Scene, frames: list[Frame], result: CalibrationResult) -> float:

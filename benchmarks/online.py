@@ -41,7 +41,8 @@ from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from
 from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orientation
 from fluoro_calib_ros.nodes.runtime.qos import latched_qos, observations_qos
 from fluoro_calib_ros.nodes.runtime.stream_reader import FaultHandlers, StreamReader
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 from .timing import table
 

@@ -21,7 +21,8 @@ from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.distortion.gauge import gauge_coefficients
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion, matrix_from_vector
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 QUANTITIES = ('xp', 'yp', 'c', 'T', 'q', 'object points')
 MARGIN_PX = 8.0  # of the grid from the edge of the image
@@ -59,7 +60,7 @@ def normalised(seed, exposures=15, model='auto'):
     its 95 % interval.
     """
     rig = virtual_rig(seed)
-    simulated = simulate_exposures(rig, exposures, seed, matched=(125, 139))
+    simulated = simulate_exposures(rig, exposures, seed, detection=Detection(beads=(125, 139)))
     return errors_of(
         calibrate({'a': simulated.frames['a']}, rig.phantom, CalibrationOptions(model)),
         rig,

@@ -23,12 +23,9 @@ from fluoro_calib_ros.calibration.rig_orientation import (
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
-from fluoro_calib_ros.simulation.rig import (
-    seen_beads,
-    simulate_exposures,
-    simulate_tracking,
-    virtual_rig,
-)
+from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 EXPOSURES = 15
 NOISE_PX = 0.25
@@ -72,9 +69,7 @@ def capture(rig, seed, count=CAPTURED):
             Frame(
                 f.name,
                 k + 1,
-                *seen_beads(
-                    rng, f, rig.true_mm, rig.phantom.target_id, NOISE_PX, 0.01, (130, 160)
-                ),
+                *detect_beads(rng, f, rig.true_mm, rig.phantom.target_id, Detection(NOISE_PX)),
                 f.image_size,
             )
             for k in range(count)
@@ -105,7 +100,7 @@ def measure(seed, ways=tuple(WAYS), seconds=4.0, rate_hz=60.0, captured=CAPTURED
     """
     rig = virtual_rig(seed)
     out = {}
-    exposures = simulate_exposures(rig, EXPOSURES, seed, NOISE_PX).frames
+    exposures = simulate_exposures(rig, EXPOSURES, seed, Detection(NOISE_PX)).frames
     standing = capture(rig, seed, captured)
     tracking = simulate_tracking(rig, seconds, rate_hz, seed, NOISE_PX)
     for way in ways:

@@ -17,12 +17,9 @@ import numpy as np
 from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.simulation.rig import (
-    SimulatedExposures,
-    VirtualRig,
-    simulate_exposures,
-    virtual_rig,
-)
+from fluoro_calib_ros.simulation.exposures import SimulatedExposures, simulate_exposures
+from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.streams import StreamStart
 
 METHODS = {
     'separate': (False, 'none'),
@@ -144,7 +141,9 @@ def compare(
     out: dict[tuple[int, str], list[Gain]] = {}
     for seed in seeds:
         rig = virtual_rig(seed)
-        test = simulate_exposures(rig, TEST_EXPOSURES, 10_000 + seed, first_number=1001)
+        test = simulate_exposures(
+            rig, TEST_EXPOSURES, 10_000 + seed, start=StreamStart(number=1001)
+        )
         for count in counts:
             training = simulate_flexible_rig(rig, count, 1000 * seed + count, *flex)
             for method in METHODS:

@@ -19,7 +19,8 @@ from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.report.tables import markdown_table
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.validation.verdict import validate
 
 FIRST_SEED = 5018  # rigs from which no limit was set

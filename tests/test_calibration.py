@@ -28,7 +28,9 @@ from fluoro_calib_ros.photogrammetry.rotations import (
     matrix_from_vector,
     rotation_angle,
 )
-from fluoro_calib_ros.simulation.rig import seen_beads, simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.streams import StreamStart
 
 OK, OUTSIDE, INVALID = CorrectionStatus
 
@@ -145,7 +147,7 @@ def test_calibration_holds_for_exposures_it_has_not_seen():
     """Adjusted with the calibration held: residuals near the noise, and nothing of the calibration
     changes.
     """
-    test = simulate_exposures(rigs.rig(), 8, seed=77, first_number=100).frames['a']
+    test = simulate_exposures(rigs.rig(), 8, seed=77, start=StreamStart(number=100)).frames['a']
     calibration = rigs.calibrated().calibrations['a']
     job = adjust_with_calibrations({'a': test}, PHANTOM, {'a': calibration})
     figures = job.fluoroscopes['a']
@@ -451,7 +453,9 @@ def test_sigma_of_the_observations_weighs_them():
     with it.
     """
     straight = virtual_rig(1, strength=0.0)
-    frames = simulate_exposures(straight, 15, 1, false_matches=0.0).frames['a']
+    frames = simulate_exposures(straight, 15, 1, detection=Detection(false_matches=0.0)).frames[
+        'a'
+    ]
     error = {}
     for told in (True, False):
         rng = np.random.default_rng(2)
@@ -564,8 +568,8 @@ def test_turns_and_shifts_are_poses_of_their_own(degrees, mm, accepted):
     for n in range(3):
         turn = matrix_from_vector([0, 0, np.deg2rad(degrees) * n / 2])
         points = rigs.rig().true_mm @ turn.T + [0, 0, mm * n / 2]
-        ids, uv = seen_beads(
-            rng, fluoroscope, points, PHANTOM.target_id, NOISE_PX, 0.0, (130, 160)
+        ids, uv = detect_beads(
+            rng, fluoroscope, points, PHANTOM.target_id, Detection(NOISE_PX, 0.0)
         )
         frames.append(replace(rigs.exposures()['a'][n], target_id=ids, uv=uv))
     if accepted:

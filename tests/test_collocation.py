@@ -65,7 +65,9 @@ from fluoro_calib_ros.photogrammetry.precision import (
     precision,
 )
 from fluoro_calib_ros.simulation.distortion import DistortionField
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.streams import StreamStart
 
 sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed
 
@@ -464,7 +466,7 @@ def test_out_of_sample_error_is_near_that_of_known_distortion(model, most):
     known distortion.
     """
     rig = rigs.rig()
-    test = simulate_exposures(rig, 40, 10**6, first_number=1001)
+    test = simulate_exposures(rig, 40, 10**6, start=StreamStart(number=1001))
     train = simulate_exposures(rig, 15, 1)
 
     def error(frames, tested, options):

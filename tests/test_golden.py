@@ -20,7 +20,8 @@ from fluoro_calib_ros.distortion.knn import KnnModel
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.precision import precision
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed
 from benchmarks.peers import TIGHT, ColmapAdjustment, drop_rarely_seen_points, with_datum
@@ -41,7 +42,7 @@ def small_problem():
 def real_problem():
     """The same for 15 undistorted exposures of about 132 targets, with false matches."""
     rig = virtual_rig(1)
-    exposures = simulate_exposures(rig, 15, 1, matched=(130, 134))
+    exposures = simulate_exposures(rig, 15, 1, detection=Detection(beads=(130, 134)))
     frames = [
         replace(frame, uv=uv)
         for frame, uv in zip(exposures.frames['a'], exposures.undistorted['a'])
@@ -95,7 +96,9 @@ def test_adjustment_equals_colmap(problem, held_points):
 def test_k_of_a_calibration_equals_grid_search(seed):
     """Values of a calibration, folds of whole exposures, equal weights."""
     rig = virtual_rig(seed)
-    frames = {'a': simulate_exposures(rig, 15, seed, matched=(130, 134)).frames['a']}
+    frames = {
+        'a': simulate_exposures(rig, 15, seed, detection=Detection(beads=(130, 134))).frames['a']
+    }
     run = calibrate(frames, rig.phantom, CalibrationOptions('knn', max_iterations=2)).runs['a']
     network = run.measured.network
     inside = np.flatnonzero(run.trained)

@@ -35,14 +35,14 @@ from fluoro_calib_ros.photogrammetry.rig_orientation import (
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from fluoro_calib_ros.reconstruction.intersection import OK, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
-from fluoro_calib_ros.simulation.rig import (
-    VirtualRig,
+from fluoro_calib_ros.simulation.exposures import (
+    Detection,
+    detect_beads,
     phantom_poses,
-    seen_beads,
     simulate_exposures,
-    simulate_tracking,
-    virtual_rig,
 )
+from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 pytestmark = pytest.mark.long
 
@@ -59,8 +59,8 @@ def capture(of_rig=None, count=1, seed=3, pose=(np.eye(3), np.zeros(3)), false_m
             Frame(
                 f.name,
                 k + 1,
-                *seen_beads(
-                    rng, f, points, of_rig.phantom.target_id, NOISE_PX, false_matches, (130, 160)
+                *detect_beads(
+                    rng, f, points, of_rig.phantom.target_id, Detection(NOISE_PX, false_matches)
                 ),
                 f.image_size,
                 None,
@@ -274,7 +274,7 @@ def test_covariance_of_a_relative_orientation_against_monte_carlo():
     for seed in range(12):
         still = without_distortion(seed)
         held = drawn_calibrations(still, seed)
-        frames = simulate_exposures(still, 4, seed, false_matches=0.0).frames
+        frames = simulate_exposures(still, 4, seed, detection=Detection(false_matches=0.0)).frames
         found = orientation_of_exposures(frames, still.phantom, held)
         a, b = still.fluoroscopes
         step = np.concatenate(

@@ -11,16 +11,16 @@ from fluoro_calib_ros.exposures.frame import points_on_image, validate_frame
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 from fluoro_calib_ros.simulation.distortion import random_field
+from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import (
     BEADS,
     CUBE_MM,
     IMAGE_SIZE,
-    START_NS,
     looking_at_origin,
-    simulate_exposures,
-    simulate_tracking,
     virtual_rig,
 )
+from fluoro_calib_ros.simulation.streams import START_NS, StreamStart
+from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 SEEDS = range(8)
 GRID = np.stack(
@@ -176,7 +176,7 @@ def test_exposures_are_as_many_and_as_full_as_promised():
             assert f.fluoroscope == name and f.frame_id == f'{name}_optical' and f.sigma is None
             np.testing.assert_array_equal(f.uv, np.round(f.uv, 4))
     later = simulate_exposures(
-        rig, 2, 5, first_number=7, start_ns=99, interval_s=0.25, matched=(20, 20)
+        rig, 2, 5, Detection(beads=(20, 20)), StreamStart(99, 7), interval_s=0.25
     ).frames['b']
     assert [(f.number, f.stamp_ns, len(f.target_id)) for f in later] == [
         (7, 99, 20),
@@ -199,7 +199,7 @@ def test_noise_and_false_matches_have_the_share_they_are_given():
     rig = rigs.rig()
     for share, noise in ((0.01, 0.25), (0.2, 0.25), (0.0, 1.0)):
         error = errors_of_image_points(
-            rig, simulate_exposures(rig, 15, 6, noise_px=noise, false_matches=share)
+            rig, simulate_exposures(rig, 15, 6, Detection(noise, share))
         )
         size = np.linalg.norm(error, axis=1)
         false = size > 6 * noise  # beads of opposite faces may coincide even so

@@ -17,7 +17,8 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.phantom import write_phantom
 from fluoro_calib_ros.jobs import calibration
-from fluoro_calib_ros.simulation.rig import simulate_exposures, virtual_rig
+from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.validation.inputs import copied_exposures, find_wrong_input
 from fluoro_calib_ros.validation.plausibility import implausible
 
@@ -26,9 +27,9 @@ PHANTOM = rig().phantom
 
 
 def frames(count=6, **options):
-    """Exposures of fluoroscope a."""
+    """Exposures of fluoroscope a; options are those of a Detection."""
     if options:
-        return simulate_exposures(rig(), count, 1, **options).frames['a']
+        return simulate_exposures(rig(), count, 1, Detection(**options)).frames['a']
     return exposures()['a'][:count]
 
 
@@ -256,7 +257,7 @@ RIGHT = {
         lambda uv: np.column_stack([1023 - uv[:, 1], uv[:, 0]])
     ),
     'whole pixels': lambda: mapped(np.round),
-    'few targets': lambda: frames(matched=(20, 25)),
+    'few targets': lambda: frames(beads=(20, 25)),
 }
 
 

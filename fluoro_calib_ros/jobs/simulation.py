@@ -7,7 +7,10 @@ import os
 from pathlib import Path
 
 from ..options import option, validate_options
-from ..simulation.rig import START_NS, simulate_exposures, simulate_tracking, virtual_rig
+from ..simulation.exposures import Detection, simulate_exposures
+from ..simulation.rig import virtual_rig
+from ..simulation.streams import START_NS, StreamStart
+from ..simulation.tracking import simulate_tracking
 from .dataset import write_exposures, write_rig, write_tracking
 
 HOUR_NS = 3600 * 10**9
@@ -50,8 +53,8 @@ def simulate(directory: str | os.PathLike[str], options: SimulationOptions | Non
     directory = Path(directory)
     rig = virtual_rig(options.seed, options.strength)
     write_rig(directory, rig, **dataclasses.asdict(options))
-    image = {'noise_px': options.noise, 'false_matches': options.false_matches}
-    calibration = simulate_exposures(rig, options.exposures, options.seed, **image)
+    detection = Detection(options.noise, options.false_matches)
+    calibration = simulate_exposures(rig, options.exposures, options.seed, detection)
     write_exposures(directory, 'calibration', rig, calibration)
     # The parts have seeds of their own, so that the size of one does not change another.
     if options.test_exposures:
@@ -59,9 +62,8 @@ def simulate(directory: str | os.PathLike[str], options: SimulationOptions | Non
             rig,
             options.test_exposures,
             options.seed + 1_000_000,
-            start_ns=START_NS + HOUR_NS,
-            first_number=options.exposures + 1,
-            **image,
+            detection,
+            StreamStart(START_NS + HOUR_NS, options.exposures + 1),
         )
         write_exposures(directory, 'test', rig, test)
     if options.seconds:
@@ -71,6 +73,6 @@ def simulate(directory: str | os.PathLike[str], options: SimulationOptions | Non
             options.rate,
             options.seed,
             options.noise,
-            START_NS + 2 * HOUR_NS,
+            StreamStart(START_NS + 2 * HOUR_NS),
         )
         write_tracking(directory, tracking)

@@ -17,14 +17,9 @@ from scipy.spatial.transform import Rotation
 from ..exposures.frame import Frame
 from ..options import option
 from ..photogrammetry.rotations import matrix_from_vector
-from ..simulation.rig import (
-    CLUSTER,
-    phantom_poses,
-    seen_beads,
-    simulate_grid,
-    simulate_tracking,
-    virtual_rig,
-)
+from ..simulation.exposures import Detection, detect_beads, phantom_poses
+from ..simulation.rig import virtual_rig
+from ..simulation.tracking import CLUSTER_MARKERS, simulate_grid, simulate_tracking
 from .messages.target_observations import message_from_frame, set_number_and_stamp
 from .runtime.discovery import wait_for_readers, wait_until_acknowledged
 from .runtime.main import run
@@ -33,7 +28,6 @@ from .runtime.qos import observations_qos, qos_overrides
 
 SCENES = ('phantom', 'standing', 'markers', 'grid')
 LOOP_S = 10.0  # length of a scene that is computed in advance and repeated
-VISIBLE_BEADS = (130, 160)  # least and largest number of beads in a frame
 
 
 @dataclass(frozen=True)
@@ -82,7 +76,10 @@ class SimulatorParameters(RigParameters):
         15, 'number of poses, after which the first one follows', minimum=1, maximum=10000
     )
     clusters: int = option(
-        4, f'rigid clusters of {CLUSTER} markers each in the scene markers', minimum=1, maximum=8
+        4,
+        f'rigid clusters of {CLUSTER_MARKERS} markers each in the scene markers',
+        minimum=1,
+        maximum=8,
     )
 
 
@@ -98,6 +95,7 @@ class SimulatorNode(Node):
         self._settings = parameters = _NODE.declare(self)
         self._rig = virtual_rig(parameters.seed, parameters.strength, parameters.fluoroscopes)
         self._rng = np.random.default_rng([parameters.seed, 4])
+        self._detection = Detection(parameters.noise, parameters.false_matches)
         self._poses = phantom_poses(self._rng, parameters.poses)
         self._outputs = {
             name: self.create_publisher(
@@ -183,14 +181,12 @@ class SimulatorNode(Node):
         )
         points = self._rig.true_mm @ rotation.T + shift
         for fluoroscope in self._rig.fluoroscopes:
-            ids, uv = seen_beads(
+            ids, uv = detect_beads(
                 self._rng,
                 fluoroscope,
                 points,
                 self._rig.phantom.target_id,
-                parameters.noise,
-                parameters.false_matches,
-                VISIBLE_BEADS,
+                self._detection,
             )
             yield Frame(
                 fluoroscope.name,

@@ -1,3 +1,1 @@
-"""A virtual dual fluoroscope: phantom, rig, distortion, exposures and moving markers, with their
-truth.
-"""
+"""A virtual dual fluoroscope: phantom, rig, distortion, exposures and markers, with truth."""

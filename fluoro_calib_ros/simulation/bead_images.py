@@ -1,36 +1,55 @@
-"""Images of the virtual fluoroscope: dark beads where they are observed, on a smooth background,
-with noise.
-"""
+"""Images of a virtual fluoroscope: dark beads on a smooth background, with noise."""
+
+from __future__ import annotations
 
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 BEAD_PX = 3.0  # standard deviation of a blob
-CONTRAST = 0.55  # part of the light that a bead takes
-REACH = 5.5  # standard deviations to which a blob is drawn: what is left is not seen in 16 bits
-BRIGHT = 0.78  # grey value in the middle of the field, as part of the largest one
+CONTRAST = 0.55  # fraction of the light that a bead absorbs
+REACH = 5.5  # standard deviations to which a blob is drawn: the rest does not show in 16 bits
+BRIGHTNESS = 0.78  # grey value in the middle of the image, as a fraction of the largest one
 
 
 def bead_image(
-    uv,
-    image_size=(1024, 1024),
-    dtype=np.uint8,
-    bead_px=BEAD_PX,
-    contrast=CONTRAST,
-    noise=0.01,
-    seed=0,
-):
-    """Image (h, w) of uint8 or uint16 of beads at observed pixels uv (n, 2), of image_size (width,
-    height) [px].
+    uv: ArrayLike,
+    image_size: tuple[int, int] = (1024, 1024),
+    dtype: DTypeLike = np.uint8,
+    bead_px: float = BEAD_PX,
+    contrast: float = CONTRAST,
+    noise: float = 0.01,
+    seed: int = 0,
+) -> np.ndarray:
+    """Draw an image of beads.
 
-    bead_px: standard deviation of a blob [px]; contrast: part of the light that a bead takes;
-    noise: standard deviation of a grey value, as part of the largest one. A bead multiplies what
-    is behind it, so two of them in one place take more than one. Beads off the image are drawn as
-    far as they reach into it; the same seed gives the same noise.
+    A bead attenuates what is behind it, so two of them in one place absorb more than one. Beads
+    off the image are drawn as far as they reach into it.
+
+    Parameters
+    ----------
+    uv : array_like
+        (n, 2), observed pixels of the beads.
+    image_size : tuple of int
+        Width and height [px].
+    dtype : numpy.uint8 or numpy.uint16
+    bead_px : float
+        Standard deviation of a blob.
+    contrast : float
+        Fraction of the light that a bead absorbs.
+    noise : float
+        Standard deviation of a grey value, as a fraction of the largest one.
+    seed : int
+        The same seed gives the same noise.
+
+    Returns
+    -------
+    ndarray
+        (h, w)
     """
     largest = np.iinfo(dtype).max
     image = background(image_size)
     for u, v in np.asarray(uv, dtype=float).reshape(-1, 2):
-        _draw(image, u, v, bead_px, contrast)
+        _draw_bead(image, (u, v), bead_px, contrast)
     image *= largest
     if noise:
         image += np.float32(noise * largest) * np.random.default_rng(seed).standard_normal(
@@ -39,30 +58,35 @@ def bead_image(
     return np.clip(np.rint(image, out=image), 0, largest, out=image).astype(dtype)
 
 
-def background(image_size):
-    """Light (h, w) float32 of 0 to 1 without any object: brighter in the middle, and darker to one
-    side.
-    """
+def background(image_size: tuple[int, int]) -> np.ndarray:
+    """Light (h, w) from 0 to 1 without any object: brightest in the middle, darker to one side."""
     width, height = image_size
     x = np.linspace(-1, 1, width, dtype=np.float32)
     y = np.linspace(-1, 1, height, dtype=np.float32)[:, None]
-    return BRIGHT * (1 - np.float32(0.22) * (x * x + y * y) + np.float32(0.05) * x)
+    return BRIGHTNESS * (1 - np.float32(0.22) * (x * x + y * y) + np.float32(0.05) * x)
 
 
-def _draw(image, u, v, bead_px, contrast):
-    """Take the light of one bead at u, v [px] off image (h, w)."""
+def _draw_bead(
+    image: np.ndarray, uv: tuple[float, float], bead_px: float, contrast: float
+) -> None:
+    """Take the light of one bead at a pixel uv off an image (h, w)."""
+    u, v = uv
     if not (np.isfinite(u) and np.isfinite(v)):
         return
-    reach = REACH * bead_px
-    rows, columns = (
-        slice(max(0, int(np.ceil(at - reach))), max(0, int(np.floor(at + reach)) + 1))
-        for at in (v, u)
-    )
+    columns = _range_around(u, REACH * bead_px)
+    rows = _range_around(v, REACH * bead_px)
     part = image[rows, columns]
     if not part.size:
         return
-    y, x = (np.arange(s.start, s.start + n) for s, n in zip((rows, columns), part.shape))
-    along_u, along_v = (
-        np.exp(-0.5 * ((axis - at) / bead_px) ** 2) for axis, at in ((x, u), (y, v))
-    )
+    x = np.arange(columns.start, columns.start + part.shape[1])
+    y = np.arange(rows.start, rows.start + part.shape[0])
+    along_u = np.exp(-0.5 * ((x - u) / bead_px) ** 2)
+    along_v = np.exp(-0.5 * ((y - v) / bead_px) ** 2)
     part *= 1 - contrast * along_v[:, None] * along_u
+
+
+def _range_around(centre: float, reach: float) -> slice:
+    """Pixels of a row or column, from 0 on, within a reach of a coordinate."""
+    start = max(0, int(np.ceil(centre - reach)))
+    stop = max(0, int(np.floor(centre + reach)) + 1)
+    return slice(start, stop)

@@ -14,13 +14,10 @@ from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.jobs.dataset import write_bag
 from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime.qos import observations_qos
-from fluoro_calib_ros.simulation.rig import (
-    START_NS,
-    seen_beads,
-    simulate_exposures,
-    simulate_tracking,
-    virtual_rig,
-)
+from fluoro_calib_ros.simulation.exposures import detect_beads, simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.streams import START_NS, StreamStart
+from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 THREE = ('a', 'b', 'c')
 POSES = 12
@@ -43,9 +40,7 @@ def standing(of_rig, number, stamp_ns):
     """Return a frame of each fluoroscope of the phantom standing in the rig frame."""
     rng = np.random.default_rng(number)
     for f in of_rig.fluoroscopes:
-        ids, uv = seen_beads(
-            rng, f, of_rig.true_mm, of_rig.phantom.target_id, 0.25, 0.01, (130, 160)
-        )
+        ids, uv = detect_beads(rng, f, of_rig.true_mm, of_rig.phantom.target_id)
         yield Frame(f.name, number, ids, uv, f.image_size, None, stamp_ns, f'{f.name}_optical')
 
 
@@ -126,7 +121,7 @@ def marker_frames(of_rig):
     end.
     """
     tracking = simulate_tracking(
-        of_rig, FRAMES / RATE_HZ, RATE_HZ, 5, start_ns=START, first_number=NUMBER
+        of_rig, FRAMES / RATE_HZ, RATE_HZ, 5, start=StreamStart(START, NUMBER)
     )
     frames = tracking.frames
     there = np.random.default_rng(3).random(SILENT) > 0.3

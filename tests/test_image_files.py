@@ -193,7 +193,7 @@ def test_tiff_with_large_offsets(tmp_path, monkeypatch, large, order):
 
 
 def test_folder(one, corrector, tmp_path, capfd):
-    """All images of it, under their names; other files are passed over, and what is there already
+    """All images of it, under their names; other files are skipped, and what is there already
     stays.
     """
     source = tmp_path / 'in'
@@ -210,7 +210,7 @@ def test_folder(one, corrector, tmp_path, capfd):
     said = capfd.readouterr()
     got = json.loads(said.out)
     assert got['kind'] == 'folder' and got['images'] == 4 and got['passed_over'] == ['readme.txt']
-    assert 'passed over: readme.txt' in said.err
+    assert 'skipped: readme.txt' in said.err
     assert sorted(os.listdir(out)) == ['0.png', '1.png', '2.png', 'note.txt', 'stack.tif']
     for n in range(3):
         assert np.array_equal(

@@ -418,7 +418,7 @@ def test_reconstruct_says_where_no_drift_can_be_told(folder, capsys):
     table = document(capsys, *command(folder, 'short.csv'))
     assert (
         table['drift']['level'] == 'unknown'
-        and 'does not tell the time' in table['drift']['message']
+        and 'does not contain the times' in table['drift']['message']
     )
     assert table['frames'] == 40 and table['incomplete'] == 20  # c takes every other one
 
@@ -440,12 +440,12 @@ def test_reconstruct_says_where_no_drift_can_be_told(folder, capsys):
         (
             'short',
             ['--cluster', 'tibia: 1 2', '--no-drift-watch'],
-            'it does not go with --no-drift-watch',
+            'it cannot be used with --no-drift-watch',
         ),
         (
             'short.csv',
             ['--cluster', 'tibia: 1 2'],
-            'a CSV file, does not hold the times of its exposures',
+            'a CSV file, does not contain the times of its exposures',
         ),
     ],
 )

@@ -1,4 +1,4 @@
-"""The command fluoro-calib, one module a command; ROS need not run."""
+"""The command fluoro-calib, one module for each command; no ROS is needed."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ COMMANDS = (simulate, calibrate, adjust, correct, validate, orient, reconstruct)
 def make_parser(command: str | None = None) -> argparse.ArgumentParser:
     """Return the parser of the command line.
 
-    command names the one that is to be parsed: the arguments of the others, which import what they
-    are declared in, are left out.
+    Only the arguments of `command` are added, by default those of all commands: each command
+    imports the modules that declare its options.
     """
     parser = argparse.ArgumentParser(
         prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.'
@@ -41,7 +41,10 @@ def make_parser(command: str | None = None) -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command line; exit status 0 done, 1 failed for a reason in the data, 2 wrong usage."""
+    """Run the command line.
+
+    Exit status 0: done, 1: failed for a reason in the data, 2: wrong usage.
+    """
     words = list(sys.argv[1:] if arguments is None else arguments)
     parser = make_parser(next((word for word in words if not word.startswith('-')), ''))
     options = parser.parse_args(words)

@@ -10,7 +10,7 @@ from .arguments import add_calibration, add_option, add_phantom, add_source
 from .output import print_note, print_result
 
 NAME = 'adjust'
-HELP = 'Adjust a bag or CSV file with the calibration held (an out-of-sample test).'
+HELP = 'Adjust the exposures of a bag or CSV file with the calibration held (out-of-sample test).'
 EXAMPLE = 'fluoro-calib adjust test --phantom phantom.csv --calibration result --out check'
 
 
@@ -18,7 +18,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..calibration.options import CalibrationOptions
 
-    add_source(parser, 'image size of a CSV file, which does not hold it [px]')
+    add_source(parser, 'image size of a CSV file, which does not contain it [px]')
     add_phantom(parser)
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'

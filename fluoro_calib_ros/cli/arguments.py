@@ -1,4 +1,4 @@
-"""Types and groups of arguments that several commands share."""
+"""Argument types, and arguments that several commands have in common."""
 
 from __future__ import annotations
 
@@ -138,11 +138,13 @@ def add_calibration(parser: argparse.ArgumentParser) -> None:
 
 def add_collect(parser: argparse.ArgumentParser, source: str = 'a bag') -> None:
     """Add --collect."""
+    from ..exposures.collector import COLLECT_MODES
+
     parser.add_argument(
         '--collect',
-        choices=('auto', 'all', 'still'),
+        choices=COLLECT_MODES,
         default='auto',
-        help=f'which exposures of {source}: all frames, or those in which the phantom stands '
-        'still in a new pose; auto: still for a stream of more than 10 frames a second '
-        '(default: auto)',
+        help=f'exposures of {source} to use: all frames, or those in which the phantom stands '
+        'still in a new pose; auto: still for a stream of more than 10 frames per second, else '
+        'all (default: auto)',
     )

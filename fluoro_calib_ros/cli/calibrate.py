@@ -27,7 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..calibration.options import CalibrationOptions
 
-    add_source(parser, 'image size of a CSV file, which does not hold it [px]')
+    add_source(parser, 'image size of a CSV file, which does not contain it [px]')
     add_phantom(parser)
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
@@ -55,8 +55,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--force',
         action='store_true',
-        help='calibrate also input that cannot be right, such as another phantom, and write the '
-        'impossible result, with the reasons in result.json',
+        help='calibrate even if the input or the result cannot be right, for example with another '
+        'phantom; the reasons are written to result.json',
     )
     parser.add_argument(
         '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
@@ -99,7 +99,7 @@ _METAVARS = {
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
-    """Call error with a sentence where arguments do not go together."""
+    """Call error with a sentence for arguments that exclude each other."""
     from ..distortion.registry import neighbour_models
 
     models = neighbour_models()

@@ -15,13 +15,10 @@ if TYPE_CHECKING:
     from ..calibration.result import FluoroscopeCalibration
 
 NAME = 'correct'
-HELP = (
-    'Correct image points (a CSV file), or images: a file, a TIFF stack, a folder or a video '
-    '(correct recording.avi --calibration result --fluoroscope a --out corrected.avi).'
-)
+HELP = 'Correct image points (CSV file) or images (image, TIFF stack, folder or video).'
 EXAMPLE = 'fluoro-calib correct points.csv --calibration result --out corrected.csv'
-POINTS = ('.csv', '.txt', '')  # endings of files with image points
-MAX_NAMES = 5  # files named in a note
+POINTS_SUFFIXES = ('.csv', '.txt', '')  # of files with image points
+MAX_NAMES = 5  # of files in a note
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -31,7 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar='SOURCE',
         help='CSV file with columns u, v [px] and optionally fluoroscope, sigma; or a grey image '
-        '(png, tif, jpg, bmp, pgm), a folder of images, or a video (avi, mkv, mp4)',
+        '(png, tif, jpg, bmp, pgm), a folder of images, or a video (avi, mkv, mp4) such as '
+        'recording.avi',
     )
     add_calibration(parser)
     parser.add_argument(
@@ -39,10 +37,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=Path,
         metavar='OUT',
-        help='file to write, for a folder the folder; its ending is the format',
+        help='file to write, whose suffix determines the format; or folder, for a folder of images',
     )
     parser.add_argument(
-        '--fluoroscope', metavar='NAME', help='fluoroscope of the source, where there are several'
+        '--fluoroscope',
+        metavar='NAME',
+        help='fluoroscope of the source, if several are calibrated',
     )
     parser.add_argument(
         '--interpolation',
@@ -67,7 +67,7 @@ def run(arguments: argparse.Namespace) -> None:
     calibrations = read_calibrations(arguments.calibration, names)
     if is_image_source(arguments.source):
         _correct_images(arguments, calibrations)
-    elif suffix_of(arguments.source) in POINTS or not arguments.source.exists():
+    elif suffix_of(arguments.source) in POINTS_SUFFIXES or not arguments.source.exists():
         _correct_points(arguments, calibrations)  # reports a missing file
     else:
         known = listed(('.csv', *IMAGE_SUFFIXES, *VIDEO_CODECS))
@@ -120,7 +120,7 @@ def _correct_images(
         names = ', '.join(done.passed_over[:MAX_NAMES])
         further = len(done.passed_over) - MAX_NAMES
         names += f' and {further} more' if further > 0 else ''
-        print_note(f'{source}: files that are no images were passed over: {names}')
+        print_note(f'{source}: files that are not images were skipped: {names}')
     size = 'x'.join(map(str, calibration.image_size))
     empty = int((~corrector.mask).sum())
     document = {
@@ -139,5 +139,5 @@ def _correct_images(
         arguments,
         document,
         f'{done.images} {noun} of {size} px corrected with {calibration.calibration_id}, written '
-        f'to {arguments.out}; {empty} pixels of each are empty, nothing was seen there',
+        f'to {arguments.out}; {empty} pixels of each are empty, the original does not show them',
     )

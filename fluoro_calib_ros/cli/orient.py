@@ -9,7 +9,7 @@ from .arguments import add_calibration, add_phantom, add_source
 from .output import print_result
 
 NAME = 'orient'
-HELP = 'Orientation of the rig from a capture of the phantom standing still in the rig frame.'
+HELP = 'Orient the rig from a capture of the phantom, which stands still in the rig frame.'
 EXAMPLE = 'fluoro-calib orient capture --phantom phantom.csv --calibration result'
 MAX_EXPOSURES = 10**6
 
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--frame-id',
         default='rig',
         metavar='NAME',
-        help='name of the rig frame, which is that of the standing phantom (default: rig)',
+        help='name of the rig frame, defined by the phantom in the capture (default: rig)',
     )
     parser.add_argument(
         '--exposures',

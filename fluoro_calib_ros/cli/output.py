@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import shutil
 import sys
 from collections.abc import Mapping
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from ..calibration.rounds import Round
 
 
-def print_result(arguments: Any, document: Mapping[str, Any], text: str) -> None:
+def print_result(arguments: argparse.Namespace, document: Mapping[str, Any], text: str) -> None:
     """Print a result: as JSON with --json, else as text for people."""
     if arguments.json:
         from ..files.json_file import json_text
@@ -29,14 +30,17 @@ def print_note(text: str) -> None:
 
 
 def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:
-    """Print how many frames have no partner, if any have none."""
+    """Print the numbers of frames without partner, if there are any."""
     lost = {name: count for name, count in unpaired.items() if count}
     if lost:
-        print_note(f'{source}: frames without partner of the other fluoroscopes, not used: {lost}')
+        counts = ', '.join(f'{name} {count}' for name, count in lost.items())
+        print_note(
+            f'{source}: frames without partner of the other fluoroscopes, not used: {counts}'
+        )
 
 
 def print_round(label: str, this: Round) -> None:
-    """Print a round of a self-calibration on a terminal."""
+    """Print a round of a self-calibration, on a terminal only."""
     if sys.stderr.isatty():
         rmse = '  '.join(f'{n}: {r[0]:.3f} {r[1]:.3f} px' for n, r in this.rmse.items())
         print_note(
@@ -46,26 +50,24 @@ def print_round(label: str, this: Round) -> None:
 
 
 def print_step(step: str, done: int, total: int) -> None:
-    """Print a step of a validation on a terminal."""
+    """Print a step of a validation, on a terminal only."""
     if sys.stderr.isatty():
         print_note(f'{100 * done // total:3d} %  {step}')
 
 
 class ProgressBar:
-    """A progress bar on a terminal, nothing elsewhere; a context manager.
-
-    Called with the number of images done and their total, 0 where that is unknown.
-    """
+    """A progress bar on a terminal, nothing elsewhere; a context manager."""
 
     def __init__(self, name: str) -> None:
         self._name = name
         self._bar: Any = None
 
     def __call__(self, done: int, total: int) -> None:
+        """Show that `done` images of `total` are done, 0 where the total is unknown."""
         if self._bar is None:
             from tqdm import tqdm
 
-            # tqdm shows nothing on a terminal that does not tell its width.
+            # tqdm shows nothing on a terminal of unknown width.
             self._bar = tqdm(
                 desc=self._name,
                 total=total or None,

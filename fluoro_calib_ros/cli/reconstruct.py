@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from ..jobs.reconstruction import ReconstructionOutcome
 
 NAME = 'reconstruct'
-HELP = 'Points in space from the observed image points of two or more fluoroscopes.'
+HELP = 'Reconstruct points in space from the image points of two or more fluoroscopes.'
 EXAMPLE = 'fluoro-calib reconstruct bags/tracking --calibration result --out points.csv'
 
 
@@ -42,17 +42,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         metavar="'NAME: ID ID ...'",
         help="rigid cluster of targets, such as 'tibia: 1001 1002 1003', whose distances the "
-        'drift watch looks at too; may be given again',
+        'drift watch also monitors; may be repeated',
     )
     parser.add_argument(
         '--no-drift-watch',
         action='store_true',
-        help='do not look for a drift of the calibration; takes less time',
+        help='do not watch for a drift of the calibration, which saves time',
     )
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
-    """Read the clusters; call error with a sentence where arguments do not go together."""
+    """Read the clusters; call error with a sentence for arguments that exclude each other."""
     from ..drift.clusters import parse_clusters
     from ..jobs.sources import is_csv
 
@@ -61,10 +61,10 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
     except ValueError as fault:
         error(f'--cluster: {fault}')
     if arguments.clusters and arguments.no_drift_watch:
-        error('--cluster is for the drift watch, it does not go with --no-drift-watch')
+        error('--cluster is for the drift watch, it cannot be used with --no-drift-watch')
     if arguments.clusters and is_csv(arguments.source):
         error(
-            f'--cluster is for the drift watch, but {arguments.source}, a CSV file, does not hold '
+            f'--cluster is for the drift watch, but {arguments.source}, a CSV file, does not contain '
             'the times of its exposures'
         )
 
@@ -82,7 +82,7 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.calibration,
         image_size=arguments.image_size,
         fluoroscopes=arguments.fluoroscopes,
-        # A frame without points, or with a lost one, is no reason to refuse a recording.
+        # A frame without points, or with an invalid one, must not reject a recording.
         validate=False,
     )
     orientation = load_orientation(path)

@@ -11,7 +11,7 @@ from .arguments import add_option
 from .output import print_result
 
 NAME = 'simulate'
-HELP = 'Write bags, CSV, phantom and truth of a virtual rig.'
+HELP = 'Simulate a rig: write bags, CSV files, phantom and truth.'
 EXAMPLE = 'fluoro-calib simulate --out rig --seed 1 --exposures 15'
 
 

@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--source',
         type=Path,
-        help='bag or CSV file that the calibration was made from (default: DIR/observations.csv)',
+        help='bag or CSV file from which the calibration was made (default: DIR/observations.csv)',
     )
     add_phantom(parser, required=False, help='its surveyed coordinates (default: DIR/phantom.csv)')
     parser.add_argument(

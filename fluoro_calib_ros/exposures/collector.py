@@ -20,6 +20,8 @@ MIN_COMMON_TARGETS = 8  # with fewer targets in common two frames cannot be comp
 MAX_RECENT = 1000  # pairs that are remembered
 MAX_GAP = 10  # a gap in a stream is at most this many times the still time
 
+COLLECT_MODES = ('auto', 'all', 'still')  # of recordings
+
 Pair = Mapping[str, Frame]
 
 

@@ -1,3 +1,1 @@
-"""Jobs: whole tasks, such as a calibration with its validation and its files, in this process or
-in another.
-"""
+"""Jobs: complete tasks, such as a calibration with its validation and its files."""

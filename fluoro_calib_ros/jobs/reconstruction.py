@@ -1,4 +1,4 @@
-"""The reconstruction job: points in space from a recording, and whether the calibration drifted."""
+"""The reconstruction job: points in space from a recording, and the drift of the calibration."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recordi
 class ReconstructionOptions:
     """Options of a reconstruction.
 
-    clusters are the rigid clusters of targets whose distances the drift watch looks at too. A
-    recording without time stamps (has_stamps False) is paired by frame number, and no drift can
-    be found in it. Raises ValueError for a value that an option cannot have.
+    The drift watch also monitors the distances in rigid clusters of targets. A recording without
+    time stamps (has_stamps False) can only be paired by frame number, and cannot show a drift.
+    Raises ValueError for a value that an option cannot have.
     """
 
     pair_by: str = option(
@@ -57,9 +57,9 @@ class ReconstructionOutcome:
     unpaired : mapping of str to int
         Frames without partner, by fluoroscope.
     orientation : RigOrientation
-        That of the fluoroscopes that were used.
+        Of the fluoroscopes that were used.
     drift : DriftVerdict or None
-        None where no drift watch was wanted.
+        None where the drift watch is switched off.
     """
 
     frames: list[ReconstructedFrame]
@@ -109,7 +109,7 @@ def reconstruct(
     options = options or ReconstructionOptions()
     if options.pair_by == 'stamp' and not options.has_stamps:
         raise DataError(
-            'the recording does not hold the times of its exposures, pair them by frame_number'
+            'the recording does not contain the times of its exposures, pair them by frame_number'
         )
     names = [name for name in orientation.fluoroscopes if name in frames]
     if len(names) < 2:
@@ -141,15 +141,16 @@ def _drift_watch(
     calibrations: Mapping[str, FluoroscopeCalibration],
     options: ReconstructionOptions,
 ) -> tuple[RecordingDriftWatch | None, DriftVerdict | None]:
-    """Return the drift watch of a recording, or None and the reason, or twice None."""
+    """Return the drift watch of a recording, or the verdict that explains why there is none."""
     if not options.drift_watch:
         return None, None
     if not options.has_stamps:
         return None, DriftVerdict(
-            'unknown', 'a CSV file does not tell the time of its exposures, no drift can be told'
+            'unknown',
+            'a CSV file does not contain the times of its exposures, a drift cannot be detected',
         )
     sizes = {name: calibrations[name].image_size for name in orientation.fluoroscopes}
     try:
         return RecordingDriftWatch(orientation, sizes, clusters=options.clusters), None
     except DataError as error:
-        return None, DriftVerdict('unknown', f'no drift can be told: {error}')
+        return None, DriftVerdict('unknown', f'a drift cannot be detected: {error}')

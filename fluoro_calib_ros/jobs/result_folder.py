@@ -41,8 +41,7 @@ def save_outcome(
     Returns
     -------
     RigOrientation or None
-        The orientation to use with the new calibrations: the new one, or the present one where it
-        is kept.
+        The orientation to use with the new calibrations, see `kept_orientation`.
 
     Raises
     ------
@@ -75,7 +74,7 @@ def save_result(
 
 
 def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | None:
-    """Return the orientation in a folder, None where there is none that can be read."""
+    """Return the orientation in a folder, None where there is no valid one."""
     try:
         return load_orientation(orientation_path(directory))
     except DataError:
@@ -99,10 +98,10 @@ def kept_orientation(
 ) -> RigOrientation | None:
     """Choose between the present orientation of a rig and that of new calibrations.
 
-    The present one is kept while it belongs to the calibrations and either was captured in the
-    frame of the lab, which exposures of a calibration do not know, or there is no new one.
+    The present one is kept if it belongs to the calibrations, and if there is no new one or it was
+    captured in the frame of the lab, which the exposures of a calibration do not determine.
     """
-    if present is not None and belongs_to(present, calibrations):
-        if new is None or present.source == 'capture':
-            return present
+    is_valid = present is not None and belongs_to(present, calibrations)
+    if present is not None and is_valid and (new is None or present.source == 'capture'):
+        return present
     return new

@@ -20,23 +20,27 @@ HOUR_NS = 3600 * 10**9
 class SimulationOptions:
     """Options of a data set. Raises ValueError for a value that an option cannot have."""
 
-    seed: int = option(1, 'number of the rig', minimum=0, maximum=2**31)
+    seed: int = option(
+        1, 'seed of the random numbers, which determines the rig', minimum=0, maximum=2**31
+    )
     exposures: int = option(
         15, 'exposures of the phantom for the calibration', minimum=1, maximum=100000
     )
     test_exposures: int = option(
         0,
-        'further exposures, written as a bag and CSV of their own',
+        'further exposures, in a bag and CSV file of their own',
         minimum=0,
         maximum=100000,
     )
-    seconds: float = option(3.0, 'markers in motion', minimum=0, maximum=86400, unit='s')
+    seconds: float = option(
+        3.0, 'duration of the recording of moving markers', minimum=0, maximum=86400, unit='s'
+    )
     rate: float = option(
-        120.0, 'frame rate of the markers in motion', minimum=1, maximum=2000, unit='Hz'
+        120.0, 'frame rate of the recording of moving markers', minimum=1, maximum=2000, unit='Hz'
     )
     noise: float = option(0.25, 'image noise', minimum=0, maximum=100, unit='px')
     false_matches: float = option(
-        0.01, 'part of the targets with a wrong id', minimum=0, maximum=0.5
+        0.01, 'fraction of the targets with a wrong id', minimum=0, maximum=0.5
     )
     strength: float = option(1.0, 'strength of the distortion', minimum=0, maximum=10)
 
@@ -52,11 +56,11 @@ def simulate(directory: str | os.PathLike[str], options: SimulationOptions | Non
     options = options or SimulationOptions()
     directory = Path(directory)
     rig = virtual_rig(options.seed, options.strength)
-    write_rig(directory, rig, **dataclasses.asdict(options))
+    write_rig(directory, rig, dataclasses.asdict(options))
     detection = Detection(options.noise, options.false_matches)
     calibration = simulate_exposures(rig, options.exposures, options.seed, detection)
     write_exposures(directory, 'calibration', rig, calibration)
-    # The parts have seeds of their own, so that the size of one does not change another.
+    # Each part has its own seed, so that its size does not change the others.
     if options.test_exposures:
         test = simulate_exposures(
             rig,

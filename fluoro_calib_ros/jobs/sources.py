@@ -1,4 +1,4 @@
-"""Read what jobs need: the frames of a bag or a CSV file, and calibrations."""
+"""Read the input of jobs: the frames of a bag or a CSV file, and calibrations."""
 
 from __future__ import annotations
 
@@ -14,8 +14,6 @@ from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
 from ..files.calibration import load_calibrations
 from ..files.observations import read_observations_csv
-
-COLLECT_MODES = ('auto', 'all', 'still')
 
 
 @dataclass(frozen=True)
@@ -46,12 +44,12 @@ def read_source(
     path : path-like
         A bag (file or folder) or a CSV file `fluoroscope,exposure,target_id,u,v[,sigma]`.
     image_size : (int, int), optional
-        Width and height [px]; needed for a CSV file, which does not hold it.
+        Width and height [px]; needed for a CSV file, which does not contain it.
     fluoroscopes : sequence of str, optional
         Names of those to read, in this order; by default all.
     collect : {'auto', 'all', 'still'}, optional
         How exposures are collected from a bag; by default all frames are returned, unpaired ones
-        too. A CSV file holds exposures already.
+        too. A CSV file already consists of exposures.
     validate : bool
         Whether every frame of a bag is validated; else only the lengths of its arrays.
 
@@ -62,7 +60,7 @@ def read_source(
     Raises
     ------
     DataError
-        For a source that cannot be read, and for a fluoroscope that it does not hold.
+        For a source that cannot be read, and for a fluoroscope that it does not contain.
     """
     if is_csv(path):
         found = read_observations_csv(path, image_size)
@@ -85,7 +83,7 @@ def select_calibrations(
 ) -> dict[str, FluoroscopeCalibration]:
     """Return the calibrations of some fluoroscopes.
 
-    where begins the sentence of the DataError that a missing calibration raises.
+    where begins the message of the DataError that is raised for a missing calibration.
     """
     place = f'{where}: ' if where else ''
     if not calibrations:

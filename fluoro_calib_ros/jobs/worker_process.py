@@ -1,4 +1,4 @@
-"""Run a calibration job in a process of its own, beside the threads of its caller."""
+"""Run a calibration job in another process, so that it does not delay its caller."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from multiprocessing.connection import Connection
 from ..calibration.request import CalibrationRequest
 from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run
 
-POLL_S = 0.05  # how often the caller may cancel
-NICE = 10  # the live nodes go first
+POLL_S = 0.05  # interval at which the caller may cancel [s]
+NICE = 10  # lower priority than the live nodes
 
 
 def run_in_worker_process(
@@ -25,14 +25,14 @@ def run_in_worker_process(
     """Run `jobs.calibration.run` in another process.
 
     Parameters and errors are those of `run`. The outcome comes without the networks behind it.
-    raise_if_cancelled is called all the time and may raise to end the process at once. Raises
-    RuntimeError where the process fails otherwise.
+    raise_if_cancelled is called repeatedly and may raise to terminate the process. Raises
+    RuntimeError for any other failure of the process.
     """
     context = multiprocessing.get_context('spawn')  # a fork would copy locks of other threads
     receiver, sender = context.Pipe(duplex=False)
     process = context.Process(target=_work, daemon=True, args=(sender, request, validate, rig))
-    # The process inherits the mask: an interrupt from the keyboard reaches the caller, which ends
-    # the process.
+    # The process inherits the mask: an interrupt from the keyboard only reaches the caller, which
+    # terminates the process.
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
     process.start()
     signal.pthread_sigmask(signal.SIG_SETMASK, masked)
@@ -71,7 +71,11 @@ def _outcome(
 def _work(
     sender: Connection, request: CalibrationRequest, validate: bool, rig: Rig | None
 ) -> None:
-    """Run the job; send ('round', ...) after every round, then ('outcome', ...) or ('error', ...)."""
+    """Run the job in the worker process.
+
+    Sends ('round', arguments of progress) after every round, and ('outcome', CalibrationOutcome)
+    or ('error', exception) at the end.
+    """
     os.nice(NICE)
     try:
         outcome = run(

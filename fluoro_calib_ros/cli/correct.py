@@ -37,7 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         required=True,
         type=Path,
         metavar='OUT',
-        help='file to write, whose suffix determines the format; or folder, for a folder of images',
+        help='file to write, whose suffix determines the format; a folder for a folder of images',
     )
     parser.add_argument(
         '--fluoroscope',

@@ -64,8 +64,8 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
         error('--cluster is for the drift watch, it cannot be used with --no-drift-watch')
     if arguments.clusters and is_csv(arguments.source):
         error(
-            f'--cluster is for the drift watch, but {arguments.source}, a CSV file, does not contain '
-            'the times of its exposures'
+            f'--cluster is for the drift watch, but {arguments.source}, a CSV file, does not '
+            'contain the times of its exposures'
         )
 
 

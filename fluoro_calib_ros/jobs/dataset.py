@@ -17,12 +17,9 @@ from ..files.json_file import write_json
 from ..files.observations import write_observations_csv
 from ..files.phantom import write_phantom
 from ..photogrammetry.rotations import quaternion_from_matrix
-from ..simulation.rig import (
-    SimulatedExposures,
-    SimulatedTracking,
-    VirtualFluoroscope,
-    VirtualRig,
-)
+from ..simulation.exposures import SimulatedExposures
+from ..simulation.rig import VirtualFluoroscope, VirtualRig
+from ..simulation.tracking import SimulatedTracking
 
 TRUE_SD_MM = 1e-6  # the file of the true coordinates has to contain a standard deviation
 

@@ -14,8 +14,10 @@ PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 PNG_COMPRESSION = 1
 EIGHT_BIT_SUFFIXES = ('.jpg', '.jpeg', '.bmp')
 
+LOG_LEVEL_SILENT = 0  # cv2.utils.logging has it from OpenCV 4.7 on
+
 # The caller reports errors in one sentence; OpenCV would print lines of its own.
-cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+cv2.setLogLevel(LOG_LEVEL_SILENT)
 
 
 def decode(content: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:

@@ -14,10 +14,18 @@ PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 PNG_COMPRESSION = 1
 EIGHT_BIT_SUFFIXES = ('.jpg', '.jpeg', '.bmp')
 
-LOG_LEVEL_SILENT = 0  # cv2.utils.logging has it from OpenCV 4.7 on
+LOG_LEVEL_SILENT = 0
 
-# The caller reports errors in one sentence; OpenCV would print lines of its own.
-cv2.setLogLevel(LOG_LEVEL_SILENT)
+
+def silence_opencv() -> None:
+    """Keep OpenCV from printing: callers report errors in one sentence."""
+    if hasattr(cv2.utils, 'logging'):
+        cv2.utils.logging.setLogLevel(LOG_LEVEL_SILENT)
+    else:  # OpenCV 4.6, as Ubuntu 24.04 has it
+        cv2.setLogLevel(LOG_LEVEL_SILENT)
+
+
+silence_opencv()
 
 
 def decode(content: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:

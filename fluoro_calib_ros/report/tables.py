@@ -1,125 +1,129 @@
-"""Tables of results as text: for a terminal and for GitHub."""
+"""Tables of results as text, for a terminal and for GitHub."""
 
-import math
+from __future__ import annotations
+
 import textwrap
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-WIDTH = 100  # columns of a terminal
-# widths of the quantity and of a fluoroscope
-LABEL = 36
-COLUMN = 20
+from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
+from .text import TERMINAL_WIDTH, number_text
+
+# Widths of the columns of quantities and of fluoroscopes.
+LABEL_WIDTH = 36
+COLUMN_WIDTH = 20
 
 
-def summary_table(job, latency_ms=None):
-    """Text of the figures of a CalibrationResult, at most 100 columns wide: a column for each fluoroscope.
+def summary_table(result: CalibrationResult, latency_ms: Mapping[str, float] | None = None) -> str:
+    """Summarise a calibration in at most 100 columns of text, one column per fluoroscope.
 
-    latency_ms: dict of the correction's latency, p50, p99 and max [ms], and the number of frames,
-    or None.
+    latency_ms: latency of the correction, p50, p99 and max [ms], and the number of frames.
     """
-    names = list(job.fluoroscopes)
-    per_block = (WIDTH - LABEL) // COLUMN
+    names = list(result.fluoroscopes)
+    per_block = (TERMINAL_WIDTH - LABEL_WIDTH) // COLUMN_WIDTH
     blocks = []
     for start in range(0, len(names), per_block):
-        columns = [_column(job, name) for name in names[start : start + per_block]]
-        blocks.append(
-            '\n'.join(
-                (
-                    label.ljust(LABEL) + ''.join(column[label].rjust(COLUMN) for column in columns)
-                ).rstrip()
-                for label in columns[0]
-            )
-        )
+        columns = [_column(result, name) for name in names[start : start + per_block]]
+        lines = []
+        for label in columns[0]:
+            values = ''.join(column[label].rjust(COLUMN_WIDTH) for column in columns)
+            lines.append((label.ljust(LABEL_WIDTH) + values).rstrip())
+        blocks.append('\n'.join(lines))
     text = '\n\n'.join(blocks)
-    text += f'\n\nAll fluoroscopes: {len(job.targets.target_id)} targets, {job.seconds:.1f} s'
-    for sentence in job.left_out:
-        text += '\n' + textwrap.fill(f'Not used: {sentence}', WIDTH, subsequent_indent='    ')
+    targets = len(result.targets.target_id)
+    text += f'\n\nAll fluoroscopes: {targets} targets, {result.seconds:.1f} s'
+    for sentence in result.left_out:
+        text += '\n' + textwrap.fill(
+            f'Not used: {sentence}', TERMINAL_WIDTH, subsequent_indent='    '
+        )
     if latency_ms is not None:
         text += (
             f'\nLatency of the correction: median {latency_ms["p50"]:.3g} ms, 99 % below '
-            f'{latency_ms["p99"]:.3g} ms, largest {latency_ms["max"]:.3g} ms ({latency_ms["frames"]} frames)'
+            f'{latency_ms["p99"]:.3g} ms, largest {latency_ms["max"]:.3g} ms '
+            f'({latency_ms["frames"]} frames)'
         )
     return text + '\n'
 
 
-def _column(job, name):
+def _column(result: CalibrationResult, name: str) -> dict[str, str]:
     """Quantities and values of one fluoroscope, as text."""
-    figures = job.fluoroscopes[name]
-    calibration = job.calibrations[name]
-    run = next((r for r in job.runs.values() if name in r.measured.fluoroscopes), None)
+    figures = result.fluoroscopes[name]
+    calibration = result.calibrations[name]
+    run = next((r for r in result.runs.values() if name in r.measured.fluoroscopes), None)
+    converged = result.converged if run is None else run.converged
+    inlier_percent = 100 * figures.inliers / max(figures.observations, 1)
     model = calibration.model
-    sd = model.evaluate(model.train_uv).sd if len(model.train_uv) else np.array([np.nan])
-    column = {'Fluoroscope': name if len(name) < COLUMN else name[: COLUMN - 4] + '...'}
-    for axis, coordinate in enumerate('uv'):
-        before = figures.rmse_before[axis]
-        after = figures.rmse_after[axis]
-        column[f'RMSE {coordinate} before [px]'] = _number(before, 3)
-        column[f'RMSE {coordinate} after [px]'] = _number(after, 3)
-        column[f'improvement {coordinate} [%]'] = _number(
-            100 * (1 - after / before) if before > 0 else np.nan, 1
-        )
-    column['correction model'] = figures.model_kind
-    column['neighbours k'] = '-' if figures.model_kind == 'none' else str(figures.k)
-    column['iterations'] = '-' if run is None else str(len(run.history))
-    column['converged'] = (
-        ('yes' if job.converged else 'NO') if run is None else ('yes' if run.converged else 'NO')
-    )
-    column['observations'] = str(figures.observations)
-    column['inliers'] = (
-        f'{figures.inliers} ({100 * figures.inliers / max(figures.observations, 1):.1f} %)'
-    )
-    column['exposures'] = str(len(figures.exposures))
-    column['interior orientation'] = 'estimated' if calibration.interior_estimated else 'held'
-    for quantity, value, sigma in zip(('xp', 'yp', 'c'), figures.interior, figures.interior_sd):
-        column[f'{quantity} [px]'] = _number(value, 2)
-        column[f'    {quantity} standard deviation [px]'] = _number(sigma, 2) if sigma > 0 else '-'
-    column['median sd of the correction [px]'] = _number(float(np.median(sd)), 3)
-    column['calibration [s]'] = _number(calibration.seconds, 1)
-    return column
+    correction_sd = model.evaluate(model.train_uv).sd if len(model.train_uv) else [np.nan]
+    return {
+        'Fluoroscope': name if len(name) < COLUMN_WIDTH else name[: COLUMN_WIDTH - 4] + '...',
+        **_rmse_rows(figures),
+        'correction model': figures.model_kind,
+        'neighbours k': '-' if figures.model_kind == 'none' else str(figures.k),
+        'iterations': '-' if run is None else str(len(run.history)),
+        'converged': 'yes' if converged else 'NO',
+        'observations': str(figures.observations),
+        'inliers': f'{figures.inliers} ({inlier_percent:.1f} %)',
+        'exposures': str(len(figures.exposures)),
+        'interior orientation': 'estimated' if calibration.interior_estimated else 'held',
+        **_interior_rows(figures),
+        'median sd of the correction [px]': number_text(float(np.median(correction_sd))),
+        'calibration [s]': number_text(calibration.seconds, 1),
+    }
 
 
-def _number(value, digits):
-    return f'{value:.{digits}f}' if math.isfinite(value) else '-'
+def _rmse_rows(figures: FluoroscopeResult) -> dict[str, str]:
+    rows = {}
+    for coordinate, before, after in zip('uv', figures.rmse_before, figures.rmse_after):
+        improvement = 100 * (1 - after / before) if before > 0 else np.nan
+        rows[f'RMSE {coordinate} before [px]'] = number_text(before)
+        rows[f'RMSE {coordinate} after [px]'] = number_text(after)
+        rows[f'improvement {coordinate} [%]'] = number_text(improvement, 1)
+    return rows
 
 
-def markdown_table(header, rows):
-    """GitHub table, aligned, of header (c,) and rows of c cells; columns of numbers are set to the
-    right.
+def _interior_rows(figures: FluoroscopeResult) -> dict[str, str]:
+    rows = {}
+    for quantity, value, sd in zip(('xp', 'yp', 'c'), figures.interior, figures.interior_sd):
+        rows[f'{quantity} [px]'] = number_text(value, 2)
+        rows[f'    {quantity} standard deviation [px]'] = number_text(sd, 2) if sd > 0 else '-'
+    return rows
+
+
+def markdown_table(header: Sequence[Any], rows: Sequence[Sequence[Any]]) -> str:
+    """Format a table for GitHub, with columns of numbers aligned to the right.
 
     Raises ValueError for a row that is not as long as the header.
     """
-    header = [_cell(cell) for cell in header]
-    rows = [[_cell(cell) for cell in row] for row in rows]
-    for row in rows:
-        if len(row) != len(header):
-            raise ValueError(f'a row has {len(row)} cells, the header has {len(header)}')
-    columns = list(zip(header, *rows))
+    titles = [_cell(cell) for cell in header]
+    cells = [[_cell(cell) for cell in row] for row in rows]
+    for row in cells:
+        if len(row) != len(titles):
+            raise ValueError(f'a row has {len(row)} cells, the header has {len(titles)}')
+    columns = list(zip(titles, *cells))
     widths = [max(3, *map(len, column)) for column in columns]
     right = [len(column) > 1 and all(map(_is_number, column[1:])) for column in columns]
     rule = ['-' * (width - 1) + ':' if r else '-' * width for width, r in zip(widths, right)]
-    return (
-        '\n'.join(
-            '| '
-            + ' | '.join(
-                cell.rjust(width) if r else cell.ljust(width)
-                for cell, width, r in zip(row, widths, right)
-            )
-            + ' |'
-            for row in [header, rule, *rows]
-        )
-        + '\n'
-    )
+    lines = []
+    for row in [titles, rule, *cells]:
+        aligned = [
+            cell.rjust(width) if r else cell.ljust(width)
+            for cell, width, r in zip(row, widths, right)
+        ]
+        lines.append('| ' + ' | '.join(aligned) + ' |')
+    return '\n'.join(lines) + '\n'
 
 
-def _cell(value):
+def _cell(value: Any) -> str:
     """Text of a cell: on one line, with the bars that would end it escaped."""
     return ' '.join(str(value).split()).replace('|', '\\|')
 
 
-def _is_number(cell):
-    """Whether a cell holds a number, with or without a percent sign, or a dash for none."""
+def _is_number(cell: str) -> bool:
+    """Whether a cell is a number, with or without a percent sign, or a dash for none."""
     try:
         float(cell.rstrip(' %'))
-        return True
     except ValueError:
         return cell in ('-', '')
+    return True

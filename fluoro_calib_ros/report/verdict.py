@@ -1,51 +1,48 @@
 """The verdict on a calibration as text for a terminal."""
 
-import math
+from __future__ import annotations
+
 import textwrap
 
-WIDTH = 100  # columns of a terminal
-WORDS = {True: 'passed', False: 'FAILED', None: 'not made'}
+from ..validation.check import Validation
+from .text import TERMINAL_WIDTH, number_text
+
+HEADER = ('check', 'fluoroscope', 'value', 'limit', 'unit', '')
+PASSED_TEXT = {True: 'passed', False: 'FAILED', None: 'not made'}
+MAX_NAME = 20  # characters
 
 
-def verdict_text(validation):
-    """Text of a Validation, at most 100 columns wide: a row for each check, the verdict, and what
-    to do.
-    """
-    rows = [('check', 'fluoroscope', 'value', 'limit', 'unit', '')]
-    rows += [
-        (
-            c.name,
-            _short(c.fluoroscope or 'all'),
-            _number(c.value),
-            _number(c.limit),
-            c.unit,
-            WORDS[c.passed],
+def verdict_text(validation: Validation) -> str:
+    """Format a Validation in at most 100 columns: the checks, the verdict, and what to do."""
+    rows = [HEADER]
+    for check in validation.checks:
+        rows.append(
+            (
+                check.name,
+                _shortened(check.fluoroscope or 'all'),
+                number_text(check.value),
+                number_text(check.limit),
+                check.unit,
+                PASSED_TEXT[check.passed],
+            )
         )
-        for c in validation.checks
-    ]
-    widths = [max(len(row[i]) for row in rows) for i in range(5)]
-    lines = [
-        '  '.join(
-            [
-                row[0].ljust(widths[0]),
-                row[1].ljust(widths[1]),
-                row[2].rjust(widths[2]),
-                row[3].rjust(widths[3]),
-                row[4].ljust(widths[4]),
-                row[5],
-            ]
-        ).rstrip()
-        for row in rows
-    ]
+    widths = [max(map(len, column)) for column in zip(*rows)]
+    lines = []
+    for name, fluoroscope, value, limit, unit, passed in rows:
+        cells = [
+            name.ljust(widths[0]),
+            fluoroscope.ljust(widths[1]),
+            value.rjust(widths[2]),
+            limit.rjust(widths[3]),
+            unit.ljust(widths[4]),
+            passed,
+        ]
+        lines.append('  '.join(cells).rstrip())
     lines += ['', f'Verdict: {validation.verdict} ({validation.seconds:.1f} s)']
     for sentence in validation.findings:
-        lines += textwrap.wrap(f'- {sentence}', WIDTH, subsequent_indent='  ')
+        lines += textwrap.wrap(f'- {sentence}', TERMINAL_WIDTH, subsequent_indent='  ')
     return '\n'.join(lines) + '\n'
 
 
-def _number(value):
-    return f'{value:.3f}' if math.isfinite(value) else '-'
-
-
-def _short(name):
-    return name if len(name) <= 20 else name[:17] + '...'
+def _shortened(name: str) -> str:
+    return name if len(name) <= MAX_NAME else name[: MAX_NAME - 3] + '...'

@@ -1,5 +1,8 @@
 """Parts of the nodes that need no graph: image layouts, invalid calibrations, requests."""
 
+import re
+import subprocess
+import sys
 import threading
 from array import array
 from dataclasses import replace
@@ -26,6 +29,7 @@ from fluoro_calib_ros.nodes.runtime.parameters import check_timeout, expand_path
 from fluoro_calib_ros.nodes.runtime.refusals import Refused
 
 SIZE = (64, 48)
+ROOT = Path(__file__).parents[1]
 
 
 @pytest.fixture(scope='module')
@@ -218,3 +222,20 @@ def test_impossible_timeout_is_refused(seconds, said):
 def test_unknown_home_folder_is_refused():
     with pytest.raises(DataError, match=r'^~nobody_of_that_name/x: there is no such home folder$'):
         expand_path('~nobody_of_that_name/x')
+
+
+# ---- the demonstration
+
+
+def test_demo_runs_as_a_module():
+    """Also where the console script is not installed."""
+    command = [sys.executable, '-m', 'fluoro_calib_ros.demo.demo', '--help']
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0 and '--bags' in done.stdout, done.stderr
+
+
+def test_demo_leaves_ros_to_the_nodes():
+    """Its modules import no ROS package themselves."""
+    for path in (ROOT / 'fluoro_calib_ros' / 'demo').glob('*.py'):
+        imports = re.findall(r'^\s*(?:from|import) (\w+)', path.read_text(), re.MULTILINE)
+        assert not [name for name in imports if name == 'rclpy' or name.endswith('_msgs')], path

@@ -537,18 +537,7 @@ class CalibrationNode(Node):
 
         Raises DataError and ValueError.
         """
-        frames = self._collector.frames(list(request.fluoroscopes))
-        joint = self._settings.joint and len(frames) > 1
-        job = CalibrationRequest(
-            frames,
-            self._phantom,
-            options_of_request(request, self._options, joint),
-            joint,
-            request.principal_distance or None,
-        )
-        others = {n: c for n, c in self._calibrations().items() if n not in frames}
-        all_frames = self._collector.frames()
-        rig = Rig(self._names, {name: all_frames[name] for name in others}, others)
+        job, rig = self._job_of(request)
         done = Future()
 
         def on_round(label: str, last: Round) -> None:
@@ -576,10 +565,29 @@ class CalibrationNode(Node):
             if self.executor is not None:
                 self.executor.wake()  # to continue what awaits the result
 
-        self._running = tuple(frames)
+        self._running = tuple(job.frames)
         self._job = threading.Thread(target=wait, daemon=True)
         self._job.start()
         return done
+
+    def _job_of(self, request: Request) -> tuple[CalibrationRequest, Rig]:
+        """Return the job of a request, and the fluoroscopes that it leaves as they are.
+
+        Raises DataError and ValueError.
+        """
+        frames = self._collector.frames(list(request.fluoroscopes))
+        joint = self._settings.joint and len(frames) > 1
+        job = CalibrationRequest(
+            frames,
+            self._phantom,
+            options_of_request(request, self._options, joint),
+            joint,
+            request.principal_distance or None,
+        )
+        others = {n: c for n, c in self._calibrations().items() if n not in frames}
+        all_frames = self._collector.frames()
+        rig = Rig(self._names, {name: all_frames[name] for name in others}, others)
+        return job, rig
 
     def _log_verdict(self, validation: Validation) -> None:
         self.get_logger().info(f'verdict: {validation.verdict} ({validation.seconds:.1f} s)')

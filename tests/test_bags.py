@@ -138,7 +138,7 @@ def cdr(one=None, **changes):
 @pytest.mark.parametrize(
     'options', [{}, {'live': True}, {'split_bytes': 2000}], ids=['usual', 'live', 'split']
 )
-def test_frames_are_the_same_to_the_last_bit(tmp_path, options):
+def test_frames_round_trip_is_exact(tmp_path, options):
     frames = some_frames(40)
     path = write_bag(tmp_path / 'run', frames, **options)
     assert_holds(path, frames)
@@ -150,7 +150,7 @@ def test_frames_are_the_same_to_the_last_bit(tmp_path, options):
         assert_holds(str(tmp_path / 'run' / 'run_0.mcap'), frames)
 
 
-def test_namespaces_topics_and_their_quality_of_service(tmp_path):
+def test_namespaces_topics_and_qos_profiles(tmp_path):
     with BagWriter(tmp_path / 'run') as writer:
         writer.write_frame(frame('a'), namespace='/rig/')
         writer.write_frame(frame('b'), topic='/other/b/target_observations')
@@ -181,7 +181,7 @@ def test_namespaces_topics_and_their_quality_of_service(tmp_path):
     assert observations_topic('a') == TOPIC and observations_topic('a', 'x/y') == '/x/y' + TOPIC
 
 
-def test_messages_come_in_time_order_whatever_their_order_in_the_file(tmp_path):
+def test_messages_are_read_in_time_order(tmp_path):
     frames = some_frames(30)
     for options in ({}, {'split_bytes': 3000}):
         path = write_bag(tmp_path / 'run', frames[::-1], overwrite=True, **options)
@@ -210,7 +210,7 @@ def test_messages_come_in_time_order_whatever_their_order_in_the_file(tmp_path):
     ],
     ids=['plain', 'unchunked', 'lz4', 'no statistics', 'no repeats', 'no summary'],
 )
-def test_other_forms_of_mcap_are_read(tmp_path, options):
+def test_mcap_variants_are_read(tmp_path, options):
     frames = [frame(number=i) for i in (3, 1, 2)]
     messages = [(TOPIC, one.stamp_ns, cdr(one)) for one in frames]
     path = mcap_file(tmp_path / 'x.mcap', messages, **options)
@@ -218,7 +218,7 @@ def test_other_forms_of_mcap_are_read(tmp_path, options):
     assert topics_of(path)[TOPIC].count == 3
 
 
-def test_many_split_files_without_metadata_come_in_the_order_of_their_numbers(tmp_path):
+def test_split_files_without_metadata_are_read_in_numerical_order(tmp_path):
     for number in (0, 2, 10, 1):
         mcap_file(tmp_path / f'run_{number}.mcap', [(TOPIC, 5, cdr(frame(number=number)))])
     assert [os.path.basename(path) for path in storage_files(tmp_path)] == [
@@ -230,7 +230,7 @@ def test_many_split_files_without_metadata_come_in_the_order_of_their_numbers(tm
     assert [one.number for one in read_frames(tmp_path).frames['a']] == [0, 1, 2, 10]
 
 
-def test_messages_of_rclpy_convert_as_well():
+def test_frame_from_a_message_without_sigma():
     header = SimpleNamespace(stamp=SimpleNamespace(sec=3, nanosec=7), frame_id='x')
     message = SimpleNamespace(
         header=header,
@@ -252,7 +252,7 @@ def test_messages_of_rclpy_convert_as_well():
 # writes them
 
 
-def test_the_same_messages_give_the_same_bytes(tmp_path):
+def test_same_messages_give_the_same_bytes(tmp_path):
     for folder in ('1', '2'):
         write_bag(tmp_path / folder / 'run')
     for name in ('run_0.mcap', 'metadata.yaml'):
@@ -308,7 +308,7 @@ def test_metadata_is_version_9_of_rosbag2(tmp_path):
     ]
 
 
-def test_the_file_has_what_rosbag2_puts_into_it(tmp_path):
+def test_file_has_the_records_of_rosbag2(tmp_path):
     write_bag(tmp_path / 'run')
     with open(tmp_path / 'run/run_0.mcap', 'rb') as file:
         reader = make_reader(file)
@@ -340,7 +340,7 @@ def test_the_file_has_what_rosbag2_puts_into_it(tmp_path):
         )
 
 
-def test_type_hashes_are_those_of_ros():
+def test_type_hashes_agree_with_ros():
     # From /opt/ros/jazzy/share/std_msgs/msg/*.json, and of ours as rosidl generates it.
     assert (
         type_hash('std_msgs/msg/Header')
@@ -355,7 +355,7 @@ def test_type_hashes_are_those_of_ros():
 # ---------------------------------------------------------------- independent readers
 
 
-def test_the_mcap_library_reads_our_bags_and_all_checksums_agree(tmp_path):
+def test_mcap_library_reads_written_bags_with_checksums(tmp_path):
     write_bag(tmp_path / 'run', some_frames(60))
     content = (tmp_path / 'run/run_0.mcap').read_bytes()
     records = list(StreamReader(io.BytesIO(content), validate_crcs=True, emit_chunks=True).records)
@@ -370,7 +370,7 @@ def test_the_mcap_library_reads_our_bags_and_all_checksums_agree(tmp_path):
         assert sum(1 for _ in reader.iter_messages()) == 120
 
 
-def test_rosbags_reads_our_bags(tmp_path):
+def test_rosbags_reads_written_bags(tmp_path):
     frames = some_frames(20)
     path = write_bag(tmp_path / 'run', frames, split_bytes=6000)
     with Reader(path) as reader:
@@ -388,7 +388,7 @@ def test_rosbags_reads_our_bags(tmp_path):
     )
 
 
-def test_a_bag_of_rosbags_is_read(tmp_path):
+def test_bag_written_by_rosbags_is_read(tmp_path):
     from rosbags.rosbag2 import StoragePlugin
     from rosbags.rosbag2 import Writer as RosbagsWriter
 
@@ -405,14 +405,14 @@ def test_a_bag_of_rosbags_is_read(tmp_path):
 # ---------------------------------------------------------------- crash safety
 
 
-def test_an_exception_leaves_nothing(tmp_path):
+def test_exception_leaves_no_bag(tmp_path):
     with pytest.raises(RuntimeError), BagWriter(tmp_path / 'run') as writer:
         writer.write_frame(frame())
         raise RuntimeError
     assert os.listdir(tmp_path) == []
 
 
-def test_an_exception_leaves_the_bag_that_was_there(tmp_path):
+def test_exception_leaves_an_existing_bag(tmp_path):
     path = write_bag(tmp_path / 'run')
     with pytest.raises(RuntimeError), BagWriter(path, overwrite=True) as writer:
         writer.write_frame(frame())
@@ -421,7 +421,7 @@ def test_an_exception_leaves_the_bag_that_was_there(tmp_path):
     assert_holds(path, some_frames())
 
 
-def test_a_recording_keeps_what_came_before_an_exception(tmp_path):
+def test_recording_keeps_messages_before_an_exception(tmp_path):
     with pytest.raises(RuntimeError), BagWriter(tmp_path / 'run', live=True) as writer:
         writer.write_frame(frame())
         writer.flush()
@@ -430,7 +430,7 @@ def test_a_recording_keeps_what_came_before_an_exception(tmp_path):
     assert_holds(tmp_path / 'run', [frame()])
 
 
-def test_only_a_bag_is_overwritten_and_only_on_request(tmp_path):
+def test_only_bags_are_overwritten_and_only_on_request(tmp_path):
     path = write_bag(tmp_path / 'run')
     assert 'is not overwritten' in message_of(write_bag, path)
     write_bag(path, [frame()], overwrite=True)
@@ -446,7 +446,7 @@ def test_only_a_bag_is_overwritten_and_only_on_request(tmp_path):
     assert_holds(path, [frame()])
 
 
-def test_a_disk_that_is_full_is_told_and_leaves_nothing(tmp_path, monkeypatch):
+def test_full_disk_is_reported_and_leaves_nothing(tmp_path, monkeypatch):
     def full(*_):
         raise OSError(28, 'No space left on device')
 
@@ -473,7 +473,7 @@ def test_a_disk_that_is_full_is_told_and_leaves_nothing(tmp_path, monkeypatch):
         ((TOPIC, 'std_msgs/msg/Empty', b'', 0), 'does not belong to this topic of type'),
     ],
 )
-def test_what_cannot_be_written_is_told(tmp_path, arguments, sentence):
+def test_invalid_messages_are_reported(tmp_path, arguments, sentence):
     with BagWriter(tmp_path / 'run') as writer:
         writer.write_frame(frame())
         assert sentence in message_of(writer.write, *arguments)
@@ -483,7 +483,7 @@ def test_what_cannot_be_written_is_told(tmp_path, arguments, sentence):
 # ---------------------------------------------------------------- faults of a bag
 
 
-def test_sources_that_are_no_bag(tmp_path):
+def test_sources_that_are_not_bags(tmp_path):
     def said(path):
         text = message_of(read_frames, path)
         assert text.startswith(str(path)) and text == message_of(topics_of, path)
@@ -513,7 +513,7 @@ def test_sources_that_are_no_bag(tmp_path):
         ({'storage_identifier': None}, 'stored as None'),
     ],
 )
-def test_metadata_that_does_not_fit_is_told(tmp_path, change, sentence):
+def test_inconsistent_metadata_is_reported(tmp_path, change, sentence):
     write_bag(tmp_path / 'run')
     path = tmp_path / 'run/metadata.yaml'
     metadata = yaml.safe_load(path.read_text())
@@ -533,7 +533,7 @@ def test_bags_without_observations(tmp_path):
     assert f'no message on {TOPIC}' in message_of(read_frames, str(tmp_path / 'silent'))
 
 
-def test_a_bag_that_is_cut_off_is_told(tmp_path):
+def test_truncated_bag_is_reported(tmp_path):
     write_bag(tmp_path / 'run')
     path = tmp_path / 'run/run_0.mcap'
     content = path.read_bytes()
@@ -553,7 +553,7 @@ def test_a_bag_that_is_cut_off_is_told(tmp_path):
             assert str(path) in message_of(read, str(tmp_path / 'run'))
 
 
-def test_a_changed_byte_is_told_or_has_no_meaning(tmp_path):
+def test_changed_byte_is_reported_or_irrelevant(tmp_path):
     frames = some_frames(20)
     write_bag(tmp_path / 'run', frames)
     path = tmp_path / 'run/run_0.mcap'
@@ -571,7 +571,7 @@ def test_a_changed_byte_is_told_or_has_no_meaning(tmp_path):
     assert told > 200
 
 
-def test_a_damaged_bag_without_checksums_raises_nothing_else(tmp_path):
+def test_damaged_bag_without_checksums_raises_only_data_errors(tmp_path):
     path = mcap_file(
         tmp_path / 'x.mcap', [(TOPIC, i, cdr(frame(number=i, targets=5))) for i in range(5)]
     )
@@ -587,7 +587,7 @@ def test_a_damaged_bag_without_checksums_raises_nothing_else(tmp_path):
                 assert '\n' not in str(error)
 
 
-def test_the_footer_and_lengths_of_a_record_may_be_nonsense(tmp_path):
+def test_damaged_footer_is_reported(tmp_path):
     write_bag(tmp_path / 'run')
     path = tmp_path / 'run/run_0.mcap'
     content = path.read_bytes()
@@ -614,7 +614,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize('changes, sentence', WRONG, ids=[sentence for _, sentence in WRONG])
-def test_a_wrong_frame_is_named_by_bag_topic_and_message(tmp_path, changes, sentence):
+def test_invalid_frame_is_reported_with_bag_topic_and_message(tmp_path, changes, sentence):
     messages = [(TOPIC, 1, cdr(frame(number=4))), (TOPIC, 2, cdr(frame(number=8), **changes))]
     path = mcap_file(tmp_path / 'x.mcap', messages)
     said = message_of(read_frames, path)
@@ -625,12 +625,12 @@ def test_a_wrong_frame_is_named_by_bag_topic_and_message(tmp_path, changes, sent
     )
 
 
-def test_frames_need_not_be_checked(tmp_path):
+def test_validation_of_frames_can_be_switched_off(tmp_path):
     path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr(u=np.full(30, np.nan)))])
     assert np.isnan(read_frames(path, validate=False).frames['a'][0].uv[:, 0]).all()
 
 
-def test_a_message_that_is_none_is_named(tmp_path):
+def test_undecodable_message_is_reported(tmp_path):
     for data in (
         b'',
         b'\0\1\0\0',
@@ -647,12 +647,12 @@ def test_a_message_that_is_none_is_named(tmp_path):
         )
 
 
-def test_a_frame_that_is_there_twice_is_named(tmp_path):
+def test_repeated_frame_is_reported(tmp_path):
     path = write_bag(tmp_path / 'run', [frame(number=1), frame(number=2), frame(number=1)])
     assert 'frame 1 is already given in message 1' in message_of(read_frames, path)
 
 
-def test_two_topics_of_one_fluoroscope_are_named(tmp_path):
+def test_two_topics_of_one_fluoroscope_are_reported(tmp_path):
     with BagWriter(tmp_path / 'run') as writer:
         writer.write_frame(frame(), namespace='x')
         writer.write_frame(frame(), namespace='y')
@@ -660,7 +660,7 @@ def test_two_topics_of_one_fluoroscope_are_named(tmp_path):
     assert '/x/a/target_observations' in said and '/y/a/target_observations' in said
 
 
-def test_another_definition_of_the_message_is_told(tmp_path):
+def test_different_message_definition_is_reported(tmp_path):
     text = full_text(TARGET_OBSERVATIONS)
     for schema in (
         text.replace('float64[] u ', 'float32[] u '),
@@ -684,7 +684,7 @@ def test_another_definition_of_the_message_is_told(tmp_path):
     assert 'only cdr is supported' in message_of(read_frames, path)
 
 
-def test_comments_and_blanks_of_a_definition_do_not_matter(tmp_path):
+def test_comments_and_blanks_of_a_definition_are_ignored(tmp_path):
     text = '\n'.join(line.split('#')[0] for line in full_text(TARGET_OBSERVATIONS).splitlines())
     path = mcap_file(tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], schema=text)
     assert_holds(path, [frame()])
@@ -692,7 +692,7 @@ def test_comments_and_blanks_of_a_definition_do_not_matter(tmp_path):
     assert_holds(path, [frame()])
 
 
-def test_an_old_bag_with_numbered_policies_tells_them_by_name(tmp_path):
+def test_numbered_policies_of_old_bags_get_their_names(tmp_path):
     old = '- history: 3\n  depth: 0\n  reliability: 1\n  durability: 2\n  liveliness: 1\n'
     path = mcap_file(
         tmp_path / 'x.mcap', [(TOPIC, 1, cdr())], metadata={'offered_qos_profiles': old}

@@ -96,7 +96,7 @@ def said(capsys, arguments, status=1):
 # ---- simulate
 
 
-def test_simulate_writes_the_same_bytes_again(tmp_path):
+def test_simulate_is_reproducible(tmp_path):
     """Of every file; another seed gives others."""
     for name, seed in (('one', 5), ('other', 5), ('third', 6)):
         assert (
@@ -134,7 +134,7 @@ def test_simulate_writes_the_same_bytes_again(tmp_path):
     } <= one.keys()
 
 
-def test_the_recorded_bags_are_made_by_the_documented_command(tmp_path):
+def test_sample_bags_were_made_by_the_documented_command(tmp_path):
     """fluoro-calib simulate --out bags: file by file what is in bags/."""
     assert 'fluoro-calib simulate --out bags' in (ROOT / 'bags' / 'README.md').read_text()
     assert command('simulate', '--out', tmp_path).returncode == 0
@@ -144,7 +144,7 @@ def test_the_recorded_bags_are_made_by_the_documented_command(tmp_path):
     assert not different and not failed
 
 
-def test_more_of_one_part_does_not_change_another(tmp_path, rig):
+def test_size_of_one_part_does_not_change_the_others(tmp_path, rig):
     """The exposures for the calibration are those without a test."""
     assert run('simulate', '--out', tmp_path) == 0
     assert (tmp_path / 'calibration.csv').read_bytes() == (rig / 'calibration.csv').read_bytes()
@@ -223,7 +223,7 @@ def test_calibrate_writes_result_and_calibrations(result):
 
 
 @pytest.mark.long
-def test_a_bag_and_its_csv_give_the_same_numbers(rig, tmp_path):
+def test_bag_and_csv_give_the_same_numbers(rig, tmp_path):
     """To the last digit, and again as a process of its own with two threads."""
     more = ('--max-iterations', 1, '--fluoroscopes', 'a')
     assert run(*calibrate(rig, tmp_path / 'bag', *more)) == 0
@@ -241,7 +241,7 @@ def test_a_bag_and_its_csv_give_the_same_numbers(rig, tmp_path):
     check_result(bag, ['a'], list(range(1, 16)))
 
 
-def test_json_is_all_there_is_on_standard_output(rig, tmp_path):
+def test_json_is_the_only_standard_output(rig, tmp_path):
     """What result.json says; nothing on standard error."""
     done = command(
         *calibrate(
@@ -260,7 +260,7 @@ def test_json_is_all_there_is_on_standard_output(rig, tmp_path):
     assert json.loads(done.stdout) == json.loads((tmp_path / 'result.json').read_text())
 
 
-def test_without_json_a_summary_for_people_is_printed(rig, tmp_path, capsys):
+def test_summary_is_printed_without_json(rig, tmp_path, capsys):
     assert (
         run(
             *calibrate(
@@ -342,7 +342,7 @@ def test_adjust_holds_the_calibration(rig, result, tmp_path):
 # ---- correct
 
 
-def test_correct_takes_the_distortion_off(rig, result, tmp_path, capsys):
+def test_correct_removes_the_distortion(rig, result, tmp_path, capsys):
     """u_corrected = u - du at the observed pixel, row by row, with all other columns as they were."""
     out = tmp_path / 'corrected.csv'
     assert run('correct', rig / 'test.csv', '--calibration', result, '--out', out, '--json') == 0
@@ -395,7 +395,7 @@ def test_correct_takes_the_distortion_off(rig, result, tmp_path, capsys):
         ('correct', 'p.csv', '--out', 'x'),
     ],
 )
-def test_wrong_usage_ends_with_status_2_and_the_usage(arguments, capsys, tmp_path, monkeypatch):
+def test_wrong_usage_exits_with_status_2_and_the_usage(arguments, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert 'usage: fluoro-calib' in said(capsys, arguments, status=2)
     assert list(tmp_path.iterdir()) == []
@@ -411,7 +411,7 @@ def test_every_command_has_help_with_an_example_that_parses(command, capsys):
     assert make_parser().parse_args(command.EXAMPLE.split()[1:]).command == command.NAME
 
 
-def test_missing_files_are_named(rig, tmp_path, capsys):
+def test_missing_files_are_reported_by_name(rig, tmp_path, capsys):
     nowhere = tmp_path / 'nowhere'
     for arguments in (
         calibrate(rig, tmp_path / 'x', source=nowhere),
@@ -433,7 +433,7 @@ def test_missing_files_are_named(rig, tmp_path, capsys):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_failures_of_a_process_end_with_one_sentence(rig, tmp_path):
+def test_failing_process_prints_one_sentence(rig, tmp_path):
     """Status 1, and no traceback, whatever the process prints else."""
     done = command(*calibrate(rig, tmp_path / 'x', source='nowhere'))
     assert (done.returncode, done.stdout) == (1, '') and done.stderr.count('\n') == 1
@@ -441,7 +441,7 @@ def test_failures_of_a_process_end_with_one_sentence(rig, tmp_path):
     assert command('calibrate').returncode == 2
 
 
-def test_a_bag_without_observations_is_refused(rig, tmp_path, capsys):
+def test_bag_without_observations_is_refused(rig, tmp_path, capsys):
     write_bag(tmp_path / 'empty', {'a': []})
     sentence = said(capsys, calibrate(rig, tmp_path / 'x', source=tmp_path / 'empty'))
     assert str(tmp_path / 'empty') in sentence and 'observations' in sentence.lower()
@@ -466,7 +466,7 @@ def test_a_bag_without_observations_is_refused(rig, tmp_path, capsys):
         ('-7,1,2,3,0.1', 'row 9: target_id'),
     ],
 )
-def test_a_bad_row_of_the_phantom_is_named(rig, tmp_path, capsys, bad, cause):
+def test_invalid_row_of_the_phantom_is_reported(rig, tmp_path, capsys, bad, cause):
     lines = (rig / 'phantom.csv').read_text().splitlines()
     lines[8] = bad
     (tmp_path / 'phantom.csv').write_text('\n'.join(lines) + '\n')
@@ -474,24 +474,24 @@ def test_a_bad_row_of_the_phantom_is_named(rig, tmp_path, capsys, bad, cause):
     assert f'{tmp_path / "phantom.csv"}, ' in sentence and cause in sentence
 
 
-def test_a_csv_needs_the_size_of_the_image(rig, tmp_path, capsys):
+def test_csv_requires_the_image_size(rig, tmp_path, capsys):
     sentence = said(capsys, calibrate(rig, tmp_path / 'x', source='calibration.csv'))
     assert 'calibration.csv' in sentence and '--image-size WxH' in sentence
 
 
-def test_points_off_the_stated_image_are_refused_with_their_row(rig, tmp_path, capsys):
+def test_points_off_the_image_are_refused_with_their_row(rig, tmp_path, capsys):
     sentence = said(
         capsys, calibrate(rig, tmp_path / 'x', '--image-size', '512x512', source='calibration.csv')
     )
     assert re.search(r'calibration.csv, row \d+: the point .* is off the image', sentence)
 
 
-def test_an_unknown_fluoroscope_is_named(rig, tmp_path, capsys):
+def test_unknown_fluoroscope_is_reported(rig, tmp_path, capsys):
     sentence = said(capsys, calibrate(rig, tmp_path / 'x', '--fluoroscopes', 'a,c'))
     assert "no fluoroscope 'c', only a, b" in sentence
 
 
-def test_too_few_exposures_are_told(rig, tmp_path, capsys):
+def test_too_few_exposures_are_reported(rig, tmp_path, capsys):
     lines = (rig / 'calibration.csv').read_text().splitlines()
     few = [line for line in lines if not line[0] == 'a' or line.split(',')[1] in ('1', '2')]
     (tmp_path / 'few.csv').write_text('\n'.join(few) + '\n')
@@ -500,7 +500,7 @@ def test_too_few_exposures_are_told(rig, tmp_path, capsys):
     assert not (tmp_path / 'x').exists()
 
 
-def test_a_k_that_the_observations_do_not_allow_is_told(rig, tmp_path, capsys):
+def test_k_that_is_too_large_is_reported(rig, tmp_path, capsys):
     more = ('--fluoroscopes', 'a', '--max-iterations', 1, '--model', 'local_linear', '--k')
     assert 'fluoroscope a: ' in said(capsys, calibrate(rig, tmp_path / 'x', *more, 100000))
     assert 'fluoroscope a: local_linear with k = 3' in said(
@@ -508,13 +508,13 @@ def test_a_k_that_the_observations_do_not_allow_is_told(rig, tmp_path, capsys):
     )
 
 
-def test_a_k_for_a_model_without_neighbours_is_wrong_usage(rig, tmp_path, capsys):
+def test_k_for_a_model_without_neighbours_is_wrong_usage(rig, tmp_path, capsys):
     with pytest.raises(SystemExit) as ended:
         main([str(a) for a in calibrate(rig, tmp_path / 'x', '--k', 30)])
     assert ended.value.code == 2 and '--k is a number of neighbours' in capsys.readouterr().err
 
 
-def test_an_empty_or_damaged_calibration_folder_is_told(rig, result, tmp_path, capsys):
+def test_empty_or_damaged_calibration_folder_is_reported(rig, result, tmp_path, capsys):
     empty = tmp_path / 'empty'
     damaged = tmp_path / 'damaged'
     empty.mkdir()
@@ -531,7 +531,7 @@ def test_an_empty_or_damaged_calibration_folder_is_told(rig, result, tmp_path, c
     assert not (tmp_path / 'x').exists()
 
 
-def test_a_fluoroscope_without_calibration_is_told(rig, result, tmp_path, capsys):
+def test_fluoroscope_without_calibration_is_reported(rig, result, tmp_path, capsys):
     (tmp_path / 'only').mkdir()
     (tmp_path / 'only' / 'b.calibration.npz').write_bytes(
         (result / 'b.calibration.npz').read_bytes()
@@ -545,7 +545,7 @@ def test_a_fluoroscope_without_calibration_is_told(rig, result, tmp_path, capsys
     )
 
 
-def test_frames_of_another_image_size_are_not_adjusted(rig, result, tmp_path, capsys):
+def test_frames_of_another_image_size_are_refused(rig, result, tmp_path, capsys):
     sentence = said(
         capsys,
         (
@@ -564,7 +564,7 @@ def test_frames_of_another_image_size_are_not_adjusted(rig, result, tmp_path, ca
     assert 'the image is 2048 x 2048 px, but the calibration is for 1024 x 1024 px' in sentence
 
 
-def test_a_failing_command_leaves_earlier_results_untouched(rig, result, tmp_path, capsys):
+def test_failing_command_leaves_earlier_results(rig, result, tmp_path, capsys):
     """Byte for byte: a calibration that fails at its second fluoroscope, an adjustment, a
     correction.
     """
@@ -598,7 +598,7 @@ def test_a_failing_command_leaves_earlier_results_untouched(rig, result, tmp_pat
     assert files_of(result) == before and corrected.read_text() == 'earlier'
 
 
-def test_what_cannot_be_written_is_told(rig, tmp_path, capsys):
+def test_impossible_output_is_reported(rig, tmp_path, capsys):
     (tmp_path / 'file').write_text('')
     for arguments in (
         ('simulate', '--out', tmp_path / 'file', '--exposures', 1, '--seconds', 0),
@@ -609,7 +609,7 @@ def test_what_cannot_be_written_is_told(rig, tmp_path, capsys):
         assert str(tmp_path / 'file') in said(capsys, arguments)
 
 
-def test_exposures_that_are_left_out_are_told(rig, tmp_path, capsys):
+def test_exposures_that_are_left_out_are_reported(rig, tmp_path, capsys):
     """On standard error and in the result; the calibration goes on."""
     lines = (rig / 'calibration.csv').read_text().splitlines()
     third = [n for n, line in enumerate(lines) if line.startswith('a,3,')]

@@ -44,7 +44,7 @@ def completed(pairer, frame):
     return exposures[0] if exposures else None
 
 
-def test_frames_pair_by_number_in_any_order():
+def test_frames_are_paired_by_number_in_any_order():
     pairer = CompletePairer('ab')
     assert (
         completed(pairer, frame('a', 1, 0)) is None and completed(pairer, frame('a', 2, 5)) is None
@@ -56,7 +56,7 @@ def test_frames_pair_by_number_in_any_order():
     assert pairer.unpaired == {'a': 0, 'b': 0}
 
 
-def test_frames_pair_by_stamp_within_the_tolerance():
+def test_frames_are_paired_by_stamp_within_the_tolerance():
     """The nearest partner; the pair is numbered anew, as the frames need not be numbered alike."""
     pairer = CompletePairer('ab', PairingOptions('stamp', 0.002))
     for number, stamp in ((70, 0), (71, 3), (72, 50)):
@@ -69,7 +69,7 @@ def test_frames_pair_by_stamp_within_the_tolerance():
     assert pairer.unpaired == {'a': 1, 'b': 1}
 
 
-def test_only_the_last_frames_wait():
+def test_number_of_waiting_frames_is_limited():
     """What drops out alone is counted, and finds no partner any more."""
     pairer = CompletePairer('ab', PairingOptions(waiting=3))
     for number in range(1, 6):
@@ -84,7 +84,7 @@ def test_only_the_last_frames_wait():
 
 
 @pytest.mark.parametrize('by', ['frame_number', 'stamp'])
-def test_frames_of_a_fluoroscope_that_was_started_anew_are_not_late(by):
+def test_frames_of_a_restarted_fluoroscope_are_not_late(by):
     pairer = CompletePairer('ab', PairingOptions(by, waiting=3))
     for number in range(10_000, 10_006):
         pairer.add(frame('a', number, number))
@@ -94,7 +94,7 @@ def test_frames_of_a_fluoroscope_that_was_started_anew_are_not_late(by):
     assert pairer.late == {'a': 0, 'b': 0}
 
 
-def test_a_number_that_comes_again_replaces_the_frame_that_waits():
+def test_repeated_number_replaces_the_waiting_frame():
     pairer = CompletePairer('ab')
     pairer.add(frame('a', 1, 0))
     pairer.add(frame('a', 1, 7))
@@ -102,11 +102,11 @@ def test_a_number_that_comes_again_replaces_the_frame_that_waits():
     assert completed(pairer, frame('b', 1))['a'].stamp_ns == 7 * MS
 
 
-def test_one_fluoroscope_alone_needs_no_partner():
+def test_single_fluoroscope_needs_no_partner():
     assert completed(CompletePairer(['a']), frame('a', 4))['a'].number == 4
 
 
-def test_pairing_of_another_kind_is_refused():
+def test_unknown_kind_of_pairing_is_refused():
     with pytest.raises(ValueError, match="not 'id'"):
         CompletePairer('ab', PairingOptions('id'))
 
@@ -126,7 +126,7 @@ def test_displacement_is_the_median_of_common_targets():
     assert displacement(frame(), reordered) == pytest.approx(1)
 
 
-def test_the_phantom_is_taken_where_it_stands_still_in_a_new_pose():
+def test_exposures_are_collected_where_the_phantom_stands_still_in_a_new_pose():
     """A stream of 50 frames a second: standing, moving, standing elsewhere, and back again."""
     collector = ExposureCollector('ab')
     taken = []
@@ -150,7 +150,7 @@ def test_the_phantom_is_taken_where_it_stands_still_in_a_new_pose():
     assert said[30] == 'the phantom moves' and said[-1] == said[10]
 
 
-def test_a_movement_that_only_one_fluoroscope_sees_counts():
+def test_movement_seen_by_one_fluoroscope_counts():
     """Along the axis of the other: neither still nor the same pose."""
     collector = ExposureCollector('ab')
     assert collector.offer(pair(1, 0)) == ''
@@ -159,7 +159,7 @@ def test_a_movement_that_only_one_fluoroscope_sees_counts():
     assert len(collector.exposures) == 2
 
 
-def test_single_shots_count_each_in_a_new_pose():
+def test_every_single_shot_in_a_new_pose_is_collected():
     """Frames further apart than the still time have nothing to be compared with but the collected
     poses.
     """
@@ -169,7 +169,7 @@ def test_single_shots_count_each_in_a_new_pose():
     assert collector.offer(pair(3, 1000, 10.1)) == ''
 
 
-def test_after_a_gap_in_a_stream_the_phantom_is_not_taken_on_its_way():
+def test_moving_phantom_after_a_gap_in_a_stream_is_not_collected():
     """A busy machine loses frames of a stream; what comes behind the gap is no single shot."""
     collector = ExposureCollector('ab')
     taken = []
@@ -185,14 +185,14 @@ def test_after_a_gap_in_a_stream_the_phantom_is_not_taken_on_its_way():
     assert collector.offer(pair(90, 3000.0, 50)) == ''  # the stream is over
 
 
-def test_take_asks_for_nothing_but_a_new_number():
+def test_add_requires_only_a_new_number():
     collector = ExposureCollector('ab')
-    assert collector.take(pair(1)) == '' and collector.take(pair(2)) == ''
-    assert collector.take(pair(2, 99)) == 'frame 2 is collected already'
+    assert collector.add(pair(1)) == '' and collector.add(pair(2)) == ''
+    assert collector.add(pair(2, 99)) == 'frame 2 is collected already'
     assert [e['b'].number for e in collector.exposures] == [1, 2]
 
 
-def test_reset_forgets_everything():
+def test_reset_discards_everything():
     collector = ExposureCollector('ab')
     collector.offer(pair(1, 0, 0))
     collector.offer(pair(2, 10, 50))
@@ -205,10 +205,10 @@ def test_reset_forgets_everything():
     assert collector.offer(pair(1, 20, 100)) == ''
 
 
-def test_frames_are_handed_out_by_fluoroscope():
+def test_frames_by_fluoroscope():
     collector = ExposureCollector('ab')
-    collector.take(pair(1))
-    collector.take(pair(2))
+    collector.add(pair(1))
+    collector.add(pair(2))
     assert {n: [f.number for f in fs] for n, fs in collector.frames().items()} == {
         'a': [1, 2],
         'b': [1, 2],
@@ -228,14 +228,14 @@ def recording(shifts, interval_ms):
     }
 
 
-def test_single_shots_of_a_recording_are_all_taken():
+def test_all_single_shots_of_a_recording_are_collected():
     frames, unpaired = collect_recorded(recording([0, 0, 50], 500.0))
     assert [f.number for f in frames['a']] == [1, 2, 3] and unpaired == {'a': 0, 'b': 0}
     frames, _ = collect_recorded(recording([0, 0, 50], 500.0), 'still')
     assert [f.number for f in frames['a']] == [1, 3]
 
 
-def test_of_a_stream_the_still_exposures_are_taken():
+def test_still_exposures_of_a_stream_are_collected():
     shifts = [0] * 20 + list(np.linspace(0, 100, 20)) + [100] * 20
     frames, _ = collect_recorded(recording(shifts, 20.0))
     assert [f.number for f in frames['b']] == [1, 45]
@@ -243,7 +243,7 @@ def test_of_a_stream_the_still_exposures_are_taken():
     assert len(frames['b']) == 60
 
 
-def test_frames_without_partner_are_left_out_and_counted():
+def test_unpaired_frames_are_left_out_and_counted():
     recorded = recording([0] * 5, 500.0)
     del recorded['a'][1], recorded['b'][3]
     recorded['b'].reverse()
@@ -252,14 +252,14 @@ def test_frames_without_partner_are_left_out_and_counted():
     assert unpaired == {'a': 1, 'b': 1}
 
 
-def test_a_recording_of_nothing_is_nothing():
+def test_empty_recording():
     assert collect_recorded({'a': [], 'b': []}) == ({'a': [], 'b': []}, {'a': 0, 'b': 0})
 
 
 # ---- coverage
 
 
-def test_coverage_grows_from_nothing_to_the_whole_image():
+def test_coverage_grows_from_zero_to_the_whole_image():
     coverage = Coverage(SIZE)
     rng = np.random.default_rng(1)
     seen = []
@@ -296,7 +296,7 @@ def test_an_image_point_covers_its_surroundings_within_the_image():
     assert half.fraction == pytest.approx(17 / 32)  # the left half and the column beside it
 
 
-def test_coverage_is_kept_for_each_fluoroscope():
+def test_coverage_by_fluoroscope():
     collector = ExposureCollector('ab')
-    collector.take({'a': frame('a', 1), 'b': frame('b', 1, ids=range(3))})
+    collector.add({'a': frame('a', 1), 'b': frame('b', 1, ids=range(3))})
     assert collector.coverage['a'].fraction > collector.coverage['b'].fraction > 0

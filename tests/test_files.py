@@ -117,7 +117,7 @@ READERS = {
 
 
 @pytest.mark.parametrize('read', READERS.values(), ids=READERS)
-def test_a_file_that_is_none_is_named(read, tmp_path):
+def test_unreadable_files_are_reported_by_name(read, tmp_path):
     assert 'no such file' in message_of(read, str(tmp_path / 'missing'))
     assert 'folder' in message_of(read, str(tmp_path))
     assert 'empty' in message_of(read, text_file(tmp_path, 'empty', ''))
@@ -137,7 +137,7 @@ def test_a_file_that_is_none_is_named(read, tmp_path):
 
 
 @pytest.mark.parametrize('read', READERS.values(), ids=READERS)
-def test_a_file_without_permission_is_named(read, tmp_path, monkeypatch):
+def test_file_without_permission_is_reported_by_name(read, tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise PermissionError(
             13, 'Permission denied'
@@ -152,7 +152,7 @@ def test_a_file_without_permission_is_named(read, tmp_path, monkeypatch):
 # ---------------------------------------------------------------- atomic writing
 
 
-def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path):
+def test_exception_leaves_only_the_old_file(tmp_path):
     path = tmp_path / 'result.json'
     write_text(path, 'old')
     with pytest.raises(RuntimeError), atomic_file(path, 'w') as file:
@@ -162,14 +162,14 @@ def test_an_exception_leaves_the_old_file_and_nothing_else(tmp_path):
     assert os.listdir(tmp_path) == ['result.json']
 
 
-def test_writing_where_it_is_impossible_is_told(tmp_path):
+def test_impossible_write_is_reported(tmp_path):
     assert 'no such file or directory' in message_of(write_bytes, tmp_path / 'no' / 'file', b'x')
     (tmp_path / 'folder').mkdir()
     assert 'directory' in message_of(write_bytes, tmp_path / 'folder', b'x')
     assert os.listdir(tmp_path) == ['folder']
 
 
-def test_a_link_stays_a_link_and_permissions_follow_the_umask(tmp_path):
+def test_symbolic_link_is_kept_and_permissions_follow_the_umask(tmp_path):
     write_bytes(tmp_path / 'file', b'old')
     (tmp_path / 'link').symlink_to(tmp_path / 'file')
     write_bytes(tmp_path / 'link', b'new')
@@ -191,7 +191,7 @@ def test_phantom_round_trip(tmp_path):
     assert (tmp_path / 'phantom.csv').read_text().startswith('target_id,x,y,z,sd\n')
 
 
-def test_phantom_as_a_spreadsheet_gives_it(tmp_path):
+def test_phantom_exported_from_a_spreadsheet(tmp_path):
     text = '\ufeff# surveyed 2020\r\n\r\nz, sd ,target_id,x,y,remark\r\n' + ''.join(
         f'3.5,0.1,{i}, 1e1 ,-2,"bead, no. {i}"\r\n# comment\r\n' for i in (4, 2, 9, 7)
     )
@@ -219,7 +219,7 @@ def test_phantom_as_a_spreadsheet_gives_it(tmp_path):
         ('5,1,2,3,\x00', 'row 6: '),
     ],
 )
-def test_phantom_names_row_and_cause(tmp_path, row, sentence):
+def test_phantom_errors_name_row_and_cause(tmp_path, row, sentence):
     good = ''.join(f'{i},1,2,3,0.1\n' for i in range(4))
     path = text_file(tmp_path, 'phantom.csv', f'target_id,x,y,z,sd\n{good}{row}\n')
     assert message_of(read_phantom, path).startswith(path) and sentence in message_of(
@@ -240,7 +240,7 @@ def test_phantom_header_encoding_and_number_of_targets(tmp_path):
     )
 
 
-def test_row_numbers_count_cells_with_line_ends_in_them(tmp_path):
+def test_row_numbers_count_line_ends_inside_cells(tmp_path):
     text = 'target_id,x,y,z,sd,note\n1,2,3,4,5,"two\nlines"\n2,2,3,4,5,\n\n3,2,3,x,5,\n'
     assert "row 6: z is 'x'" in message_of(read_phantom, text_file(tmp_path, 'phantom.csv', text))
 
@@ -281,7 +281,7 @@ def test_observations_in_any_order_of_rows_and_columns(tmp_path):
     )
 
 
-def test_observations_need_the_image_size(tmp_path):
+def test_observations_require_the_image_size(tmp_path):
     path = text_file(tmp_path, 'o.csv', OBSERVATIONS + 'a,0,1,2,3,\n')
     assert '--image-size' in message_of(read_observations_csv, path)
 
@@ -302,13 +302,13 @@ def test_observations_need_the_image_size(tmp_path):
         (',0,3,1,2,', "row 4: the fluoroscope is called ''"),
     ],
 )
-def test_observations_name_row_and_cause(tmp_path, row, sentence):
+def test_observation_errors_name_row_and_cause(tmp_path, row, sentence):
     path = text_file(tmp_path, 'o.csv', OBSERVATIONS + f'a,0,1,1,2,\nb,0,2,1,2,\n{row}\n')
     said = message_of(read_observations_csv, path, SIZE)
     assert said.startswith(path) and sentence in said
 
 
-def test_the_row_is_exact_far_down_a_large_file(tmp_path):
+def test_row_number_is_exact_in_a_large_file(tmp_path):
     rows = [f'a,{i // 100},{i % 100},{i % 900}.5,1,\n' for i in range(60_000)]
     rows[54_320] = 'a,1,1,1.5.2,1,\n'
     said = message_of(
@@ -317,7 +317,7 @@ def test_the_row_is_exact_far_down_a_large_file(tmp_path):
     assert "row 54322: u is '1.5.2'" in said
 
 
-def test_a_campaign_is_read_in_a_second(tmp_path):
+def test_large_file_is_read_within_a_second(tmp_path):
     write_observations_csv(tmp_path / 'o.csv', some_frames(135, 140))
     start = time.perf_counter()
     read_observations_csv(str(tmp_path / 'o.csv'), SIZE)
@@ -339,7 +339,7 @@ def test_a_campaign_is_read_in_a_second(tmp_path):
     ],
     ids=['usual', 'gaussian', 'no model', 'held'],
 )
-def test_a_calibration_is_the_same_to_the_last_bit(tmp_path, calibration):
+def test_calibration_round_trip_is_exact(tmp_path, calibration):
     path = save_calibration(tmp_path / 'new' / 'folder', calibration)
     again = load_calibration(path)
     assert path == str(tmp_path / 'new' / 'folder' / f'{calibration.fluoroscope}.calibration.npz')
@@ -355,7 +355,7 @@ def test_a_calibration_is_the_same_to_the_last_bit(tmp_path, calibration):
         assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
 
 
-def test_the_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
+def test_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
     first = open(save_calibration(tmp_path / '1', some_calibration()), 'rb').read()
     monkeypatch.setattr(time, 'time', lambda: 2_000_000_000.0)
     monkeypatch.setattr(time, 'localtime', lambda *_: time.gmtime(2_000_000_000))
@@ -367,7 +367,7 @@ def test_the_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
     assert first == second == third
 
 
-def test_numpy_reads_it_without_pickle_and_the_document_names_every_array(tmp_path):
+def test_numpy_reads_the_file_without_pickle_and_every_array_is_documented(tmp_path):
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
         assert file.files == ['format_version', *ARRAYS]
         assert file['format_version'] == 2
@@ -422,14 +422,14 @@ class Bomb:
         ({'format_version': np.array(Bomb(), dtype=object)}, 'does not contain plain numbers'),
     ],
 )
-def test_a_wrong_calibration_is_refused(tmp_path, arrays, sentence):
+def test_invalid_calibration_is_refused(tmp_path, arrays, sentence):
     path = changed(tmp_path, **arrays)
     said = message_of(load_calibration, path)
     assert said.startswith(path) and sentence in said
     assert not os.path.exists('/tmp/this_must_never_be_made')
 
 
-def test_a_calibration_that_is_cut_off_or_changed_by_a_byte_is_refused(tmp_path):
+def test_truncated_or_damaged_calibration_is_refused(tmp_path):
     path = save_calibration(tmp_path, some_calibration())
     content = open(path, 'rb').read()
     good = load_calibration(path)
@@ -459,14 +459,14 @@ def test_a_calibration_that_is_cut_off_or_changed_by_a_byte_is_refused(tmp_path)
         )
 
 
-def test_other_archives_are_no_calibration(tmp_path):
+def test_other_archive_is_refused(tmp_path):
     path = str(tmp_path / 'x.npz')
     with zipfile.ZipFile(path, 'w') as archive:
         archive.writestr('readme.txt', 'hello')
     assert 'not a calibration file' in message_of(load_calibration, path)
 
 
-def test_what_could_not_be_read_again_is_not_written(tmp_path):
+def test_calibration_that_could_not_be_read_is_not_written(tmp_path):
     save_calibration(tmp_path, some_calibration())
     before = (tmp_path / 'a.calibration.npz').read_bytes()
     assert 'interior' in message_of(
@@ -480,7 +480,7 @@ def test_what_could_not_be_read_again_is_not_written(tmp_path):
     assert (tmp_path / 'a.calibration.npz').read_bytes() == before
 
 
-def test_all_calibrations_of_a_folder(tmp_path):
+def test_load_all_calibrations_of_a_folder(tmp_path):
     assert 'no calibration in this folder' in message_of(load_calibrations, str(tmp_path))
     assert 'no such folder' in message_of(load_calibrations, str(tmp_path / 'missing'))
     for name in ('b', 'a'):
@@ -501,7 +501,7 @@ def corrected_rows(tmp_path, text, calibrations):
     return [row.split(',') for row in (tmp_path / 'out.csv').read_text().splitlines()]
 
 
-def test_points_are_corrected_and_all_else_is_kept(tmp_path):
+def test_points_are_corrected_and_other_columns_kept(tmp_path):
     calibration = some_calibration()
     header, good, empty, off, outside = corrected_rows(
         tmp_path, 'note,v,u\n kept ,500.25,400\n1,,3\n2,5,nan\n3,1,1\n', {'a': calibration}
@@ -547,7 +547,7 @@ def test_points_of_two_fluoroscopes_with_their_own_sigma(tmp_path):
         ('u\n1\n', 'no column v'),
     ],
 )
-def test_points_name_row_and_cause(tmp_path, text, sentence):
+def test_point_errors_name_row_and_cause(tmp_path, text, sentence):
     calibrations = {name: some_calibration(name) for name in 'ab'}
     assert sentence in message_of(corrected_rows, tmp_path, text, calibrations)
 
@@ -582,7 +582,7 @@ def test_results_round_trip_and_have_no_nan(tmp_path):
     json.loads((tmp_path / 'result.json').read_text(), parse_constant=pytest.fail)
 
 
-def test_a_damaged_result_names_its_row(tmp_path):
+def test_damaged_json_is_reported_with_its_row(tmp_path):
     assert 'row 2: this is not JSON' in message_of(
         read_json, text_file(tmp_path, 'r.json', '{"a": 1,\n b}')
     )

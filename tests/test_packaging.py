@@ -28,7 +28,7 @@ def package_xml(folder):
     return fields, {element.text for element in root.iter() if element.tag.endswith('depend')}
 
 
-def test_metadata_agree():
+def test_metadata_agrees():
     """Name, version, licence and maintainer are the same wherever they are written."""
     ours, depends = package_xml(ROOT)
     messages, _ = package_xml(MSG_DEFS)
@@ -49,7 +49,7 @@ def test_metadata_agree():
     assert f'project({messages["name"]})' in (MSG_DEFS / 'CMakeLists.txt').read_text()
 
 
-def test_scripts_go_where_ros2_run_looks():
+def test_scripts_are_installed_where_ros2_run_looks():
     """On a colcon install the scripts go into lib/<package>."""
     config = configparser.ConfigParser()
     config.read(ROOT / 'setup.cfg')
@@ -65,7 +65,7 @@ def test_scripts_go_where_ros2_run_looks():
     importlib.metadata.distribution('fluoro_calib_ros').entry_points,
     ids=lambda entry: entry.name,
 )
-def test_console_script_has_its_module(entry):
+def test_console_scripts_exist(entry):
     """Every console script names a module that exists and defines its function."""
     spec = importlib.util.find_spec(entry.module)
     assert spec is not None, f'{entry.name}: there is no module {entry.module}'
@@ -81,7 +81,7 @@ def test_every_interface_is_built():
 
 
 @pytest.mark.parametrize('path', INTERFACES, ids=lambda path: path.name)
-def test_every_field_says_what_it_is(path):
+def test_every_message_field_is_documented(path):
     """Every field and constant has a comment, and every number in it a unit."""
     for number, line in enumerate(path.read_text().splitlines(), 1):
         field, _, comment = line.partition('#')
@@ -147,7 +147,7 @@ def project_files():
     ]
 
 
-def test_no_path_of_a_machine():
+def test_no_machine_paths():
     """No file of the project names a folder of the machine on which it was written."""
     files = project_files()
     assert ROOT / 'README.md' in files

@@ -18,10 +18,12 @@ from fluoro_calib_ros.files.calibration import load_calibrations, save_calibrati
 from fluoro_calib_ros.files.calibration_sources import read_sources, write_sources
 from fluoro_calib_ros.files.validation import validation_document
 from fluoro_calib_ros.report.verdict import verdict_text
+from fluoro_calib_ros.validation import verdict as verdict_module
 from fluoro_calib_ros.validation.bead_intersection import Beads, distances, intersect
 from fluoro_calib_ros.validation.beads import FALSE_ALARM as BEADS_FALSE_ALARM
 from fluoro_calib_ros.validation.beads import compare_with_survey
-from fluoro_calib_ros.validation.check import Check, Validation, verdict_of
+from fluoro_calib_ros.validation.check import Check, Finding, Validation, judge, verdict_of
+from fluoro_calib_ros.validation.evidence import Subject
 from fluoro_calib_ros.validation.field_comparison import difference, orientation_fields, place_name
 from fluoro_calib_ros.validation.residual_tests import (
     FALSE_ALARM,
@@ -91,7 +93,7 @@ def noise(seed, exposures=12, count=120, sd=0.25, trend=lambda uv, e: 0.0):
 # ---- the whole
 
 
-def test_a_good_calibration_passes():
+def test_good_calibration_passes():
     found = verdict(**LOCAL)
     assert found.verdict == 'pass' and found.findings == ()
     assert [check.name for check in found.checks] == CHECKS
@@ -101,7 +103,7 @@ def test_a_good_calibration_passes():
     assert found.calibration_id == {'a': calibrated('a', **LOCAL).calibrations['a'].calibration_id}
 
 
-def test_a_distortion_without_a_model_fails():
+def test_distortion_without_a_model_fails():
     """By the trend in its residuals, and by exposures held out, whose residuals are no noise."""
     found = verdict(model='none')
     assert found.verdict == 'fail' and {'whiteness', 'worst_area', 'held_out'} <= failed(found)
@@ -110,7 +112,7 @@ def test_a_distortion_without_a_model_fails():
     )
 
 
-def test_a_distortion_that_moves_fails_and_its_place_is_named():
+def test_changing_distortion_fails_with_its_place():
     found = verdict('drift', **LOCAL)
     drift = next(check for check in found.checks if check.name == 'drift')
     assert (
@@ -122,7 +124,7 @@ def test_a_distortion_that_moves_fails_and_its_place_is_named():
     assert drift.sentence in found.findings
 
 
-def test_too_few_exposures_for_halves_cannot_tell():
+def test_too_few_exposures_for_halves():
     frames = {'a': exposures()['a'][:5]}
     job = calibrate(frames, rig().phantom, CalibrationOptions(max_iterations=3, **LOCAL))
     options = CalibrationOptions(max_iterations=3, **LOCAL)
@@ -133,7 +135,7 @@ def test_too_few_exposures_for_halves_cannot_tell():
     assert found.verdict in ('cannot tell', 'fail') and halves.sentence in found.findings
 
 
-def test_both_fluoroscopes_in_one_adjustment_tell_their_progress_and_can_be_stopped():
+def test_joint_validation_reports_progress_and_can_be_cancelled():
     options = CalibrationOptions(max_iterations=1, k=40, **LOCAL)
     frames = {n: f[:8] for n, f in exposures().items()}
     job = calibrate(frames, rig().phantom, options, joint=True)
@@ -156,7 +158,7 @@ def test_both_fluoroscopes_in_one_adjustment_tell_their_progress_and_can_be_stop
         validate(request, job.calibrations, raise_if_cancelled=stop)
 
 
-def test_what_cannot_be_adjusted_cannot_tell_why_not():
+def test_failed_adjustment_gives_cannot_tell():
     """For the node, whose calibration stays; the command ends with the sentence."""
     calibrations = calibrated('a', **LOCAL).calibrations
     few = {'a': [replace(f, target_id=f.target_id[:5], uv=f.uv[:5]) for f in exposures()['a']]}
@@ -169,7 +171,7 @@ def test_what_cannot_be_adjusted_cannot_tell_why_not():
     )
 
 
-def test_a_verdict_is_fail_before_cannot_tell_before_pass():
+def test_fail_takes_precedence_over_cannot_tell_and_pass():
     def of(*passed):
         return verdict_of([Check('x', '', 1.0, 2.0, 'px', p, 's') for p in passed])
 
@@ -177,10 +179,30 @@ def test_a_verdict_is_fail_before_cannot_tell_before_pass():
     assert (of(None, False, True), of()) == ('fail', 'cannot tell')
 
 
+def test_new_check_is_one_subject(monkeypatch):
+    """A module with a Subject and its entry in SUBJECTS are all that a check needs."""
+
+    def count_exposures(evidence, names):
+        evidence.report_step('counting')
+        return [
+            judge('count', name, Finding(1, len(evidence.frames[name]), '1', 'counted', 'none'))
+            for name in names
+        ]
+
+    monkeypatch.setattr(verdict_module, 'SUBJECTS', (Subject(count_exposures, steps=1),))
+    request = CalibrationRequest({'a': exposures()['a']}, rig().phantom)
+    steps = []
+    found = validate(
+        request, calibrated('a', **LOCAL).calibrations, lambda *step: steps.append(step)
+    )
+    assert [(c.name, c.fluoroscope, c.limit) for c in found.checks] == [('count', 'a', 15.0)]
+    assert found.verdict == 'pass' and steps[1:] == [('counting', 1, 2)]
+
+
 # ---- two halves
 
 
-def test_what_the_orientation_absorbs_is_no_difference():
+def test_difference_ignores_what_orientations_absorb():
     """A calibration whose rays are turned, shifted, scaled and tilted predicts the same."""
     one = calibrated('a', **LOCAL).calibrations['a']
     model = one.model
@@ -192,7 +214,7 @@ def test_what_the_orientation_absorbs_is_no_difference():
     assert difference(one, replace(one, interior=one.interior + (8, -5, 30))).rms_px < 0.02
 
 
-def test_a_real_difference_keeps_its_size_and_place():
+def test_difference_has_the_right_size_and_place():
     one = calibrated('a', **LOCAL).calibrations['a']
     bump = np.exp(-np.sum((one.model.train_uv - (300, 300)) ** 2, axis=1) / (2 * 100**2))
     other = replace(
@@ -203,7 +225,7 @@ def test_a_real_difference_keeps_its_size_and_place():
     assert 0.7 < np.abs(found.duv).max() < 2
 
 
-def test_places_have_names():
+def test_place_names():
     places = ((10, 10), (500, 10), (1000, 500), (500, 500), (1023.4, 1023.4), (-0.5, 900))
     names = [place_name(uv, SIZE) for uv in places]
     assert names == [
@@ -219,7 +241,7 @@ def test_places_have_names():
 # ---- residuals
 
 
-def test_white_residuals_are_called_so_as_often_as_is_said():
+def test_false_alarm_rate_of_white_residuals():
     """Also with an offset and turn of every exposure, which a test of single residuals would not
     bear.
     """
@@ -242,7 +264,7 @@ def test_white_residuals_are_called_so_as_often_as_is_said():
     assert FALSE_ALARM == 2e-3 and alarms.max() <= 3
 
 
-def test_a_trend_is_found_with_its_size_and_place():
+def test_trend_is_detected_with_size_and_place():
     def trend(uv, e):
         return (
             0.5
@@ -259,14 +281,14 @@ def test_a_trend_is_found_with_its_size_and_place():
     )
 
 
-def test_a_change_is_found_with_its_size():
+def test_change_of_trend_is_detected_with_its_size():
     found = change_of_trend(
         noise(2, trend=lambda uv, e: (e >= 6)[:, None] * (0.2, 0.0) - 0.1), SIZE
     )
     assert found.size > found.limit and abs(found.size - 0.2 / np.sqrt(2)) < 0.05
 
 
-def test_residuals_are_those_of_the_adjustment():
+def test_residuals_agree_with_the_adjustment():
     job = calibrated('a', **LOCAL)
     frames = exposures()['a']
     held = adjust_with_calibrations({'a': frames}, rig().phantom, job.calibrations)
@@ -294,7 +316,7 @@ def phantom_with_a_wrong_bead(mm=3.0):
     return Phantom(phantom.target_id, xyz, phantom.sd_mm), int(phantom.target_id[row])
 
 
-def test_a_bead_with_a_wrong_survey_is_named_with_its_size():
+def test_bead_with_a_wrong_survey_is_reported_with_its_error():
     phantom, wrong = phantom_with_a_wrong_bead()
     frames = {'a': exposures()['a']}
     job = calibrate(frames, phantom, CalibrationOptions(max_iterations=6, **LOCAL))
@@ -306,7 +328,7 @@ def test_a_bead_with_a_wrong_survey_is_named_with_its_size():
     assert dist.passed  # without the bead that is named
 
 
-def test_beads_from_images_keep_to_their_covariance():
+def test_errors_of_intersected_beads_agree_with_their_covariance():
     frames = {'a': exposures()['a']}
     held = adjust_with_calibrations(frames, rig().phantom, calibrated('a', **LOCAL).calibrations)
     beads = intersect(held, frames, rig().phantom)
@@ -319,7 +341,7 @@ def test_beads_from_images_keep_to_their_covariance():
     assert all(check.passed for check in compare_with_survey(beads)) and BEADS_FALSE_ALARM < 0.01
 
 
-def test_distances_tell_scale_and_precision():
+def test_distances_give_scale_and_precision():
     rng = np.random.default_rng(0)
     true = rng.uniform(-130, 130, (150, 3))
     n = 150
@@ -342,7 +364,7 @@ def test_distances_tell_scale_and_precision():
     assert compare_with_survey(replace(beads, survey_sd_mm=np.full(n, 0.02)))[1].passed is False
 
 
-def test_few_beads_cannot_tell():
+def test_too_few_beads():
     none = Beads(
         np.arange(2),
         np.zeros((2, 3)),
@@ -395,7 +417,7 @@ def copied(folder, to):
     return to
 
 
-def test_sources_come_back_as_they_were(tmp_path):
+def test_sources_round_trip(tmp_path):
     """Also of fluoroscopes with images of different size."""
     job = calibrated('a', **LOCAL)
     frames = exposures()['a']
@@ -415,7 +437,7 @@ def test_sources_come_back_as_they_were(tmp_path):
     )
 
 
-def test_the_command_writes_and_prints_the_verdict(folder, tmp_path, capsys):
+def test_command_writes_and_prints_the_verdict(folder, tmp_path, capsys):
     place = copied(folder, tmp_path / 'x')
     capsys.readouterr()
     status = run('validate', place, '--json')
@@ -429,7 +451,7 @@ def test_the_command_writes_and_prints_the_verdict(folder, tmp_path, capsys):
     assert document['calibration_id'] == ids
 
 
-def test_a_fail_is_written_and_ends_with_status_1_and_one_sentence(
+def test_command_fails_with_one_sentence_after_writing_the_verdict(
     folder, tmp_path, capsys, monkeypatch
 ):
     place = copied(folder, tmp_path / 'x')
@@ -487,7 +509,7 @@ def test_a_fail_is_written_and_ends_with_status_1_and_one_sentence(
         ('a.calibration.npz', 'x', 'damaged'),
     ],
 )
-def test_missing_and_damaged_files_are_told_in_one_sentence(
+def test_missing_and_damaged_files_are_reported_in_one_sentence(
     folder, tmp_path, capsys, name, content, cause
 ):
     place = copied(folder, tmp_path / 'x')
@@ -498,7 +520,7 @@ def test_missing_and_damaged_files_are_told_in_one_sentence(
     assert name in err and cause in err and not (place / 'validation.json').exists()
 
 
-def test_an_unknown_fluoroscope_and_a_missing_folder_are_told(folder, tmp_path, capsys):
+def test_unknown_fluoroscope_and_missing_folder_are_reported(folder, tmp_path, capsys):
     assert (
         run('validate', folder, '--fluoroscopes', 'c') == 1
         and run('validate', tmp_path / 'none') == 1
@@ -509,7 +531,7 @@ def test_an_unknown_fluoroscope_and_a_missing_folder_are_told(folder, tmp_path, 
     )
 
 
-def test_the_table_fits_a_terminal_and_tells_what_to_do():
+def test_table_fits_a_terminal_and_gives_advice():
     checks = (
         Check('halves', 'a' * 60, 1.2, 2.0, 'predicted sd', True, 'fine'),
         Check('held_out', 'a', np.nan, np.nan, '', None, 'not to be had ' * 20),

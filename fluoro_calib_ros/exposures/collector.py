@@ -110,7 +110,7 @@ class ExposureCollector:
         for known in self.exposures:
             if self._displacement(pair, known) < self.still.new_px:
                 return 'this pose of the phantom is already collected'
-        return self.take(pair)
+        return self.add(pair)
 
     def _displacement(self, one: Pair, other: Pair) -> float:
         """Return the largest displacement [px] that a fluoroscope sees between two pairs."""
@@ -127,7 +127,7 @@ class ExposureCollector:
         elif before is None or not 0 <= now - before <= MAX_GAP * still_ns:
             self._streaming = False
 
-    def take(self, pair: Pair) -> str:
+    def add(self, pair: Pair) -> str:
         """Collect a pair as it is, unless one of its frame numbers is already collected.
 
         Returns '' if the pair was collected, else the reason why not.
@@ -198,7 +198,7 @@ def collect_recorded(
     collector = ExposureCollector(frames, still)
     if mode == 'auto':
         mode = 'still' if any(_is_stream(f, still) for f in frames.values()) else 'all'
-    collect = collector.offer if mode == 'still' else collector.take
+    collect = collector.offer if mode == 'still' else collector.add
     recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
     for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):
         for pair in pairer.add(frame):

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import struct
 from os import PathLike
-from typing import BinaryIO
+from typing import IO
 
 import numpy as np
 from tifffile import TiffFile, TiffFileError, TiffWriter
@@ -35,7 +35,7 @@ class StackWriter:
         Largest number of pages and the size of one; they decide the size of the offsets.
     """
 
-    def __init__(self, file: BinaryIO, pages: int, page_bytes: int) -> None:
+    def __init__(self, file: IO[bytes], pages: int, page_bytes: int) -> None:
         size = pages * (page_bytes + PAGE_OVERHEAD)
         self._writer = TiffWriter(file, bigtiff=size > CLASSIC_BYTES, byteorder='<')
 

@@ -310,7 +310,7 @@ class CalibrationNode(Node):
         """Collect a pair for the oldest capture, or because the phantom stands still."""
         self._orientation.add(pair)
         if self._captures:
-            refusal = self._capture_refusal = self._collector.take(pair)
+            refusal = self._capture_refusal = self._collector.add(pair)
             if not refusal:
                 self._captures.popleft().set_result(pair)
         elif self._collect == 'still':

@@ -1,0 +1,15 @@
+"""A model that is added to the registry is described by the calibration node's parameter."""
+
+from fluoro_calib_ros.distortion import registry
+from fluoro_calib_ros.distortion.knn import KnnModel
+from fluoro_calib_ros.nodes.calibration_node import PARAMETERS
+from fluoro_calib_ros.nodes.runtime.parameters import descriptor_of, parameters_of
+
+
+def test_the_parameter_model_lists_an_added_model(monkeypatch):
+    class AddedModel(KnnModel):
+        kind = 'added'
+
+    monkeypatch.setitem(registry.MODELS, 'added', AddedModel)
+    descriptor = descriptor_of(parameters_of(PARAMETERS)['model'])
+    assert 'added' in descriptor.description and 'added' in descriptor.additional_constraints

@@ -14,8 +14,12 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.calibrate import SEEN_FOR_NOISE, calibrate, held_corrections
-from fluoro_calib_ros.calibration.initial_network import measured_network
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.held_calibration import (
+    held_corrections,
+    too_few_rays_for_noise,
+)
+from fluoro_calib_ros.calibration.initial_network import KnownSensor, network_of_known_sensors
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.robust_adjustment import start_noise
 from fluoro_calib_ros.errors import DataError
@@ -229,15 +233,12 @@ class Scene:
         key = fluoroscopes, known
         if key not in self._tested:
             frames = self._frames(self.recording, known, lambda i: i % self._every != 0)
-            true = {f.name: f.interior for f in self.rig.fluoroscopes}
-            fields = None if known else {f.name: f.distortion for f in self.rig.fluoroscopes}
-            self._tested[key] = measured_network(
-                {n: frames[n] for n in fluoroscopes},
-                self.rig.phantom,
-                interior=true,
-                interior_free=False,
-                corrections=fields,
-                min_exposures=1,
+            sensors = {
+                f.name: KnownSensor(f.interior, np.zeros_like if known else f.distortion)
+                for f in self.rig.fluoroscopes
+            }
+            self._tested[key] = network_of_known_sensors(
+                {n: frames[n] for n in fluoroscopes}, self.rig.phantom, sensors
             )
         return self._tested[key]
 
@@ -354,7 +355,7 @@ def errors_of_test(scene, case, calibrations):
         scale=float(np.median([c.sigma0 for c in calibrations.values()])),
         nu=float(np.median([c.nu for c in calibrations.values()])),
     )
-    if len(network.uv) < SEEN_FOR_NOISE * len(network.survey_mm):
+    if too_few_rays_for_noise(network):
         after = adjust(network, start, correction, noise, SolverOptions(TEST_TOLERANCE))
     else:
         after = adjust_and_estimate_noise(

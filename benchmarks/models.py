@@ -76,8 +76,9 @@ class Figures:
     """What was measured of a model on one rig.
 
     points_mm: 3-D RMSE of the object points of test exposures, adjusted with the calibration held;
-    ratio to that of known distortion; correction_px: RMS difference of a
-    coordinate from the true distortion over the calibrated area, without the gauge; rounds; converged; seconds of the calibration.
+    ratio to that of known distortion; correction_px: RMS difference of a coordinate from the true
+    distortion over the calibrated area, without the gauge; rounds; converged; seconds of the
+    calibration.
     """
 
     points_mm: float
@@ -121,7 +122,7 @@ def known_distortion_error(scene: Scene) -> float:
 
 
 def correction_error(scene: Scene, result: CalibrationResult) -> float:
-    """RMS difference [px] of a coordinate of the correction from the truth, without the gauge."""
+    """RMS difference [px] of a coordinate of the correction from the truth, gauge removed."""
     calibration = result.calibrations[NAME]
     true = next(f for f in scene.rig.fluoroscopes if f.name == NAME).distortion
     axes = [np.arange(0.0, size, GRID_PX) for size in calibration.image_size]

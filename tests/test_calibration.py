@@ -530,7 +530,7 @@ def shuffled_ids(frame, seed=4):
             lambda f: f[:4] + [with_value(f[4], 1024.0)],
             'fluoroscope a, frame 5: target .* is off the image',
         ),
-        (lambda f: f[:4] + [f[2]], 'fluoroscope a: exposure 3 is there twice'),
+        (lambda f: f[:4] + [f[2]], 'fluoroscope a: exposure 3 appears twice'),
         (
             lambda f: f[:4] + [replace(f[4], image_size=(1024, 1025))],
             'fluoroscope a, frame 5: the image is 1024 x 1025 px, but the calibration is for 1024 x 1024 px',

@@ -40,8 +40,8 @@ from fluoro_calib_ros.distortion.series import (
 from fluoro_calib_ros.distortion.terms import (
     GAUGE,
     HIGHEST,
-    _polynomial,
     expert_terms,
+    polynomial_coefficients,
     trend_transformation,
 )
 from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
@@ -243,7 +243,7 @@ def test_the_prior_of_a_signal_is_found_from_the_observations():
 
 def test_expert_terms_and_gauge_are_independent():
     names, terms = expert_terms()
-    gauge = np.stack([_polynomial(HIGHEST, parts) for parts in GAUGE.values()])
+    gauge = np.stack([polynomial_coefficients(HIGHEST, parts) for parts in GAUGE.values()])
     assert len(set(names)) == len(terms) == 31
     everything = np.concatenate([terms, gauge]).reshape(37, -1)
     assert np.linalg.matrix_rank(everything / np.linalg.norm(everything, axis=1)[:, None]) == 37

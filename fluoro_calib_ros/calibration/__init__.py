@@ -1,1 +1,1 @@
-"""Self-calibration: collecting exposures, the loop of adjustment and regression, and its result."""
+"""Self-calibration: the alternation of adjustment and regression, and its result."""

@@ -1,6 +1,12 @@
-"""Anderson acceleration of a fixed-point iteration (Walker and Ni, SIAM J. Numer. Anal. 49, 2011)."""
+"""Anderson acceleration of a fixed-point iteration.
+
+Walker and Ni, "Anderson acceleration for fixed-point iterations", SIAM Journal on Numerical
+Analysis 49, 2011.
+"""
 
 from __future__ import annotations
+
+from itertools import pairwise
 
 import numpy as np
 
@@ -34,7 +40,7 @@ class Anderson:
         if len(self._x) == 1:
             return f
         residual = [(b - a)[counted].ravel() for a, b in zip(self._x, self._f)]
-        d_residual = np.stack([b - a for a, b in zip(residual, residual[1:])], axis=1)
+        d_residual = np.stack([b - a for a, b in pairwise(residual)], axis=1)
         # Columns are scaled and small singular values dropped: late differences are nearly
         # parallel.
         scale = np.maximum(np.linalg.norm(d_residual, axis=0), 1e-300)

@@ -1,31 +1,52 @@
 """A whole calibration or adjustment: from frames to what is published and saved."""
 
+from __future__ import annotations
+
 import time
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from ..distortion.base import CorrectionModel
 from ..exposures.frame import validate_frame
-from ..photogrammetry.precision import geometric_redundancy
+from ..exposures.phantom import Phantom
+from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.precision import Precision, geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
-from .constraints import relative_orientations
+from .constraints import RelativeOrientation, relative_orientations
 from .diagnostics import correlations_of, outliers_of
-from .initial_network import measured_network
+from .held_calibration import (
+    held_corrections,
+    network_of_calibrations,
+    noise_of_calibrations,
+    too_few_rays_for_noise,
+)
+from .initial_network import Frames, Measured, measured_network
 from .options import CalibrationOptions
 from .result import FluoroscopeCalibration, digest_of_sources
-from .robust_adjustment import adjusted_with_precision, start_noise
-from .rounds import rmse_of_inliers
+from .robust_adjustment import adjusted_with_precision
+from .rounds import Round, SelfCalibration, rmse_of_inliers
 from .self_calibration import self_calibrate
 
-# mean number of image points of a target from which an adjustment estimates the noise itself
-SEEN_FOR_NOISE = 3
+TOLERANCE_WITHOUT_CORRECTION = 1e-4  # its residuals are only reported
 
 
 @dataclass(frozen=True)
 class ExposureResult:
-    """Exterior orientation of an exposure: position_mm (3,), quaternion_wxyz (4,), their sd_mm
-    (3,) and sd_rad (3,) about the axes of the sensor.
+    """Exterior orientation of an exposure.
+
+    Attributes
+    ----------
+    exposure : int
+        Its number.
+    position_mm : (3,) ndarray
+        Position of the source.
+    quaternion_wxyz : (4,) ndarray
+        Rotation phantom -> sensor.
+    sd_mm, sd_rad : (3,) ndarray
+        Standard deviations of the position, and of the rotation about the axes of the sensor.
     """
 
     exposure: int
@@ -37,20 +58,34 @@ class ExposureResult:
 
 @dataclass(frozen=True)
 class FluoroscopeResult:
-    """Figures of one fluoroscope: interior (3,) and interior_sd (3,) [px], rmse before and after
-    (2,) [px].
+    """Figures of one fluoroscope.
+
+    Attributes
+    ----------
+    interior, interior_sd : (3,) ndarray
+        xp, yp, c and their standard deviations [px].
+    image_size : (int, int)
+        Width and height [px].
+    model_kind : str
+    k : int
+        Number of neighbours of the model.
+    rmse_before, rmse_after : (2,) ndarray
+        RMSE of the inlier residuals in u and v [px], without and with the correction.
+    observations, inliers : int
+        Numbers of image points.
+    exposures : tuple of ExposureResult
     """
 
     interior: np.ndarray
     interior_sd: np.ndarray
-    image_size: tuple
+    image_size: tuple[int, int]
     model_kind: str
     k: int
     rmse_before: np.ndarray
     rmse_after: np.ndarray
     observations: int
     inliers: int
-    exposures: tuple
+    exposures: tuple[ExposureResult, ...]
 
 
 @dataclass(frozen=True)
@@ -64,57 +99,91 @@ class Targets:
 
 @dataclass(frozen=True)
 class CalibrationResult:
-    """Result of a job: figures and calibrations by fluoroscope, targets, and for the report the
-    runs behind it.
+    """Result of a calibration, or of an adjustment with calibrations held.
 
-    history: Rounds by fluoroscope, or by '+'.join(fluoroscopes) where they were adjusted together;
-    runs: SelfCalibration by the same names; left_out: a sentence for every exposure that was not
-    used; relative: a RelativeOrientation of every further fluoroscope with the first where they
-    were adjusted together; outliers: dicts of image points and of targets that fail their tests;
-    correlations above 0.95: (name, name, value).
+    Attributes
+    ----------
+    fluoroscopes : dict of str to FluoroscopeResult
+    calibrations : dict of str to FluoroscopeCalibration
+    targets : Targets
+        Object points of all fluoroscopes together.
+    history : dict of str to tuple of Round
+        By fluoroscope, or by '+'.join(fluoroscopes) where they were adjusted together.
+    runs : dict of str to SelfCalibration
+        By the same names; for the report.
+    left_out : tuple of str
+        A sentence for every exposure that was not used.
+    converged : bool
+    seconds : float
+    relative : tuple of RelativeOrientation
+        Of every further fluoroscope with the first, where they were adjusted together.
+    outliers : (tuple, tuple)
+        Dicts of the image points and of the targets that fail their tests.
+    correlations : tuple of (str, str, float)
+        Correlations above 0.95 between unknowns.
     """
 
-    fluoroscopes: dict
-    calibrations: dict
+    fluoroscopes: dict[str, FluoroscopeResult]
+    calibrations: dict[str, FluoroscopeCalibration]
     targets: Targets
-    history: dict
-    runs: dict
-    left_out: tuple
+    history: dict[str, tuple[Round, ...]]
+    runs: dict[str, SelfCalibration]
+    left_out: tuple[str, ...]
     converged: bool
     seconds: float
-    relative: tuple = ()
-    outliers: tuple = ((), ())
-    correlations: tuple = ()
+    relative: tuple[RelativeOrientation, ...] = ()
+    outliers: tuple[tuple, tuple] = ((), ())
+    correlations: tuple[tuple[str, str, float], ...] = ()
 
 
 def calibrate(
-    frames,
-    phantom,
-    options=CalibrationOptions(),
-    joint=False,
-    principal_distance=None,
-    progress=None,
-    raise_if_cancelled=None,
-):
-    """Self-calibrate fluoroscopes, one after the other or in one adjustment (joint).
+    frames: Frames,
+    phantom: Phantom,
+    options: CalibrationOptions | None = None,
+    joint: bool = False,
+    principal_distance: float | None = None,
+    progress: Callable[[str, Round], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> CalibrationResult:
+    """Self-calibrate fluoroscopes, one after the other or in one adjustment.
 
-    frames {fluoroscope: [Frame, ...]}; progress(fluoroscope, Round) after every round;
-    raise_if_cancelled() may raise to stop. Returns CalibrationResult, the same to the last bit for the
-    same observations, whatever their order. Raises DataError for observations that do not suffice,
-    ValueError for a relative orientation that is to be constrained while the fluoroscopes are not
-    adjusted together.
+    The result is the same to the last bit for the same observations, whatever their order.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        By fluoroscope.
+    phantom : Phantom
+    options : CalibrationOptions, optional
+    joint : bool
+        True for one adjustment of all fluoroscopes.
+    principal_distance : float, optional
+        Start value [px]; by default it is taken from the observations.
+    progress : callable, optional
+        Called with the name of the fluoroscope and the Round after every round.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop.
+
+    Returns
+    -------
+    CalibrationResult
+
+    Raises
+    ------
+    DataError
+        If the observations do not suffice.
+    ValueError
+        If the relative orientation is to be constrained in separate adjustments.
     """
+    options = options or CalibrationOptions()
     if options.relative_orientation != 'none' and not joint:
         raise ValueError('a relative orientation constraint needs the joint adjustment')
     began = time.perf_counter()
     groups = [tuple(frames)] if joint else [(name,) for name in frames]
-    figures = {}
-    calibrations = {}
-    runs = {}
-    targets = []
-    left_out = []
-    relative = ()
-    # One thread: faster than two for these sizes, and the sums are always made in the same order.
+    figures: dict[str, FluoroscopeResult] = {}
+    calibrations: dict[str, FluoroscopeCalibration] = {}
+    runs: dict[str, SelfCalibration] = {}
+    # One thread: faster than two for these sizes, and sums are always made in the same order.
     with threadpool_limits(1):
         for group in groups:
             start = time.perf_counter()
@@ -123,97 +192,107 @@ def calibrate(
                 {name: frames[name] for name in group},
                 phantom,
                 principal_distance,
-                raise_if_cancelled=raise_if_cancelled,
+                raise_if_cancelled,
             )
             run = self_calibrate(
-                measured,
-                options,
-                raise_if_cancelled=raise_if_cancelled,
-                progress=progress and (lambda r, label=label: progress(label, r)),
+                measured, options, _progress_of(label, progress), raise_if_cancelled
             )
             runs[label] = run
             seconds = time.perf_counter() - start
-            targets.append(_targets(run.measured, run.after, run.precision))
-            left_out += run.measured.left_out
-            relative += relative_orientations(run, options.relative_orientation)
             for f, name in enumerate(group):
                 figures[name] = _figures(
                     run.measured, run.before, run.after, run.precision, f, run.models[name]
                 )
-                calibrations[name] = _calibration(
-                    run, f, name, options, digest_of_sources(frames[name], phantom), seconds
-                )
+                digest = digest_of_sources(frames[name], phantom)
+                calibrations[name] = _calibration(run, f, name, options, digest, seconds)
+        relative = [
+            relative_orientations(run, options.relative_orientation) for run in runs.values()
+        ]
+    targets = [_targets(run.measured, run.after, run.precision) for run in runs.values()]
     return CalibrationResult(
         figures,
         calibrations,
         combined_targets(targets, phantom, options.datum == 'survey'),
         {label: run.history for label, run in runs.items()},
         runs,
-        tuple(left_out),
+        tuple(sentence for run in runs.values() for sentence in run.measured.left_out),
         all(run.converged for run in runs.values()),
         time.perf_counter() - began,
-        relative,
-        *_judged(runs.values()),
+        tuple(one for of_run in relative for one in of_run),
+        _outliers_of_all(runs.values()),
+        tuple(one for run in runs.values() for one in correlations_of(run)),
     )
 
 
-def _judged(runs):
-    """Outliers (image points, targets) of all runs, and their correlations."""
+def _progress_of(
+    label: str, progress: Callable[[str, Round], None] | None
+) -> Callable[[Round], None] | None:
+    """Report rounds with the name of what is calibrated."""
+    if progress is None:
+        return None
+    return lambda one: progress(label, one)
+
+
+def _outliers_of_all(runs: Iterable[SelfCalibration]) -> tuple[tuple, tuple]:
+    """Outliers of all runs: image points, and targets."""
     found = [outliers_of(run) for run in runs]
     return (
-        tuple(sum((part[i] for part in found), []) for i in (0, 1)),
-        tuple(c for run in runs for c in correlations_of(run)),
+        tuple(point for points, _ in found for point in points),
+        tuple(target for _, targets in found for target in targets),
     )
 
 
 def adjust_with_calibrations(
-    frames, phantom, calibrations, loss='student_t', raise_if_cancelled=None
-):
-    """Adjust frames with calibrations held: interior orientations and corrections are not changed.
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    loss: str = 'student_t',
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> CalibrationResult:
+    """Adjust frames with calibrations held: interior orientations and corrections do not change.
 
-    frames {fluoroscope: [Frame, ...]}, calibrations {fluoroscope: FluoroscopeCalibration}. All
-    fluoroscopes share the object points. Returns CalibrationResult. Raises DataError for wrong frames,
-    also those of another image size than the calibration's.
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        By fluoroscope; all fluoroscopes share the object points.
+    phantom : Phantom
+    calibrations : mapping of str to FluoroscopeCalibration
+    loss : str
+        Noise model of the image points.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop.
+
+    Returns
+    -------
+    CalibrationResult
+
+    Raises
+    ------
+    DataError
+        If a frame is invalid or has another image size than its calibration.
     """
     began = time.perf_counter()
     for name, of_fluoroscope in frames.items():
         for frame in of_fluoroscope:
             validate_frame(frame, phantom, calibrations[name].image_size)
-    interior = {name: calibrations[name].interior for name in frames}
     with threadpool_limits(1):
-        measured = measured_network(
-            frames,
-            phantom,
-            interior=interior,
-            interior_free=False,
-            min_exposures=1,
-            corrections={n: calibrations[n].model.predict for n in frames},
-            raise_if_cancelled=raise_if_cancelled,
-        )
+        measured = network_of_calibrations(frames, phantom, calibrations, raise_if_cancelled)
         correction, network = held_corrections(measured, calibrations)
-        # Few exposures do not tell noise from errors of the survey; then it is that of the
-        # calibration.
-        held = len(network.uv) < SEEN_FOR_NOISE * len(network.survey_mm)
-        noise = replace(
-            start_noise(loss),
-            scale=float(np.median([c.sigma0 for c in calibrations.values()])),
-            nu=float(np.median([c.nu for c in calibrations.values()])),
-        )
         after, precise = adjusted_with_precision(
             network,
             measured.start,
             correction,
-            noise,
+            noise_of_calibrations(loss, calibrations.values()),
             raise_if_cancelled=raise_if_cancelled,
-            noise_held=held,
+            noise_held=too_few_rays_for_noise(network),
         )
         before, _ = adjusted_with_precision(
             network,
             after.parameters,
             np.zeros_like(correction),
             after.noise,
-            tolerance=1e-4,
-            raise_if_cancelled=raise_if_cancelled,
+            TOLERANCE_WITHOUT_CORRECTION,
+            raise_if_cancelled,
         )
     figures = {
         name: _figures(measured, before, after, precise, f, calibrations[name].model)
@@ -231,33 +310,16 @@ def adjust_with_calibrations(
     )
 
 
-def held_corrections(measured, calibrations):
-    """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in its
-    sigma.
-
-    Where a correction is uncertain, at the rim and beyond the calibrated area, an image point
-    weighs less.
-    """
-    network = measured.network
-    correction = np.zeros_like(network.uv)
-    sigma = network.sigma.copy()
-    for f, name in enumerate(measured.fluoroscopes):
-        rows = network.rows(f)
-        found = calibrations[name].model.evaluate(network.uv[rows])
-        correction[rows] = found.duv
-        sigma[rows] = np.hypot(sigma[rows], found.sd / calibrations[name].sigma0)
-    return correction, replace(network, sigma=sigma)
-
-
-def _targets(measured, adjustment, precise):
+def _targets(measured: Measured, adjustment: Adjustment, precise: Precision) -> Targets:
     return Targets(measured.target_id, adjustment.parameters.points_mm, precise.points)
 
 
-def combined_targets(parts, phantom, weighted=True):
-    """One set of object points from separate adjustments of the same phantom (Targets, ...).
+def combined_targets(parts: Sequence[Targets], phantom: Phantom, weighted: bool = True) -> Targets:
+    """Return one set of object points from separate adjustments of the same phantom.
 
-    Each holds the survey once; in the sum of their information it is to count once only, so that
-    of the survey is taken off for every further one; weighted False: none holds the survey.
+    Every adjustment holds the survey. In the sum of their information it counts once, so the
+    information of the survey is subtracted for every further adjustment; weighted False: none of
+    them holds the survey.
     """
     if len(parts) == 1:
         return parts[0]
@@ -280,12 +342,20 @@ def combined_targets(parts, phantom, weighted=True):
     return Targets(target_id, (covariance @ right[..., None])[..., 0], covariance)
 
 
-def _rows_of(measured, f):
+def _rows_of(measured: Measured, f: int) -> np.ndarray:
+    """Image points of fluoroscope number f."""
     return np.flatnonzero(measured.network.fluoroscope[measured.network.exposure] == f)
 
 
-def _figures(measured, before, after, precise, f, model):
-    """FluoroscopeResult of fluoroscope number f of an adjustment."""
+def _figures(
+    measured: Measured,
+    before: Adjustment,
+    after: Adjustment,
+    precise: Precision,
+    f: int,
+    model: CorrectionModel,
+) -> FluoroscopeResult:
+    """Figures of fluoroscope number f of an adjustment."""
     rows = _rows_of(measured, f)
     exposures = []
     for j in np.flatnonzero(measured.network.fluoroscope == f):
@@ -313,21 +383,27 @@ def _figures(measured, before, after, precise, f, model):
     )
 
 
-def _image_sd(run, rows):
-    """Standard deviation [px] of an image coordinate, from the inlier residuals of the image
-    points rows.
+def _image_sd(run: SelfCalibration, rows: np.ndarray) -> float:
+    """Standard deviation [px] of an image coordinate of the image points rows.
 
-    A residual is smaller than the noise by the root of its redundancy number. The scale of a
-    Student-t will not do: where the tails are heavy it is smaller than the standard deviation of
-    what is in its core.
+    It is that of the inlier residuals, which are smaller than the noise by the root of their
+    redundancy numbers. The scale of a Student-t noise is no substitute: where the tails are heavy
+    it is smaller than the standard deviation of its core.
     """
     redundancy = geometric_redundancy(run.measured.network, run.after.parameters, run.after.noise)
     rows = rows[run.after.inliers[rows]]
     return float(np.sqrt(np.sum(run.after.residuals[rows] ** 2) / np.sum(2 * redundancy[rows])))
 
 
-def _calibration(run, f, name, options, digest, seconds):
-    """FluoroscopeCalibration of fluoroscope number f of a self-calibration."""
+def _calibration(
+    run: SelfCalibration,
+    f: int,
+    name: str,
+    options: CalibrationOptions,
+    digest: str,
+    seconds: float,
+) -> FluoroscopeCalibration:
+    """Calibration of fluoroscope number f of a self-calibration."""
     rows = _rows_of(run.measured, f)
     last = run.history[-1]
     frames = [frame for frame in run.measured.frames if frame.fluoroscope == name]

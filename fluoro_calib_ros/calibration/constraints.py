@@ -116,7 +116,8 @@ def _relative_constraints(
     first, *others = measured.fluoroscopes
     if not others:
         raise DataError(
-            f'a relative orientation needs two fluoroscopes in one adjustment, there is only {first}'
+            'a relative orientation needs two fluoroscopes in one adjustment, there is only '
+            f'{first}'
         )
     soft = options.relative_orientation == 'soft'
     sd_mm, sd_rad = options.relative_sd if soft else (RIGID_SD_MM, RIGID_SD_RAD)
@@ -223,7 +224,7 @@ def _mean_of_pairs(run: SelfCalibration, pairs: np.ndarray) -> tuple[RelativePos
     )
     count = len(pairs)
     one, other = (a.ravel() for a in np.indices((count, count)))
-    mixed = 0
+    mixed: np.ndarray = np.zeros(())
     for p, d_p in zip(pairs.T, (d_a, d_b)):
         for q, d_q in zip(pairs.T, (d_a, d_b)):
             between = blocks.between(p[one], q[other])

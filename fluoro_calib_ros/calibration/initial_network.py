@@ -1,114 +1,198 @@
-"""From frames to a network: checks, start values and what has to be left out."""
+"""From frames to a network: validation, start values and what has to be left out."""
 
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..errors import DataError
-from ..exposures.frame import validate_frame
+from ..exposures.frame import Frame, validate_frame
+from ..exposures.phantom import Phantom
 from ..photogrammetry.network import Network
-from ..photogrammetry.resection import principal_distance_of, resect, robust_dlt
+from ..photogrammetry.resection import Resection, principal_distance_of, resect, robust_dlt
 from ..photogrammetry.rotations import rotation_angle
 from ..photogrammetry.unknowns import Parameters
 
 MIN_EXPOSURES = 3
 MIN_TARGETS_OF_EXPOSURE = 12
-ONE_POSE_RAD = np.deg2rad(2.0)
-ONE_POSE_MM = 20.0
-MISFIT = 8.0  # an exposure whose resection is that many times worse than the median does not fit
+# Smaller differences of rotation and distance make two exposures show one pose of the phantom.
+MIN_POSE_RAD = np.deg2rad(2.0)
+MIN_POSE_MM = 20.0
+# A distance along the optical axis is determined this many times worse than one across it.
+AXIAL_FACTOR = 10.0
+MAX_MISFIT = 8.0  # residuals of a resection relative to the median of the exposures
+
+Frames = Mapping[str, Sequence[Frame]]  # by fluoroscope
 
 
 @dataclass(frozen=True)
 class Measured:
-    """A network with what it was made from.
+    """A network and what it was made from.
 
-    network; start values; fluoroscopes and image_size (F); frames: the frame of every exposure
-    row; target_id (n,) of the object points; left_out: one sentence for every frame that was not
-    used.
+    Attributes
+    ----------
+    network : Network
+    start : Parameters
+        Start values.
+    fluoroscopes : tuple of str
+        Names, in the order of the network.
+    image_size : tuple of (int, int)
+        Width and height [px] by fluoroscope.
+    frames : tuple of Frame
+        The frame of every exposure of the network.
+    target_id : (n,) ndarray of int
+        Of the object points.
+    left_out : tuple of str
+        One sentence for every frame that was not used.
     """
 
     network: Network
     start: Parameters
-    fluoroscopes: tuple
-    image_size: tuple
-    frames: tuple
+    fluoroscopes: tuple[str, ...]
+    image_size: tuple[tuple[int, int], ...]
+    frames: tuple[Frame, ...]
     target_id: np.ndarray
-    left_out: tuple
+    left_out: tuple[str, ...]
 
 
-def nominal_interior(image_size, principal_distance):
-    """Interior orientation (3,) with the principal point in the middle of the image [px]."""
+@dataclass(frozen=True)
+class KnownSensor:
+    """A fluoroscope whose interior orientation (3,) [px] and correction are known.
+
+    predict: correction (n, 2) [px] at pixels (n, 2).
+    """
+
+    interior: np.ndarray
+    predict: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What start values are made from; sensors None: the fluoroscopes are to be calibrated."""
+
+    phantom: Phantom
+    sensors: Mapping[str, KnownSensor] | None
+    principal_distance: float | None
+    raise_if_cancelled: Callable[[], None] | None
+
+    @property
+    def min_exposures(self) -> int:
+        """Number of exposures that a fluoroscope needs."""
+        return MIN_EXPOSURES if self.sensors is None else 1
+
+
+@dataclass(frozen=True)
+class _Resected:
+    """Exposures of one fluoroscope that fit the phantom, and sentences on those that do not."""
+
+    frames: list[Frame]
+    resections: list[Resection]
+    interior: np.ndarray
+    left_out: list[str]
+
+
+def nominal_interior(image_size: tuple[int, int], principal_distance: float) -> np.ndarray:
+    """Interior orientation (3,) [px] with the principal point at the centre of the image."""
     return np.array([(image_size[0] - 1) / 2, (image_size[1] - 1) / 2, principal_distance])
 
 
 def measured_network(
-    frames,
-    phantom,
-    principal_distance=None,
-    interior=None,
-    interior_free=True,
-    corrections=None,
-    min_exposures=MIN_EXPOSURES,
-    raise_if_cancelled=None,
-):
-    """Network, start values and index of the frames of one or more fluoroscopes.
+    frames: Frames,
+    phantom: Phantom,
+    principal_distance: float | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Measured:
+    """Return network and start values of the frames of fluoroscopes that are to be calibrated.
 
-    frames: {fluoroscope: [Frame, ...]}; principal_distance: start value [px], None: from the
-    observations; interior: {fluoroscope: (3,)} known orientations, used instead of start values;
-    corrections: {fluoroscope: uv (n, 2) -> duv (n, 2)} applied for the resection;
-    raise_if_cancelled(): called for every exposure. Raises DataError for wrong frames, too few
-    exposures or targets, and exposures that show one pose only.
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+    phantom : Phantom
+    principal_distance : float, optional
+        Start value [px]; by default it is taken from the observations.
+    raise_if_cancelled : callable, optional
+        Called for every exposure; may raise to stop.
+
+    Returns
+    -------
+    Measured
+
+    Raises
+    ------
+    DataError
+        If a frame is invalid, if exposures or targets are too few, or if all exposures show one
+        pose.
     """
-    used = []
-    orientations = []
-    interiors = []
-    left_out = []
-    for name, of_fluoroscope in frames.items():
-        ordered, skipped = _usable_frames(name, of_fluoroscope, phantom, min_exposures)
-        correct = (corrections or {}).get(name, np.zeros_like)
-        known = None if interior is None else np.asarray(interior[name])
-        found, start, misfits = _resect_all(
-            ordered, phantom, principal_distance, known, correct, raise_if_cancelled
-        )
-        if min_exposures > 1:
-            _refuse_one_pose(name, found)
-        used += [frame for frame, orientation in zip(ordered, found) if orientation is not None]
-        orientations += [
-            (f, orientation)
-            for f, orientation in zip([len(interiors)] * len(found), found)
-            if orientation is not None
-        ]
-        if sum(o is not None for o in found) < min_exposures:
-            raise DataError(
-                f'fluoroscope {name}: only {sum(o is not None for o in found)} of {len(found)} '
-                f'exposures fit the phantom, {min_exposures} are needed; the first that does not: '
-                f'{(skipped + misfits)[0]}'
-            )
-        interiors.append(start)
-        left_out += skipped + misfits
-    network, target_id = _index(
-        used, [f for f, _ in orientations], phantom, len(interiors), interior_free
+    task = _Task(phantom, None, principal_distance, raise_if_cancelled)
+    return _measured(
+        task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
     )
+
+
+def network_of_known_sensors(
+    frames: Frames,
+    phantom: Phantom,
+    sensors: Mapping[str, KnownSensor],
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Measured:
+    """Return network and start values with interior orientations and corrections held.
+
+    One exposure of a fluoroscope is enough. The arguments and errors are those of
+    `measured_network`; sensors {fluoroscope: KnownSensor}.
+    """
+    task = _Task(phantom, sensors, None, raise_if_cancelled)
+    return _measured(
+        task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
+    )
+
+
+def _measured(task: _Task, found: Mapping[str, _Resected]) -> Measured:
+    """Return the network of resected exposures {fluoroscope: _Resected}."""
+    frames = [frame for one in found.values() for frame in one.frames]
+    resections = [resection for one in found.values() for resection in one.resections]
+    fluoroscope = np.repeat(np.arange(len(found)), [len(one.frames) for one in found.values()])
+    network, target_id = _index(frames, fluoroscope, task, len(found))
     start = Parameters(
-        np.array(interiors),
-        np.array([o.rotation for _, o in orientations]),
-        np.array([o.position_mm for _, o in orientations]),
+        np.array([one.interior for one in found.values()]),
+        np.array([resection.rotation for resection in resections]),
+        np.array([resection.position_mm for resection in resections]),
         network.survey_mm.copy(),
     )
-    sizes = tuple(next(f.image_size for f in used if f.fluoroscope == name) for name in frames)
-    return Measured(network, start, tuple(frames), sizes, tuple(used), target_id, tuple(left_out))
+    sizes = tuple(one.frames[0].image_size for one in found.values())
+    left_out = tuple(sentence for one in found.values() for sentence in one.left_out)
+    return Measured(network, start, tuple(found), sizes, tuple(frames), target_id, left_out)
 
 
-def _usable_frames(name, frames, phantom, min_exposures):
-    """The frames in order of their number, those with too few targets left out, and a sentence for
-    each.
-    """
-    ordered = []
-    left_out = []
+def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
+    """Resect the exposures of one fluoroscope. Raises DataError."""
+    ordered, left_out = _usable_frames(task, name, frames)
+    found, interior, misfits = _resect_all(task, name, ordered)
+    if task.sensors is None:
+        _require_different_poses(name, found)
+    left_out += misfits
+    fitting = [(frame, one) for frame, one in zip(ordered, found) if one is not None]
+    if len(fitting) < task.min_exposures:
+        raise DataError(
+            f'fluoroscope {name}: only {len(fitting)} of {len(found)} exposures fit the phantom, '
+            f'{task.min_exposures} are needed; the first that does not: {left_out[0]}'
+        )
+    return _Resected(
+        [frame for frame, _ in fitting], [one for _, one in fitting], interior, left_out
+    )
+
+
+def _usable_frames(
+    task: _Task, name: str, frames: Sequence[Frame]
+) -> tuple[list[Frame], list[str]]:
+    """Frames with enough targets, ordered by number, and a sentence for each of the others."""
+    ordered: list[Frame] = []
+    left_out: list[str] = []
     for frame in sorted((f.sorted() for f in frames), key=lambda f: f.number):
-        validate_frame(frame, phantom, frames[0].image_size)
+        validate_frame(frame, task.phantom, frames[0].image_size)
         if ordered and ordered[-1].number == frame.number:
-            raise DataError(f'fluoroscope {name}: exposure {frame.number} is there twice')
+            raise DataError(f'fluoroscope {name}: exposure {frame.number} appears twice')
         if len(frame.target_id) < MIN_TARGETS_OF_EXPOSURE:
             left_out.append(
                 f'fluoroscope {name}, exposure {frame.number}: {len(frame.target_id)} targets are '
@@ -116,87 +200,110 @@ def _usable_frames(name, frames, phantom, min_exposures):
             )
         else:
             ordered.append(frame)
-    if len(ordered) < min_exposures:
+    if len(ordered) < task.min_exposures:
         few = f', {len(left_out)} more have too few targets' if left_out else ''
         raise DataError(
             f'fluoroscope {name}: {len(ordered)} exposures are too few, '
-            f'{min_exposures} are needed{few}'
+            f'{task.min_exposures} are needed{few}'
         )
     return ordered, left_out
 
 
-def _resect_all(frames, phantom, principal_distance, known, correct, raise_if_cancelled):
-    """Resections (None where one fails), interior orientation (3,) and a sentence for every
+def _resect_all(
+    task: _Task, name: str, frames: Sequence[Frame]
+) -> tuple[list[Resection | None], np.ndarray, list[str]]:
+    """Resections of the frames of one fluoroscope.
+
+    Returns them, None where one fails; the interior orientation (3,); and a sentence for every
     failure.
     """
-    pairs = [(phantom.xyz_mm[phantom.index(f.target_id)], f.uv - correct(f.uv)) for f in frames]
-    projections = []
+    sensor = None if task.sensors is None else task.sensors[name]
+    predict = np.zeros_like if sensor is None else sensor.predict
+    phantom = task.phantom
+    targets = [phantom.xyz_mm[phantom.index(frame.target_id)] for frame in frames]
+    pixels = [frame.uv - predict(frame.uv) for frame in frames]
+    projections: list[np.ndarray | None] = []
     sentences = []
-    for frame, (xyz, uv) in zip(frames, pairs):
-        if raise_if_cancelled is not None:
-            raise_if_cancelled()
+    for frame, xyz, uv in zip(frames, targets, pixels):
+        if task.raise_if_cancelled is not None:
+            task.raise_if_cancelled()
         try:
             projections.append(robust_dlt(xyz, uv, seed=0))
         except DataError as error:
             projections.append(None)
-            sentences.append(f'fluoroscope {frame.fluoroscope}, exposure {frame.number}: {error}')
-    if known is None:
+            sentences.append(f'{_exposure(frame)}: {error}')
+    if sensor is None:
         distances = [principal_distance_of(p) for p in projections if p is not None]
         if not distances:
             raise DataError(sentences[0])
-        known = nominal_interior(
-            frames[0].image_size, principal_distance or float(np.median(distances))
-        )
-    found = []
-    for frame, projection, (xyz, uv) in zip(frames, projections, pairs):
+        distance = task.principal_distance or float(np.median(distances))
+        interior = nominal_interior(frames[0].image_size, distance)
+    else:
+        interior = np.asarray(sensor.interior)
+    found: list[Resection | None] = []
+    for frame, projection, xyz, uv in zip(frames, projections, targets, pixels):
         try:
-            found.append(None if projection is None else resect(xyz, uv, known, projection))
+            found.append(None if projection is None else resect(xyz, uv, interior, projection))
         except DataError as error:
             found.append(None)
-            sentences.append(f'fluoroscope {frame.fluoroscope}, exposure {frame.number}: {error}')
-    typical = np.median([f.scale for f in found if f is not None]) if any(found) else np.inf
-    for i, (frame, orientation) in enumerate(zip(frames, found)):
-        if orientation is not None and orientation.scale > MISFIT * typical:
+            sentences.append(f'{_exposure(frame)}: {error}')
+    sentences += _reject_misfits(frames, found)
+    return found, interior, sentences
+
+
+def _reject_misfits(frames: Sequence[Frame], found: list[Resection | None]) -> list[str]:
+    """Set resections to None whose residuals are too large; return a sentence for each."""
+    scales = [one.scale for one in found if one is not None]
+    typical = np.median(scales) if scales else np.inf
+    sentences = []
+    for row, (frame, one) in enumerate(zip(frames, found)):
+        if one is not None and one.scale > MAX_MISFIT * typical:
             sentences.append(
-                f'fluoroscope {frame.fluoroscope}, exposure {frame.number}: the image points do not '
-                f'fit the phantom, their residuals are about {orientation.scale:.0f} px'
+                f'{_exposure(frame)}: the image points do not fit the phantom, their residuals '
+                f'are about {one.scale:.0f} px'
             )
-            found[i] = None
-    return found, known, sentences
+            found[row] = None
+    return sentences
 
 
-def _refuse_one_pose(name, resections):
+def _exposure(frame: Frame) -> str:
+    """Name of an exposure in a sentence."""
+    return f'fluoroscope {frame.fluoroscope}, exposure {frame.number}'
+
+
+def _require_different_poses(name: str, resections: Sequence[Resection | None]) -> None:
     """Raise DataError where all exposures show the phantom in one pose."""
-    found = [r for r in resections if r is not None]
+    found = [one for one in resections if one is not None]
     if len(found) < 2:
         return
-    turn = max(rotation_angle(r.rotation @ found[0].rotation.T) for r in found)
-    places = np.array([-r.rotation @ r.position_mm for r in found])
-    # Along the axis a distance is known an order worse than across it.
-    shift = np.max(np.abs(places - places[0]) / (1, 1, 10))
-    if turn < ONE_POSE_RAD and shift < ONE_POSE_MM:
+    turn = max(rotation_angle(one.rotation @ found[0].rotation.T) for one in found)
+    places = np.array([-one.rotation @ one.position_mm for one in found])
+    shift = np.max(np.abs(places - places[0]) / (1, 1, AXIAL_FACTOR))
+    if turn < MIN_POSE_RAD and shift < MIN_POSE_MM:
         raise DataError(
-            f'fluoroscope {name}: all {len(found)} exposures show the phantom in one pose (turned by at '
-            f'most {np.rad2deg(turn):.1f} degrees); turn and move it between the exposures'
+            f'fluoroscope {name}: all {len(found)} exposures show the phantom in one pose (turned '
+            f'by at most {np.rad2deg(turn):.1f} degrees); turn and move it between the exposures'
         )
 
 
-def _index(frames, fluoroscope, phantom, n_fluoroscopes, interior_free):
-    """The network of frames that are in order, and the target ids (n,) of its object points."""
-    counts = [len(f.target_id) for f in frames]
-    rows = phantom.index(np.concatenate([f.target_id for f in frames]))
+def _index(
+    frames: Sequence[Frame], fluoroscope: np.ndarray, task: _Task, n_fluoroscopes: int
+) -> tuple[Network, np.ndarray]:
+    """The network of frames, and the target ids (n,) of its object points."""
+    counts = [len(frame.target_id) for frame in frames]
+    rows = task.phantom.index(np.concatenate([frame.target_id for frame in frames]))
     used, point = np.unique(rows, return_inverse=True)
-    sigma = np.concatenate(
-        [np.ones(len(f.target_id)) if f.sigma is None else f.sigma for f in frames]
-    )
+    sigma = [
+        np.ones(len(frame.target_id)) if frame.sigma is None else frame.sigma for frame in frames
+    ]
     network = Network(
-        np.concatenate([f.uv for f in frames]),
-        sigma,
+        np.concatenate([frame.uv for frame in frames]),
+        np.concatenate(sigma),
         np.repeat(np.arange(len(frames)), counts),
         point,
-        np.array(fluoroscope),
-        phantom.xyz_mm[used],
-        phantom.sd_mm[used],
-        np.full(n_fluoroscopes, bool(interior_free)),
+        fluoroscope,
+        task.phantom.xyz_mm[used],
+        task.phantom.sd_mm[used],
+        np.full(n_fluoroscopes, task.sensors is None),
     )
-    return network, phantom.target_id[used]
+    return network, task.phantom.target_id[used]

@@ -7,7 +7,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from ..distortion.collocation import CollocationTerms
 from ..distortion.cross_validation import CrossValidation
-from ..distortion.estimation import AdjustedTerms, exposure_folds
+from ..distortion.estimation import AdjustedTerms, exposure_folds, prior_of_additional
 from ..distortion.knn import KnnModel
 from ..distortion.local_linear import LocalLinearModel
 from ..distortion.neighbour_model import NeighbourModel
@@ -56,7 +56,7 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
             scores[model_type.kind] += float(np.min(validation.scores(values, information)))
         held_out = {
             START_MODEL: _held_out(
-                terms.functions[f](uv), network.additional[f].prior, values, weight, fold
+                terms.functions[f](uv), prior_of_additional(network, f), values, weight, fold
             ),
             'parametric': _held_out(
                 Functions(image_size, HIGHEST)(uv), None, values, weight, fold

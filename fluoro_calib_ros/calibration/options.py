@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..distortion.registry import neighbour_models, selectable_models
 from ..distortion.user_regressor import is_regressor, regressor_name
 from ..options import option, validate_options
 from ..photogrammetry.datum import DATUMS
 from ..photogrammetry.noise import LOSSES
+
+if TYPE_CHECKING:
+    from sklearn.base import RegressorMixin
 
 AUTO = 'auto'
 INTERIORS = ('estimated', 'fixed')
@@ -56,7 +59,9 @@ class CalibrationOptions:
         If a value is not allowed, or two options exclude each other.
     """
 
-    model: Any = option(AUTO, 'correction model', choices=model_choices)
+    model: str | RegressorMixin = option(  # noqa: RUF009
+        AUTO, 'correction model', choices=model_choices
+    )
     interior: str = option(
         'estimated',
         'interior orientation, estimated, or held and learned by the model',

@@ -1,22 +1,29 @@
 """Calibration of one fluoroscope: what is published, saved and used for the correction."""
 
+from __future__ import annotations
+
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..distortion.base import CorrectionModel
 from ..distortion.grid import CorrectionGrid
 from ..distortion.series import packed
 from ..distortion.status import CorrectionStatus
-from ..exposures.frame import points_on_image
+from ..exposures.frame import Frame, points_on_image
+from ..exposures.phantom import Phantom
 
 
 @dataclass(frozen=True)
 class CorrectedPoints:
-    """Corrected image points: uv (n, 2) [px], sigma (n,) [px] of each coordinate, status (n,) OK,
-    OUTSIDE or INVALID. Where the status is INVALID, uv and sigma are NaN.
+    """Corrected image points.
+
+    uv (n, 2) [px]; sigma (n,): standard deviation of each coordinate [px]; status (n,):
+    `CorrectionStatus`. uv and sigma are NaN where the status is INVALID.
     """
 
     uv: np.ndarray
@@ -26,20 +33,49 @@ class CorrectedPoints:
 
 @dataclass(frozen=True)
 class FluoroscopeCalibration:
-    """Interior orientation and correction model of one fluoroscope, with the figures of their
-    quality.
+    """Interior orientation and correction model of one fluoroscope, and their quality.
 
-    interior (3,) xp, yp, c and interior_covariance (3, 3) [px]; image_size (width, height) [px];
-    image_sd: standard deviation of an image coordinate of an inlier [px]; sigma0 and nu: scale and
-    degrees of freedom of the Student-t noise, sigma0 a factor of sigma where that was given;
-    rmse_before and rmse_after (2,) of the inlier residuals [px]; cost_adjustment F and
-    cost_regression G; stamp_ns of the last exposure used; seconds the calibration took, NaN where
-    it was read from a file; source_digest of observations and phantom. calibration_id follows from
-    the content.
+    Attributes
+    ----------
+    fluoroscope : str
+    image_size : (int, int)
+        Width and height [px].
+    interior : (3,) ndarray
+        xp, yp, c [px].
+    interior_covariance : (3, 3) ndarray
+    interior_estimated : bool
+        False where the interior orientation was held.
+    model : CorrectionModel
+    train_exposure : (N,) ndarray of int
+        Exposure of each training point of the model.
+    image_sd : float
+        Standard deviation of an image coordinate of an inlier [px].
+    sigma0, nu : float
+        Scale and degrees of freedom of the Student-t noise; sigma0 is a factor of sigma where that
+        was given.
+    exposures, observations, inliers : int
+        Numbers of exposures and image points.
+    rmse_before, rmse_after : (2,) ndarray
+        RMSE of the inlier residuals in u and v [px], without and with the correction.
+    cost_adjustment, cost_regression : float
+        F and G of the last round.
+    iterations : int
+        Number of rounds.
+    converged : bool
+    stamp_ns : int
+        Time of the last exposure used.
+    frame_id : str
+        Optical frame in ROS.
+    source_digest : str
+        SHA-256 of observations and phantom.
+    seconds : float
+        Time the calibration took; NaN where it was read from a file.
+    calibration_id : str
+        Follows from the content.
     """
 
     fluoroscope: str
-    image_size: tuple
+    image_size: tuple[int, int]
     interior: np.ndarray
     interior_covariance: np.ndarray
     interior_estimated: bool
@@ -63,7 +99,7 @@ class FluoroscopeCalibration:
     seconds: float = field(default=np.nan, compare=False)
     calibration_id: str = field(init=False)
 
-    def __post_init__(self):
+    def __post_init__(self) -> None:
         digest = hashlib.sha256()
         for array in (
             self.interior,
@@ -82,33 +118,48 @@ class FluoroscopeCalibration:
         object.__setattr__(self, 'calibration_id', f'{self.fluoroscope}-{digest.hexdigest()[:16]}')
 
     @cached_property
-    def grid(self):
-        """The CorrectionGrid that answers for the model; it is built when it is first asked for."""
+    def grid(self) -> CorrectionGrid:
+        """Lookup grid of the model, built at its first use."""
         return CorrectionGrid(self.model, self.image_size)
 
-    def prepare(self):
+    def prepare(self) -> None:
         """Build what the first correction needs, so that no frame waits for it."""
-        self.grid
+        _ = self.grid
 
-    def correct(self, uv, sigma=None, exact=False):
-        """Corrected image points of observed pixels uv (n, 2); sigma (n,) of them, None: that of
-        the calibration.
+    def correct(
+        self, uv: ArrayLike, sigma: ArrayLike | None = None, exact: bool = False
+    ) -> CorrectedPoints:
+        """Return the corrected image points of observed pixels.
 
-        Standard deviations are those of observation and correction together. exact: from the model
-        itself and not from its grid, which differs by grid.error_px and tells OUTSIDE up to a cell
-        before the calibrated area ends.
+        Parameters
+        ----------
+        uv : (n, 2) array_like
+            Observed pixels.
+        sigma : (n,) array_like, optional
+            Their standard deviations [px]; by default that of the calibration.
+        exact : bool
+            True for the model itself instead of its grid, which differs by grid.error_px and is
+            OUTSIDE up to a cell before the calibrated area ends.
+
+        Returns
+        -------
+        CorrectedPoints
+            With standard deviations of observation and correction together.
         """
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         sigma = None if sigma is None else np.asarray(sigma, dtype=float)
         if exact:
             return self._correct_exactly(uv, self.image_sd if sigma is None else sigma)
-        u, v, sigma, _, status = self.correct_arrays(uv[:, 0], uv[:, 1], sigma)
-        return CorrectedPoints(np.stack([u, v], axis=1), sigma, status)
+        u, v, total, _, status = self.correct_arrays(uv[:, 0], uv[:, 1], sigma)
+        return CorrectedPoints(np.stack([u, v], axis=1), total, status)
 
-    def correct_arrays(self, u, v, sigma=None):
-        """The same for arrays u, v and sigma (n,) of floats: corrected u and v (n,) [px], sigma
-        (n,) [px], that of the correction alone (n,) [px] and status (n,). The numbers are those of
-        `correct`, and nothing is done that a frame of few points would wait for.
+    def correct_arrays(
+        self, u: np.ndarray, v: np.ndarray, sigma: np.ndarray | None = None
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Correct arrays u, v and sigma (n,) of floats, with the least overhead.
+
+        Returns corrected u and v, their standard deviation, that of the correction alone [px], and
+        status, each (n,). The numbers are those of `correct`.
         """
         (du, dv, sd), status = self.grid.look_up(u, v)
         np.subtract(u, du, out=du)
@@ -117,7 +168,8 @@ class FluoroscopeCalibration:
         total += self.image_sd**2 if sigma is None else sigma * sigma
         return du, dv, np.sqrt(total, out=total), sd, status
 
-    def _correct_exactly(self, uv, sigma):
+    def _correct_exactly(self, uv: np.ndarray, sigma: np.ndarray | float) -> CorrectedPoints:
+        """Correct by the model itself."""
         good = points_on_image(uv, self.image_size)
         out = CorrectedPoints(
             np.full(uv.shape, np.nan),
@@ -133,7 +185,7 @@ class FluoroscopeCalibration:
         return out
 
 
-def digest_of_sources(frames, phantom):
+def digest_of_sources(frames: Iterable[Frame], phantom: Phantom) -> str:
     """SHA-256 (hex) of the frames of one fluoroscope and of the phantom."""
     digest = hashlib.sha256()
     for frame in sorted(frames, key=lambda f: f.number):

@@ -1,21 +1,24 @@
-"""Where the fluoroscopes of a rig stand: from a capture of the phantom, or from the exposures of a
-calibration.
+"""Orientation of the fluoroscopes of a rig, from a capture of the phantom or from the exposures.
 
 Interior orientations and corrections are held at their calibrations, so that rays and corrected
-image points belong together; what is uncertain in the interior orientation is carried on, not
-estimated again. With N the normal matrix of the adjustment of exteriors e and object points, were
-the interiors i free beside them,
+image points are consistent. The uncertainty of the interior orientation is propagated, not
+estimated again. With N the normal matrix of the adjustment of exteriors e and object points, with
+the interiors i as further unknowns,
 
-    de/di = -N_ee^-1 N_ei (object points eliminated),   C_e = N_ee^-1 + de/di C_i (de/di)^T,   C_ei
-    = de/di C_i,
+    de/di = -N_ee^-1 N_ei (object points eliminated),
+    C_e = N_ee^-1 + de/di C_i (de/di)^T,   C_ei = de/di C_i,
 
-the covariance of an estimate with parameters that are held, but not known (Schmidt's consider
-parameters: Bierman, "Factorization Methods for Discrete Sequential Estimation", Academic Press
-1977, ch. VIII). An error of the principal distance moves the source, and the points that are
-intersected afterwards hardly: that is in C_ei.
+the covariance of an estimate with parameters that are held, but not known (consider parameters of
+Schmidt: Bierman, "Factorization Methods for Discrete Sequential Estimation", Academic Press 1977,
+ch. VIII). An error of the principal distance moves the source, but hardly the points that are
+intersected afterwards: C_ei describes that.
 """
 
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -26,150 +29,256 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
-from ..photogrammetry.elimination import factorize
+from ..photogrammetry.elimination import CovarianceBlocks, factorize
+from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.relative_orientation import (
     RelativeConstraint,
+    RelativePose,
     discrepancies,
     discrepancies_with_jacobian,
     mean_pose,
 )
-from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
-from .calibrate import SEEN_FOR_NOISE, held_corrections
+from ..photogrammetry.rig_orientation import (
+    ORIENTATION_SIZE,
+    RigOrientation,
+    with_datum_of_points,
+)
+from .calibrate import Targets
 from .constraints import paired_exposures
-from .initial_network import MIN_TARGETS_OF_EXPOSURE, Measured, measured_network
-from .robust_adjustment import adjusted_with_precision, start_noise
+from .held_calibration import (
+    held_corrections,
+    network_of_calibrations,
+    noise_of_calibrations,
+    too_few_rays_for_noise,
+)
+from .initial_network import MIN_TARGETS_OF_EXPOSURE, Frames, Measured
+from .result import FluoroscopeCalibration
+from .robust_adjustment import adjusted_with_precision
 
-# exposures that are used: more tell no more, the interior orientations are what is uncertain then
+Calibrations = Mapping[str, FluoroscopeCalibration]
+
+# Exposures that are used: with more of them the interior orientations remain the uncertainty.
 MAX_PAIRS = 30
-# Median displacement between two frames of a capture from which the phantom does not stand still:
-# further than both, pixels and standard deviations of the noise; and distance from the median of a
-# target at which a match is false.
-STILL_PX = 1.0
-STILL_SD = 4.0
-FALSE_SD = 5.0
-# Of the interior orientations where they are added as unknowns, so that their normal matrix can be
-# inverted also where one pose of the phantom does not determine them; the derivative de/di does
-# not depend on it.
+# The phantom moves where the median displacement between two frames of a capture exceeds both
+# limits, in pixels and in standard deviations of the noise.
+MAX_STILL_PX = 1.0
+MAX_STILL_SD = 4.0
+MAX_MATCH_SD = 5.0  # distance from the median of a target above which a match is false
+# Of interior orientations that are added as unknowns: their normal matrix can then be inverted
+# also where one pose of the phantom does not determine them. The derivative de/di does not depend
+# on it.
 ASSUMED_SD_PX = 1.0
 
 
 @dataclass(frozen=True)
-class _Held:
-    """An adjustment with calibrations held: exteriors (m, 6, 3F): their derivatives by the
-    interiors (de/di); covariance(e, f): (k, 6, 6) of exposures e (k,) with others f (k,), the
-    interiors taken as known; interiors (3F, 3F): covariance of these.
+class _HeldAdjustment:
+    """An adjustment of m exposures with the calibrations of F fluoroscopes held.
+
+    Attributes
+    ----------
+    measured : Measured
+    after : Adjustment
+    by_interior : (m, 6, 3F) ndarray
+        Derivatives de/di of the exteriors by the interiors.
+    blocks : CovarianceBlocks
+        Of the adjustment with the interiors among the unknowns.
+    interiors : (3F, 3F) ndarray
+        Covariance of the interiors.
     """
 
     measured: Measured
     after: Adjustment
     by_interior: np.ndarray
-    covariance: object
+    blocks: CovarianceBlocks
     interiors: np.ndarray
+
+    def covariance(self, e: np.ndarray, f: np.ndarray) -> np.ndarray:
+        """Covariances (k, 6, 6) of exposures e (k,) with others f (k,), the interiors known."""
+        derivative = self.by_interior
+        of_interiors = derivative[e] @ self.blocks.gg @ derivative[f].transpose(0, 2, 1)
+        return self.blocks.between(e, f) - of_interiors
+
+    def covariance_of_all(self) -> np.ndarray:
+        """Covariance (6m, 6m) of all exposures, the interiors known."""
+        count = len(self.measured.frames)
+        every = np.arange(count)
+        rows = [
+            self.covariance(np.full(count, e), every).transpose(1, 0, 2).reshape(6, 6 * count)
+            for e in every
+        ]
+        return np.concatenate(rows)
+
+
+@dataclass(frozen=True)
+class _Exteriors:
+    """Exterior orientations of F fluoroscopes in the frame of a rig.
+
+    Attributes
+    ----------
+    rotation : (F, 3, 3) ndarray
+    position_mm : (F, 3) ndarray
+    covariance : (6F, 6F) ndarray
+        With the interiors known.
+    by_interior : (6F, 3F) ndarray
+        Derivatives by the interiors.
+    """
+
+    rotation: np.ndarray
+    position_mm: np.ndarray
+    covariance: np.ndarray
+    by_interior: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """Where an orientation comes from; see `RigOrientation`."""
+
+    frame_id: str
+    source: str
+    stamp_ns: int
+    exposures: int
 
 
 def orientation_of_capture(
-    frames, phantom, calibrations, frame_id='rig', loss='student_t', raise_if_cancelled=None
-):
-    """RigOrientation from a capture of the phantom standing still: the frame of the phantom is
-    that of the rig.
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Calibrations,
+    frame_id: str = 'rig',
+    loss: str = 'student_t',
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> RigOrientation:
+    """Orientation from a capture of the phantom at rest, whose frame is that of the rig.
 
-    frames {fluoroscope: [Frame, ...]}: one or several of every fluoroscope, they need not be
-    paired; phantom: survey of its targets, or a Phantom of the better known object points of a
-    calibration; calibrations {fluoroscope: FluoroscopeCalibration}, held; raise_if_cancelled():
-    called during the adjustment, may raise to stop it. The object points are estimated along, with
-    their survey as weighted observations. Raises DataError for fewer than two fluoroscopes,
-    missing calibrations, wrong frames, other image sizes, too few targets, and a phantom that
-    moves.
+    The object points are estimated, too, with their survey as weighted observations.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        One or more of every fluoroscope; they need not be paired.
+    phantom : Phantom
+        Survey of its targets, or the better known object points of a calibration (`phantom_of`).
+    calibrations : mapping of str to FluoroscopeCalibration
+        Held.
+    frame_id : str
+        Name of the rig frame.
+    loss : str
+        Noise model of the image points.
+    raise_if_cancelled : callable, optional
+        Called during the adjustment; may raise to stop it.
+
+    Returns
+    -------
+    RigOrientation
+
+    Raises
+    ------
+    DataError
+        If there are fewer than two fluoroscopes, calibrations are missing, frames are invalid or
+        of another image size, targets are too few, or the phantom moves.
     """
-    _check(frames, phantom, calibrations)
-    standing = {name: [frame] for name, frame in standing_frames(frames, calibrations).items()}
-    for name, (frame,) in standing.items():
+    _validate(frames, phantom, calibrations)
+    still = {name: [frame] for name, frame in standing_frames(frames, calibrations).items()}
+    for name, (frame,) in still.items():
         if len(frame.target_id) < MIN_TARGETS_OF_EXPOSURE:
             raise DataError(
-                f'fluoroscope {name}: the capture shows {len(frame.target_id)} targets of the phantom, '
-                f'{MIN_TARGETS_OF_EXPOSURE} are needed'
+                f'fluoroscope {name}: the capture shows {len(frame.target_id)} targets of the '
+                f'phantom, {MIN_TARGETS_OF_EXPOSURE} are needed'
             )
     with threadpool_limits(1):
-        held = _adjusted(standing, phantom, calibrations, loss, True, raise_if_cancelled)
-        count = len(frames)
-        one, other = (index.ravel() for index in np.indices((count, count)))
-        known = (
-            held.covariance(one, other)
-            .reshape(count, count, 6, 6)
-            .transpose(0, 2, 1, 3)
-            .reshape(6 * count, -1)
-        )
+        measured = network_of_calibrations(still, phantom, calibrations, raise_if_cancelled)
+        held = _adjusted(measured, calibrations, loss, True, raise_if_cancelled)
+        known = held.covariance_of_all()
     parameters = held.after.parameters
-    return _orientation(
-        held,
+    count = len(frames)
+    exteriors = _Exteriors(
         parameters.rotation,
         parameters.position_mm,
         known,
         held.by_interior.reshape(6 * count, -1),
-        calibrations,
-        frame_id,
-        'capture',
-        _last_stamp(frames),
-        min(len(of_one) for of_one in frames.values()),
     )
+    exposures = min(len(of_one) for of_one in frames.values())
+    origin = _Origin(frame_id, 'capture', _last_stamp(frames), exposures)
+    return _orientation(held, exteriors, calibrations, origin)
 
 
 def orientation_of_exposures(
-    frames, phantom, calibrations, loss='student_t', raise_if_cancelled=None
-):
-    """RigOrientation in the optical frame of the first fluoroscope, from the exposures that all
-    took of the phantom.
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Calibrations,
+    loss: str = 'student_t',
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> RigOrientation:
+    """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
 
-    The frame is the sensor's as it was estimated, and its covariance is held to where the phantom
-    stood (with_datum_of_points).
+    The relative orientation is the weighted mean of those of the exposures. Where these scatter
+    more than their standard deviations, its covariance is enlarged accordingly. The frame is the
+    estimated one of the sensor, and its covariance is given a datum where the phantom was
+    (`with_datum_of_points`).
 
-    frames {fluoroscope: [Frame, ...]}, those of the same number belong together; calibrations
-    {fluoroscope: FluoroscopeCalibration}, held. The relative orientation is the weighted mean of
-    those of the exposures; where they scatter by more than their standard deviations, its
-    covariance grows accordingly. Raises DataError as orientation_of_capture, and where no
-    exposures can be paired.
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        Those of the same number belong together.
+    phantom : Phantom
+    calibrations : mapping of str to FluoroscopeCalibration
+        Held.
+    loss : str
+        Noise model of the image points.
+    raise_if_cancelled : callable, optional
+        Called during the adjustment; may raise to stop it.
+
+    Returns
+    -------
+    RigOrientation
+
+    Raises
+    ------
+    DataError
+        As `orientation_of_capture`, and if no exposures can be paired.
     """
-    _check(frames, phantom, calibrations)
+    _validate(frames, phantom, calibrations)
     paired = _paired(frames)
     with threadpool_limits(1):
-        held = _adjusted(paired, phantom, calibrations, loss, False, raise_if_cancelled)
-        count = len(frames)
-        rotation = np.tile(np.eye(3), (count, 1, 1))
-        position = np.zeros((count, 3))
-        operator = np.zeros((6 * count, 6 * len(held.measured.frames)))
-        growth = np.ones(6 * count)
-        used = []
-        for b in range(1, count):
-            pairs = paired_exposures(held.measured, b)
-            if not len(pairs):
-                raise DataError(_unpaired(held.measured.fluoroscopes, b))
-            rows = slice(6 * b, 6 * b + 6)
-            pose, operator[rows], growth[rows] = _mean_of_pairs(held, pairs)
-            rotation[b] = pose.rotation
-            position[b] = pose.translation_mm
-            used.append(len(pairs))
-        known = growth[:, None] * (operator @ _all_exposures(held) @ operator.T) * growth
-    by_interior = operator @ held.by_interior.reshape(operator.shape[1], -1)
+        measured = network_of_calibrations(paired, phantom, calibrations, raise_if_cancelled)
+        held = _adjusted(measured, calibrations, loss, False, raise_if_cancelled)
+        exteriors, exposures = _relative_to_first(held)
     first = held.measured.fluoroscopes[0]
-    found = _orientation(
-        held,
-        rotation,
-        position,
-        known,
-        by_interior,
-        calibrations,
-        calibrations[first].frame_id or f'{first}_optical',
-        'joint calibration',
-        _last_stamp(paired),
-        min(used),
-    )
+    frame_id = calibrations[first].frame_id or f'{first}_optical'
+    origin = _Origin(frame_id, 'joint calibration', _last_stamp(paired), exposures)
+    found = _orientation(held, exteriors, calibrations, origin)
     return with_datum_of_points(found, _seen_by_first(held))
 
 
-def _seen_by_first(held):
-    """Object points (n, 3) [mm] of all image points of the first fluoroscope, in its sensor frame."""
+def _relative_to_first(held: _HeldAdjustment) -> tuple[_Exteriors, int]:
+    """Exteriors relative to the first fluoroscope, and the smallest number of paired exposures.
+
+    Raises DataError where no exposures can be paired.
+    """
+    names = held.measured.fluoroscopes
+    count = len(names)
+    rotation = np.tile(np.eye(3), (count, 1, 1))
+    position = np.zeros((count, 3))
+    operator = np.zeros((6 * count, 6 * len(held.measured.frames)))
+    growth = np.ones(6 * count)
+    used = []
+    for b in range(1, count):
+        pairs = paired_exposures(held.measured, b)
+        if not len(pairs):
+            raise DataError(_unpaired(names, b))
+        rows = slice(6 * b, 6 * b + 6)
+        pose, operator[rows], growth[rows] = _mean_of_pairs(held, pairs)
+        rotation[b] = pose.rotation
+        position[b] = pose.translation_mm
+        used.append(len(pairs))
+    known = growth[:, None] * (operator @ held.covariance_of_all() @ operator.T) * growth
+    by_interior = operator @ held.by_interior.reshape(operator.shape[1], -1)
+    return _Exteriors(rotation, position, known, by_interior), min(used)
+
+
+def _seen_by_first(held: _HeldAdjustment) -> np.ndarray:
+    """Object points (n, 3) [mm] that the first fluoroscope sees, in its sensor frame."""
     network = held.measured.network
     parameters = held.after.parameters
     rows = network.rows(0)
@@ -178,8 +287,8 @@ def _seen_by_first(held):
     return to_sensor(parameters.rotation[exposure], parameters.position_mm[exposure], points)
 
 
-def phantom_of(targets):
-    """Phantom of the object points of a calibration (Targets), better known than by their survey.
+def phantom_of(targets: Targets) -> Phantom:
+    """Phantom of the object points of a calibration, better known than by their survey.
 
     The standard deviation of a target is the root mean square of those of its coordinates.
     """
@@ -187,11 +296,12 @@ def phantom_of(targets):
     return Phantom(targets.target_id, targets.xyz_mm, np.sqrt(variance))
 
 
-def _check(frames, phantom, calibrations):
-    """Raise DataError for frames and calibrations that do not go together."""
+def _validate(frames: Frames, phantom: Phantom, calibrations: Calibrations) -> None:
+    """Raise DataError for frames and calibrations that do not belong together."""
     if len(frames) < 2:
         raise DataError(
-            f'a rig has two fluoroscopes or more, there are frames of {", ".join(frames) or "none"} only'
+            'a rig has two fluoroscopes or more, there are frames of '
+            f'{", ".join(frames) or "none"} only'
         )
     for name, of_one in frames.items():
         if name not in calibrations:
@@ -204,29 +314,27 @@ def _check(frames, phantom, calibrations):
             validate_frame(frame, phantom, calibrations[name].image_size)
 
 
-def _last_stamp(frames):
+def _last_stamp(frames: Frames) -> int:
     return max(frame.stamp_ns for of_one in frames.values() for frame in of_one)
 
 
-def standing_frames(frames, calibrations):
-    """{fluoroscope: Frame} of a capture {fluoroscope: [Frame, ...]} in which the phantom stands
-    still: weighted means of the image points of every target. Raises DataError where the phantom
-    moves.
+def standing_frames(frames: Frames, calibrations: Calibrations) -> dict[str, Frame]:
+    """One frame by fluoroscope of a capture of the phantom at rest.
 
-    An image point that is far from the median of its target is a false match and left out.
+    Its image points are the weighted means of those of every target. An image point that is far
+    from the median of its target is a false match and left out. Raises DataError where the phantom
+    moves.
     """
     return {
-        name: _standing(of_one, calibrations[name].image_sd) for name, of_one in frames.items()
+        name: _mean_frame(of_one, calibrations[name].image_sd) for name, of_one in frames.items()
     }
 
 
-def _standing(frames, image_sd):
-    """One Frame of the frames (Frame, ...) of a fluoroscope; image_sd: noise of an image
-    coordinate [px].
-    """
+def _mean_frame(frames: Sequence[Frame], image_sd: float) -> Frame:
+    """Mean of the frames of a fluoroscope; image_sd: noise of an image coordinate [px]."""
     if len(frames) == 1:
         return frames[0]
-    _refuse_motion(frames, max(STILL_PX, STILL_SD * image_sd))
+    _require_still(frames, max(MAX_STILL_PX, MAX_STILL_SD * image_sd))
     ids, row = np.unique(np.concatenate([f.target_id for f in frames]), return_inverse=True)
     uv = np.concatenate([f.uv for f in frames])
     sigma = np.concatenate(
@@ -236,147 +344,132 @@ def _standing(frames, image_sd):
     ends = np.cumsum(np.bincount(row))[:-1]
     middle = np.array([np.median(uv[part], axis=0) for part in np.split(order, ends)])
     off = uv - middle[row]
-    weight = np.where(
-        np.linalg.norm(off, axis=1) <= max(STILL_PX, FALSE_SD * image_sd), sigma**-2.0, 0.0
-    )
+    limit = max(MAX_STILL_PX, MAX_MATCH_SD * image_sd)
+    weight = np.where(np.linalg.norm(off, axis=1) <= limit, sigma**-2.0, 0.0)
     total = np.bincount(row, weight, len(ids))
-    kept = total > 0
-    mean = (
-        np.column_stack([np.bincount(row, weight * off[:, i], len(ids)) for i in (0, 1)])[kept]
-        / total[kept, None]
-    )
+    matched = total > 0
+    sums = np.column_stack([np.bincount(row, weight * off[:, i], len(ids)) for i in (0, 1)])
+    mean = sums[matched] / total[matched, None]
     last = max(frames, key=lambda f: (f.stamp_ns, f.number))
     return Frame(
         last.fluoroscope,
         last.number,
-        ids[kept],
-        middle[kept] + mean,
+        ids[matched],
+        middle[matched] + mean,
         last.image_size,
-        total[kept] ** -0.5,
+        total[matched] ** -0.5,
         last.stamp_ns,
         last.frame_id,
     )
 
 
-def _refuse_motion(frames, still_px):
-    """Raise DataError where a frame shows the phantom displaced from the one before or from the
-    first by more than still_px.
+def _require_still(frames: Sequence[Frame], still_px: float) -> None:
+    """Raise DataError where a frame shows the phantom displaced by more than still_px.
+
+    Every frame is compared with the one before, and with the first.
     """
-    for before, frame in [*zip(frames, frames[1:]), *((frames[0], frame) for frame in frames[2:])]:
+    to_first = ((frames[0], frame) for frame in frames[2:])
+    for before, frame in [*pairwise(frames), *to_first]:
         moved = displacement(before, frame)
         if np.isfinite(moved) and moved > still_px:
             raise DataError(
-                f'fluoroscope {frame.fluoroscope}: the phantom does not stand still, between frames '
-                f'{before.number} and {frame.number} it moves by {moved:.1f} px'
+                f'fluoroscope {frame.fluoroscope}: the phantom does not stand still, between '
+                f'frames {before.number} and {frame.number} it moves by {moved:.1f} px'
             )
 
 
-def _paired(frames):
-    """The frames of which the first fluoroscope and another have one of the same number, at most
-    MAX_PAIRS each.
+def _paired(frames: Frames) -> dict[str, list[Frame]]:
+    """Frames that the first fluoroscope and another have in common, at most MAX_PAIRS each.
+
+    Raises DataError where a fluoroscope has none in common with the first.
     """
     first, *others = frames
     numbers = {name: {frame.number for frame in of_one} for name, of_one in frames.items()}
     for b, name in enumerate(others, 1):
         if not numbers[name] & numbers[first]:
             raise DataError(_unpaired(tuple(frames), b))
-    # The exposures of which most views are there come first, evenly over their numbers.
-    every = sorted(numbers[first] & set.union(*(numbers[name] for name in others)))
-    full = [n for n in every if all(n in numbers[name] for name in others)]
-    used = full if len(full) >= MAX_PAIRS else every
-    used = {used[i] for i in np.unique(np.linspace(0, len(used) - 1, MAX_PAIRS).astype(int))}
+    # Exposures that all fluoroscopes took are preferred; they are spread evenly over the numbers.
+    common = sorted(numbers[first].intersection(n for name in others for n in numbers[name]))
+    complete = [n for n in common if all(n in numbers[name] for name in others)]
+    usable = complete if len(complete) >= MAX_PAIRS else common
+    selected = np.unique(np.linspace(0, len(usable) - 1, MAX_PAIRS).astype(int))
+    used = {usable[i] for i in selected}
     return {
         name: [frame for frame in of_one if frame.number in used]
         for name, of_one in frames.items()
     }
 
 
-def _unpaired(names, b):
+def _unpaired(names: Sequence[str], b: int) -> str:
+    """Return the sentence on fluoroscopes without paired exposures."""
     return (
-        f'fluoroscopes {names[0]} and {names[b]}: no exposures have the same number, so that their relative '
-        'orientation is not known'
+        f'fluoroscopes {names[0]} and {names[b]}: no exposures have the same number, so that '
+        'their relative orientation is not known'
     )
 
 
-def _adjusted(frames, phantom, calibrations, loss, noise_held, raise_if_cancelled):
-    """The _Held adjustment of frames; noise_held: noise is that of the calibrations, else only
-    where there are too few exposures to estimate it.
+def _adjusted(
+    measured: Measured,
+    calibrations: Calibrations,
+    loss: str,
+    noise_held: bool,
+    raise_if_cancelled: Callable[[], None] | None,
+) -> _HeldAdjustment:
+    """Adjust a network with the calibrations held.
+
+    noise_held: the noise is that of the calibrations; else only where the exposures are too few to
+    estimate it. Raises DataError.
     """
-    names = tuple(frames)
-    measured = measured_network(
-        frames,
-        phantom,
-        interior={n: calibrations[n].interior for n in names},
-        interior_free=False,
-        min_exposures=1,
-        corrections={n: calibrations[n].model.predict for n in names},
-        raise_if_cancelled=raise_if_cancelled,
-    )
+    used = [calibrations[name] for name in measured.fluoroscopes]
     correction, network = held_corrections(measured, calibrations)
-    noise_held = noise_held or len(network.uv) < SEEN_FOR_NOISE * len(network.survey_mm)
-    used = [calibrations[n] for n in names]
-    noise = replace(
-        start_noise(loss),
-        scale=float(np.median([c.sigma0 for c in used])),
-        nu=float(np.median([c.nu for c in used])),
-    )
     after, _ = adjusted_with_precision(
         network,
         measured.start,
         correction,
-        noise,
+        noise_of_calibrations(loss, used),
         raise_if_cancelled=raise_if_cancelled,
-        noise_held=noise_held,
+        noise_held=noise_held or too_few_rays_for_noise(network),
     )
     if not np.isfinite(after.parameters.position_mm).all():
         raise DataError('the exposures do not determine the orientation of the fluoroscopes')
-    count = 3 * len(names)
+    blocks = _with_free_interiors(network, after, correction)
+    by_interior = blocks.eg @ np.linalg.inv(blocks.gg)
+    return _HeldAdjustment(measured, after, by_interior, blocks, _covariance_of_interiors(used))
+
+
+def _with_free_interiors(
+    network: Network, after: Adjustment, correction: np.ndarray
+) -> CovarianceBlocks:
+    """Covariances of an adjustment with the interiors as further unknowns."""
+    count = network.n_fluoroscopes
     free = replace(
         network,
-        interior_free=np.ones(len(names), dtype=bool),
+        interior_free=np.ones(count, dtype=bool),
         interior_mean=after.parameters.interior,
-        interior_sd=np.full((len(names), 3), ASSUMED_SD_PX),
+        interior_sd=np.full((count, 3), ASSUMED_SD_PX),
     )
-    blocks = covariance_blocks(
-        factorize(
-            free,
-            normal_equations(
-                free,
-                after.parameters,
-                correction,
-                after.noise,
-                after.noise.information_factor(after.q),
-            ),
-        ),
-    )
-    by_interior = blocks.eg @ np.linalg.inv(blocks.gg)
-    interiors = np.zeros((count, count))
+    factor = after.noise.information_factor(after.q)
+    equations = normal_equations(free, after.parameters, correction, after.noise, factor)
+    return covariance_blocks(factorize(free, equations))
+
+
+def _covariance_of_interiors(calibrations: Iterable[FluoroscopeCalibration]) -> np.ndarray:
+    """Covariance (3F, 3F) of the interior orientations of calibrations."""
+    used = list(calibrations)
+    out = np.zeros((3 * len(used), 3 * len(used)))
     for f, calibration in enumerate(used):
-        interiors[3 * f : 3 * f + 3, 3 * f : 3 * f + 3] = calibration.interior_covariance
-
-    def covariance(e, f):
-        return blocks.between(e, f) - by_interior[e] @ blocks.gg @ by_interior[f].transpose(
-            0, 2, 1
-        )
-
-    return _Held(measured, after, by_interior, covariance, interiors)
+        rows = slice(3 * f, 3 * f + 3)
+        out[rows, rows] = calibration.interior_covariance
+    return out
 
 
-def _all_exposures(held):
-    """Covariance (6m, 6m) of all exposures, the interiors taken as known."""
-    count = len(held.measured.frames)
-    every = np.arange(count)
-    rows = [
-        held.covariance(np.full(count, e), every).transpose(1, 0, 2).reshape(6, 6 * count)
-        for e in every
-    ]
-    return np.concatenate(rows)
+def _mean_of_pairs(
+    held: _HeldAdjustment, pairs: np.ndarray
+) -> tuple[RelativePose, np.ndarray, float]:
+    """Weighted mean of the relative orientations of pairs (k, 2) of exposures.
 
-
-def _mean_of_pairs(held, pairs):
-    """Weighted mean RelativePose of pairs (k, 2) of exposures, its derivatives (6, 6m) by the
-    exposures, and the factor by which the pairs scatter more than their standard deviations say,
-    at least 1.
+    Returns it, its derivatives (6, 6m) by the exposures, and the factor, at least 1, by which the
+    pairs scatter more than their standard deviations.
     """
     parameters = held.after.parameters
     (a, b) = pairs.T
@@ -405,23 +498,15 @@ def _mean_of_pairs(held, pairs):
 
 
 def _orientation(
-    held,
-    rotation,
-    position,
-    known,
-    by_interior,
-    calibrations,
-    frame_id,
-    source,
-    stamp_ns,
-    exposures,
-):
-    """RigOrientation of exteriors: known (6F, 6F): their covariance with the interiors known,
-    by_interior (6F, 3F).
-    """
+    held: _HeldAdjustment, exteriors: _Exteriors, calibrations: Calibrations, origin: _Origin
+) -> RigOrientation:
+    """Rig orientation of exteriors, with the uncertainty of the interiors."""
     names = held.measured.fluoroscopes
+    used = [calibrations[name] for name in names]
+    by_interior = exteriors.by_interior
     mixed = by_interior @ held.interiors
-    every = np.block([[known + mixed @ by_interior.T, mixed], [mixed.T, held.interiors]])
+    total = exteriors.covariance + mixed @ by_interior.T
+    every = np.block([[total, mixed], [mixed.T, held.interiors]])
     count = len(names)
     order = np.concatenate(
         [np.r_[6 * f : 6 * f + 6, 6 * count + 3 * f : 6 * count + 3 * f + 3] for f in range(count)]
@@ -429,14 +514,14 @@ def _orientation(
     covariance = every[np.ix_(order, order)].reshape(ORIENTATION_SIZE * count, -1)
     return RigOrientation(
         names,
-        np.array([calibrations[n].interior for n in names]),
-        rotation,
-        position,
+        np.array([calibration.interior for calibration in used]),
+        exteriors.rotation,
+        exteriors.position_mm,
         (covariance + covariance.T) / 2,
-        frame_id,
-        source,
-        tuple(calibrations[n].calibration_id for n in names),
-        stamp_ns,
-        exposures,
-        tuple(calibrations[n].frame_id or f'{n}_optical' for n in names),
+        origin.frame_id,
+        origin.source,
+        tuple(calibration.calibration_id for calibration in used),
+        origin.stamp_ns,
+        origin.exposures,
+        tuple(c.frame_id or f'{name}_optical' for name, c in zip(names, used)),
     )

@@ -163,7 +163,7 @@ class CorrectionModel(ABC):
         return out
 
     def outside(self, uv: ArrayLike) -> np.ndarray:
-        """True (n,) where a pixel of uv (n, 2) is beyond the convex hull of the training points."""
+        """True (n,) where a pixel uv (n, 2) is beyond the convex hull of the training points."""
         uv = np.asarray(uv, dtype=float)
         return (uv @ self._hull[:, :2].T + self._hull[:, 2] > 0).any(axis=1)
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
-from .estimation import AdjustedTerms, AdjustmentProblem
+from .estimation import AdjustedTerms, AdjustmentProblem, prior_of_additional
 from .priors import Prior, gauge_precision, most_likely_prior, prior_precision, starting_prior
 from .series import MARGIN, Functions, Series, sd_over_image
 from .series_model import SeriesModel
@@ -117,7 +117,7 @@ class CollocationTerms(AdjustedTerms):
         self.interior = adjustment.parameters.interior
         for f, functions in enumerate(self.functions):
             last = self.priors[f]
-            present = network.additional[f].prior
+            present = prior_of_additional(network, f)
             information = information_of_additional(matrix, f) - present
             right = (information + present) @ coefficients[f]
             now = most_likely_prior(functions, information, right, self.gauges[f], last)

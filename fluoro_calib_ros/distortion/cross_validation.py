@@ -103,7 +103,7 @@ class CrossValidation:
         return trend + np.einsum('nk,cnk->nc', weights, near[:, :, :k])
 
     def scores(self, values: np.ndarray, information: np.ndarray) -> np.ndarray:
-        """G (K,) for every candidate: squared errors weighted by information (N, 2, 2) = C_r^-1."""
+        """G (K,) for every candidate: errors weighted by information (N, 2, 2) = C_r^-1."""
         error = values - self.predictions(values)
         return weighted_square_sum(error, information)
 

@@ -230,6 +230,14 @@ def require_training(count: int) -> None:
         )
 
 
+def prior_of_additional(network: Network, f: int) -> np.ndarray:
+    """Prior precision matrix (p, p) of the additional parameters of fluoroscope f."""
+    additional = network.additional[f]
+    if additional is None:
+        raise ValueError(f'fluoroscope number {f} has no additional parameters')
+    return additional.prior
+
+
 def exposure_folds(exposure: np.ndarray, folds: int = FOLDS) -> np.ndarray:
     """Fold (N,) of each image point: the exposures (N,) are dealt out in turn."""
     _, number = np.unique(exposure, return_inverse=True)

@@ -111,7 +111,7 @@ class CorrectionGrid:
         self.divided = len(divided.row)
 
     def _errors_of_divided(self, model: CorrectionModel, divided: DividedCells) -> np.ndarray:
-        """Errors (2, d) [px] of correction and standard deviation that divided cells still have."""
+        """Errors (2, d) [px] of correction and standard deviation left in divided cells."""
         place = np.random.default_rng(0).random((2, CHECKS_OF_DIVIDED, self.divided))
         u, v = (
             axis[k] + part * (axis[k + 1] - axis[k])

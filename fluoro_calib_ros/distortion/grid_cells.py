@@ -167,7 +167,9 @@ def _cell_sizes(smoothness: Smoothness, image_size: tuple[int, int]) -> list[flo
     """Sizes of cells [px] to try, each half the one before."""
     area = image_size[0] * image_size[1]
     bytes_of_cell = COEFFICIENTS * 8
-    sizes = [size for size in CELL_PX if area / size**2 * bytes_of_cell <= MAX_TABLE_BYTES]
+    sizes: list[float] = [
+        size for size in CELL_PX if area / size**2 * bytes_of_cell <= MAX_TABLE_BYTES
+    ]
     if not sizes:
         return [2 ** np.ceil(np.log2(area * bytes_of_cell / MAX_TABLE_BYTES) / 2)]
     if smoothness is Smoothness.STEPPED:

@@ -1,4 +1,4 @@
-"""The model `hybrid`: a cubic trend estimated in the adjustment, local planes on what it leaves."""
+"""The model `hybrid`: a cubic trend in the adjustment, local planes on what it leaves."""
 
 from __future__ import annotations
 

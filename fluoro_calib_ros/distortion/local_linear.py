@@ -9,6 +9,8 @@ S-shape and spiral bend over the whole image and are cubic polynomials to first 
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from .neighbour_model import NeighbourModel
@@ -21,7 +23,7 @@ class LocalLinearModel(NeighbourModel):
     kind = 'local_linear'
     description = 'cubic trend, and planes fitted to the k nearest residuals'
     min_k = 6
-    trend_degree = 3
+    trend_degree: ClassVar[int | None] = 3
     gauge_passes = 1  # the trend reproduces the gauge
 
     @classmethod

@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.noise_estimation import LOOSE
 from ..photogrammetry.precision import information_of_additional
-from .estimation import AdjustedTerms, AdjustmentProblem
+from .estimation import AdjustedTerms, AdjustmentProblem, prior_of_additional
 from .gauge import gauge_basis
 from .series import Functions, Series, sd_over_image
 from .series_model import SeriesModel
@@ -36,7 +36,7 @@ NEIGHBOURS = 8  # of an image point, whose mean residual shows the trend
 
 
 class ParametricModel(SeriesModel):
-    """Polynomial terms of lens and image-intensifier distortion, selected by their significance."""
+    """Polynomial terms of lens and image-intensifier distortion, selected by significance."""
 
     kind = 'parametric'
     description = 'physical terms in the adjustment, selected stepwise'
@@ -118,7 +118,7 @@ class StepwiseTerms(AdjustedTerms):
         self, f: int, network: Network, matrix: FactorizedNormalMatrix, result: Adjustment
     ) -> bool:
         """Add the best term of fluoroscope f, or remove one that is not significant any more."""
-        present = network.additional[f].prior
+        present = prior_of_additional(network, f)
         information = information_of_additional(matrix, f) - present
         coefficients = result.parameters.additional[f]
         selected = self.selected[f]

@@ -1,12 +1,14 @@
-"""Trend and signal of a distortion: what is known of their coefficients before the adjustment.
+"""Prior distributions of the coefficients of a distortion's trend and signal.
 
 Least-squares collocation (Moritz, "Advanced Physical Geodesy", 1980): the signal is a random field
 with a covariance function, here of Matern's family with nu = 5/2, the same for u and v. Its
-standard deviation and reach, and for each term of the trend whether it is there at all, are
+standard deviation and correlation length, and for each term of the trend whether it exists, are
 estimated from the observations themselves by their marginal likelihood (Rasmussen and Williams,
 "Gaussian Processes for Machine Learning", 2006, 5.4; for the trend Tipping and Faul, "Fast
 marginal likelihood maximisation for sparse Bayesian models", 2003).
 """
+
+from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
@@ -15,26 +17,28 @@ from scipy.linalg import cho_factor, cho_solve, lapack, solve_triangular
 from scipy.optimize import minimize
 
 from .gauge import gauge_basis
+from .series import Functions
 from .terms import trend_transformation
 
 MATERN = 2.5
-GAUGE_SD_PX = (
-    3e-5  # to which the gauge is held; a much smaller one would damp the steps of the adjustment
-)
+# Standard deviation to which the gauge is held; a much smaller one would damp the steps of the
+# adjustment.
+GAUGE_SD_PX = 3e-5
 MIN_VARIANCE = 1e-10  # of a coefficient of the signal: an amplitude of 1e-8 px
-NOT_THERE = (
-    1e-3  # variance of a trend term that is not there, over that with which it is determined
-)
-MAX_VARIANCE = 1e8  # of a trend term that is taken to be there
-REACH_RANGE = (0.02, 1.0)  # of the longer side of the image
+# Prior variance of a trend term that does not exist, relative to that with which it is determined.
+MIN_RELATIVE_VARIANCE = 1e-3
+MAX_VARIANCE = 1e8  # of a trend term that exists
+REACH_RANGE = (0.02, 1.0)  # correlation length relative to the longer side of the image
 MIN_SD_PX = 1e-3  # of the signal
 SWEEPS = 3  # over the terms of the trend
 
 
 @dataclass(frozen=True)
 class Prior:
-    """Standard deviation sd [px] and reach [px] of the signal, and variances (t,) [px^2] of the
-    trend terms.
+    """Prior of a distortion.
+
+    sd: standard deviation of the signal [px]; reach: its correlation length [px]; trend (t,):
+    variances of the trend terms [px^2].
     """
 
     sd: float
@@ -42,30 +46,28 @@ class Prior:
     trend: np.ndarray
 
 
-def starting_prior(functions, sd):
-    """A Prior to start with, for residuals of standard deviation sd [px] without any correction."""
+def starting_prior(functions: Functions, sd: float) -> Prior:
+    """Return a prior to start with; sd: RMS residual without correction [px]."""
     _, count = trend_transformation(functions.degree)
     return Prior(0.3 * sd, 0.15 * max(functions.image_size), np.full(count, MAX_VARIANCE))
 
 
-def spectral_density(frequency, sd, reach):
+def spectral_density(frequency: np.ndarray, sd: float, reach: float) -> np.ndarray:
     """Variances (s,) of the coefficients of sines: Matern's covariance in two dimensions.
 
-    frequency (s,) [1/px], sd [px], reach [px] (Rasmussen and Williams 2006, Eq. 4.15 for D = 2).
+    frequency (s,) [1/px]; sd, reach [px] (Rasmussen and Williams 2006, Eq. 4.15 for D = 2).
     """
     a = 2 * MATERN / reach**2
     return sd**2 * 4 * np.pi * MATERN * a**MATERN * (a + frequency**2) ** -(MATERN + 1)
 
 
-def prior_precision(functions, prior):
-    """Precision matrix (2m, 2m) of the coefficients of a series under a Prior."""
+def prior_precision(functions: Functions, prior: Prior) -> np.ndarray:
+    """Precision matrix (2m, 2m) of the coefficients of a series."""
     m = len(functions)
     t = len(functions.powers)
     out = np.zeros((2 * m, 2 * m))
     if functions.modes:
-        signal = 1 / np.maximum(
-            spectral_density(functions.frequency, prior.sd, prior.reach), MIN_VARIANCE
-        )
+        signal = 1 / _signal_variance(functions, prior.sd, prior.reach)
         for axis in (0, 1):
             at = axis * m + np.arange(t, m)
             out[at, at] = signal
@@ -74,43 +76,83 @@ def prior_precision(functions, prior):
     return out
 
 
-def _trend_columns(functions):
+def _signal_variance(functions: Functions, sd: float, reach: float) -> np.ndarray:
+    """Prior variances (s,) of the coefficients of the sines."""
+    return np.maximum(spectral_density(functions.frequency, sd, reach), MIN_VARIANCE)
+
+
+def _trend_columns(functions: Functions) -> np.ndarray:
+    """Places of the coefficients of the polynomials, those of u first."""
     m = len(functions)
     t = len(functions.powers)
     return np.concatenate([np.arange(t), m + np.arange(t)])
 
 
-def _trend_precision(functions, prior):
-    """Precision matrix of the polynomials' coefficients: variances of the terms, none for what the
-    gauge holds.
-    """
+def _trend_precision(functions: Functions, prior: Prior) -> np.ndarray:
+    """Precision matrix of the coefficients of the polynomials; zero for what the gauge holds."""
     to_terms, count = trend_transformation(functions.degree)
     return to_terms[:count].T @ (to_terms[:count] / prior.trend[:, None])
 
 
-def gauge_precision(values, uv, interior, interior_held=False):
-    """Precision matrix (2m, 2m) that keeps a series with values (n, m) of its functions at pixels
-    uv (n, 2) orthogonal to the gauge there.
+def gauge_precision(
+    values: np.ndarray, uv: np.ndarray, interior: np.ndarray, interior_held: bool = False
+) -> np.ndarray:
+    """Precision matrix that keeps a series orthogonal to the gauge at image points.
+
+    Parameters
+    ----------
+    values : (n, m) ndarray
+        Functions of the series at the image points.
+    uv : (n, 2) ndarray
+        Image points [px].
+    interior : (3,) ndarray
+        xp, yp, c [px].
+    interior_held : bool
+        True where the interior orientation is not estimated.
+
+    Returns
+    -------
+    (2m, 2m) ndarray
     """
     gauge = gauge_basis(uv, interior, interior_held)
     rows = np.concatenate([gauge[:, axis].T @ values for axis in (0, 1)], axis=1) / len(uv)
     return rows.T @ rows / GAUGE_SD_PX**2
 
 
-def most_likely_prior(functions, information, right, gauge, prior):
-    """A Prior with larger marginal likelihood than that given: signal, then trend; to be repeated
-    until it stays.
+def most_likely_prior(
+    functions: Functions,
+    information: np.ndarray,
+    right: np.ndarray,
+    gauge: np.ndarray,
+    prior: Prior,
+) -> Prior:
+    """Return a prior with a larger marginal likelihood: signal first, then trend.
 
-    information (2m, 2m) and right side (2m,) of the coefficients, all other unknowns eliminated
-    and without any prior; gauge (2m, 2m) its precision matrix.
+    It is to be repeated until the prior does not change.
+
+    Parameters
+    ----------
+    functions : Functions
+    information, right : (2m, 2m) and (2m,) ndarray
+        Normal equations of the coefficients without a prior, all other unknowns eliminated.
+    gauge : (2m, 2m) ndarray
+        Precision matrix of the gauge.
+    prior : Prior
+        Present prior.
+
+    Returns
+    -------
+    Prior
     """
     if functions.modes:
         prior = _most_likely_signal(functions, information + gauge, right, prior)
     return _most_likely_trend(functions, information + gauge, right, prior)
 
 
-def _most_likely_signal(functions, information, right, prior):
-    """The Prior with sd and reach of the signal renewed."""
+def _most_likely_signal(
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+) -> Prior:
+    """Return the prior with renewed standard deviation and correlation length of the signal."""
     side = max(functions.image_size)
     at = _trend_columns(functions)
     base = information.copy(order='F')
@@ -119,15 +161,13 @@ def _most_likely_signal(functions, information, right, prior):
     t = len(functions.powers)
     signal = np.concatenate([np.arange(t, m), m + np.arange(t, m)])
 
-    def cost(log):
+    def cost(log: np.ndarray) -> float:
         sd, reach = np.exp(log)
         if not (
             REACH_RANGE[0] * side <= reach <= REACH_RANGE[1] * side and MIN_SD_PX <= sd <= side
         ):
             return np.inf
-        variance = np.tile(
-            np.maximum(spectral_density(functions.frequency, sd, reach), MIN_VARIANCE), 2
-        )
+        variance = np.tile(_signal_variance(functions, sd, reach), 2)
         matrix = base.copy(order='F')
         matrix[signal, signal] += 1 / variance
         factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=1)
@@ -152,8 +192,10 @@ def _most_likely_signal(functions, information, right, prior):
     return replace(prior, sd=float(np.exp(found.x[0])), reach=float(np.exp(found.x[1])))
 
 
-def _most_likely_trend(functions, information, right, prior):
-    """The Prior with the variances of the trend terms renewed, one after the other."""
+def _most_likely_trend(
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+) -> Prior:
+    """Return the prior with renewed variances of the trend terms, one after the other."""
     to_terms, count = trend_transformation(functions.degree)
     if not count:
         return prior
@@ -166,27 +208,30 @@ def _most_likely_trend(functions, information, right, prior):
         for j in range(count):
             precision = np.concatenate([1 / variance, np.zeros(len(to_terms) - count)])
             precision[j] = 0
-            # The term is estimated once without prior; beyond its own variance, its square is the
-            # prior's.
+            # The term is estimated without its prior; its square exceeds its own variance by that
+            # of the prior.
             c = np.linalg.solve(
                 matrix + np.diag(precision), np.stack([right, np.eye(len(right))[j]], axis=1)
             )
-            variance[j] = np.clip(c[j, 0] ** 2 - c[j, 1], NOT_THERE * c[j, 1], MAX_VARIANCE)
+            variance[j] = np.clip(
+                c[j, 0] ** 2 - c[j, 1], MIN_RELATIVE_VARIANCE * c[j, 1], MAX_VARIANCE
+            )
     return replace(prior, trend=variance)
 
 
-def _trend_alone(functions, information, right, prior):
-    """Information and right side of the polynomials' coefficients with the signal eliminated."""
+def _trend_alone(
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information and right side of the coefficients of the polynomials, the signal eliminated."""
     at = _trend_columns(functions)
     rest = np.setdiff1d(np.arange(len(right)), at)
     if not len(rest):
         return information, right
     signal = information[np.ix_(rest, rest)].copy()
     signal[np.diag_indices(len(rest))] += 1 / np.tile(
-        np.maximum(spectral_density(functions.frequency, prior.sd, prior.reach), MIN_VARIANCE), 2
+        _signal_variance(functions, prior.sd, prior.reach), 2
     )
     mixed = information[np.ix_(rest, at)]
     solved = cho_solve(cho_factor(signal, lower=True), np.column_stack([mixed, right[rest]]))
-    return information[np.ix_(at, at)] - mixed.T @ solved[:, :-1], right[at] - mixed.T @ solved[
-        :, -1
-    ]
+    reduced = information[np.ix_(at, at)] - mixed.T @ solved[:, :-1]
+    return reduced, right[at] - mixed.T @ solved[:, -1]

@@ -91,7 +91,12 @@ def model_from_arrays(content: dict[str, Any], image_size: tuple[int, int]) -> C
 
     image_size: width and height [px], which the functions of a series need. Raises ValueError.
     """
-    names = ('kind', 'k', 'train_uv', 'train_duv', 'noise_px', 'bias_px')
     return create_model(
-        *(content[name] for name in names), series_from_arrays(image_size, content)
+        content['kind'],
+        content['k'],
+        content['train_uv'],
+        content['train_duv'],
+        content['noise_px'],
+        content['bias_px'],
+        series_from_arrays(image_size, content),
     )

@@ -51,6 +51,7 @@ class KnnRegressor(KNeighborsRegressor):
         if getattr(self, '_scipy_tree', None) is None or self.n_neighbors > self.n_samples_fit_:
             return super().predict(X)
         X = validate_data(self, X, reset=False, dtype=float)
+        assert self._scipy_tree is not None
         _, index = self._scipy_tree.query(X, k=np.arange(1, self.n_neighbors + 1))
         values = self._y[:, None] if self._y.ndim == 1 else self._y
         if self.sample_weight_ is None:

@@ -7,21 +7,26 @@ image intensifiers (Gronenschild, Medical Physics 24, 1997; Lichti et al., IEEE 
 34, 2015).
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterable
 from functools import cache
+from math import comb
 
 import numpy as np
 
 HIGHEST = 7  # degree of the highest term
 
+Part = tuple[int, int, int, float]  # (axis, i, j, factor): factor x^i y^j in u (axis 0) or v (1)
 
-def _powers(degree):
+
+def _powers(degree: int) -> list[tuple[int, int]]:
+    """Exponents (i, j) of the polynomials x^i y^j."""
     return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
 
 
-def _polynomial(degree, parts):
-    """Coefficients (2, m) of a term: parts are (axis, i, j, factor) for factor x^i y^j in u (axis
-    0) or v (axis 1).
-    """
+def polynomial_coefficients(degree: int, parts: Iterable[Part]) -> np.ndarray:
+    """Coefficients (2, m) of a term as polynomials of a degree."""
     number = {power: k for k, power in enumerate(_powers(degree))}
     out = np.zeros((2, len(number)))
     for axis, i, j, factor in parts:
@@ -29,21 +34,19 @@ def _polynomial(degree, parts):
     return out
 
 
-def _radial(order):
-    """r^(2 order) (x, y)."""
-    from math import comb
-
-    parts = [(2 * k, 2 * (order - k), comb(order, k)) for k in range(order + 1)]
+def _radial(order: int) -> list[Part]:
+    """Return the term r^(2 order) (x, y)."""
+    parts = [(2 * k, 2 * (order - k), float(comb(order, k))) for k in range(order + 1)]
     return [(0, i + 1, j, f) for i, j, f in parts] + [(1, i, j + 1, f) for i, j, f in parts]
 
 
-def _spiral(order):
-    """r^(2 order) (-y, x)."""
+def _spiral(order: int) -> list[Part]:
+    """Return the term r^(2 order) (-y, x)."""
     return [(1 - axis, i, j, -f if axis else f) for axis, i, j, f in _radial(order)]
 
 
-def _plain(degree):
-    """x^i y^j of one degree, each in u and in v."""
+def _plain(degree: int) -> dict[str, list[Part]]:
+    """Return the terms x^i y^j of one degree, each in u and in v."""
     return {
         f'{axis}: x{i}y{degree - i}': [('uv'.index(axis), i, degree - i, 1.0)]
         for axis in 'uv'
@@ -51,7 +54,7 @@ def _plain(degree):
     }
 
 
-GAUGE = {
+GAUGE: dict[str, list[Part]] = {
     'shift u': [(0, 0, 0, 1.0)],
     'shift v': [(1, 0, 0, 1.0)],
     'scale': _radial(0),
@@ -59,14 +62,17 @@ GAUGE = {
     'tilt u': [(0, 2, 0, 1.0), (1, 1, 1, 1.0)],
     'tilt v': [(0, 1, 1, 1.0), (1, 0, 2, 1.0)],
 }
-AFFINE = {'affinity': [(0, 1, 0, 1.0), (1, 0, 1, -1.0)], 'shear': [(0, 0, 1, 1.0), (1, 1, 0, 1.0)]}
-DECENTRING = {
+AFFINE: dict[str, list[Part]] = {
+    'affinity': [(0, 1, 0, 1.0), (1, 0, 1, -1.0)],
+    'shear': [(0, 0, 1, 1.0), (1, 1, 0, 1.0)],
+}
+DECENTRING: dict[str, list[Part]] = {
     'decentring u': [(0, 2, 0, 3.0), (0, 0, 2, 1.0), (1, 1, 1, 2.0)],
     'decentring v': [(1, 0, 2, 3.0), (1, 2, 0, 1.0), (0, 1, 1, 2.0)],
 }
-# Of each degree the plain terms that, with gauge, decentring, radial and spiral, make it complete.
-SQUARES = {'u: x0y2': [(0, 0, 2, 1.0)], 'v: x2y0': [(1, 2, 0, 1.0)]}
-CUBES = {
+# The plain terms of a degree that complete it, with gauge, decentring, radial and spiral terms.
+SQUARES: dict[str, list[Part]] = {'u: x0y2': [(0, 0, 2, 1.0)], 'v: x2y0': [(1, 2, 0, 1.0)]}
+CUBES: dict[str, list[Part]] = {
     'S-shape u': [(0, 0, 3, 1.0)],
     'S-shape v': [(1, 3, 0, 1.0)],
     **{
@@ -75,9 +81,9 @@ CUBES = {
         if name in ('u: x3y0', 'u: x1y2', 'u: x2y1', 'v: x2y1')
     },
 }
-# The expert's 31: radial 1 to 3, spiral 1 and 2, decentring, affinity and shear, then degrees two
-# to five.
-EXPERT = {
+# The 31 terms of the expert: radial 1 to 3, spiral 1 and 2, decentring, affinity and shear, then
+# degrees two to five.
+EXPERT: dict[str, list[Part]] = {
     'radial 1': _radial(1),
     'radial 2': _radial(2),
     'radial 3': _radial(3),
@@ -96,17 +102,19 @@ EXPERT = {
 }
 
 
-def expert_terms():
-    """Names of the 31 terms and their coefficients (31, 2, m) as polynomials of degree 7."""
-    return list(EXPERT), np.stack([_polynomial(HIGHEST, parts) for parts in EXPERT.values()])
+def expert_terms() -> tuple[list[str], np.ndarray]:
+    """Names of the 31 terms, and their coefficients (31, 2, m) as polynomials of degree 7."""
+    return list(EXPERT), np.stack(
+        [polynomial_coefficients(HIGHEST, parts) for parts in EXPERT.values()]
+    )
 
 
 @cache
-def trend_transformation(degree):
-    """Matrix (2m, 2m) from coefficients of the polynomials of u, then v, to those of terms; and
-    the number of terms.
+def trend_transformation(degree: int) -> tuple[np.ndarray, int]:
+    """Matrix (2m, 2m) from coefficients of polynomials to those of terms; number of terms.
 
-    The terms that are not gauge come first. degree 3, or -1 without a trend.
+    The polynomials are those of u, then of v. The terms that are not gauge come first, and only
+    they are counted. degree: 3, or -1 without a trend.
     """
     if degree < 0:
         return np.zeros((0, 0)), 0
@@ -118,5 +126,8 @@ def trend_transformation(degree):
         **SQUARES,
         **CUBES,
     }
-    columns = [_polynomial(degree, parts).ravel() for parts in [*own.values(), *GAUGE.values()]]
+    columns = [
+        polynomial_coefficients(degree, parts).ravel()
+        for parts in [*own.values(), *GAUGE.values()]
+    ]
     return np.linalg.inv(np.stack(columns, axis=1)), len(own)

@@ -1,10 +1,10 @@
 """A user's own scikit-learn regressor as correction model.
 
-Any regressor with `fit(X, y)` and `predict(X)` can be calibrated with: it is fitted to the residuals
-of the inliers between adjustments, as the other models of `alternation`. X (n, 2) are image
-coordinates relative to the centre of the image in units of half its longer side, so from -1 to 1;
-y (n, 2) is (du, dv) [px]. A regressor of one output is fitted to each of them. What is saved is
-the fitted correction on a grid, the model `lookup`.
+Any regressor with `fit(X, y)` and `predict(X)` will do: it is fitted to the residuals of the
+inliers between adjustments, as other models are. X (n, 2) are image coordinates relative to the
+centre of the image in units of half its longer side, so from -1 to 1; y (n, 2) is (du, dv) [px]. A
+regressor of one output is fitted to each of them. What is saved is the fitted correction on a
+grid, the model `lookup`.
 """
 
 from __future__ import annotations

@@ -1,0 +1,71 @@
+"""Networks whose interior orientations and corrections are held at their calibrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ..exposures.phantom import Phantom
+from ..photogrammetry.network import Network
+from ..photogrammetry.noise import Noise
+from .initial_network import Frames, KnownSensor, Measured, network_of_known_sensors
+from .result import FluoroscopeCalibration
+from .robust_adjustment import start_noise
+
+# Mean number of image points of a target from which the noise can be estimated: with fewer the
+# noise cannot be told from errors of the survey.
+MIN_RAYS_FOR_NOISE = 3
+
+
+def network_of_calibrations(
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Measured:
+    """Return network and start values of frames {fluoroscope: [Frame, ...]}.
+
+    calibrations {fluoroscope: FluoroscopeCalibration} are held. Raises DataError as
+    `measured_network`.
+    """
+    sensors = {
+        name: KnownSensor(calibrations[name].interior, calibrations[name].model.predict)
+        for name in frames
+    }
+    return network_of_known_sensors(frames, phantom, sensors, raise_if_cancelled)
+
+
+def held_corrections(
+    measured: Measured, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> tuple[np.ndarray, Network]:
+    """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in sigma.
+
+    Where a correction is uncertain, at the rim and beyond the calibrated area, an image point has
+    less weight.
+    """
+    network = measured.network
+    correction = np.zeros_like(network.uv)
+    sigma = network.sigma.copy()
+    for f, name in enumerate(measured.fluoroscopes):
+        rows = network.rows(f)
+        found = calibrations[name].model.evaluate(network.uv[rows])
+        correction[rows] = found.duv
+        sigma[rows] = np.hypot(sigma[rows], found.sd / calibrations[name].sigma0)
+    return correction, replace(network, sigma=sigma)
+
+
+def noise_of_calibrations(loss: str, calibrations: Iterable[FluoroscopeCalibration]) -> Noise:
+    """Return the noise model of calibrations: medians of their scales and degrees of freedom."""
+    used = list(calibrations)
+    return replace(
+        start_noise(loss),
+        scale=float(np.median([c.sigma0 for c in used])),
+        nu=float(np.median([c.nu for c in used])),
+    )
+
+
+def too_few_rays_for_noise(network: Network) -> bool:
+    """Whether the noise of a network cannot be estimated and is that of the calibrations."""
+    return len(network.uv) < MIN_RAYS_FOR_NOISE * len(network.survey_mm)

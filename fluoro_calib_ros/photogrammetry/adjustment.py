@@ -165,7 +165,7 @@ class _Problem:
         # The robustly weighted normal matrix is larger than the Fisher information. With heavy
         # tails, stretched steps converge in a third of the iterations.
         stretch = 1 / self.noise.information_factor(iterate.q)
-        step = self.elimination.by_kind(stretch * x_blocks, stretch * x_rest)
+        step = self.elimination.to_unknowns(stretch * x_blocks, stretch * x_rest)
         return iterate.parameters.updated(self.network, step), predicted
 
 

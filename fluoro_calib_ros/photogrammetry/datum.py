@@ -22,7 +22,7 @@ from .rotations import cross_matrix
 
 if TYPE_CHECKING:
     from .network import Network
-    from .unknowns import ByKind, Parameters
+    from .unknowns import Parameters, UnknownVector
 
 DATUMS = ('survey', 'inner')
 DATUM_DEFECT = 7  # shift, turn and scale
@@ -122,7 +122,7 @@ class STransformation:
     E (B^T E)^-1 and of C B, from `exteriors`, `points` or `globals`.
     """
 
-    def __init__(self, gauge: Gauge, covariance_times_b: ByKind) -> None:
+    def __init__(self, gauge: Gauge, covariance_times_b: UnknownVector) -> None:
         inverse = np.linalg.inv(np.einsum('nia,nib->ab', gauge.constraint, gauge.points))
         self.exteriors = (gauge.exteriors @ inverse, covariance_times_b.exteriors)
         self.points = (gauge.points @ inverse, covariance_times_b.points)

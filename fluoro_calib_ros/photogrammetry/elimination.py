@@ -19,7 +19,7 @@ from scipy.linalg import blas, cho_factor, cho_solve
 from .datum import Gauge, stabilising_factor
 from .network import Network
 from .normal_equations import NormalEquations
-from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ByKind, ReducedLayout
+from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ReducedLayout, UnknownVector
 
 
 @dataclass(frozen=True)
@@ -193,7 +193,7 @@ class Elimination(ABC):
         """
 
     @abstractmethod
-    def by_kind(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> ByKind:
+    def to_unknowns(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> UnknownVector:
         """Values (k, s, ...) of the eliminated and (q, ...) of the remaining unknowns, by kind."""
 
     @abstractmethod
@@ -282,10 +282,10 @@ class EliminatePoints(Elimination):
         rest_right = np.concatenate([equations.e.ravel(), equations.g[free]])
         return BorderedSystem(equations.pp, border, rest, equations.p, rest_right)
 
-    def by_kind(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> ByKind:
+    def to_unknowns(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> UnknownVector:
         """Values of object points (n, 3, ...) and of the remaining unknowns (q, ...), by kind."""
         exteriors = x_rest[self.layout.blocks].reshape(-1, EXTERIOR_SIZE, *x_rest.shape[1:])
-        return ByKind(exteriors, x_blocks, self._globals_of(x_rest))
+        return UnknownVector(exteriors, x_blocks, self._globals_of(x_rest))
 
     def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The values themselves, and zeros for the remaining unknowns."""
@@ -374,10 +374,10 @@ class EliminateExposures(Elimination):
         border[self.cell, self.place, :, self.layout.globals] = equations.eg[:, :, free]
         return border.reshape(self.n_cells, EXTERIOR_SIZE * self.n_places, -1)
 
-    def by_kind(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> ByKind:
+    def to_unknowns(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> UnknownVector:
         """Values of the cells (k, s, ...) and of the remaining unknowns (q, ...), by kind."""
         points = x_rest[self.layout.blocks].reshape(-1, POINT_SIZE, *x_rest.shape[1:])
-        return ByKind(self._of_exposures(x_blocks), points, self._globals_of(x_rest))
+        return UnknownVector(self._of_exposures(x_blocks), points, self._globals_of(x_rest))
 
     def right_side_of_points(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Zeros for the cells, and the values in the rows of the object points."""

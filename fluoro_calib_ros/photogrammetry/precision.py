@@ -18,7 +18,7 @@ from .network import Network
 from .noise import Noise
 from .normal_equations import normal_equations
 from .relative_orientation import discrepancies_with_jacobian
-from .unknowns import ByKind, Parameters
+from .unknowns import Parameters, UnknownVector
 
 # Smallest weight of a gross error, so that its variance stays finite.
 MIN_WEIGHT = 1e-9
@@ -102,11 +102,11 @@ def _in_datum(
     )
 
 
-def _covariance_times_points(matrix: FactorizedNormalMatrix, values: np.ndarray) -> ByKind:
+def _covariance_times_points(matrix: FactorizedNormalMatrix, values: np.ndarray) -> UnknownVector:
     """Products of the inverse normal matrix with columns of values (n, 3, d) of the points."""
     elimination = matrix.elimination
     solution = matrix.factor.solve(*elimination.right_side_of_points(values))
-    return elimination.by_kind(*solution)
+    return elimination.to_unknowns(*solution)
 
 
 def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> np.ndarray:

@@ -19,7 +19,7 @@ from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
 
 if TYPE_CHECKING:
     from .network import Network
-    from .unknowns import ByKind, Parameters
+    from .unknowns import Parameters, UnknownVector
 
 POSE_SIZE = 6  # translation [mm], rotation vector [rad]
 # Standard deviations that stand for a rigid mounting: a thousandth of what one pair of exposures
@@ -217,7 +217,7 @@ def exposures_from_pose(
 
 
 def exposures_after_step(
-    network: Network, before: Parameters, after: Parameters, step: ByKind
+    network: Network, before: Parameters, after: Parameters, step: UnknownVector
 ) -> Parameters:
     """Parameters after a step, with b's exposures moved along their constraints.
 

@@ -162,8 +162,8 @@ class UnknownLayout:
 
 
 @dataclass(frozen=True)
-class ByKind:
-    """One value, or one row of values, per scalar unknown, sorted by kind.
+class UnknownVector:
+    """A vector, or columns of vectors, over the unknowns of a network, split by kind.
 
     Attributes
     ----------
@@ -219,7 +219,7 @@ class Parameters:
             self.interior[network.fluoroscope[exposure]],
         )
 
-    def updated(self, network: Network, step: ByKind) -> Parameters:
+    def updated(self, network: Network, step: UnknownVector) -> Parameters:
         """Parameters after a step; rotations are varied on the left, R -> exp([w]x) R.
 
         The second exposures of constrained pairs follow their constraint (see

@@ -1,43 +1,72 @@
-"""How often the verdict on a calibration is right: false alarms on good rigs, and faults of a
-given size found.
+"""Error rates of the verdict on a calibration: false alarms, and detected faults of a given size.
 
-Every case draws virtual rigs with one fluoroscope, calibrates it and validates the calibration.
-The rows are kept in a file, so that a run that was stopped goes on where it ended. Prints the
-tables of docs/verdict.md.
+Every case simulates rigs with one fluoroscope, calibrates it and validates the calibration. The
+results are kept in a file, so that an interrupted run continues where it stopped. Prints the table
+of docs/verdict.md.
 """
+
+from __future__ import annotations
 
 import argparse
 import json
 import sys
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.report.tables import markdown_table
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.validation.verdict import validate
 
-FIRST_SEED = 5018  # rigs from which no limit was set
-RIPPLE_PX = 80.0  # width of the local ripple that comes in the middle of the exposures
-# case: what is wrong, its size, exposures, model (None: the one asked for); how many rigs of it
-# are drawn
+FIRST_SEED = 5018  # rigs that were not used to set a limit
+RIPPLE_PX = 80.0  # width of the local ripple that appears in the middle of the exposures
+PX_PER_MM = 2.67  # in the image, of a displacement of the phantom
+MAX_PX = 1023  # largest image coordinate
+
+
+@dataclass(frozen=True)
+class Case:
+    """A fault, its size, and the rigs that have it.
+
+    Attributes
+    ----------
+    fault : {'', 'drift', 'bead', 'survey', 'blur'}
+    size : float
+        In the unit of the fault: px, mm, times the sd, mm.
+    exposures : int
+    model : str
+        Correction model; '' for the one that the user selects.
+    rigs : int
+        Number of rigs.
+    """
+
+    fault: str = ''
+    size: float = 0.0
+    exposures: int = 15
+    model: str = ''
+    rigs: int = 3
+
+
 CASES = {
-    'good, 15 exposures': (None, 0, 15, None, 30),
-    'good, 8 exposures': (None, 0, 8, None, 6),
-    'good, 25 exposures': (None, 0, 25, None, 2),
-    'no correction model': (None, 0, 15, 'none', 3),
-    'ripple of 1 px from the middle on': ('drift', 1.0, 15, None, 3),
-    'ripple of 0.5 px from the middle on': ('drift', 0.5, 15, None, 3),
-    'bead 3 mm off its survey': ('bead', 3.0, 15, None, 3),
-    'bead 1 mm off its survey': ('bead', 1.0, 15, None, 3),
-    'survey twice as bad as its sd': ('survey', 2.0, 15, None, 3),
-    'phantom moved 1 mm in an exposure': ('blur', 1.0, 15, None, 3),
+    'good, 15 exposures': Case(rigs=30),
+    'good, 8 exposures': Case(exposures=8, rigs=6),
+    'good, 25 exposures': Case(exposures=25, rigs=2),
+    'no correction model': Case(model='none'),
+    'ripple of 1 px from the middle on': Case('drift', 1.0),
+    'ripple of 0.5 px from the middle on': Case('drift', 0.5),
+    'bead 3 mm off its survey': Case('bead', 3.0),
+    'bead 1 mm off its survey': Case('bead', 1.0),
+    'survey twice as bad as its sd': Case('survey', 2.0),
+    'phantom moved 1 mm in an exposure': Case('blur', 1.0),
 }
 CHECKS = (
     'halves',
@@ -51,56 +80,53 @@ CHECKS = (
 )
 
 
-def scene(seed, fault, size, exposures):
-    """Frames of a fluoroscope and its phantom, with a fault of a size."""
+def simulate(seed: int, case: Case) -> tuple[list[Frame], Phantom]:
+    """Return the frames of a fluoroscope and the survey of its phantom, with the fault."""
     rig = virtual_rig(seed, names=('a',))
-    frames = simulate_exposures(rig, exposures, seed).frames['a']
+    frames = list(simulate_exposures(rig, case.exposures, seed).frames['a'])
     phantom = rig.phantom
     rng = np.random.default_rng([seed, 4])
-    if fault == 'drift':
-        frames = with_ripple(frames, size, rng.uniform(350, 650, 2))
-    elif fault == 'bead':
+    if case.fault == 'drift':
+        frames = with_ripple(frames, case.size, rng.uniform(350, 650, 2))
+    elif case.fault == 'bead':
         xyz = phantom.xyz_mm.copy()
         counts = np.bincount(np.concatenate([f.target_id for f in frames]), minlength=504)
         direction = rng.normal(size=3)
-        xyz[rng.choice(np.flatnonzero(counts[1:] >= 5))] += (
-            size * direction / np.linalg.norm(direction)
-        )
+        offset = case.size * direction / np.linalg.norm(direction)
+        xyz[rng.choice(np.flatnonzero(counts[1:] >= 5))] += offset
         phantom = Phantom(phantom.target_id, xyz, phantom.sd_mm)
-    elif fault == 'survey':
-        phantom = Phantom(
-            phantom.target_id, rig.true_mm + size * (phantom.xyz_mm - rig.true_mm), phantom.sd_mm
-        )
-    elif fault == 'blur':  # half of the targets of an exposure were found before it moved
-        number = int(rng.integers(exposures))
+    elif case.fault == 'survey':
+        xyz = rig.true_mm + case.size * (phantom.xyz_mm - rig.true_mm)
+        phantom = Phantom(phantom.target_id, xyz, phantom.sd_mm)
+    elif case.fault == 'blur':
+        # The phantom moved during an exposure: half of its targets are displaced.
+        number = int(rng.integers(case.exposures))
         uv = frames[number].uv.copy()
-        uv[rng.random(len(uv)) < 0.5] += size * 2.67 * np.array([0.8, 0.6])
-        frames = [
-            replace(f, uv=np.clip(uv, 0, 1023)) if i == number else f for i, f in enumerate(frames)
-        ]
+        uv[rng.random(len(uv)) < 0.5] += case.size * PX_PER_MM * np.array([0.8, 0.6])
+        frames[number] = replace(frames[number], uv=np.clip(uv, 0, MAX_PX))
     return frames, phantom
 
 
-def with_ripple(frames, height, middle):
-    """Frames whose later half has a further local ripple [px]."""
+def with_ripple(frames: Sequence[Frame], height: float, centre: np.ndarray) -> list[Frame]:
+    """Add a local ripple of a height [px] to the later half of the frames."""
     out = []
     for i, frame in enumerate(frames):
-        bump = np.exp(-np.sum((frame.uv - middle) ** 2, axis=1) / (2 * RIPPLE_PX**2))
+        bump = np.exp(-np.sum((frame.uv - centre) ** 2, axis=1) / (2 * RIPPLE_PX**2))
         shift = height * bump[:, None] * np.array([0.8, 0.6]) * (i >= len(frames) // 2)
-        out.append(replace(frame, uv=np.clip(frame.uv + shift, 0, 1023)))
+        out.append(replace(frame, uv=np.clip(frame.uv + shift, 0, MAX_PX)))
     return out
 
 
-def measured(case, seed, model):
-    """Row of a rig: verdict and, by check, value, limit and whether it passed."""
-    fault, size, exposures, other, _ = CASES[case]
-    frames, phantom = scene(seed, fault, size, exposures)
-    options = CalibrationOptions(model=other or model)
+def measure(name: str, seed: int, model: str) -> dict[str, Any]:
+    """Return the verdict on a rig, and value, limit and result of every check."""
+    case = CASES[name]
+    frames, phantom = simulate(seed, case)
+    options = CalibrationOptions(model=case.model or model)
     request = CalibrationRequest({'a': frames}, phantom, options)
     calibrations = calibrate({'a': frames}, phantom, options).calibrations
     found = validate(request, calibrations)
     return {
-        'case': case,
+        'case': name,
         'seed': seed,
         'model': model,
         'kind': calibrations['a'].model.kind,
@@ -110,18 +136,31 @@ def measured(case, seed, model):
     }
 
 
-def table(rows):
-    """Markdown table: a line for each case, how many rigs failed, and by which checks."""
+def table(rows: Sequence[Mapping[str, Any]]) -> str:
+    """Return a Markdown table: how many rigs of each case failed, and by which checks."""
     lines = []
-    for case in CASES:
-        mine = [row for row in rows if row['case'] == case]
-        if mine:
-            failed = [sum(row['checks'][name][2] is False for row in mine) for name in CHECKS]
-            lines.append([case, len(mine), sum(row['verdict'] == 'fail' for row in mine), *failed])
+    for name in CASES:
+        of_case = [row for row in rows if row['case'] == name]
+        if of_case:
+            failed = [sum(row['checks'][c][2] is False for row in of_case) for c in CHECKS]
+            verdicts = sum(row['verdict'] == 'fail' for row in of_case)
+            lines.append([name, len(of_case), verdicts, *failed])
     return markdown_table(['case', 'rigs', 'fail', *CHECKS], lines)
 
 
-def main():
+def rigs_to_measure(prefix: str, done: Iterable[tuple[str, int]]) -> list[tuple[str, int]]:
+    """Return case and seed of the rigs of the cases with a prefix that are not done."""
+    finished = set(done)
+    rigs = [
+        (name, FIRST_SEED + i)
+        for name, case in CASES.items()
+        if name.startswith(prefix)
+        for i in range(case.rigs)
+    ]
+    return [rig for rig in rigs if rig not in finished]
+
+
+def main() -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument(
@@ -133,33 +172,21 @@ def main():
         '--rows',
         type=Path,
         default=Path('verdict.jsonl'),
-        help='file of the rows (default: %(default)s)',
+        help='file of the results (default: %(default)s)',
     )
-    parser.add_argument('--cases', help='cases that begin so (default: all)', default='')
+    parser.add_argument('--cases', help='prefix of the cases (default: all)', default='')
     options = parser.parse_args()
-    rows = (
-        [json.loads(line) for line in options.rows.read_text().splitlines()]
-        if options.rows.exists()
-        else []
-    )
-    done = {(row['case'], row['seed']) for row in rows if row['model'] == options.model}
+    rows = []
+    if options.rows.exists():
+        rows = [json.loads(line) for line in options.rows.read_text().splitlines()]
     rows = [row for row in rows if row['model'] == options.model]
-    for case, (*_, count) in CASES.items():
-        for seed in (
-            range(FIRST_SEED, FIRST_SEED + count) if case.startswith(options.cases) else ()
-        ):
-            if (case, seed) not in done:
-                rows.append(measured(case, seed, options.model))
-                with open(options.rows, 'a', encoding='utf-8') as file:
-                    file.write(json.dumps(rows[-1]) + '\n')
-                print(
-                    case,
-                    seed,
-                    rows[-1]['verdict'],
-                    *rows[-1]['findings'],
-                    sep=' | ',
-                    file=sys.stderr,
-                )
+    done = [(row['case'], row['seed']) for row in rows]
+    for name, seed in rigs_to_measure(options.cases, done):
+        row = measure(name, seed, options.model)
+        rows.append(row)
+        with open(options.rows, 'a', encoding='utf-8') as file:
+            file.write(json.dumps(row) + '\n')
+        print(name, seed, row['verdict'], *row['findings'], sep=' | ', file=sys.stderr)
     print(table(rows))
 
 

@@ -343,7 +343,7 @@ def test_adjust_holds_the_calibration(rig, result, tmp_path):
 
 
 def test_correct_removes_the_distortion(rig, result, tmp_path, capsys):
-    """u_corrected = u - du at the observed pixel, row by row, with all other columns as they were."""
+    """u_corrected = u - du at the observed pixel, row by row; all other columns are kept."""
     out = tmp_path / 'corrected.csv'
     assert run('correct', rig / 'test.csv', '--calibration', result, '--out', out, '--json') == 0
     told = json.loads(capsys.readouterr().out)
@@ -493,7 +493,7 @@ def test_unknown_fluoroscope_is_reported(rig, tmp_path, capsys):
 
 def test_too_few_exposures_are_reported(rig, tmp_path, capsys):
     lines = (rig / 'calibration.csv').read_text().splitlines()
-    few = [line for line in lines if not line[0] == 'a' or line.split(',')[1] in ('1', '2')]
+    few = [line for line in lines if line[0] != 'a' or line.split(',')[1] in ('1', '2')]
     (tmp_path / 'few.csv').write_text('\n'.join(few) + '\n')
     sentence = said(capsys, calibrate(rig, tmp_path / 'x', *IMAGE, source=tmp_path / 'few.csv'))
     assert 'fluoroscope a: 2 exposures are too few, 3 are needed' in sentence

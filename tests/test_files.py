@@ -1,9 +1,10 @@
-"""Files: what is written is read again to the last bit, and every fault is told in one sentence."""
+"""Files: round trips are exact, and every fault is reported in one sentence."""
 
 import json
 import os
 import time
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -356,14 +357,12 @@ def test_calibration_round_trip_is_exact(tmp_path, calibration):
 
 
 def test_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
-    first = open(save_calibration(tmp_path / '1', some_calibration()), 'rb').read()
+    first = Path(save_calibration(tmp_path / '1', some_calibration())).read_bytes()
     monkeypatch.setattr(time, 'time', lambda: 2_000_000_000.0)
     monkeypatch.setattr(time, 'localtime', lambda *_: time.gmtime(2_000_000_000))
-    second = open(save_calibration(tmp_path / '2', some_calibration(seconds=99.0)), 'rb').read()
-    third = open(
-        save_calibration(tmp_path / '3', load_calibration(tmp_path / '1' / 'a.calibration.npz')),
-        'rb',
-    ).read()
+    second = Path(save_calibration(tmp_path / '2', some_calibration(seconds=99.0))).read_bytes()
+    again = load_calibration(tmp_path / '1' / 'a.calibration.npz')
+    third = Path(save_calibration(tmp_path / '3', again)).read_bytes()
     assert first == second == third
 
 
@@ -371,9 +370,8 @@ def test_numpy_reads_the_file_without_pickle_and_every_array_is_documented(tmp_p
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
         assert file.files == ['format_version', *ARRAYS]
         assert file['format_version'] == 2
-        document = open(
-            os.path.join(os.path.dirname(__file__), '..', 'docs', 'calibration_file.md')
-        ).read()
+        docs = Path(__file__).parent.parent / 'docs'
+        document = (docs / 'calibration_file.md').read_text()
         for name in file.files:
             dtype = 'text' if file[name].dtype.kind == 'U' else file[name].dtype.name
             assert f'| `{name}` | {dtype} |' in document
@@ -431,7 +429,7 @@ def test_invalid_calibration_is_refused(tmp_path, arrays, sentence):
 
 def test_truncated_or_damaged_calibration_is_refused(tmp_path):
     path = save_calibration(tmp_path, some_calibration())
-    content = open(path, 'rb').read()
+    content = Path(path).read_bytes()
     good = load_calibration(path)
     for length in (1, 10, 200, len(content) // 2, len(content) - 100, len(content) - 1):
         assert path in message_of(

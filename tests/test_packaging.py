@@ -99,7 +99,7 @@ def test_every_message_field_is_documented(path):
 
 
 def test_messages_without_ros():
-    """The bag writer reads the message definitions from inside the package, where ROS need not be."""
+    """The bag writer reads the message definitions from the package, without ROS."""
     folder = ROOT / 'fluoro_calib_ros' / 'bags' / 'msg'
     assert sorted(path.name for path in folder.glob('*.msg')) == sorted(
         path.name for path in INTERFACES if path.suffix == '.msg'
@@ -107,7 +107,7 @@ def test_messages_without_ros():
 
 
 def test_lock_is_exact():
-    """The lock file pins every package to one version, and has every package of requirements.in."""
+    """The lock file pins every package to one version, and contains all of requirements.in."""
     pins = [
         line
         for line in (ROOT / 'requirements.lock').read_text().splitlines()

@@ -1,10 +1,9 @@
-"""The drift watch, end to end on virtual rigs: false alarms against the stated rate, delays, what
-is told of a drift.
+"""The drift watch, end to end on virtual rigs: false alarms, delays and reported drifts.
 
-A rig is calibrated with 15 exposures, its orientation taken from the same; then 30 markers in five
-rigid clusters move through it, are corrected, checked by their epipolar residuals and intersected
-as in the stream. The motions repeat, the noise does not. Frames are handed over block by block,
-which is the same for the watch and faster than real time.
+A rig is calibrated with 15 exposures, from which its orientation is taken, too. Then 30 markers in
+five rigid clusters move through it. They are corrected, checked by their epipolar residuals and
+intersected as in the stream. The motions repeat, the noise does not. Frames are handed over block
+by block, which makes no difference to the watch and is faster than real time.
 """
 
 import argparse
@@ -60,8 +59,9 @@ AFTER_S = 20.0  # after which it is given up
 
 @dataclass(frozen=True)
 class Scene:
-    """A calibrated rig and its markers: observed pixels without noise by fluoroscope (frames,
-    markers, 2).
+    """A calibrated rig and its markers.
+
+    pixels: observed pixels (frames, markers, 2) without noise, by fluoroscope.
     """
 
     names: tuple
@@ -89,8 +89,9 @@ class Scene:
 
 
 def markers(rng, beads, seconds):
-    """Positions (frames, 30, 3) [mm] of rigid clusters, beads (5, 6, 3) [mm], on the bones of a
-    joint that bends, straightens and sways.
+    """Positions (frames, 30, 3) [mm] of rigid clusters on the bones of a moving joint.
+
+    beads (5, 6, 3): shapes of the clusters [mm].
     """
     places = np.array(
         [[-8, 0, 85], [12, 10, 40], [0, -5, 0], [-10, -8, -35], [10, 5, -80]], dtype=float
@@ -119,8 +120,9 @@ def markers(rng, beads, seconds):
 
 
 def scene(seed, source='exposures'):
-    """The Scene of a rig; source of its orientation: 'exposures' of the calibration, or a
-    'capture' of the phantom.
+    """Scene of a rig.
+
+    Its orientation comes from the 'exposures' of the calibration, or a 'capture' of the phantom.
     """
     rig = virtual_rig(seed)
     exposures = simulate_exposures(rig, 15, seed).frames
@@ -148,18 +150,17 @@ def scene(seed, source='exposures'):
 
 
 def false_matches(rng, uv):
-    """Pixels with FALSE_MATCHES of them some pixels away, where another bead may have been."""
+    """Pixels, a fraction FALSE_MATCHES of them displaced as by another bead."""
     wrong = rng.random(uv.shape[:2]) < FALSE_MATCHES
     uv[wrong] += rng.uniform(-12, 12, (int(wrong.sum()), 2))
     return uv
 
 
 def blocks(scene_, rng, first, count, drift=None):
-    """Blocks of the stream: pixels by fluoroscope (FRAMES, markers, 2), corrected points, their
-    systematic sd, stamps.
+    """Blocks of the stream: pixels, corrected points, their systematic sd, and stamps.
 
-    first: number of the block to begin with; drift(name, uv, t): shift (k, 2) [px] of observed
-    pixels (k, 2) at t [s].
+    first: number of the block to begin with; drift(name, uv, time_s): shift (k, 2) [px] of
+    observed pixels (k, 2) at a time [s].
     """
     total = next(iter(scene_.pixels.values())).shape[0] // FRAMES
     for number in range(first, first + count):
@@ -175,7 +176,7 @@ def blocks(scene_, rng, first, count, drift=None):
                     uv.shape
                 )
             found = scene_.calibrations[name].correct(uv.reshape(-1, 2), np.zeros(uv[..., 0].size))
-            # What lies beyond the calibrated area is not looked at, as by watch_exposure.
+            # Points beyond the calibrated area are omitted, as by watch_exposure.
             inside = np.where(found.status[:, None] == CorrectionStatus.OUTSIDE, np.nan, found.uv)
             seen[name] = uv.reshape(-1, 2)
             corrected[name] = inside
@@ -230,29 +231,55 @@ def feed(scene_, watch, block, clusters=True):
     return state
 
 
-def step_of(fluoroscope, quarter, size, direction, begin, ramp_s=0.0):
-    """A drift for `blocks`: size [px] in a direction [deg] over a quarter of an image from begin
-    [s] on, after ramp_s at its full size.
+@dataclass(frozen=True)
+class Drift:
+    """A drift of a quarter of an image, or of the whole image.
+
+    Attributes
+    ----------
+    fluoroscope : str
+    quarter : str
+        A key of QUARTERS, or WHOLE.
+    size : float
+        [px]
+    direction : float
+        Of the shift in the image [deg].
+    ramp_s : float
+        Time after which it has its size.
     """
-    vector = size * np.array([np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))])
-    column, row = QUARTERS.get(quarter, (None, None))
 
-    def drift(name, uv, t):
-        if name != fluoroscope or t < begin:
+    fluoroscope: str
+    quarter: str
+    size: float
+    direction: float
+    ramp_s: float = 0.0
+
+    @property
+    def vector(self):
+        """Shift (2,) at full size [px]."""
+        angle = np.deg2rad(self.direction)
+        return self.size * np.array([np.cos(angle), np.sin(angle)])
+
+    def fraction(self, time_s):
+        """Fraction of its size at a time after its begin [s]."""
+        return min(1.0, time_s / self.ramp_s) if self.ramp_s else 1.0
+
+    def shift(self, name, uv, time_s):
+        """Shift (k, 2) [px] of observed pixels (k, 2) at a time after its begin [s]."""
+        if name != self.fluoroscope or time_s < 0:
             return np.zeros_like(uv)
-        inside = (
-            np.ones(len(uv), dtype=bool)
-            if column is None
-            else (((uv[:, 0] >= SIZE / 2) == column) & ((uv[:, 1] >= SIZE / 2) == row))
-        )
-        return inside[:, None] * vector * (min(1.0, (t - begin) / ramp_s) if ramp_s else 1.0)
-
-    return drift
+        inside = np.ones(len(uv), dtype=bool)
+        if self.quarter != WHOLE:
+            column, row = QUARTERS[self.quarter]
+            inside = ((uv[:, 0] >= SIZE / 2) == column) & ((uv[:, 1] >= SIZE / 2) == row)
+        return inside[:, None] * self.vector * self.fraction(time_s)
 
 
 def false_alarms(seed, hours=0.5, source='exposures', options=None, clusters=True):
-    """Alarms of a stream without drift: dict of hours, the number of WARNs and ERRORs that began,
-    the largest evidence over the threshold of WARN, and the sentences of the alarms.
+    """Alarms of a stream without drift.
+
+    Returns hours, the number of WARNs and ERRORs that began, the largest evidence over the
+    threshold of WARN, and the messages of the alarms.
     """
     scene_ = scene(seed, source)
     watch = scene_.watch(options, clusters)
@@ -260,12 +287,12 @@ def false_alarms(seed, hours=0.5, source='exposures', options=None, clusters=Tru
     count = [0, 0, 0]
     level = OK
     largest = 0.0
-    said = []
+    messages = []
     for block in blocks(scene_, rng, 0, round(hours * 3600 * RATE_HZ / FRAMES)):
         state = feed(scene_, watch, block, clusters)
         largest = max(largest, state.evidence / state.threshold_warn)
         if state.level > level:
-            said.append(state.message)
+            messages.append(state.message)
             for passed in range(level + 1, state.level + 1):
                 count[passed] += 1
         level = state.level
@@ -276,7 +303,7 @@ def false_alarms(seed, hours=0.5, source='exposures', options=None, clusters=Tru
         'warn': count[WARN],
         'error': count[ERROR],
         'largest': largest,
-        'said': said,
+        'messages': messages,
     }
 
 
@@ -292,71 +319,70 @@ def right_place(state, quarter):
     )
 
 
-def detection(
-    scene_,
-    watch,
-    first,
-    fluoroscope,
-    quarter,
-    size,
-    direction,
-    rng,
-    clusters=True,
-    ramp_s=0.0,
-    after_s=AFTER_S,
-):
-    """One drift from block first on: delays of WARN and ERROR [s] (inf: not found), and what was
-    told of it.
+def detection(scene_, watch, first, drift, rng, clusters=True, after_s=AFTER_S):
+    """Result of one drift: delays of WARN and ERROR [s] (inf: not found), and what is reported.
+
+    Parameters
+    ----------
+    scene_ : Scene
+    watch : DriftWatch
+    first : int
+        Number of the block in which the drift begins.
+    drift : Drift
+    rng : numpy.random.Generator
+    clusters : bool
+        Whether the watch is given points in space.
+    after_s : float
+        Time after which the drift counts as not found.
     """
-    begin = first * FRAMES / RATE_HZ
-    drift = step_of(fluoroscope, quarter, size, direction, begin, ramp_s)
+    begin_s = first * FRAMES / RATE_HZ
     out = {
-        'fluoroscope': fluoroscope,
-        'quarter': quarter,
-        'size': size,
-        'direction': direction,
+        'fluoroscope': drift.fluoroscope,
+        'quarter': drift.quarter,
+        'size': drift.size,
+        'direction': drift.direction,
         'warn': np.inf,
         'error': np.inf,
         'message': '',
     }
-    for number, block in enumerate(
-        blocks(scene_, rng, first, round(after_s * RATE_HZ / FRAMES), drift)
-    ):
+
+    def shift(name, uv, time_s):
+        return drift.shift(name, uv, time_s - begin_s)
+
+    stream = blocks(scene_, rng, first, round(after_s * RATE_HZ / FRAMES), shift)
+    for number, block in enumerate(stream):
         state = feed(scene_, watch, block, clusters)
-        # A block is judged when the next one begins: that is the time of the alarm.
+        # A block is tested when the next one begins: that is the time of the alarm.
         delay = number * FRAMES / RATE_HZ
         if state.level >= WARN:
             out['warn'] = min(out['warn'], delay)
         if state.level == ERROR:
             out['error'] = min(out['error'], delay)
-            if (
-                delay >= min(WITHIN_S, after_s - 1) or ramp_s
-            ):  # what is told is judged then, or when it is found later
-                vector = size * np.array(
-                    [np.cos(np.deg2rad(direction)), np.sin(np.deg2rad(direction))]
-                )
-                along = float(vector @ state.direction) * (
-                    min(1.0, delay / ramp_s) if ramp_s else 1.0
-                )
-                if ' or ' in state.fluoroscope:  # down in one is up in the other
-                    along = abs(along)
-                out.update(
-                    message=state.message,
-                    named=state.fluoroscope,
-                    place=right_place(state, quarter),
-                    source=state.source,
-                    sd=state.sd,
-                    since=state.since_s - delay,
-                    size_error=state.size - along,
-                )
+            # The report counts at this time, or later if the drift is found later.
+            if delay >= min(WITHIN_S, after_s - 1) or drift.ramp_s:
+                out.update(_reported(state, drift, delay))
                 break
     return out
 
 
+def _reported(state, drift, delay):
+    """What the state of an alarm says of a drift, delay [s] after its begin."""
+    along = float(drift.vector @ state.direction) * drift.fraction(delay)
+    if ' or ' in state.fluoroscope:  # down in one is up in the other
+        along = abs(along)
+    return {
+        'message': state.message,
+        'named': state.fluoroscope,
+        'place': right_place(state, drift.quarter),
+        'source': state.source,
+        'sd': state.sd,
+        'since': state.since_s - delay,
+        'size_error': state.size - along,
+    }
+
+
 def started(seed, clusters=True, source='exposures'):
-    """Scene, its watch after the start, the generator and the number of blocks that the start
-    took.
-    """
+    """Scene, its watch after the start, the generator, and the number of blocks of the start."""
     scene_ = scene(seed, source)
     watch = scene_.watch(clusters=clusters)
     rng = np.random.default_rng([seed, 6])
@@ -369,77 +395,42 @@ def started(seed, clusters=True, source='exposures'):
 def detections(
     seed, size=0.5, clusters=True, source='exposures', quarters=tuple(QUARTERS), directions=8
 ):
-    """Drifts over every quarter of both images in so many directions: a list of dicts of
-    `detection`.
-    """
+    """Results of `detection` for drifts over all quarters of both images."""
     scene_, watch, rng, learned = started(seed, clusters, source)
     out = []
     total = PERIOD_S * MOTIONS * RATE_HZ // FRAMES
     for name in scene_.names:
         for quarter in quarters:
             for k in range(directions):
-                first = learned + int(rng.integers(total))  # the motion from anywhere on
-                out.append(
-                    detection(
-                        scene_,
-                        copy.deepcopy(watch),
-                        first,
-                        name,
-                        quarter,
-                        size,
-                        360 * k / directions,
-                        rng,
-                        clusters,
-                    )
-                )
+                first = learned + int(rng.integers(total))  # from anywhere in the motion
+                drift = Drift(name, quarter, size, 360 * k / directions)
+                fresh = copy.deepcopy(watch)
+                out.append(detection(scene_, fresh, first, drift, rng, clusters))
     return out
 
 
 def from_the_start(seed, size=0.5, directions=8):
-    """Drifts that are there before the watch starts, so that it can only hold them against the
-    calibration.
-    """
+    """Results for drifts that exist before the watch starts: only the calibration shows them."""
     scene_ = scene(seed)
     rng = np.random.default_rng([seed, 8])
-    return [
-        detection(
-            scene_,
-            scene_.watch(),
-            int(rng.integers(700)),
-            name,
-            quarter,
-            size,
-            360 * k / directions,
-            rng,
-        )
-        for name in scene_.names
-        for quarter in QUARTERS
-        for k in range(directions)
-    ]
+    out = []
+    for name in scene_.names:
+        for quarter in QUARTERS:
+            for k in range(directions):
+                drift = Drift(name, quarter, size, 360 * k / directions)
+                first = int(rng.integers(700))
+                out.append(detection(scene_, scene_.watch(), first, drift, rng))
+    return out
 
 
 def slow(seed, size=0.5, hours=1.0):
-    """A drift that takes hours to its size, in a quarter drawn at random, in one of 8 directions:
-    list of one dict.
-    """
+    """Result for a drift that takes hours to its size, in a random quarter and direction."""
     scene_, watch, rng, learned = started(seed)
-    place = str(rng.choice(list(QUARTERS)))
+    quarter = str(rng.choice(list(QUARTERS)))
     direction = 45 * int(rng.integers(8))
-    return [
-        detection(
-            scene_,
-            watch,
-            learned,
-            str(rng.choice(scene_.names)),
-            place,
-            size,
-            direction,
-            rng,
-            True,
-            hours * 3600,
-            1.1 * hours * 3600,
-        )
-    ]
+    name = str(rng.choice(scene_.names))
+    drift = Drift(name, quarter, size, direction, hours * 3600)
+    return [detection(scene_, watch, learned, drift, rng, after_s=1.1 * hours * 3600)]
 
 
 # Title of a row, function, its arguments but the seed.
@@ -479,9 +470,9 @@ HEADER = [
 def row(title, sector, found):
     """A line of the table of detections: of dicts of `detection`."""
     delay = np.array([f['error'] for f in found])
-    told = [f for f in found if 'named' in f]
-    error = np.array([f['size_error'] for f in told])
-    normalised = error / np.array([f['sd'] for f in told])
+    reported = [f for f in found if 'named' in f]
+    error = np.array([f['size_error'] for f in reported])
+    normalised = error / np.array([f['sd'] for f in reported])
 
     def part(values):
         return f'{100 * np.mean(values):.0f} %' if len(values) else '-'
@@ -498,11 +489,11 @@ def row(title, sector, found):
         part(np.isfinite(delay)),
         figure(np.quantile(delay, 0.5, method='higher')),
         figure(np.quantile(delay, 0.95, method='higher')),
-        figure(np.sqrt(np.mean(error**2)) if len(told) else np.nan),
-        figure(np.sqrt(np.mean(normalised**2)) if len(told) else np.nan),
-        part([f['named'] == f['fluoroscope'] for f in told]),
-        part([' or ' in f['named'] and f['fluoroscope'] in f['named'] for f in told]),
-        part([f['place'] for f in told]),
+        figure(np.sqrt(np.mean(error**2)) if len(reported) else np.nan),
+        figure(np.sqrt(np.mean(normalised**2)) if len(reported) else np.nan),
+        part([f['named'] == f['fluoroscope'] for f in reported]),
+        part([' or ' in f['named'] and f['fluoroscope'] in f['named'] for f in reported]),
+        part([f['place'] for f in reported]),
     ]
 
 
@@ -560,7 +551,7 @@ def report(figures):
             f'{hours / options.warn_interval_h:.2g}); largest evidence '
             f'{max(a["largest"] for a in alarms):.2f} of the threshold of WARN.'
         ]
-        lines += [text for a in alarms for text in a['said']]
+        lines += [text for a in alarms for text in a['messages']]
     rows = []
     for title, found in figures['cases'].items():
         for sector, degrees in SECTORS.items():

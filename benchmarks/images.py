@@ -1,5 +1,4 @@
-"""Corrected images: how fast one core is, and the node live beside a relay that does nothing with
-the same images.
+"""Corrected images: the speed of one core, and of the live node compared with a plain relay.
 
     python -m benchmarks.images [--seconds 10] [--only NAME]      printed as the tables of
     docs/images.md
@@ -74,13 +73,14 @@ def calibration_of_the_rig():
 
 
 def on_one_core(calibration, frames, repeats=200):
-    """[{depth, interpolation, ms: median wall time, cpu_ms, rate: images a second of CPU}] of the
-    correction alone, and scipy's map_coordinates with the same map.
+    """Times of the correction alone, and of scipy's map_coordinates with the same map.
+
+    ms: median wall time; rate: images per second of CPU.
     """
     cv2.setNumThreads(1)
     out = []
     for interpolation, order in (('linear', 1), ('cubic', 3)):
-        (corrector, seconds) = timed(lambda: ImageCorrector(calibration, interpolation))
+        corrector, seconds = timed(lambda: ImageCorrector(calibration, interpolation))
         for dtype in (np.uint8, np.uint16):
             image = bead_image(frames[0].uv, calibration.image_size, dtype)
             into = np.empty_like(image)
@@ -137,7 +137,8 @@ class Reader:
 
         from .online import logged
 
-        came = self.came = []
+        came = []
+        self.came = came
 
         def take(data, info):
             seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
@@ -174,7 +175,7 @@ def _start(*command, log, **parameters):
 
 
 def measured(reader, encoding, rate, node, seconds, log):
-    """{images, lost, p50, p99, max [ms], cpu_ms an image} of a node at a rate."""
+    """Figures of a node at a rate: losses, latencies [ms] and CPU time per image [ms]."""
     frames = round(rate * seconds)
     command = (
         ['fluoro_calib_ros.nodes.image_node']
@@ -217,7 +218,14 @@ def measured(reader, encoding, rate, node, seconds, log):
                 process.send_signal(signal.SIGINT)
             process.wait(20)
         reader.reader.stop()
-    came = np.array(reader.came)
+    return {
+        **_stream_figures(np.array(reader.came), frames),
+        'cpu_ms': 1e3 * used / max(counted, 1),
+    }
+
+
+def _stream_figures(came, frames):
+    """Losses, rate [Hz] and latencies [ms] of the stamps and latencies (n, 2) [ns] that came."""
     latency = came[:, 1] * 1e-6
     span = (came[-1, 0] - came[0, 0]) * 1e-9
     return {
@@ -227,14 +235,11 @@ def measured(reader, encoding, rate, node, seconds, log):
         'p50': float(np.percentile(latency, 50)),
         'p99': float(np.percentile(latency, 99)),
         'max': float(latency.max()),
-        'cpu_ms': 1e3 * used / max(counted, 1),
     }
 
 
 def live(calibration, seconds, only=''):
-    """{case: figures} of those whose name contains only, with the transports of this process's
-    environment.
-    """
+    """Figures of the cases whose name contains `only`, by case, with the present transports."""
     import rclpy
 
     from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
@@ -253,7 +258,7 @@ def live(calibration, seconds, only=''):
 
 
 def live_wide(seconds, only=''):
-    """The same in a process of its own, with large segments of shared memory."""
+    """The same in another process, with large segments of shared memory."""
     with tempfile.NamedTemporaryFile('w', suffix='.xml') as profile:
         profile.write(WIDE)
         profile.flush()
@@ -276,7 +281,7 @@ def live_wide(seconds, only=''):
 
 
 def run(seconds=10.0, only=''):
-    """(figures of one core, {case: figures} live)."""
+    """Figures of one core, and live figures by case."""
     calibration, frames = calibration_of_the_rig()
     return on_one_core(calibration, frames), live(calibration, seconds, only) | live_wide(
         seconds, only
@@ -284,9 +289,7 @@ def run(seconds=10.0, only=''):
 
 
 def draw(path, lines=15):
-    """Draw a square pattern of beads through the fluoroscope of the rig, and corrected, with
-    straight lines.
-    """
+    """Draw a square pattern of beads as observed and as corrected, with straight lines."""
     fluoroscope = virtual_rig(1).fluoroscopes[0]
     calibration = calibration_of_the_rig()[0]
     at = np.linspace(24, 999, lines)

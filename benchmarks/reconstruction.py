@@ -31,7 +31,7 @@ EXPOSURES = 15
 NOISE_PX = 0.25
 CAPTURED = 1
 CLUSTERS = np.arange(24).reshape(4, 6)  # rows of the markers of each rigid cluster
-# round images without distortion: at the edge a point leaves the image when its distortion is off
+# Around images without distortion: a point at the edge leaves the image without its distortion.
 MARGIN_PX = 100
 WAYS = {
     'uncorrected': 'none',
@@ -44,12 +44,25 @@ FROM_EXPOSURES = ', orientation from the calibration'
 
 @dataclass(frozen=True)
 class Outcome:
-    """Figures of one way on one rig: rmse_mm (3-D) of the markers; normalised: mean normalised
-    squared error, NaN for a rig frame that is not the true one; epipolar: mean squared
-    standardised epipolar distance; lost: share of the points without coordinates; constancy (4,):
-    standard deviation over time of the distances in each cluster, over the predicted one;
-    distance_mm: RMSE of these distances; sd_orientation_mm (3-D) of the points by the rig's
-    orientation, NaN as normalised.
+    """Figures of one way on one rig.
+
+    Attributes
+    ----------
+    rmse_mm : float
+        Of the markers, 3-D.
+    normalised : float
+        Mean normalised squared error, NaN for a rig frame that is not the true one.
+    epipolar : float
+        Mean squared standardised epipolar distance.
+    lost : float
+        Fraction of the points without coordinates.
+    constancy : ndarray
+        (4,), standard deviation over time of the distances in each cluster, over the predicted
+        one.
+    distance_mm : float
+        RMSE of these distances.
+    sd_orientation_mm : float
+        Of the points by the orientation of the rig, 3-D; NaN as `normalised`.
     """
 
     rmse_mm: float
@@ -79,7 +92,7 @@ def capture(rig, seed, count=CAPTURED):
 
 
 def undistorted(rig, frames):
-    """The frames with their true distortion taken off, in images with a margin."""
+    """Remove the true distortion from frames; the images get a margin."""
     field = {f.name: f.distortion for f in rig.fluoroscopes}
     return {
         name: [
@@ -95,8 +108,9 @@ def undistorted(rig, frames):
 
 
 def measure(seed, ways=tuple(WAYS), seconds=4.0, rate_hz=60.0, captured=CAPTURED):
-    """{way: Outcome} of one virtual rig, each way also with the orientation from the exposures of
-    the calibration.
+    """Outcomes of one virtual rig, by way.
+
+    Each way also comes with the orientation from the exposures of the calibration.
     """
     rig = virtual_rig(seed)
     out = {}
@@ -128,7 +142,8 @@ def _outcome(found, truth, in_rig_frame):
         for name in ('xyz_mm', 'covariance', 'covariance_noise', 'standardised')
     )
     good = np.isfinite(xyz).all(axis=2)
-    normalised = of_rig = np.nan
+    normalised = np.nan
+    of_rig = np.nan
     if in_rig_frame:
         error = xyz - truth
         normalised = float(
@@ -160,9 +175,7 @@ def _outcome(found, truth, in_rig_frame):
 
 
 def _fitted(points, truth):
-    """Points (n, 3) moved as a rigid body onto the truth (Kabsch 1976): a rig frame that is not
-    the true one.
-    """
+    """Points (n, 3) moved as a rigid body onto the truth (Kabsch 1976), for another rig frame."""
     a = points.mean(axis=0)
     b = truth.mean(axis=0)
     left, _, right = np.linalg.svd((points - a).T @ (truth - b))
@@ -171,8 +184,9 @@ def _fitted(points, truth):
 
 
 def _distances(xyz, truth, noise):
-    """Of the distances in a rigid cluster (frames, k, 3): standard deviation over time over the
-    predicted one, and RMSE [mm].
+    """Constancy and RMSE [mm] of the distances in a rigid cluster (frames, k, 3).
+
+    Constancy is the standard deviation over time over the predicted one.
     """
     one, other = np.triu_indices(xyz.shape[1], 1)
     apart = xyz[:, one] - xyz[:, other]
@@ -188,8 +202,9 @@ def _distances(xyz, truth, noise):
 
 
 def table(outcomes):
-    """Markdown table of {way: [Outcome of every rig]}: squares averaged over the rigs; +-:
-    standard error.
+    """Markdown table of {way: [Outcome of every rig]}.
+
+    Squares are averaged over the rigs; +- is the standard error.
     """
     known = {
         suffix: _rms([o.rmse_mm for o in outcomes['known distortion' + suffix]])
@@ -220,9 +235,7 @@ def table(outcomes):
 
 
 def cluster_table(outcomes):
-    """Markdown table of the constancy of the distances: observed over predicted standard deviation
-    by cluster.
-    """
+    """Markdown table of the constancy of the distances, by cluster."""
     lines = [
         '| correction | '
         + ' | '.join(f'cluster {k + 1}' for k in range(len(CLUSTERS)))
@@ -244,9 +257,7 @@ def _rms(values):
 
 
 def speed(points=30, repeats=2000):
-    """Time [s] of one intersection of points in two views with covariance, the smallest of ten
-    means.
-    """
+    """Time [s] of one intersection of points in two views, the least of ten means."""
     rig = virtual_rig(1)
     calibrations = calibrate(
         simulate_exposures(rig, 5, 1).frames, rig.phantom, CalibrationOptions('parametric')

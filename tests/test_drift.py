@@ -1,6 +1,4 @@
-"""The drift watch: the stated rate of false alarms holds under hard conditions; drifts are found,
-placed and sized.
-"""
+"""The drift watch: the rate of false alarms, and place and size of the drifts that it finds."""
 
 import copy
 import functools
@@ -34,6 +32,7 @@ from benchmarks.drift import (  # noqa: E402
     QUARTERS,
     RATE_HZ,
     WHOLE,
+    Drift,
     Scene,
     blocks,
     detection,
@@ -94,12 +93,12 @@ def residuals(ids, uv_a, uv_b, residual, systematic=SYSTEMATIC_PX):
     )
 
 
-def handed_over(watch, stamp_s, ids, uv_a, uv_b, residual, pair=('a', 'b')):
+def add_residuals(watch, stamp_s, ids, uv_a, uv_b, residual, pair=('a', 'b')):
     """State after residuals (n,) at one stamp."""
     return watch.add_residuals(round(stamp_s * 1e9), *pair, residuals(ids, uv_a, uv_b, residual))
 
 
-def streamed(
+def state_after(
     watch, seconds, residual_of, seed=0, count=12, rate_hz=24, start_s=0.0, noise=0.25, each=None
 ):
     """State after a stream in frames of count markers: residual_of(t, uv_a, uv_b) [px], and noise
@@ -110,7 +109,7 @@ def streamed(
     state = watch.state
     for k, (a, b) in enumerate(zip(uv_a, uv_b)):
         t = start_s + k / rate_hz
-        state = handed_over(
+        state = add_residuals(
             watch, t, np.arange(count), a, b, residual_of(t, a, b) + rng.normal(0, noise, count)
         )
         if each is not None:
@@ -135,8 +134,7 @@ def quarter_of(side, size, begin_s=0.0, quarter='upper left'):
     return residual
 
 
-# ----------------------------------------------------------------------------------------------
-# false alarms
+# ---- false alarms
 
 
 @pytest.mark.parametrize('correlation', [0.0, 0.5])
@@ -197,7 +195,7 @@ def test_stated_rate_of_false_alarms_holds_with_correlated_noise_and_false_match
     residual[wrong] = rng.uniform(-1, 1, int(wrong.sum()))
     ids = np.tile(np.arange(count), n)
     for k in range(0, len(residual), n):
-        state = handed_over(
+        state = add_residuals(
             watch,
             k / rate,
             ids,
@@ -212,14 +210,14 @@ def test_stated_rate_of_false_alarms_holds_with_correlated_noise_and_false_match
     assert alarms <= 6 * hours  # stated: 6 an hour on average
 
 
-def test_noise_with_a_correlation_of_a_tenth_of_a_second_is_taken_for_what_it_is():
+def test_correlated_noise_raises_the_variance():
     rng = np.random.default_rng(3)
     r = 0.8
     watch = DriftWatch(SIZES, OFTEN)
     uv_a, uv_b = moving(rng, 20, 50, 120)
     residual = 0.25 * autoregressive(rng, uv_a.shape[:2], r)
     for k in range(0, len(residual), FRAMES):
-        handed_over(
+        add_residuals(
             watch,
             k / 120,
             np.tile(np.arange(20), FRAMES),
@@ -235,15 +233,14 @@ def test_systematic_errors_within_what_the_calibration_claims_are_no_drift():
         return 2.5 * SYSTEMATIC_PX * np.sin(a[:, 0] / 90) * np.cos(b[:, 0] / 120 + a[:, 1] / 100)
 
     largest = []
-    state = streamed(
+    state = state_after(
         DriftWatch(SIZES), 60, residual, seed=4, each=lambda t, s: largest.append(s.evidence)
     )
     assert state.level == OK and max(largest) < 0.5 * state.threshold_warn
     assert state.message == 'no drift is seen' and not state.learning
 
 
-# ------------------------------------------------------------------------------------- detection,
-# epipolar
+# ---- detection by epipolar residuals
 
 
 def first_times(
@@ -258,7 +255,7 @@ def first_times(
                 at[level] = min(at[level], t - begin_s)
 
     drift = drift or quarter_of(side, size, begin_s, quarter)
-    state = streamed(DriftWatch(SIZES), seconds, drift, seed, each=note, **more)
+    state = state_after(DriftWatch(SIZES), seconds, drift, seed, each=note, **more)
     return at[WARN], at[ERROR], state
 
 
@@ -271,9 +268,7 @@ def first_times(
         (1, 'lower left', -0.35),
     ],
 )
-def test_a_drift_over_a_quarter_is_found_within_five_seconds_and_told_as_it_is(
-    side, quarter, size
-):
+def test_a_drift_over_a_quarter_is_found_within_five_seconds_and_described(side, quarter, size):
     warn, error, state = first_times(size, side, quarter, seconds=27.0, count=30, rate_hz=120)
     assert 0 < warn <= error <= 5.0
     assert state.level == ERROR and state.fluoroscope == 'ab'[side] and quarter in state.place
@@ -310,9 +305,9 @@ def test_a_slow_drift_is_found_before_it_has_its_size():
     assert warn < error < 85 and 0.15 < state.size < 0.6 and state.level == ERROR
 
 
-def test_a_drift_that_was_there_before_the_start_is_held_against_the_calibration():
+def test_a_drift_before_the_start_is_held_against_the_calibration():
     at = []
-    state = streamed(
+    state = state_after(
         DriftWatch(SIZES),
         25,
         quarter_of(1, 0.6, 0.0),
@@ -325,7 +320,7 @@ def test_a_drift_that_was_there_before_the_start_is_held_against_the_calibration
     )
 
 
-def test_a_calibration_that_claims_less_is_let_be():
+def test_a_calibration_that_claims_less_accuracy_gets_a_wider_band():
     """The same step of 0.35 px against the calibration: seen at 0.05 px, and within what 0.2 px
     allow.
     """
@@ -353,11 +348,11 @@ def test_an_alarm_ends_with_the_drift_and_with_a_reset():
         return quarter_of(0, 0.6, 15.0)(t, a, b) * (t < 22)
 
     watch = DriftWatch(SIZES)
-    state = streamed(
+    state = state_after(
         watch, 40, passing, seed=9, each=lambda t, s: levels.update({round(t): s.level})
     )
     assert levels[22] == ERROR and levels[38] == OK == state.level
-    streamed(watch, 8, quarter_of(0, 0.6), seed=10, start_s=41)
+    state_after(watch, 8, quarter_of(0, 0.6), seed=10, start_s=41)
     assert watch.state.level == ERROR
     watch.reset()
     assert (
@@ -365,15 +360,14 @@ def test_an_alarm_ends_with_the_drift_and_with_a_reset():
         and watch.state.observations == 0
         and watch.state.message == 'no markers were seen'
     )
-    state = streamed(watch, 15, quarter_of(0, 0.0), seed=11, start_s=50)
+    state = state_after(watch, 15, quarter_of(0, 0.0), seed=11, start_s=50)
     assert state.level == OK and state.evidence < 0.5 * state.threshold_warn
 
 
-# ---------------------------------------------------------------------------------------- odd
-# input
+# ---- odd input
 
 
-def test_frames_with_nan_without_markers_late_or_from_the_past_are_taken_as_they_are():
+def test_frames_with_nan_without_markers_late_or_from_the_past():
     watch = DriftWatch(SIZES)
     rng = np.random.default_rng(12)
     uv_a, uv_b = moving(rng, 12, 30, 24)
@@ -385,23 +379,23 @@ def test_frames_with_nan_without_markers_late_or_from_the_past_are_taken_as_they
         late = (
             k / 24 - 0.3 * (k % 5 == 0) - 1000 * (k > 500)
         )  # late frames, and a recording that begins anew
-        state = handed_over(watch, late, np.arange(12), a, b, residual)
-        state = handed_over(watch, late, np.zeros(0, dtype=int), nothing, nothing, np.zeros(0))
+        state = add_residuals(watch, late, np.arange(12), a, b, residual)
+        state = add_residuals(watch, late, np.zeros(0, dtype=int), nothing, nothing, np.zeros(0))
     assert state.level == ERROR and state.fluoroscope == 'a' and 0 <= state.since_s < 14
     assert 0.6 * 12 * 720 < state.observations < 0.9 * 12 * 720
 
 
 @pytest.mark.parametrize('count', [1, 2])
-def test_one_or_two_markers_are_no_ground_for_an_alarm(count):
-    state = streamed(DriftWatch(SIZES), 20, lambda t, a, b: 1.0 * (t > 12), count=count)
+def test_one_or_two_markers_raise_no_alarm(count):
+    state = state_after(DriftWatch(SIZES), 20, lambda t, a, b: 1.0 * (t > 12), count=count)
     assert state.level == OK and state.evidence == 0
 
 
-def test_a_marker_with_a_false_match_that_lasts_is_no_drift():
+def test_a_lasting_false_match_of_one_marker_is_no_drift():
     def residual(t, a, b):
         return np.where(np.arange(len(a)) == 3, 0.95 * (t > 14), 0.0)
 
-    assert streamed(DriftWatch(SIZES), 30, residual, seed=13, count=30).level == OK
+    assert state_after(DriftWatch(SIZES), 30, residual, seed=13, count=30).level == OK
 
 
 def test_pairs_in_either_order_and_three_fluoroscopes():
@@ -412,24 +406,24 @@ def test_pairs_in_either_order_and_three_fluoroscopes():
     for k, (a, b) in enumerate(zip(uv_a, uv_b)):
         c = b * (800 / 1024, 600 / 1024)
         drift = quarter_of(0, 0.6, 16)(k / 24, b, a)  # of b
-        state = handed_over(
+        state = add_residuals(
             watch, k / 24, np.arange(15), b, a, drift + rng.normal(0, 0.25, 15), ('b', 'a')
         )
-        state = handed_over(
+        state = add_residuals(
             watch, k / 24, np.arange(15), a, c, rng.normal(0, 0.25, 15), ('a', 'c')
         )
-        state = handed_over(
+        state = add_residuals(
             watch, k / 24, np.arange(15), b, c, drift + rng.normal(0, 0.25, 15), ('b', 'c')
         )
     assert state.level == ERROR and state.fluoroscope == 'b' and 'upper left' in state.place
     with pytest.raises(ValueError, match="no pair of fluoroscopes 'a' and 'd'"):
-        handed_over(watch, 0, np.arange(15), a, b, drift, ('a', 'd'))
+        add_residuals(watch, 0, np.arange(15), a, b, drift, ('a', 'd'))
 
 
-def test_arrays_that_do_not_belong_together_are_refused():
+def test_arrays_of_different_lengths_are_refused():
     watch = DriftWatch(SIZES)
     with pytest.raises(ValueError):
-        handed_over(watch, 0.0, np.arange(5), np.zeros((4, 2)), np.zeros((5, 2)), np.zeros(5))
+        add_residuals(watch, 0.0, np.arange(5), np.zeros((4, 2)), np.zeros((5, 2)), np.zeros(5))
 
 
 @pytest.mark.parametrize(
@@ -494,8 +488,7 @@ def test_the_field_of_systematic_errors_is_learned():
     assert np.sqrt(np.mean(error**2)) < 0.03 and 0.6 < np.sqrt(np.mean((error / sd) ** 2)) < 1.3
 
 
-# ---------------------------------------------------------------------------- clusters, and end to
-# end
+# ---- clusters, and end to end
 
 
 class Known:
@@ -549,16 +542,9 @@ def perfect(learned_s=12):
 )
 def test_clusters_see_a_drift_along_the_epipolar_lines(name, quarter, direction):
     scene, watch, first = perfect()
+    drift = Drift(name, quarter, 0.5, direction)
     found = detection(
-        scene,
-        copy.deepcopy(watch),
-        first,
-        name,
-        quarter,
-        0.5,
-        direction,
-        np.random.default_rng(17),
-        after_s=12,
+        scene, copy.deepcopy(watch), first, drift, np.random.default_rng(17), after_s=12
     )
     assert found['error'] <= 8 and found['named'] == name and found['place']
     assert found['source'].startswith('cluster bone')
@@ -568,18 +554,7 @@ def test_clusters_see_a_drift_along_the_epipolar_lines(name, quarter, direction)
     )
     blind = copy.deepcopy(watch)
     blind._cluster_watch = None
-    missed = detection(
-        scene,
-        blind,
-        first,
-        name,
-        quarter,
-        0.5,
-        direction,
-        np.random.default_rng(17),
-        False,
-        after_s=5,
-    )
+    missed = detection(scene, blind, first, drift, np.random.default_rng(17), False, after_s=5)
     assert missed['warn'] == np.inf
 
 
@@ -593,17 +568,14 @@ def test_what_clusters_cannot_see_is_not_claimed():
             scene,
             copy.deepcopy(watch),
             first,
-            'a',
-            WHOLE,
-            size,
-            0,
+            Drift('a', WHOLE, size, 0),
             np.random.default_rng(18),
             after_s=6,
         )
         assert found['warn'] == np.inf
 
 
-def test_a_bead_that_moves_is_told_as_what_it_may_be():
+def test_a_moved_bead_is_named_as_a_possible_cause():
     scene, watch, first = perfect()
     watch = copy.deepcopy(watch)
     rng = np.random.default_rng(19)
@@ -654,7 +626,7 @@ def test_distances_may_be_declared():
         (('c', (1, 2), None, -1.0), 'sd_mm'),
     ],
 )
-def test_clusters_that_are_none_are_refused(arguments, sentence):
+def test_invalid_clusters_are_refused(arguments, sentence):
     with pytest.raises(ValueError, match=sentence):
         Cluster(*arguments)
 
@@ -670,7 +642,7 @@ def points(n, views=2, **arrays):
     return PointObservations(np.arange(n), **{**zeros, **arrays})
 
 
-def test_watches_that_cannot_be_are_refused():
+def test_invalid_watches_are_refused():
     o = perfect()[0].orientation
     cluster = Cluster('c', (1, 2, 3))
     with pytest.raises(ValueError, match='two fluoroscopes'):

@@ -55,7 +55,8 @@ class RigDriftWatch:
         clusters: Sequence[Cluster] = (),
         rate_hz: float = 120.0,
     ) -> None:
-        names = self._names = orientation.fluoroscopes
+        names = orientation.fluoroscopes
+        self._names = names
         self._pairs = [
             (i, j, EpipolarGeometry(orientation, names[i], names[j]))
             for i, j in combinations(range(len(names)), 2)

@@ -85,7 +85,8 @@ class DriftWatch:
     ) -> None:
         if len(image_sizes) < 2:
             raise ValueError(f'a drift watch needs two fluoroscopes, not {len(image_sizes)}')
-        self.options = options = options or DriftOptions()
+        options = options or DriftOptions()
+        self.options = options
         self._sizes = {name: tuple(size) for name, size in image_sizes.items()}
         self._names = tuple(self._sizes)
         self._areas = ImageAreas(int(options.cells))
@@ -187,7 +188,8 @@ class DriftWatch:
         now = int(stamp_ns) + self._offset_ns
         length = round(self.options.block_s * 1e9)
         if self._block_ns is None:
-            self._block_ns = self._newest_ns = now
+            self._block_ns = now
+            self._newest_ns = now
         if now < self._newest_ns - RESTART_S * 1e9:
             self._offset_ns += self._newest_ns - now
             now = self._newest_ns
@@ -279,7 +281,7 @@ class DriftWatch:
             self._watches[number].field.estimate(float(np.median(factor)))
 
     def _is_learning(self) -> bool:
-        """Whether there is nothing yet, or a start that has begun and not ended."""
+        """Whether no start has begun yet, or one is still being learned."""
         counts = [*self._learned_blocks, self._learned_cluster_blocks]
         begun = [count for count in counts if count]
         return not begun or not all(self._has_learned(count) for count in begun)

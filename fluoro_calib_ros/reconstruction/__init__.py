@@ -1,3 +1,1 @@
-"""Points in space from two or more corrected views: orientation of the rig, epipolar check,
-intersection of rays.
-"""
+"""Points in space from two or more corrected views: matching, epipolar check, intersection."""

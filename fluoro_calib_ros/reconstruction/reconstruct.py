@@ -155,7 +155,9 @@ def _corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> Correc
         frame.uv[:, 0], frame.uv[:, 1], frame.sigma
     )
     uv = np.stack([u, v], axis=1)
-    return CorrectedView(frame.target_id, uv, sigma, correction_sd, status == CorrectionStatus.OUTSIDE)
+    return CorrectedView(
+        frame.target_id, uv, sigma, correction_sd, status == CorrectionStatus.OUTSIDE
+    )
 
 
 def reconstruct_recording(

@@ -1,6 +1,4 @@
-"""fluoro-calib correct for images: files, stacks, folders and videos, and what users get wrong
-with them.
-"""
+"""fluoro-calib correct for images: files, stacks, folders and videos, and wrong input."""
 
 import io
 import json
@@ -112,7 +110,7 @@ def frames_of(path, deep=False):
         frames.append(frame if deep else frame[:, :, 0])
 
 
-# ---- good ones
+# ---- valid input
 
 
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
@@ -138,7 +136,7 @@ def test_image_file(one, corrector, tmp_path, capfd, ending, dtype):
     assert sorted(os.listdir(tmp_path)) == sorted([f'in{ending}', f'out{ending}'])
 
 
-def test_formats_are_those_of_the_names(one, corrector, tmp_path):
+def test_the_suffix_decides_the_format(one, corrector, tmp_path):
     """From any to any; jpg loses little."""
     (tmp_path / 'in.bmp').write_bytes(encode(image_of(), '.bmp'))
     for ending in IMAGE_SUFFIXES:
@@ -162,7 +160,7 @@ def test_cubic_is_another_image(one, corrector, tmp_path):
 
 @pytest.mark.parametrize('dtype', [np.uint8, np.uint16])
 def test_stack(one, corrector, tmp_path, monkeypatch, dtype):
-    """Page by page, however many are read at once."""
+    """Page by page, in batches of any size."""
     monkeypatch.setattr('fluoro_calib_ros.files.image_reading.MAX_BATCH_BYTES', 3 * 128 * 96)
     pages = stack_of(8, dtype)
     assert cv2.imwritemulti(str(tmp_path / 'in.tif'), pages)
@@ -176,7 +174,7 @@ def test_stack(one, corrector, tmp_path, monkeypatch, dtype):
 @pytest.mark.parametrize('order', ['little', 'big'])
 @pytest.mark.parametrize('large', [False, True])
 def test_tiff_with_large_offsets(tmp_path, monkeypatch, large, order):
-    """Files beyond 4 GB, and those of other makers: read by OpenCV, and their pages counted."""
+    """Files beyond 4 GB and of either byte order: read by OpenCV, and their pages counted."""
     if large:
         monkeypatch.setattr(tiff, 'CLASSIC_BYTES', 0)
     pages = stack_of(3, np.uint16)
@@ -269,16 +267,19 @@ def test_fluoroscope_is_chosen(both, tmp_path):
     assert correct(tmp_path / 'p.csv', both, tmp_path / 'q.csv', '--fluoroscope', 'b') == 0
 
 
-def test_progress_is_told(one, corrector, tmp_path):
+def test_progress_is_reported(one, corrector, tmp_path):
     video_of(tmp_path / 'in.avi', stack_of(5))
-    told = []
+    calls = []
     done = correct_images(
-        tmp_path / 'in.avi', tmp_path / 'out.avi', corrector, lambda *numbers: told.append(numbers)
+        tmp_path / 'in.avi',
+        tmp_path / 'out.avi',
+        corrector,
+        lambda *numbers: calls.append(numbers),
     )
-    assert told == [(n + 1, 5) for n in range(5)] and (done.kind, done.images) == ('video', 5)
+    assert calls == [(n + 1, 5) for n in range(5)] and (done.kind, done.images) == ('video', 5)
 
 
-def test_bar_only_on_a_terminal(one, tmp_path, capfd, monkeypatch):
+def test_progress_bar_only_on_a_terminal(one, tmp_path, capfd, monkeypatch):
     """On standard error, and gone at the end."""
     video_of(tmp_path / 'in.avi', stack_of(5))
 
@@ -293,7 +294,7 @@ def test_bar_only_on_a_terminal(one, tmp_path, capfd, monkeypatch):
     json.loads(capfd.readouterr().out)
 
 
-# ---- bad ones
+# ---- invalid input
 
 
 def said(capfd, *arguments):
@@ -368,7 +369,7 @@ BAD = {  # file: content, what is said
 
 @pytest.mark.parametrize('name', BAD)
 def test_bad_source(one, tmp_path, capfd, name):
-    """One sentence with its name; what was there before stays, and nothing else is left."""
+    """One sentence with its name; an earlier file stays, and nothing else is left."""
     content, sentence = BAD[name]
     source = tmp_path / name
     out = tmp_path / f'out.{name.rpartition(".")[2]}'
@@ -389,8 +390,8 @@ def test_cut_video(one, tmp_path, capfd, ending, codec):
     assert str(source) in text and 'damaged' in text and os.listdir(tmp_path) == [source.name]
 
 
-def test_bad_image_in_the_midst(one, tmp_path, capfd):
-    """Of a folder, a stack or a video: its place is said, and nothing is written."""
+def test_bad_image_among_good_ones(one, tmp_path, capfd):
+    """In a folder, a stack or a video: the error names its place, and nothing is written."""
     source = tmp_path / 'in'
     out = tmp_path / 'out'
     source.mkdir()
@@ -405,8 +406,8 @@ def test_bad_image_in_the_midst(one, tmp_path, capfd):
     assert sorted(os.listdir(tmp_path)) == ['in', 'in.tif']
 
 
-def test_outputs_that_cannot_be(one, both, tmp_path, capfd):
-    """What cannot hold the images, is not there, or would be written over."""
+def test_impossible_outputs_are_refused(one, both, tmp_path, capfd):
+    """Outputs that cannot hold the images, or would overwrite the source."""
     eight, deep, stack, video = (tmp_path / n for n in ('8.png', '16.png', 's.tif', 'v.avi'))
     eight.write_bytes(encode(image_of(), '.png'))
     deep.write_bytes(encode(image_of(0, np.uint16), '.png'))
@@ -441,7 +442,7 @@ def test_outputs_that_cannot_be(one, both, tmp_path, capfd):
     assert len(os.listdir(tmp_path)) == 6
 
 
-def test_names_that_are_no_text(one, tmp_path, capfd):
+def test_file_names_that_are_not_utf8(one, tmp_path, capfd):
     """An image may have one; what OpenCV reads or writes by its name may not: it would end the
     process.
     """
@@ -462,7 +463,7 @@ def test_names_that_are_no_text(one, tmp_path, capfd):
     assert sorted(os.listdir(tmp_path)) == sorted(['out.png', *(p.name for p in odd)])
 
 
-def test_folder_in_the_way_of_an_image(one, tmp_path, capfd):
+def test_folder_in_place_of_an_image(one, tmp_path, capfd):
     """All or nothing: no image is replaced where one of them cannot be."""
     (tmp_path / 'in').mkdir()
     (tmp_path / 'out' / 'b.png').mkdir(parents=True)

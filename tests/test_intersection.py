@@ -1,6 +1,4 @@
-"""Points in space: orientation of a rig, epipolar check, intersection of rays, matching of views,
-recordings.
-"""
+"""Points in space: orientation, epipolar check, intersection, matching of views, recordings."""
 
 from dataclasses import replace
 
@@ -33,8 +31,9 @@ SIGMA = 0.25
 
 
 def orientation_of(names=('a', 'b'), uncertain=1.0, seed=1):
-    """RigOrientation of a virtual rig, true, with a full covariance of uncertain times a realistic
-    size.
+    """True RigOrientation of a virtual rig, with a full covariance.
+
+    uncertain: factor on realistic standard deviations.
     """
     fluoroscopes = virtual_rig(seed, names=names).fluoroscopes
     count = 9 * len(names)
@@ -102,9 +101,7 @@ STEPS = [1e-2] * 3 + [1e-6] * 3 + [1e-2] * 3
 
 @pytest.mark.parametrize('names', [('a', 'b'), ('a', 'b', 'c')])
 def test_intersection_is_the_least_squares_solution(names):
-    """The same point as scipy finds for every point by itself, with sigma of its own for every
-    image point.
-    """
+    """The same points as scipy's, with a different sigma for every image point."""
     orientation = orientation_of(names)
     _, uv, sigma = seen(orientation, 12)
     sigma = sigma * np.random.default_rng(3).uniform(0.5, 2, sigma.shape)
@@ -133,9 +130,7 @@ def test_intersection_is_the_least_squares_solution(names):
 
 
 def test_pycolmap_triangulates_the_same_points():
-    """An independent program; it minimises angles, which for equal weights differs by less than
-    the noise does.
-    """
+    """It minimises angles; with equal weights this differs by less than the noise."""
     orientation = orientation_of()
     _, uv, sigma = seen(orientation, 10)
     found = Intersector(orientation).intersect(uv, sigma)
@@ -174,9 +169,7 @@ def test_derivatives_of_the_image_points_by_the_orientation():
 
 @pytest.mark.parametrize('names', [('a', 'b'), ('a', 'b', 'c')])
 def test_covariance_is_that_of_noise_and_orientation(names):
-    """By the law of propagation, with the derivatives of the intersected point as finite
-    differences.
-    """
+    """Propagated with the derivatives of the intersected point as finite differences."""
     orientation = orientation_of(names)
     _, uv, sigma = seen(orientation, 5, noise_px=0)
     found = Intersector(orientation).intersect(uv, sigma)
@@ -273,9 +266,7 @@ def test_epipolar_distance_and_its_standard_deviations():
 
 
 def test_epipolar_distance_is_the_smallest_shift_that_makes_the_rays_meet():
-    """For two views of equal sigma it is the length of the residuals, and standardised what the
-    intersection tells.
-    """
+    """For two views of equal sigma it is the length of the residuals, also standardised."""
     orientation = orientation_of()
     _, uv, sigma = seen(orientation, 8)
     distance = epipolar_residuals(orientation, 'b', 'a', *uv[::-1], SIGMA, SIGMA)
@@ -299,7 +290,7 @@ def test_epipolar_nan_stays_nan():
 
 
 def test_false_match_of_two_views_is_rejected():
-    """Across the epipolar line; along it nothing can be seen."""
+    """A shift across the epipolar line is seen, one along it is not."""
     orientation = orientation_of()
     xyz, uv, sigma = seen(orientation)
     normal = epipolar_residuals(orientation, 'a', 'b', *uv, SIGMA, SIGMA).normal_b
@@ -339,8 +330,8 @@ def test_false_match_of_more_views_loses_its_ray(names):
     np.testing.assert_allclose(found.covariance[0], alone.covariance[0], rtol=1e-3, atol=1e-7)
 
 
-def test_points_that_few_fluoroscopes_see():
-    """Every point by the rays it has, as if the others were not there."""
+def test_points_seen_by_few_fluoroscopes():
+    """Every point is intersected from its own rays."""
     orientation = orientation_of(('a', 'b', 'c'))
     _, uv, sigma = seen(orientation, 6)
     uv[0, 0] = np.nan
@@ -363,7 +354,7 @@ def test_points_that_few_fluoroscopes_see():
     assert nothing.status.tolist() == [SINGLE_VIEW] * 2
 
 
-def test_outside_is_said():
+def test_points_outside_the_calibrated_area_have_a_status():
     orientation = orientation_of()
     _, uv, sigma = seen(orientation, 5)
     outside = np.zeros((2, 5), dtype=bool)
@@ -376,7 +367,7 @@ def test_outside_is_said():
 
 
 def test_rays_that_do_not_meet_in_front_of_the_sources():
-    """Behind the source, parallel, or from one place: a status, no exception and no numbers."""
+    """Behind the source, parallel, or from one place: a status and NaN, no exception."""
     orientation = orientation_of()
     across = orientation.rotation[1] @ orientation.rotation[0].T
     direction = np.array([0.0, 0.0, 1.0])
@@ -449,7 +440,7 @@ def test_empty_frame_and_wrong_shapes():
         ),
     ],
 )
-def test_a_wrong_orientation_is_refused_in_a_sentence(change, sentence):
+def test_invalid_orientations_are_refused(change, sentence):
     with pytest.raises(DataError, match='^rig orientation: ' + sentence):
         replace(orientation_of(), **change)
 
@@ -516,9 +507,7 @@ def test_views_are_matched_by_id():
 
 
 def recording(count=3, **change):
-    """Frames of fluoroscopes a and b, of three targets each, and what is needed to reconstruct
-    them.
-    """
+    """Frames of fluoroscopes a and b with three targets, calibrations, Intersector and truth."""
     rig = virtual_rig(1)
     calibrations = {
         name: calibrated(name, 5, model='parametric').calibrations[name] for name in ('a', 'b')
@@ -546,9 +535,7 @@ def recording(count=3, **change):
 
 
 def test_recording_frame_by_frame():
-    """Observed points are corrected first; frames without partner are counted, by number or by
-    time.
-    """
+    """Observed points are corrected first; frames without partner are counted."""
     frames, calibrations, intersector, xyz = recording()
     frames['b'] = [replace(frames['b'][0], target_id=np.array([3, 1, 8])), *frames['b'][2:]]
     found, unpaired = reconstruct_recording(frames, calibrations, intersector)
@@ -562,7 +549,7 @@ def test_recording_frame_by_frame():
     np.testing.assert_array_equal(again[1].points.xyz_mm, found[1].points.xyz_mm)
 
 
-def test_wrong_recordings_are_refused_in_a_sentence():
+def test_invalid_recordings_are_refused():
     frames, calibrations, intersector, _ = recording(1)
     for change, sentence in (
         (
@@ -590,7 +577,7 @@ def test_wrong_recordings_are_refused_in_a_sentence():
         (['tibia: 1 2', 'femur: 2 3'], 'target 2 is in two clusters'),
     ],
 )
-def test_declared_clusters_that_are_none(texts, sentence):
+def test_invalid_declarations_of_clusters_are_refused(texts, sentence):
     with pytest.raises(ValueError, match=sentence):
         parse_clusters(texts)
 

@@ -1,6 +1,4 @@
-"""Exposures of three fluoroscopes or more, with views missing: which come out, when, in which
-order, and the counts.
-"""
+"""Pairing of three fluoroscopes or more with missing views: exposures, their order, and counts."""
 
 import itertools
 from dataclasses import dataclass, replace
@@ -21,7 +19,7 @@ BY = ('frame_number', 'stamp')
 
 @dataclass(frozen=True)
 class Frame:
-    """What the pairing looks at; row: of which exposure it is."""
+    """What the pairing needs of a frame; row: number of its exposure."""
 
     fluoroscope: str
     number: int
@@ -46,8 +44,9 @@ def streams(rng, names, count, loss, jitter_ms=0.9):
 
 
 def merged(rng, of_each, most_behind=None):
-    """Frames of streams in a random order that keeps that of each, none more than so many
-    exposures behind others.
+    """Frames of all streams in a random order that keeps that of each stream.
+
+    most_behind: largest lag of a stream in exposures.
     """
     left = {name: list(of_one) for name, of_one in of_each.items()}
     out = []
@@ -64,18 +63,18 @@ def merged(rng, of_each, most_behind=None):
     return out
 
 
-def expected(of_each, fewest=2):
-    """[(row, names)] of the exposures of which enough views are there."""
+def expected(of_each, min_views=2):
+    """[(row, names)] of the exposures with enough views."""
     rows = sorted({f.row for of_one in of_each.values() for f in of_one})
     there = [
         (row, {name for name, of_one in of_each.items() if row in {f.row for f in of_one}})
         for row in rows
     ]
-    return [(row, names) for row, names in there if len(names) >= fewest]
+    return [(row, names) for row, names in there if len(names) >= min_views]
 
 
 def paired(pairer, frames, flush=True):
-    """[(row, names)] of what comes out, all views of which are of one exposure."""
+    """[(row, names)] of the exposures of a pairer; checks that their views belong together."""
     exposures = [e for f in frames for e in pairer.add(f)]
     exposures += pairer.flush() if flush else ()
     assert all(
@@ -88,12 +87,8 @@ def paired(pairer, frames, flush=True):
 
 @pytest.mark.parametrize('by', BY)
 @pytest.mark.parametrize('lost', list(itertools.product([(), (0,), (1,), (0, 1)], repeat=3)))
-def test_in_every_order_of_arrival_every_exposure_of_two_views_comes_out_once_and_in_order(
-    by, lost
-):
-    """All orders of two exposures and a complete third one, of three streams that are in order
-    themselves.
-    """
+def test_every_order_of_arrival_gives_each_exposure_once_and_in_order(by, lost):
+    """All orders of two exposures and a complete third one, from three ordered streams."""
     of_each = {
         name: [frame(name, row, 1, k * MS // 2) for row in range(3) if row not in gone]
         for k, (name, gone) in enumerate(zip('abc', lost))
@@ -112,9 +107,7 @@ def test_in_every_order_of_arrival_every_exposure_of_two_views_comes_out_once_an
 
 @pytest.mark.parametrize('seed', range(30))
 def test_random_losses_jitter_and_delays(seed):
-    """Three to five fluoroscopes: what is late by less than the patience, and the frames lost
-    before it, is waited for.
-    """
+    """Three to five fluoroscopes: frames that lag by less than the patience are awaited."""
     rng = np.random.default_rng(seed)
     names = 'abcde'[: 3 + seed % 3]
     patience = int(rng.integers(24, 40))
@@ -128,10 +121,8 @@ def test_random_losses_jitter_and_delays(seed):
 
 
 @pytest.mark.parametrize('seed', range(30))
-def test_delays_beyond_the_patience_cost_views_and_nothing_else(seed):
-    """In order, each at most once, every frame in an exposure or counted, and queues as long as is
-    allowed.
-    """
+def test_delays_beyond_the_patience_only_cost_views(seed):
+    """Exposures in order, each at most once; every frame is used or counted."""
     rng = np.random.default_rng(seed)
     waiting = int(rng.integers(1, 12))
     patience = int(rng.integers(1, 12))
@@ -164,10 +155,8 @@ def test_a_lost_view_is_certain_with_the_next_frame(by):
 
 
 @pytest.mark.parametrize('by', BY)
-def test_a_silent_fluoroscope_is_waited_for_once_and_taken_up_again(by):
-    """Then the others come out with their own last frame; it comes back at their pace, a frame
-    late at first.
-    """
+def test_a_silent_fluoroscope_is_awaited_once_and_resumed(by):
+    """The others then go on at once; when it delivers again, its first frame is late."""
     pairer = exposure_pairer('abc', PairingOptions(by, 0.001, 64, 5))
     out = []
     for row in range(20):
@@ -185,8 +174,8 @@ def test_a_silent_fluoroscope_is_waited_for_once_and_taken_up_again(by):
     assert pairer.incomplete == 20 and pairer.unpaired == {'a': 0, 'b': 0, 'c': 1}
 
 
-def test_one_that_lags_for_good_stays_out_and_the_others_are_not_delayed():
-    """Far behind, or numbered otherwise, before or after: what it sends is counted."""
+def test_a_fluoroscope_that_lags_for_good_does_not_delay_the_others():
+    """Far behind, or numbered differently: its frames are counted."""
     for first in (-1000, 1000, 10**6):
         pairer = exposure_pairer('abc', PairingOptions(waiting=8, patience=5))
         out = []
@@ -205,10 +194,8 @@ def test_one_that_lags_for_good_stays_out_and_the_others_are_not_delayed():
         assert pairer.unpaired['a'] == pairer.unpaired['b'] == 0 and pairer.unpaired['c'] >= 90
 
 
-def test_one_alone_waits_as_long_as_its_queue():
-    """A single view is of no use: it is not given up for patience, and the pair comes out when its
-    partner comes.
-    """
+def test_a_single_view_waits_as_long_as_its_queue():
+    """A single view makes no exposure, so patience does not apply to it."""
     pairer = exposure_pairer('abc', PairingOptions(waiting=8, patience=2))
     assert paired(pairer, [frame('a', row) for row in range(10)], flush=False) == []
     assert pairer.unpaired == {'a': 2, 'b': 0, 'c': 0} and not pairer.silent
@@ -220,10 +207,8 @@ def test_one_alone_waits_as_long_as_its_queue():
 
 @pytest.mark.parametrize('count', [5, 200])
 @pytest.mark.parametrize('later', [True, False])
-def test_streams_that_begin_anew(count, later):
-    """Fluoroscopes started anew, or a recording played again: by number, with stamps that go on or
-    fall back.
-    """
+def test_restarted_streams(count, later):
+    """Restarted fluoroscopes, or a repeated recording: stamps go on or fall back."""
     pairer = exposure_pairer('abc', PairingOptions(waiting=64))
     for turn in range(3):
         frames = [
@@ -249,7 +234,7 @@ def test_streams_that_begin_anew(count, later):
         )
 
 
-def test_what_waits_comes_out_when_a_stream_begins_anew():
+def test_a_restarted_stream_releases_waiting_frames():
     pairer = exposure_pairer('abc')
     assert not paired(pairer, [frame('a', 500), frame('b', 500), frame('a', 501)], flush=False)
     assert paired(pairer, [replace(frame('a', 0), stamp_ns=10**12)], flush=False) == [
@@ -259,7 +244,7 @@ def test_what_waits_comes_out_when_a_stream_begins_anew():
 
 
 @pytest.mark.parametrize('by', BY)
-def test_frames_that_come_again_or_out_of_their_order_are_late(by):
+def test_repeated_and_unordered_frames_are_late(by):
     pairer = exposure_pairer('abc', PairingOptions(by, 0.001))
     frames = [
         frame('a', 5),
@@ -274,10 +259,8 @@ def test_frames_that_come_again_or_out_of_their_order_are_late(by):
     assert pairer.late == pairer.unpaired == {'a': 2, 'b': 1, 'c': 1}
 
 
-def test_by_stamp_exposures_are_numbered():
-    """And belong together by time, however they are numbered, within the tolerance of the
-    earliest.
-    """
+def test_exposures_paired_by_stamp_are_numbered():
+    """Frames within the tolerance of the earliest belong together, whatever their numbers."""
     pairer = exposure_pairer('abc', PairingOptions('stamp', 0.002))
     frames = [
         Frame('b', 70, 1 * MS, 0),
@@ -296,8 +279,8 @@ def test_by_stamp_exposures_are_numbered():
 
 
 @pytest.mark.parametrize('by', BY)
-def test_two_fluoroscopes_are_paired_as_before(by):
-    """Complete or not at all; of what has dropped out the partner is late."""
+def test_two_fluoroscopes_are_paired_completely(by):
+    """Only complete exposures; the partner of a displaced frame is late."""
     pairer = exposure_pairer('ab', PairingOptions(by, 0.001, 3, 1))
     assert not isinstance(pairer, PartialPairer)
     assert paired(pairer, [frame('a', row) for row in range(5)], flush=False) == []
@@ -314,6 +297,6 @@ def test_two_fluoroscopes_are_paired_as_before(by):
 
 
 @pytest.mark.parametrize('names', ['ab', 'abc'])
-def test_pairing_of_another_kind_is_refused_of_any_number(names):
+def test_unknown_kinds_of_pairing_are_refused(names):
     with pytest.raises(ValueError, match="not 'id'"):
         exposure_pairer(names, PairingOptions('id'))

@@ -1,4 +1,4 @@
-"""Recordings: exposures with views missing, and what the drift watch says of the whole."""
+"""Recordings: exposures with missing views, and the verdict of the drift watch."""
 
 import csv
 import functools
@@ -108,7 +108,7 @@ def watched(frames, names, clusters=(), options=DriftOptions()):
     return watch
 
 
-# ---- views that are missing
+# ---- missing views
 
 
 def test_a_missing_view_is_matched_as_one_that_sees_nothing():
@@ -135,8 +135,8 @@ def test_a_missing_view_is_matched_as_one_that_sees_nothing():
 
 
 @pytest.mark.parametrize('missing', 'abc')
-def test_without_a_view_the_points_are_those_of_the_others(missing):
-    """The same numbers as of a rig of two; with all three they are more exact."""
+def test_without_a_view_the_points_are_those_of_the_other_two(missing):
+    """The same numbers as with a rig of two; all three together are more accurate."""
     calibrations, orientation = known()
     frames = tracking(0.5, 40).frames
     others = [name for name in 'abc' if name != missing]
@@ -196,7 +196,7 @@ def test_every_exposure_of_two_views_is_reconstructed(by, seed):
     assert sum(unpaired.values()) == np.count_nonzero(views == 1)
 
 
-def test_a_target_that_one_view_of_two_sees_is_told():
+def test_a_target_in_one_view_of_two_has_the_status_single_view():
     calibrations, orientation = known()
     frames = {name: of_one[:1] for name, of_one in tracking(0.5, 40).frames.items() if name != 'c'}
     one = frames['a'][0]
@@ -210,7 +210,7 @@ def test_a_target_that_one_view_of_two_sees_is_told():
 # ---- the drift watch of a recording
 
 
-def test_a_drift_of_a_recording_is_found_and_told():
+def test_a_drift_of_a_recording_is_found_and_reported():
     frames = shifted(tracking(30.0, 30.0, 'ab').frames, 'b', 16.0)
     watch = watched(frames, 'ab')
     start = frames['a'][0].stamp_ns
@@ -230,10 +230,8 @@ def test_a_drift_of_a_recording_is_found_and_told():
 
 @pytest.mark.long
 @pytest.mark.parametrize('outside', [True, False])
-def test_what_lies_beyond_the_calibrated_area_is_no_drift(outside):
-    """There the correction is extrapolated: it may be wrong by a pixel, and by another one
-    elsewhere.
-    """
+def test_points_beyond_the_calibrated_area_are_no_drift(outside):
+    """The correction is extrapolated there: its error may be a pixel and change with the place."""
     calibrations, orientation = known('ab')
     watch = RecordingDriftWatch(orientation, {n: c.image_size for n, c in calibrations.items()})
     frames = shifted(tracking(20, 120, 'ab').frames, 'a', 12.0)
@@ -264,7 +262,7 @@ def test_the_state_is_that_of_a_watch_fed_frame_by_frame():
 
 
 @pytest.mark.long
-def test_a_drift_that_has_gone_by_the_end_is_told_all_the_same():
+def test_a_drift_that_ended_before_the_recording_is_reported():
     frames = shifted(tracking(45.0, 30.0, 'ab').frames, 'b', 14.0, 20.0)
     found = watched(frames, 'ab').verdict()
     assert (found.level, found.level_at_end) == ('error', 'ok') and found.state.fluoroscope == 'b'
@@ -288,8 +286,8 @@ def test_a_healthy_recording_is_ok():
     )
 
 
-def test_what_cannot_be_told_is_not_called_ok():
-    """Too short, without markers in common, and with too few of them."""
+def test_an_undecided_verdict_is_not_ok():
+    """Too short, without common markers, and with too few of them."""
     frames = tracking(30.0, 30.0, 'ab').frames
     short = watched({name: of_one[:320] for name, of_one in frames.items()}, 'ab').verdict()
     assert short.level == 'learning' and short.message == (
@@ -310,7 +308,7 @@ def test_what_cannot_be_told_is_not_called_ok():
 
 
 @pytest.mark.long
-def test_views_that_are_missing_are_no_drift_and_hide_none():
+def test_missing_views_are_no_drift_and_hide_none():
     """Of three fluoroscopes one is off for half of the time and loses frames: its pairs have a
     start of their own.
     """
@@ -367,8 +365,8 @@ def document(capsys, *arguments):
 
 
 @pytest.mark.long
-def test_reconstruct_tells_of_a_drift_and_of_missing_views(folder, capsys):
-    """And writes the points all the same, with exit status 0."""
+def test_reconstruct_reports_a_drift_and_missing_views(folder, capsys):
+    """It writes the points nevertheless, with exit status 0."""
     said = document(capsys, *command(folder, 'drifted'))
     drift = said['drift']
     assert (
@@ -408,7 +406,7 @@ def test_reconstruct_tells_of_a_drift_and_of_missing_views(folder, capsys):
     )
 
 
-def test_reconstruct_says_where_no_drift_can_be_told(folder, capsys):
+def test_reconstruct_reports_where_no_drift_can_be_detected(folder, capsys):
     short = document(capsys, *command(folder, 'short'))['drift']
     assert short['level'] == 'learning' and short['size_px'] is None and short['found_s'] is None
     assert 'too short to detect a drift: it has 1.3 s' in short['message']
@@ -449,7 +447,7 @@ def test_reconstruct_says_where_no_drift_can_be_told(folder, capsys):
         ),
     ],
 )
-def test_wrong_clusters_are_refused_in_a_sentence(folder, capsys, source, more, sentence):
+def test_invalid_clusters_are_refused(folder, capsys, source, more, sentence):
     (folder / 'out.csv').unlink(missing_ok=True)
     assert run(*command(folder, source, *more)) == 2
     out, err = capsys.readouterr()

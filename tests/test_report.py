@@ -1,4 +1,4 @@
-"""Figures and tables of a calibration: what is written, and that it tells the result's numbers."""
+"""Figures and tables of a calibration: the files, and the numbers in them."""
 
 import dataclasses
 import os
@@ -46,10 +46,8 @@ def plain(scene):
 
 
 @pytest.mark.long
-def test_figures_are_whole_pictures(job, tmp_path):
-    """Every figure is there under its name, can be read, is no empty sheet, and nothing else is
-    left.
-    """
+def test_figures_are_complete(job, tmp_path):
+    """Every figure exists, can be read and is not empty, and no other file is left."""
     paths = write_figures(job, tmp_path / 'new' / 'folder')
     names = [f'cost_{n}.png' for n in 'ab'] + [
         f'{kind}_{n}.png' for kind in OF_FLUOROSCOPE for n in 'ab'
@@ -63,10 +61,8 @@ def test_figures_are_whole_pictures(job, tmp_path):
             assert np.asarray(picture.convert('L')).std() > 10
 
 
-def test_figures_are_the_same_again(plain, tmp_path, monkeypatch):
-    """The same job gives the same bytes over the old files, whatever matplotlib's settings, which
-    stay.
-    """
+def test_figures_are_reproducible(plain, tmp_path, monkeypatch):
+    """The same result gives the same bytes, whatever matplotlib's settings, which stay."""
     first = {path: Path(path).read_bytes() for path in write_figures(plain, tmp_path)}
     monkeypatch.setitem(matplotlib.rcParams, 'axes.facecolor', 'black')
     settings = {key: matplotlib.rcParams[key] for key in ('axes.facecolor', *STYLE)}
@@ -97,9 +93,7 @@ def test_figures_of_joint_run_with_interior_held(scene, tmp_path):
 
 
 def test_figures_without_model_or_runs(scene, job, plain, tmp_path):
-    """Without a correction model neither loop nor field is shown; a job without runs has no
-    figures.
-    """
+    """Without a model there is no cost or distortion; without runs there are no figures."""
     phantom, frames = scene
     names = {os.path.basename(path) for path in write_figures(plain, tmp_path)}
     assert names == {'residuals_histogram_a.png', 'residuals_position_a.png'}
@@ -120,9 +114,7 @@ def test_figures_without_model_or_runs(scene, job, plain, tmp_path):
 
 
 def test_folder_that_cannot_be_written(plain, tmp_path):
-    """A file in the folder's place, or a folder in a figure's place, is told, and leaves no
-    temporary file.
-    """
+    """A file in place of the folder, a folder in place of a figure; no temporary file is left."""
     (tmp_path / 'file').write_text('mine')
     with pytest.raises(DataError, match='file'):
         write_figures(plain, tmp_path / 'file')
@@ -133,7 +125,7 @@ def test_folder_that_cannot_be_written(plain, tmp_path):
     assert not [name for name in os.listdir(tmp_path / 'out') if name.endswith('.tmp')]
 
 
-def test_what_the_figures_show(job):
+def test_costs_and_normalised_residuals(job):
     """Costs in percent of the adjustment without correction; residuals in units of the noise."""
     run = job.runs['a']
     f, g, recorded = relative_costs(run)
@@ -203,7 +195,7 @@ def test_summary_fits_a_terminal(job):
 
 
 def test_markdown_table():
-    """Cells are aligned, numbers to the right, bars and line ends cannot break the table."""
+    """Cells are aligned, numbers to the right; bars and line breaks do not break the table."""
     assert markdown_table(['model', 'RMSE [px]'], [['knn', 0.31], ['a|b\nc', '-']]) == (
         '| model  | RMSE [px] |\n'
         '| ------ | --------: |\n'

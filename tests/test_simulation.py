@@ -64,7 +64,7 @@ def test_the_same_seed_gives_the_same_numbers():
 
 
 @pytest.mark.parametrize('seed', SEEDS)
-def test_sources_stand_where_they_are_said_to(seed):
+def test_the_sources_are_where_the_documentation_says(seed):
     """About 1.5 m from the middle, about 2 m apart, looking at it, image upright (v down is z of
     the rig down).
     """
@@ -108,7 +108,7 @@ def test_looking_at_the_origin_puts_it_on_the_axis():
 
 @pytest.mark.parametrize('seed', SEEDS)
 def test_the_phantom_is_a_cube_of_503_beads_with_a_survey(seed):
-    """On its four side faces, none doubled; the survey is off the truth by its standard deviation."""
+    """On its four side faces, without duplicates; the survey has its standard deviation."""
     rig = virtual_rig(seed)
     assert rig.true_mm.shape == (BEADS, 3) == (503, 3)
     x, y, z = np.abs(rig.true_mm).T
@@ -163,7 +163,7 @@ def test_distort_is_the_inverse_of_the_correction(seed):
     assert field.distort(np.zeros((0, 2))).shape == (0, 2)
 
 
-def test_exposures_are_as_many_and_as_full_as_promised():
+def test_number_and_size_of_the_exposures():
     rig = rigs.rig()
     simulated = simulate_exposures(rig, 20, 5)
     counts = np.array([len(f.target_id) for fs in simulated.frames.values() for f in fs])
@@ -194,8 +194,8 @@ def errors_of_image_points(rig, simulated):
     return np.concatenate(out)
 
 
-def test_noise_and_false_matches_have_the_share_they_are_given():
-    """A false match sits on another bead nearby; what is left is Gaussian noise."""
+def test_noise_and_false_matches_have_the_given_size():
+    """A false match is on another bead nearby; the rest is Gaussian noise."""
     rig = rigs.rig()
     for share, noise in ((0.01, 0.25), (0.2, 0.25), (0.0, 1.0)):
         error = errors_of_image_points(

@@ -88,8 +88,8 @@ def off(image, light, uv, reach=9):
 
 @pytest.mark.long
 @pytest.mark.parametrize('kind', ['auto', 'local_linear', 'parametric'])
-def test_every_pixel_shows_what_belongs_to_it(kind):
-    """The source of a pixel, corrected as points are, is that pixel."""
+def test_the_source_of_a_pixel_corrected_is_that_pixel(kind):
+    """The source is corrected as points are."""
     this = corrector(kind=kind)
     corrected = calibration(kind).correct(this.source[:, this.mask].T)
     v, u = np.nonzero(this.mask)
@@ -126,7 +126,7 @@ def test_beads_go_where_points_go(dtype, interpolation):
 
 
 @pytest.mark.parametrize('interpolation, limit', [('linear', 1 / 64), ('cubic', 1 / 45)])
-def test_map_is_as_exact_as_said(interpolation, limit):
+def test_map_is_as_accurate_as_documented(interpolation, limit):
     """On an image that tells where its pixels are: within what OpenCV's 1/32 px leave, and
     rounding.
     """
@@ -141,7 +141,7 @@ def test_map_is_as_exact_as_said(interpolation, limit):
 
 @pytest.mark.parametrize('interpolation, order', [('linear', 1), ('cubic', 3)])
 @pytest.mark.parametrize('dtype', DEPTHS)
-def test_beside_scipy(dtype, interpolation, order):
+def test_against_scipy(dtype, interpolation, order):
     """map_coordinates at the same sources gives the same image, but for 1/64 px of its slope. Its
     cubic is a spline through the pixels, OpenCV's a convolution: on a smooth image the two are
     alike.
@@ -157,7 +157,7 @@ def test_beside_scipy(dtype, interpolation, order):
 
 
 @pytest.mark.parametrize('interpolation, limit', [('linear', 0.02), ('cubic', 0.005)])
-def test_there_and_back(interpolation, limit):
+def test_distorted_and_corrected_image_is_the_original(interpolation, limit):
     """An image bent by the correction, and corrected, is the image again, but for what
     interpolation takes.
     """
@@ -256,7 +256,7 @@ def test_steps_of_nearest_neighbours_leave_few_holes():
 # ---- images, and what is none
 
 
-def test_sixteen_bits_are_kept():
+def test_sixteen_bits_are_preserved():
     """Values that eight bits could not tell apart."""
     image = np.full(SIZE[::-1], 40_000, np.uint16)
     image[:, ::2] += 1
@@ -264,7 +264,7 @@ def test_sixteen_bits_are_kept():
     assert got.dtype == np.uint16 and set(np.unique(got[corrector().mask])) <= {40_000, 40_001}
 
 
-def test_cubic_does_not_run_over():
+def test_cubic_does_not_wrap_around():
     """Beside a step from black to white cubic interpolation overshoots: values are cut off, not
     wrapped round.
     """
@@ -277,7 +277,7 @@ def test_cubic_does_not_run_over():
         ).all()
 
 
-def test_array_for_the_result_and_memory_with_gaps():
+def test_output_array_and_rows_with_gaps():
     """The same numbers into an array that is there, from rows with a gap behind them, and from
     what cannot be written.
     """
@@ -295,7 +295,7 @@ def test_array_for_the_result_and_memory_with_gaps():
         assert np.array_equal(this.correct(backward), this.correct(backward.copy()))
 
 
-def test_images_of_the_wrong_kind():
+def test_invalid_images_are_refused():
     """One sentence for each."""
     this = corrector()
     image = np.zeros(SIZE[::-1], np.uint8)

@@ -361,7 +361,7 @@ def test_calibrations_change_between_two_images(graph, by_command, pictures):
     wrong = message_from_calibration(first)
     wrong.xp += 1.0
     latched.publish(wrong)
-    values = eyes.diagnostics(lambda v, _: 'does not belong to its id' in v['last fault'])
+    values = eyes.diagnostics(lambda v, _: 'does not match its id' in v['last fault'])
     eyes.client.destroy_timer(stream)
     assert values['calibration'] == second.calibration_id
     came = [results.index(message.data.tobytes()) for message in eyes.images]  # it is one of them

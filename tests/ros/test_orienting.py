@@ -125,7 +125,7 @@ def test_refused_orientation_gives_the_reason(graph, tmp_path, calibrated):
     client = graph.client
     graph.calibration_node(tmp_path)
     answer = client.call(Orient, 'orient', timeout_sec=0.2)
-    assert not answer.success and 'no calibration of fluoroscope a yet' in answer.message
+    assert not answer.success and 'fluoroscope a is not calibrated yet' in answer.message
     assert graph.processes[-1].end() == 0
     client.wait_until(
         lambda: not client.count_publishers('rig_orientation'), what='the node to be gone'

@@ -22,5 +22,5 @@ def test_job_reports_the_verdict_on_request(rig):
     answer = client.call(Calibrate, 'calibrate', model='none', fluoroscopes=['b'])
     assert answer.success and answer.verdict == '' and not answer.findings
     assert not (rig.folder / 'validation.json').exists(), (
-        'it is the verdict on an earlier calibration'
+        'that was the verdict on an earlier calibration'
     )

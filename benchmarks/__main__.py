@@ -16,7 +16,7 @@ from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.initial_network import measured_network
-from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.options import CalibrationOptions, model_choices
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
@@ -24,8 +24,6 @@ from . import adjustments, profiling, scaling
 from .lookup import lookup_section
 from .peers import self_calibrate_with_peers
 from .timing import section, timed
-
-MODELS = ('auto', 'local_linear', 'collocation', 'hybrid', 'parametric', 'knn', 'none')
 
 
 def exposures():
@@ -37,12 +35,8 @@ def exposures():
 
 
 def models():
-    """CalibrationOptions of the correction models that there are."""
-    for model in MODELS:
-        try:
-            yield CalibrationOptions(model)
-        except ValueError:  # not in this version
-            continue
+    """CalibrationOptions of all correction models."""
+    return [CalibrationOptions(model) for model in model_choices()]
 
 
 def calibration_section():

@@ -20,8 +20,9 @@ from fluoro_calib_ros.calibration.held_calibration import (
     too_few_rays_for_noise,
 )
 from fluoro_calib_ros.calibration.initial_network import KnownSensor, network_of_known_sensors
-from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.options import AUTO, CalibrationOptions
 from fluoro_calib_ros.calibration.robust_adjustment import start_noise
+from fluoro_calib_ros.distortion.registry import selectable_models
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import points_on_image
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
@@ -38,7 +39,7 @@ BEFORE = 'before'
 HELD = 'knn, interior held'
 KNOWN = 'known distortion'
 # In the order of the tables; what this version's CalibrationOptions does not take is left out.
-MODELS = ('knn', 'local_linear', 'parametric', 'hybrid', 'collocation', 'auto')
+MODELS = tuple(name for name in (*selectable_models(), AUTO) if name != 'none')
 RELATIVE = ('none', 'soft', 'hard')
 TEST_TOLERANCE = 1e-4  # decrease of F left by the adjustment of a test: a hundredth of a sigma
 GRID_PX = 16  # spacing of the pixels at which the correction is compared with the truth

@@ -17,12 +17,13 @@ from threadpoolctl import threadpool_limits
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.distortion.grid import CorrectionGrid
+from fluoro_calib_ros.distortion.registry import selectable_models
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 from .timing import section, timed
 
-MODELS = ('knn', 'local_linear', 'hybrid', 'parametric', 'collocation')
+MODELS = tuple(name for name in selectable_models() if name != 'none')
 POINTS = 2**20  # of a large array
 FRAME = 30  # points of a frame
 ROUNDS = 41  # in each, ours and theirs one after the other

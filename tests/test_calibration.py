@@ -394,7 +394,7 @@ def test_start_values_are_near_the_truth():
 
 
 def test_exterior_orientations_are_those_of_the_rig():
-    """Quaternion phantom -> sensor and source in the phantom's frame [mm], exposure by exposure."""
+    """Quaternion phantom -> sensor, and source in the frame of the phantom [mm]."""
     fluoroscope = rigs.rig().fluoroscopes[0]
     poses = simulate_exposures(rigs.rig(), 15, 1).poses
     for found, pose in zip(rigs.calibrated().fluoroscopes['a'].exposures, poses, strict=True):
@@ -533,7 +533,8 @@ def shuffled_ids(frame, seed=4):
         (lambda f: f[:4] + [f[2]], 'fluoroscope a: exposure 3 appears twice'),
         (
             lambda f: f[:4] + [replace(f[4], image_size=(1024, 1025))],
-            'fluoroscope a, frame 5: the image is 1024 x 1025 px, but the calibration is for 1024 x 1024 px',
+            'fluoroscope a, frame 5: the image is 1024 x 1025 px, '
+            'but the calibration is for 1024 x 1024 px',
         ),
         (lambda f: f[:4] + [cut(f[4], 0)], 'fluoroscope a, frame 5: the frame is empty'),
         (
@@ -546,7 +547,8 @@ def shuffled_ids(frame, seed=4):
         ),
         (
             lambda f: f[:2] + [shuffled_ids(f[2])],
-            'fluoroscope a: only 2 of 3 exposures fit the phantom, 3 are needed; the first .* fluoroscope a, exposure 3: ',
+            'fluoroscope a: only 2 of 3 exposures fit the phantom, 3 are needed; '
+            'the first .* fluoroscope a, exposure 3: ',
         ),
     ],
 )
@@ -598,7 +600,7 @@ def test_a_frame_that_does_not_fit_the_phantom_is_left_out_with_a_sentence():
 
 def test_a_fault_of_the_second_fluoroscope_is_told_by_its_name():
     frames = {'a': frames_of()['a'], 'b': rigs.exposures()['b'][:2]}
-    with pytest.raises(DataError, match='^fluoroscope b: 2 exposures are too few'):
+    with pytest.raises(DataError, match=r'^fluoroscope b: 2 exposures are too few'):
         calibrate(frames, PHANTOM, rounds(1), joint=True)
 
 

@@ -164,7 +164,8 @@ def test_no_correction_corrects_nothing_and_knows_no_outside():
     [
         (
             ('spline', 5, np.zeros((9, 2)), np.zeros((9, 2))),
-            "one of none, knn, local_linear, parametric, hybrid, collocation, lookup, not 'spline'",
+            'one of none, knn, local_linear, parametric, hybrid, collocation, lookup, '
+            "not 'spline'",
         ),
         (
             ('knn', 10, np.zeros((9, 2)), np.zeros((9, 2))),
@@ -454,7 +455,7 @@ def test_a_change_is_told_and_inliers_do_not_flicker():
     regressor.choose(values, q, information)
     assert regressor.changed and not regressor.inliers[0] and regressor.inliers[30]
     with pytest.raises(
-        ValueError, match='^10 inliers are too few for the correction model, 60 are needed'
+        ValueError, match=r'^10 inliers are too few for the correction model, 60 are needed'
     ):
         regressor.choose(values, np.where(np.arange(600) < 11, q, 2 * INLIER_Q), information)
 

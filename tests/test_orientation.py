@@ -5,6 +5,7 @@ and use it.
 import csv
 import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -168,7 +169,7 @@ def test_covariance_of_a_capture_against_monte_carlo():
 
 
 def test_frames_of_a_capture_are_averaged():
-    """In any order; a false match in one of them does no harm, and the noise is that of the mean."""
+    """In any order; a false match does no harm, and the noise is that of the mean."""
     frames = capture(count=12, false_matches=0.0)
     one = orientation_of_capture(
         {n: f[:1] for n, f in frames.items()}, rig().phantom, calibrations()
@@ -233,7 +234,8 @@ def test_better_known_targets_make_a_better_orientation():
         (lambda f, c: ({**f, 'b': []}, c), 'fluoroscope b: there is no frame of the phantom'),
         (
             lambda f, c: ({**f, 'b': [replace(f['b'][0], image_size=(2048, 2048))]}, c),
-            'fluoroscope b, frame 1: the image is 2048 x 2048 px, but the calibration is for 1024 x 1024 px',
+            'fluoroscope b, frame 1: the image is 2048 x 2048 px, '
+            'but the calibration is for 1024 x 1024 px',
         ),
         (
             lambda f, c: (
@@ -407,11 +409,11 @@ def found():
 def test_file_gives_the_same_orientation(tmp_path, found):
     """To the last bit, and the same bytes again."""
     path = save_orientation(tmp_path / 'new' / 'folder', found)
-    content = open(path, 'rb').read()
+    content = Path(path).read_bytes()
     again = load_orientation(path)
     for name in found.__dataclass_fields__:
         assert np.array_equal(getattr(again, name), getattr(found, name)), name
-    assert open(save_orientation(tmp_path, again), 'rb').read() == content
+    assert Path(save_orientation(tmp_path, again)).read_bytes() == content
     with np.load(path, allow_pickle=False) as file:
         assert file.files == ['format_version', *ARRAYS] and file['format_version'] == 1
 

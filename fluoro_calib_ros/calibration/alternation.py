@@ -102,11 +102,7 @@ class Regressions:
         """Models of values (N, 2) by fluoroscope, with their terms from the last adjustment."""
         out = {}
         for f, (name, rows) in enumerate(self._rows.items()):
-            series = (
-                None
-                if terms is None
-                else terms.series(f, after.parameters.additional[f], precise.additional[f])
-            )
+            series = None if terms is None else terms.fitted_series(f, after, precise)
             out[name] = self.steps[name].model(values[rows], series)
         return out
 

@@ -90,7 +90,7 @@ def calibrate_by_adjustment(
             0,
             network.uv[rows],
             (after.residuals + correction)[rows],
-            series=terms.series(f, after.parameters.additional[f], precise.additional[f]),
+            series=terms.fitted_series(f, after, precise),
         )
     return SelfCalibration(
         replace(measured, network=network),

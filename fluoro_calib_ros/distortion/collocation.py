@@ -14,7 +14,7 @@ import numpy as np
 
 from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
-from .estimation import AdjustedTerms, AdjustmentProblem, prior_of_additional
+from .estimation import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
 from .priors import Prior, gauge_precision, most_likely_prior, prior_precision, starting_prior
 from .series import MARGIN, Functions, Series, sd_over_image
 from .series_model import SeriesModel
@@ -113,7 +113,7 @@ class CollocationTerms(AdjustedTerms):
         Returns whether the priors have settled, and the coefficients with which to continue.
         """
         settled = True
-        coefficients = adjustment.parameters.additional
+        coefficients = coefficients_of(adjustment)
         self.interior = adjustment.parameters.interior
         for f, functions in enumerate(self.functions):
             last = self.priors[f]

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
+    from ..photogrammetry.precision import Precision
     from .base import CorrectionModel
     from .series import Series
 
@@ -107,6 +108,14 @@ class AdjustedTerms(ABC):
 
         Returns whether nothing changed, and the coefficients with which to continue.
         """
+
+    def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
+        """Return the series of fluoroscope f that an adjustment has estimated."""
+        coefficients = adjustment.parameters.additional[f]
+        covariance = precise.additional[f]
+        if coefficients is None or covariance is None:
+            raise ValueError(f'no terms were estimated for fluoroscope number {f}')
+        return self.series(f, coefficients, covariance)
 
 
 class RegressionStep(ABC):
@@ -228,6 +237,11 @@ def require_training(count: int) -> None:
         raise ValueError(
             f'{count} inliers are too few for the correction model, {MIN_TRAINING} are needed'
         )
+
+
+def coefficients_of(adjustment: Adjustment) -> tuple[np.ndarray, ...]:
+    """Coefficients of the additional parameters by fluoroscope, which all have some."""
+    return tuple(c for c in adjustment.parameters.additional if c is not None)
 
 
 def prior_of_additional(network: Network, f: int) -> np.ndarray:

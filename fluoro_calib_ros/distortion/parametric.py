@@ -18,7 +18,7 @@ from scipy.special import stdtrit
 from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.noise_estimation import LOOSE
 from ..photogrammetry.precision import information_of_additional
-from .estimation import AdjustedTerms, AdjustmentProblem, prior_of_additional
+from .estimation import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
 from .gauge import gauge_basis
 from .series import Functions, Series, sd_over_image
 from .series_model import SeriesModel
@@ -112,7 +112,7 @@ class StepwiseTerms(AdjustedTerms):
         Returns whether no term was, and the coefficients with which to continue.
         """
         changed = [self._step(f, network, matrix, adjustment) for f in range(len(self.functions))]
-        return not any(changed), adjustment.parameters.additional
+        return not any(changed), coefficients_of(adjustment)
 
     def _step(
         self, f: int, network: Network, matrix: FactorizedNormalMatrix, result: Adjustment
@@ -120,7 +120,7 @@ class StepwiseTerms(AdjustedTerms):
         """Add the best term of fluoroscope f, or remove one that is not significant any more."""
         present = prior_of_additional(network, f)
         information = information_of_additional(matrix, f) - present
-        coefficients = result.parameters.additional[f]
+        coefficients = coefficients_of(result)[f]
         selected = self.selected[f]
         rows = network.rows(f)
         dof = 2 * len(rows) - network.n_unknowns + len(self.names) * len(self.selected)

@@ -35,11 +35,11 @@ class KnnRegressor(KNeighborsRegressor):
         """Fit to samples X (N, d) with targets y (N,) or (N, outputs)."""
         self.sample_weight_ = None
         if sample_weight is not None:
-            X, y = validate_data(self, X, y, multi_output=True, accept_sparse='csr')
-            weight = _check_sample_weight(sample_weight, X)
+            samples, targets = validate_data(self, X, y, multi_output=True, accept_sparse='csr')
+            weight = _check_sample_weight(sample_weight, samples)
             positive = weight > 0
-            X = X[positive]
-            y = y[positive]
+            X = samples[positive]
+            y = targets[positive]
             self.sample_weight_ = weight[positive]
         super().fit(X, y)
         fast = self.weights == 'uniform' and self.effective_metric_ == 'euclidean'
@@ -50,9 +50,9 @@ class KnnRegressor(KNeighborsRegressor):
         """Predict the targets of samples X (n, d)."""
         if getattr(self, '_scipy_tree', None) is None or self.n_neighbors > self.n_samples_fit_:
             return super().predict(X)
-        X = validate_data(self, X, reset=False, dtype=float)
+        samples = validate_data(self, X, reset=False, dtype=float)
         assert self._scipy_tree is not None
-        _, index = self._scipy_tree.query(X, k=np.arange(1, self.n_neighbors + 1))
+        _, index = self._scipy_tree.query(samples, k=np.arange(1, self.n_neighbors + 1))
         values = self._y[:, None] if self._y.ndim == 1 else self._y
         if self.sample_weight_ is None:
             predicted = np.mean(values[index], axis=1)
@@ -89,39 +89,41 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
 
         Sample weights weight the fits of trend and planes; a sample of weight 0 is left out.
         """
-        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        samples, targets = validate_data(
+            self, X, y, multi_output=True, y_numeric=True, dtype=np.float64
+        )
         if self.n_neighbors < 1:
             raise ValueError(f'n_neighbors is at least 1, not {self.n_neighbors}')
-        weight = np.ones(len(X))
+        weight = np.ones(len(samples))
         if sample_weight is not None:
-            weight = _check_sample_weight(sample_weight, X, dtype=np.float64)
+            weight = _check_sample_weight(sample_weight, samples, dtype=np.float64)
         positive = weight > 0
-        X = X[positive]
-        self._single_output = y.ndim == 1
-        y = y[positive].reshape(len(X), -1).astype(np.float64)
+        samples = samples[positive]
+        self._single_output = targets.ndim == 1
+        targets = targets[positive].reshape(len(samples), -1).astype(np.float64)
         self._weight = weight[positive]
-        self._centre = X.mean(axis=0)
-        self._scale = max(float(np.max(np.abs(X - self._centre))), 1e-300)
-        basis = self._basis(X)
+        self._centre = samples.mean(axis=0)
+        self._scale = max(float(np.max(np.abs(samples - self._centre))), 1e-300)
+        basis = self._basis(samples)
         root = np.sqrt(self._weight)[:, None]
-        self.trend_coefficients_ = np.linalg.pinv(root * basis) @ (root * y)
-        self._remainder = y - basis @ self.trend_coefficients_
-        self._tree = cKDTree(X)
-        self.n_neighbors_ = min(self.n_neighbors, len(X))
+        self.trend_coefficients_ = np.linalg.pinv(root * basis) @ (root * targets)
+        self._remainder = targets - basis @ self.trend_coefficients_
+        self._tree = cKDTree(samples)
+        self.n_neighbors_ = min(self.n_neighbors, len(samples))
         return self
 
     def predict(self, X: ArrayLike) -> np.ndarray:
         """Predict the targets of samples X (n, d)."""
         check_is_fitted(self)
-        X = validate_data(self, X, reset=False, dtype=np.float64)
-        distance, index = self._tree.query(X, k=np.arange(1, self.n_neighbors_ + 1))
+        samples = validate_data(self, X, reset=False, dtype=np.float64)
+        distance, index = self._tree.query(samples, k=np.arange(1, self.n_neighbors_ + 1))
         bandwidth = np.maximum(distance[:, -1:], MIN_BANDWIDTH)
         kernel = (1 - (distance / bandwidth) ** 3) ** 3
         kernel[kernel.sum(axis=1) <= 1e-9] = 1.0  # all neighbours at one distance
         kernel *= self._weight[index]
-        offset = (self._tree.data[index] - X[:, None]) / bandwidth[:, :, None]
+        offset = (self._tree.data[index] - samples[:, None]) / bandwidth[:, :, None]
         weights = _plane_weights(offset, kernel)
-        predicted = self._basis(X) @ self.trend_coefficients_
+        predicted = self._basis(samples) @ self.trend_coefficients_
         predicted += np.einsum('nk,nko->no', weights, self._remainder[index])
         return predicted[:, 0] if self._single_output else predicted
 

@@ -1,5 +1,5 @@
-"""The exception that faults in the data raise."""
+"""The exception for faults in the data."""
 
 
 class DataError(ValueError):
-    """A fault in the data: one sentence that names the place and the cause."""
+    """A fault in the data; the message is one sentence that names place and cause."""

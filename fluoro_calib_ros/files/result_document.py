@@ -43,10 +43,8 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
     }
 
 
-def _relative(orientations: Sequence[Any]) -> Any:
-    """The relative orientation of two fluoroscopes, a list where there are more, None where there
-    is none.
-    """
+def _relative(orientations: Sequence[RelativeOrientation]) -> Any:
+    """Return the relative orientation of two fluoroscopes, a list for more, None without any."""
     out = [
         {
             'fluoroscopes': list(o.fluoroscopes),
@@ -61,7 +59,9 @@ def _relative(orientations: Sequence[Any]) -> Any:
         }
         for o in orientations
     ]
-    return out if len(out) > 1 else (out[0] if out else None)
+    if not out:
+        return None
+    return out[0] if len(out) == 1 else out
 
 
 def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
@@ -87,7 +87,7 @@ def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
 
 
 def _history(history: Mapping[str, Sequence[Round]]) -> list[dict[str, Any]]:
-    """Rounds in order, those of fluoroscopes that were calibrated one after the other likewise."""
+    """Return all rounds in order, those of separately calibrated fluoroscopes one after another."""
     return [
         {
             'fluoroscopes': label.split('+'),

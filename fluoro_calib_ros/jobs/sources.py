@@ -102,7 +102,7 @@ def read_calibrations(
 ) -> dict[str, FluoroscopeCalibration]:
     """Read the calibrations in a result folder, by default all.
 
-    Raises DataError where there is none, where one is missing, and for a damaged file.
+    Raises DataError for a folder without calibrations, a missing one, and a damaged file.
     """
     found = load_calibrations(directory)
     if not found:

@@ -24,7 +24,7 @@ from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.rotations import matrix_from_quaternion
 
-NEIGHBOURS = 8  # image points examined around each, of which those of other exposures count
+NEIGHBOURS = 8  # of each image point; those of other exposures count
 CELLS = 8  # across the image
 MIN_IN_CELL = 10  # image points
 FALSE_ALARM = 2e-3  # chance of a false alarm of each test

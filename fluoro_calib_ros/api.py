@@ -18,13 +18,12 @@ from .calibration.result import CorrectedPoints, FluoroscopeCalibration
 from .errors import DataError
 from .exposures.frame import Frame
 from .exposures.phantom import Phantom
-from .files.calibration_sources import read_sources as read_request
+from .files.calibration_request import read_request
 from .files.phantom import read_phantom
 from .files.reconstructed_points import write_reconstruction
 from .files.rig_orientation import load_orientation, save_orientation
 from .jobs.adjustment import adjust
-from .jobs.calibration import CalibrationOutcome
-from .jobs.calibration import run as run_calibration
+from .jobs.calibration import CalibrationOutcome, run_calibration
 from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
 from .jobs.result_folder import save_outcome, save_result

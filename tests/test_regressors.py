@@ -25,7 +25,7 @@ from fluoro_calib_ros.distortion.regressors import KnnRegressor, LocalLinearRegr
 from fluoro_calib_ros.distortion.user_regressor import regressor_name, resolve_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.files.calibration import load_calibration, save_calibration
-from fluoro_calib_ros.files.calibration_sources import _read_options
+from fluoro_calib_ros.files.calibration_request import _read_options
 
 SIZE = (640, 480)
 REGRESSORS = [(KnnModel, KnnRegressor), (LocalLinearModel, LocalLinearRegressor)]

@@ -15,7 +15,7 @@ from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
-from fluoro_calib_ros.files.calibration_sources import read_sources, write_sources
+from fluoro_calib_ros.files.calibration_request import read_request, write_request
 from fluoro_calib_ros.files.validation import validation_document
 from fluoro_calib_ros.report.verdict import verdict_text
 from fluoro_calib_ros.validation import verdict as verdict_module
@@ -425,11 +425,11 @@ def test_sources_round_trip(tmp_path):
     options = CalibrationOptions(k=20, loss='huber', **LOCAL)
     save_calibration(str(tmp_path), calibration)
     (tmp_path / 'validation.json').write_text('of an earlier calibration')
-    write_sources(
+    write_request(
         tmp_path, CalibrationRequest({'a': frames}, rig().phantom, options, True, 4000.0)
     )
     assert not (tmp_path / 'validation.json').exists()
-    found = read_sources(tmp_path, load_calibrations(str(tmp_path)))
+    found = read_request(tmp_path, load_calibrations(str(tmp_path)))
     assert (found.options, found.joint, found.principal_distance) == (options, True, 4000.0)
     assert all(
         np.array_equal(f.sorted().uv, g.sorted().uv) and f.image_size == g.image_size

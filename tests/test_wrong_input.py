@@ -16,7 +16,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.phantom import write_phantom
-from fluoro_calib_ros.jobs import calibration
+from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.validation.inputs import copied_exposures, find_wrong_input
@@ -163,8 +163,8 @@ WRONG = {
 def test_wrong_input_is_refused_with_its_cause(kind):
     make_frames, make_phantom, sentence = WRONG[kind]
     phantom = PHANTOM if make_phantom is None else make_phantom()
-    with pytest.raises(DataError, match='^fluoroscope a: ') as error:
-        calibration.run(CalibrationRequest({'a': make_frames()}, phantom, FAST))
+    with pytest.raises(DataError, match=r'^fluoroscope a: ') as error:
+        run_calibration(CalibrationRequest({'a': make_frames()}, phantom, FAST))
     assert sentence in str(error.value)
 
 
@@ -229,13 +229,13 @@ HOSTILE = {
 def test_hostile_numbers_end_in_one_sentence(kind):
     make_frames, make_phantom, sentence = HOSTILE[kind]
     with pytest.raises(DataError, match=sentence) as error:
-        calibration.run(CalibrationRequest({'a': make_frames()}, make_phantom(), FAST))
+        run_calibration(CalibrationRequest({'a': make_frames()}, make_phantom(), FAST))
     assert '\n' not in str(error.value)
 
 
 @pytest.mark.filterwarnings('error')
 def test_an_exposure_on_a_line_does_not_spoil_the_others():
-    outcome = calibration.run(CalibrationRequest({'a': flattened(1)}, PHANTOM, FAST))
+    outcome = run_calibration(CalibrationRequest({'a': flattened(1)}, PHANTOM, FAST))
     assert len(outcome.result.fluoroscopes['a'].exposures) == 5
     assert 'exposure 1: all image points lie on one line' in outcome.result.left_out[0]
 
@@ -277,18 +277,18 @@ def test_a_few_wrong_exposures_are_left_out_and_named():
     wrong = simulate_exposures(virtual_rig(2), 2, 9).frames['a']
     mixed = frames(8) + [replace(f, number=f.number + 100) for f in wrong]
     mixed.append(replace(frames()[0], number=200))
-    outcome = calibration.run(CalibrationRequest({'a': mixed}, PHANTOM, FAST))
+    outcome = run_calibration(CalibrationRequest({'a': mixed}, PHANTOM, FAST))
     assert [e.exposure for e in outcome.result.fluoroscopes['a'].exposures] == list(range(1, 9))
     assert len(outcome.result.left_out) == 3
     assert 'exposure 200: the image points are those of exposure 1' in outcome.result.left_out[0]
 
 
 def test_an_impossible_result_is_refused_unless_it_is_forced():
-    """Every bead is labelled as one nearby: a half fits by chance, and the rest bends the result."""
+    """Beads are labelled as ones nearby: half of them fit by chance, the rest bend the result."""
     request = CalibrationRequest({'a': frames(10, false_matches=0.45)}, PHANTOM, FAST)
     with pytest.raises(DataError, match='fluoroscope a: the residuals are too large: RMSE'):
-        calibration.run(request)
-    outcome = calibration.run(request, force=True)
+        run_calibration(request)
+    outcome = run_calibration(request, force=True)
     assert len(outcome.doubts) == 1
     assert list(outcome.doubts) == implausible(request, outcome.result)
 
@@ -297,13 +297,13 @@ def test_frames_that_do_not_belong_together_give_no_orientation():
     """Fluoroscope b is one exposure behind a: both are calibrated well, the rig is not rigid."""
     seen = {n: list(f[:8]) for n, f in exposures().items()}
     seen['b'] = [replace(f, number=f.number + 1) for f in seen['b']]
-    outcome = calibration.run(CalibrationRequest(seen, PHANTOM, FAST))
+    outcome = run_calibration(CalibrationRequest(seen, PHANTOM, FAST))
     assert outcome.orientation is None
     assert (
         'the exposures of fluoroscopes a and b contradict each other' in outcome.orientation_note
     )
     seen = {n: f[:8] for n, f in exposures().items()}
-    assert calibration.run(CalibrationRequest(seen, PHANTOM, FAST)).orientation is not None
+    assert run_calibration(CalibrationRequest(seen, PHANTOM, FAST)).orientation is not None
 
 
 def test_the_command_refuses_wrong_input_and_writes_it_only_when_forced(tmp_path, capsys):

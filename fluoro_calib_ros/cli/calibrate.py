@@ -119,7 +119,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..calibration.request import CalibrationRequest
     from ..files.phantom import read_phantom
     from ..files.result_document import result_document
-    from ..jobs import calibration
+    from ..jobs.calibration import run_calibration
     from ..jobs.result_folder import save_outcome
     from ..jobs.sources import read_source
     from ..report.tables import summary_table
@@ -142,7 +142,7 @@ def run(arguments: argparse.Namespace) -> None:
     request = CalibrationRequest(
         recording.frames, phantom, options, arguments.joint, arguments.principal_distance
     )
-    outcome = calibration.run(request, force=arguments.force, progress=print_round)
+    outcome = run_calibration(request, force=arguments.force, progress=print_round)
     save_outcome(arguments.out, outcome)
     if arguments.figures:
         from ..report.figures import write_figures

@@ -38,7 +38,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     Raises DataError, also for the verdict 'fail', after everything is written.
     """
-    from ..files.calibration_sources import read_sources
+    from ..files.calibration_request import read_request
     from ..files.phantom import read_phantom
     from ..files.validation import validation_document, write_validation
     from ..jobs.sources import read_calibrations, read_source
@@ -58,7 +58,7 @@ def run(arguments: argparse.Namespace) -> None:
         frames = recording.frames
     if arguments.phantom is not None:
         phantom = read_phantom(arguments.phantom)
-    request = read_sources(arguments.directory, calibrations, frames, phantom)
+    request = read_request(arguments.directory, calibrations, frames, phantom)
     validation = validate(request, calibrations, print_step)
     write_validation(arguments.directory, validation)
     print_result(arguments, validation_document(validation), verdict_text(validation))

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
+from ..calibration.constraints import RelativeOrientation
 from ..calibration.rounds import Round
 from ..drift.recording_watch import DriftVerdict
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -87,7 +88,7 @@ def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
 
 
 def _history(history: Mapping[str, Sequence[Round]]) -> list[dict[str, Any]]:
-    """Return all rounds in order, those of separately calibrated fluoroscopes one after another."""
+    """Return all rounds in order, one calibration after the other."""
     return [
         {
             'fluoroscopes': label.split('+'),

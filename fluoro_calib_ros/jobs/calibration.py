@@ -1,7 +1,7 @@
 """The calibration job: self-calibrate, orient the rig, validate.
 
-The command line, the calibration node, its worker process and Python users all call `run`;
-`result_folder.save_outcome` writes what it returns.
+The command line, the calibration node, its worker process and Python users all call
+`run_calibration`; `result_folder.save_outcome` writes what it returns.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ class CalibrationOutcome:
         return replace(self, result=replace(self.result, runs={}))
 
 
-def run(
+def run_calibration(
     request: CalibrationRequest,
     *,
     validate: bool = False,

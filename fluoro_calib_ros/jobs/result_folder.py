@@ -10,7 +10,7 @@ from ..calibration.calibrate import CalibrationResult
 from ..calibration.result import FluoroscopeCalibration
 from ..errors import DataError
 from ..files.calibration import save_calibration
-from ..files.calibration_sources import write_sources
+from ..files.calibration_request import write_request
 from ..files.json_file import write_json
 from ..files.result_document import result_document
 from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
@@ -50,7 +50,7 @@ def save_outcome(
     """
     directory = Path(directory)
     save_result(directory, outcome.result, outcome.doubts)
-    write_sources(directory, outcome.request)
+    write_request(directory, outcome.request)
     saved = saved_orientation(directory)
     orientation = kept_orientation(present or saved, outcome.orientation, outcome.calibrations)
     if orientation is not None and orientation is not saved:

@@ -8,7 +8,7 @@ import signal
 from multiprocessing.connection import Connection
 
 from ..calibration.request import CalibrationRequest
-from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run
+from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run_calibration
 
 POLL_S = 0.05  # interval at which the caller may cancel [s]
 NICE = 10  # lower priority than the live nodes
@@ -22,9 +22,9 @@ def run_in_worker_process(
     progress: Progress | None = None,
     raise_if_cancelled: Cancellation | None = None,
 ) -> CalibrationOutcome:
-    """Run `jobs.calibration.run` in another process.
+    """Run `run_calibration` in another process.
 
-    Parameters and errors are those of `run`. The outcome comes without the networks behind it.
+    Parameters and errors are those of `run_calibration`. The outcome has no networks.
     raise_if_cancelled is called repeatedly and may raise to terminate the process. Raises
     RuntimeError for any other failure of the process.
     """
@@ -78,7 +78,7 @@ def _work(
     """
     os.nice(NICE)
     try:
-        outcome = run(
+        outcome = run_calibration(
             request,
             validate=validate,
             rig=rig,

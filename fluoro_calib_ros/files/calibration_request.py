@@ -27,7 +27,7 @@ OPTIONS = 'options.json'
 VERSION = 1  # of options.json
 
 
-def write_sources(directory: PathLike, request: CalibrationRequest) -> None:
+def write_request(directory: PathLike, request: CalibrationRequest) -> None:
     """Write what a calibration was made from, and delete the verdict on an earlier one.
 
     Raises DataError where a file cannot be written.
@@ -45,7 +45,7 @@ def write_sources(directory: PathLike, request: CalibrationRequest) -> None:
     write_json(directory / OPTIONS, document)
 
 
-def read_sources(
+def read_request(
     directory: PathLike,
     calibrations: Mapping[str, FluoroscopeCalibration],
     frames: Mapping[str, Sequence[Frame]] | None = None,

@@ -1,5 +1,6 @@
 """The regressors: scikit-learn's checks, agreement with the models, and users' own regressors."""
 
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -26,6 +27,8 @@ from fluoro_calib_ros.distortion.user_regressor import regressor_name, resolve_m
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.files.calibration import load_calibration, save_calibration
 from fluoro_calib_ros.files.calibration_request import _read_options
+from fluoro_calib_ros.files.observations import write_observations_csv
+from fluoro_calib_ros.files.phantom import write_phantom
 
 SIZE = (640, 480)
 REGRESSORS = [(KnnModel, KnnRegressor), (LocalLinearModel, LocalLinearRegressor)]
@@ -256,3 +259,24 @@ def test_lookup_cannot_be_asked_for():
     assert 'lookup' in MODELS
     with pytest.raises(ValueError, match='model is one of'):
         CalibrationOptions('lookup')
+
+
+def test_the_command_calibrates_with_a_users_regressor(tmp_path, capsys):
+    """The result folder names it; nothing that reads the folder runs it."""
+    write_observations_csv(tmp_path / 'points.csv', {'a': rigs.exposures()['a'][:6]})
+    write_phantom(tmp_path / 'phantom.csv', rigs.rig().phantom)
+    source = ['--phantom', tmp_path / 'phantom.csv', '--image-size', '1024x1024']
+    command = ['calibrate', tmp_path / 'points.csv', *source, '--out', tmp_path / 'result']
+    status = rigs.run(*command, '--model', 'test_regressors:cubic', '--max-iterations', 2)
+    assert status == 0, capsys.readouterr().err
+    assert load_calibration(str(tmp_path / 'result' / 'a.calibration.npz')).model.kind == 'lookup'
+    options = json.loads((tmp_path / 'result' / 'options.json').read_text())['options']
+    assert options['model'] == 'sklearn.pipeline:Pipeline'
+    capsys.readouterr()
+    assert rigs.run('validate', tmp_path / 'result') == 1
+    said = capsys.readouterr().err
+    assert 'only on the command line and in Python' in said and said.count('\n') == 1
+    assert rigs.run(*command, '--model', 'test_regressors:nothing') == 2
+    assert 'cannot be imported' in capsys.readouterr().err
+    assert rigs.run(*command, '--model', 'splines') == 2
+    assert 'choose from auto, none, knn' in capsys.readouterr().err

@@ -109,7 +109,7 @@ def on_one_core(calibration, frames, repeats=200):
 
 
 class Reader:
-    """Publishes the calibration, and takes what the nodes put out."""
+    """Publishes the calibration, and records the outputs of the nodes."""
 
     def __init__(self, calibration):
         import rclpy
@@ -129,7 +129,7 @@ class Reader:
         self.reader = None
 
     def listen(self, topic):
-        """Collect (stamp, latency) [ns] of a topic anew, with the images unread."""
+        """Collect (stamp, latency) [ns] of a topic, without decoding the images."""
         from sensor_msgs.msg import Image
 
         from fluoro_calib_ros.nodes.runtime.qos import images_qos
@@ -363,7 +363,7 @@ if __name__ == '__main__':
     parser.add_argument('--only', default='', help='live cases whose name contains this')
     parser.add_argument('--live', action='store_true', help='the live cases alone, as JSON')
     parser.add_argument(
-        '--picture', metavar='FILE', help='draw docs/images/corrected_image.png anew, nothing else'
+        '--picture', metavar='FILE', help='only draw docs/images/corrected_image.png'
     )
     options = parser.parse_args()
     if options.picture:

@@ -1,10 +1,10 @@
-"""The online path at lab rates: nodes as processes of their own, beside relays that do nothing
+"""The online path at lab rates: nodes as processes, compared with relays that do nothing
 with the same messages.
 
     python -m benchmarks.online [--seconds 60] [--only NAME]
 
 The simulator, the nodes under test and the reader (this process) share the machine. A frame is
-lost when it does not come out. Latency is told twice: within the node, from the arrival of the
+lost when it does not come out. Latency is reported twice: within the node, from the arrival of the
 input (of the last view, for points) to the publication of the output, as the node's diagnostics
 have it (the median of its medians, and the largest of its 99 %, each of 2,000 frames); and from
 the stamp of the simulator, set just before it publishes, to the time stamp that DDS gives the
@@ -114,7 +114,7 @@ class Reader(Node):
                 )
 
     def listen(self, nodes):
-        """Count the outputs of nodes anew."""
+        """Start to count the outputs of nodes."""
         self.came = {}
         self.within = {}
         self.reader = StreamReader(self, logged(self))

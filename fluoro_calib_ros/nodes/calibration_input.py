@@ -1,4 +1,4 @@
-"""Calibrations that arrive at a node, each prepared in a thread beside the stream."""
+"""Calibrations that arrive at a node, each prepared in a thread in parallel to the stream."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class CalibrationInput:
         return self._current[name]
 
     def close(self) -> None:
-        """Unsubscribe and wait for what is being prepared: it needs the node."""
+        """Unsubscribe, and wait for the calibrations in preparation: they need the node."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []

@@ -2,8 +2,8 @@
 
 One thread runs all callbacks. Those that take long (calibrate, capture) are coroutines that await
 what they need, and the calibration itself is a process of its own. rclpy's MultiThreadedExecutor
-is no alternative: it schedules a callback again until it has started, which on a busy machine
-takes so much time that frames are lost.
+is no alternative: it schedules a callback again and again until it has started, which on a busy
+machine costs so much time that frames are lost.
 """
 
 from __future__ import annotations

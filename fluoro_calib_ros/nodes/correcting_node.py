@@ -82,7 +82,7 @@ class CorrectingNode(StreamNode):
         return Stream(name, self.item, self.limited_logger)
 
     def prepare(self, calibration: FluoroscopeCalibration) -> Any:
-        """Return what is kept of a calibration; called in a thread."""
+        """Prepare a calibration for use, and return it; called in a thread."""
         return calibration
 
     def on_calibration_ready(self, name: str, prepared: Any) -> None:
@@ -97,7 +97,7 @@ class CorrectingNode(StreamNode):
         self.streams = {name: self.make_stream(name) for name in self.names}
 
     def prepared(self, name: str) -> Any:
-        """Return what is kept of the calibration in use, None before the first one."""
+        """Return the prepared calibration in use, None before the first one."""
         return self._calibrations.current(name)
 
     def subscribe_calibrations(self) -> None:

@@ -140,7 +140,7 @@ class _Rig(NamedTuple):
 
 
 class ReconstructionNode(StreamNode):
-    """Publishes points in space for every exposure of which at least two views have come."""
+    """Publishes points in space for every exposure with at least two views."""
 
     def __init__(self) -> None:
         super().__init__('reconstruction_node')

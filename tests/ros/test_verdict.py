@@ -4,9 +4,10 @@ import json
 
 from fluoro_calib_msgs.srv import Calibrate
 from ros_graph import SUCCEEDED
+from test_jobs import rig  # noqa: F401  a fixture
 
 
-def test_job_reports_the_verdict_on_request(rig):
+def test_job_reports_the_verdict_on_request(rig):  # noqa: F811
     """A model that corrects nothing is published, its verdict is fail, with the reason."""
     client = rig.client
     done = client.result_of(

@@ -132,7 +132,7 @@ def compressed_message(
     Parameters
     ----------
     message : Image
-        Header and encoding are taken from it.
+        Source of header and encoding.
     image : np.ndarray
         Its pixels (h, w).
     kind : {'png', 'jpeg'}
@@ -149,5 +149,5 @@ def compressed_message(
 
 
 def use_single_thread() -> None:
-    """Let OpenCV work in the calling thread: beside other streams, more threads are slower."""
+    """Let OpenCV work in the calling thread: with several streams, more threads are slower."""
     cv2.setNumThreads(1)

@@ -21,8 +21,8 @@ def wait_for_readers(
     """Wait until each publisher of a node has `count` readers, and these know it.
 
     A publisher discovers a reader and the reader the publisher independently of each other. What
-    is published between these moments is lost, reliable or not, and nothing tells when the second
-    one has come. Setting `stop` ends the wait.
+    is published between these moments is lost, reliable or not, and nothing signals the second
+    one. Setting `stop` ends the wait.
     """
     while missing := [p.topic_name for p in publishers if p.get_subscription_count() < count]:
         node.get_logger().info(

@@ -1,9 +1,9 @@
 """Receiving the messages of streams at lab rates.
 
-rclpy's executors build their wait set anew for every message, of everything a node has. With the
-services of parameters and lifecycle that takes some 0.2 ms, twice the time of handling a frame. So
-a thread of its own waits for the subscriptions of streams alone and takes all that has come;
-services and timers stay with the executor. What the two threads share is replaced as a whole,
+rclpy's executors rebuild their wait set for every message, from all entities of a node. With the
+services of parameters and lifecycle this costs some 0.2 ms, twice the time of handling a frame. So
+a dedicated thread waits for the subscriptions of streams only and receives all pending messages;
+services and timers stay with the executor. Data that both threads use is replaced as a whole,
 never changed in place.
 
 Events of these subscriptions are not requested: an event in a wait set wakes the executor at every
@@ -39,7 +39,7 @@ DECODING_ERRORS = (ValueError, RCLError, RuntimeError, MemoryError)
 
 
 class _ReaderGroup(CallbackGroup):
-    """Callback group whose subscriptions no executor takes."""
+    """Callback group whose subscriptions are ignored by executors."""
 
     def can_execute(self, entity: Any) -> bool:
         return not isinstance(entity, Subscription)
@@ -176,7 +176,7 @@ class StreamReader:
     def _drain(
         self, topic: str, kind: type, handle: Any, decode: Callable, callback: Callable
     ) -> None:
-        """Handle the messages that have come on a subscription, but at most MAX_BATCH of them."""
+        """Handle the pending messages of a subscription, at most MAX_BATCH of them."""
         for _ in range(MAX_BATCH):
             if self._stopping.is_set():
                 return

@@ -14,7 +14,7 @@ def test_job_reports_the_verdict_on_request(rig):  # noqa: F811
         client.goal(model='none', fluoroscopes=['b'], validate=True).get_result_async()
     )
     assert done.status == SUCCEEDED and done.result.verdict == 'fail'
-    assert 'the residuals keep a trend of' in done.result.findings[0]
+    assert 'the residuals have a trend of' in done.result.findings[0]
     assert done.result.message.endswith('; verdict: fail')
     document = json.loads((rig.folder / 'validation.json').read_text())
     assert document['findings'] == list(done.result.findings)

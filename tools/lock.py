@@ -16,12 +16,13 @@ import tempfile
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 HEAD = """\
-# Made by tools/lock.py from requirements.in: do not edit. Every package, exactly, for Python {pythons}.
+# Made by tools/lock.py from requirements.in: do not edit. Every package, exactly, for Python \
+{pythons}.
 """
 
 
 def resolve(python):
-    """Return (minor version, {name: version}) as this interpreter's pip resolves requirements.in."""
+    """Return the minor version, and {name: version} as pip of this Python resolves them."""
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([python, '-m', 'venv', folder], check=True)
         pip = [folder + '/bin/python', '-m', 'pip', 'install', '--quiet', '--quiet']
@@ -76,6 +77,7 @@ def merge(answers):
 
 
 def main():
+    """Resolve for the Pythons of the command line and write the lock."""
     if len(sys.argv) < 2:
         sys.exit(__doc__)
     answers = dict(

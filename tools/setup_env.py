@@ -189,8 +189,8 @@ def check_machine():
         libc, libc_version = platform.libc_ver()
         if libc != 'glibc' or tuple(int(part) for part in libc_version.split('.')[:2]) < (2, 28):
             missing.append(
-                f'The ROS 2 packages need glibc 2.28 or newer, and this is {libc or "another libc"} '
-                f'{libc_version}: use a distribution of 2019 or later that is built on glibc.'
+                'The ROS 2 packages need glibc 2.28 or newer, and this is '
+                f'{libc or "another libc"} {libc_version}: use a distribution of 2019 or later that is built on glibc.'
             )
     if subprocess.run(
         [BASE_PYTHON, '-c', 'import venv, ensurepip'], env=environment(), stderr=subprocess.DEVNULL
@@ -207,8 +207,8 @@ def check_machine():
         )
     if not compiles():
         missing.append(
-            "There is no working C and C++ compiler: get one with 'sudo apt install g++' (Debian, Ubuntu) "
-            "or 'sudo dnf install gcc-c++' (Fedora), or name yours in CC and CXX."
+            "There is no working C and C++ compiler: get one with 'sudo apt install g++' "
+            "(Debian, Ubuntu) or 'sudo dnf install gcc-c++' (Fedora), or name yours in CC and CXX."
         )
     if not shutil.which('make'):
         missing.append(
@@ -287,7 +287,7 @@ def rewrite_cmake_files():
             )
             if '/opt/python/' in new:
                 raise SetupError(
-                    f'{path} names a folder of the machine the wheel was built on, in a way not known here'
+                    f'{path} names a folder of the machine the wheel was built on, in an unknown way'
                 )
             path.write_text(new)
 
@@ -344,7 +344,8 @@ def build_messages():
         VENV_PYTHON,
         '-c',
         'import rclpy, fluoro_calib_msgs.msg as m, tf2_msgs.msg as t; '
-        'm.TargetObservations.__class__.__import_type_support__(); t.TFMessage.__class__.__import_type_support__()',
+        'm.TargetObservations.__class__.__import_type_support__(); '
+        't.TFMessage.__class__.__import_type_support__()',
     )
 
 

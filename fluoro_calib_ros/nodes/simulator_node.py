@@ -12,11 +12,10 @@ import numpy as np
 import rclpy
 from fluoro_calib_msgs.msg import TargetObservations
 from rclpy.node import Node
-from scipy.spatial.transform import Rotation
 
 from ..exposures.frame import Frame
 from ..options import option
-from ..photogrammetry.rotations import matrix_from_vector
+from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from ..simulation.exposures import Detection, detect_beads, phantom_poses
 from ..simulation.rig import virtual_rig
 from ..simulation.tracking import CLUSTER_MARKERS, simulate_grid, simulate_tracking
@@ -208,7 +207,7 @@ class SimulatorNode(Node):
             return start
         end = self._poses[(int(cycle) + 1) % len(self._poses)]
         part = (time_s - stand_s) / move_s
-        turn = matrix_from_vector(part * Rotation.from_matrix(end[0] @ start[0].T).as_rotvec())
+        turn = matrix_from_vector(part * vector_from_matrix(end[0] @ start[0].T))
         return turn @ start[0], start[1] + part * (end[1] - start[1])
 
     def stop(self) -> None:

@@ -190,7 +190,8 @@ def check_machine():
         if libc != 'glibc' or tuple(int(part) for part in libc_version.split('.')[:2]) < (2, 28):
             missing.append(
                 'The ROS 2 packages need glibc 2.28 or newer, and this is '
-                f'{libc or "another libc"} {libc_version}: use a distribution of 2019 or later that is built on glibc.'
+                f'{libc or "another libc"} {libc_version}: use a distribution of 2019 or later '
+                'that is built on glibc.'
             )
     if subprocess.run(
         [BASE_PYTHON, '-c', 'import venv, ensurepip'], env=environment(), stderr=subprocess.DEVNULL
@@ -287,7 +288,8 @@ def rewrite_cmake_files():
             )
             if '/opt/python/' in new:
                 raise SetupError(
-                    f'{path} names a folder of the machine the wheel was built on, in an unknown way'
+                    f'{path} names a folder of the machine the wheel was built on, in an '
+                    'unknown way'
                 )
             path.write_text(new)
 

@@ -141,9 +141,11 @@ class _Fluoroscope:
         self.last_round: Round | None = None
         self.calibration: calibration_result.FluoroscopeCalibration | None = None
         self.calibrated_at = float('nan')
+        self.refused_calibration = ''  # why the last calibration was refused
 
     def use(self, calibration: calibration_result.FluoroscopeCalibration) -> None:
         """Use a calibration from now on."""
+        self.refused_calibration = ''
         self.calibration = calibration
         self.calibrated_at = time.monotonic()
 
@@ -367,6 +369,7 @@ class CalibrationNode(Node):
         self._start_collection()
         for fluoroscope in self._fluoroscopes.values():
             fluoroscope.image_size = None
+            fluoroscope.refused_calibration = ''
         response.success = True
         response.message = f'{count} exposures discarded, the calibration stays in use'
         return response
@@ -499,6 +502,8 @@ class CalibrationNode(Node):
         except (DataError, ValueError, OSError) as error:
             result.message = str(error)
             self.get_logger().error(result.message)
+            for name in self._running:
+                self._fluoroscopes[name].refused_calibration = result.message
         except Exception as error:  # a bug must reach the caller, and must not end the node
             result.message = f'the self-calibration failed unexpectedly: {error}'
             self.get_logger().error(result.message)
@@ -665,6 +670,13 @@ class CalibrationNode(Node):
             return WARN, fluoroscope.incompatible
         if self._load_fault:
             return ERROR, f'no calibration loaded: {self._load_fault}'
+        if fluoroscope.refused_calibration:
+            in_use = progress.calibration_id or 'no calibration'
+            return (
+                ERROR,
+                f'the last calibration was refused: {fluoroscope.refused_calibration}; '
+                f'{in_use} is in use',
+            )
         topic = f'{fluoroscope.name}/target_observations'
         if not fluoroscope.received and not self.count_publishers(topic):
             return WARN, 'no publisher of target observations'

@@ -120,15 +120,16 @@ class Evidence(ABC):
         charts = self.charts
         candidates = charts.evidence >= min_evidence
         likelihood = self._preferred(np.where(candidates, charts.log_likelihood(), -1))
-        sign, series, area = np.unravel_index(np.argmax(likelihood), likelihood.shape)
-        begin, run = self._run(series, area, charts.begin[sign, series, area])
-        score = sum(record.score for record in run)
-        information = sum(record.information for record in run)
-        factor = float(np.median(charts.variance_factor()[series]))
+        peak = np.unravel_index(np.argmax(likelihood), likelihood.shape)
+        chart = int(peak[1])
+        begin, run = self._run(chart, int(peak[2]), int(charts.begin[peak]))
+        score = np.asarray(sum(record.score for record in run))
+        information = np.asarray(sum(record.information for record in run))
+        factor = float(np.median(charts.variance_factor()[chart]))
         with np.errstate(divide='ignore', invalid='ignore'):
             size = score / information
         likelihood = np.nan_to_num(score * size / (2 * factor))
-        names, series, area = self._likeliest(likelihood, int(series))
+        names, series, area = self._likeliest(likelihood, chart)
         systematic = np.nansum(
             [r.systematic[series, area] * r.information[series, area] for r in run]
         )

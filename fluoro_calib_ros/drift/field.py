@@ -77,8 +77,8 @@ class SystematicErrorField:
         markers = len(count)
         size = 2 * self._nodes
         index = marker[:, None] * size + nodes
-        rows = np.bincount(index.ravel(), weights.ravel(), markers * size)
-        rows = rows.reshape(markers, size) / count[:, None]
+        sums = np.bincount(index.ravel(), weights.ravel(), markers * size)
+        rows = sums.reshape(markers, size) / count[:, None]
         weight = count**2 / np.bincount(marker, variance)
         self._normal += rows.T @ (rows * weight[:, None])
         self._right += rows.T @ (weight * np.bincount(marker, residual) / count)

@@ -39,7 +39,7 @@ def decode(content: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
     if not len(data):
         raise DataError('the image is empty, it has no data')
     if data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE:
-        _check_png(memoryview(data))
+        _check_png(data.data)
     try:
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:

@@ -91,7 +91,7 @@ class ImageCorrector:
         if interpolation == 'cubic':
             u = _cubic_coordinates(u)
             v = _cubic_coordinates(v)
-        self._map = cv2.convertMaps(u, v, cv2.CV_16SC2)
+        self._map_1, self._map_2 = cv2.convertMaps(u, v, cv2.CV_16SC2)
 
     def correct(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """Correct an image (h, w) of uint8 or uint16; its rows need not be contiguous.
@@ -110,7 +110,8 @@ class ImageCorrector:
         if self.interpolation == 'linear':
             cv2.remap(
                 image,
-                *self._map,
+                self._map_1,
+                self._map_2,
                 cv2.INTER_LINEAR,
                 dst=out,
                 borderMode=cv2.BORDER_CONSTANT,
@@ -139,13 +140,21 @@ class ImageCorrector:
         if image.dtype == np.uint8:  # OpenCV is three times as fast with 16 bits
             wide = cv2.remap(
                 image.astype(np.uint16),
-                *self._map,
+                self._map_1,
+                self._map_2,
                 cv2.INTER_CUBIC,
                 borderMode=cv2.BORDER_REPLICATE,
             )
             np.minimum(wide, 255, out=out, casting='unsafe')
         else:
-            cv2.remap(image, *self._map, cv2.INTER_CUBIC, dst=out, borderMode=cv2.BORDER_REPLICATE)
+            cv2.remap(
+                image,
+                self._map_1,
+                self._map_2,
+                cv2.INTER_CUBIC,
+                dst=out,
+                borderMode=cv2.BORDER_REPLICATE,
+            )
         out.ravel()[self._empty] = self.border
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,7 +13,7 @@ from matplotlib.ticker import LogLocator
 from ..calibration.rounds import SETTLED_PX, SelfCalibration
 from .style import BLACK, BLUE, GREY, RED, new_figure
 
-MARKER = {'marker': 'o', 'markersize': 4}
+MARKER: dict[str, Any] = {'marker': 'o', 'markersize': 4}
 
 
 def relative_costs(run: SelfCalibration) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -82,7 +83,7 @@ def _draw_image_frame(axes: Axes, image_size: Sequence[int]) -> None:
     """Draw the image as a hatched area with a frame, v pointing down."""
     width, height = image_size
     margin = MARGIN * max(image_size)
-    image = {'xy': (-0.5, -0.5), 'width': width, 'height': height}
+    image: dict[str, Any] = {'xy': (-0.5, -0.5), 'width': width, 'height': height}
     axes.add_patch(
         Rectangle(**image, facecolor='white', edgecolor='#AAAAAA', hatch='///', zorder=0.5)
     )

@@ -99,7 +99,7 @@ def _plot_histogram(axes: Axes, values: np.ndarray, limit: float, when: str) -> 
         label += f', {beyond:.1f} % beyond the panel'
     axes.hist(
         values,
-        edges,
+        edges.tolist(),
         weights=np.full(len(values), 1 / (len(values) * (edges[1] - edges[0]))),
         color=colour,
         alpha=alpha,

@@ -7,6 +7,7 @@ people can tell apart.
 from __future__ import annotations
 
 import io
+from typing import Any
 
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -29,7 +30,7 @@ BEFORE = RED
 AFTER = BLUE
 
 
-def new_figure(width: float, height: float, title: str, layout: str = 'constrained') -> Figure:
+def new_figure(width: float, height: float, title: str, layout: Any = 'constrained') -> Figure:
     """An empty figure; width and height in inches."""
     figure = Figure(figsize=(width, height), dpi=DPI, layout=layout)
     figure.suptitle(title)

@@ -41,7 +41,7 @@ def message_from_frame(frame: Frame) -> Any:
     """Return the TargetObservations message of a Frame."""
     uv = np.asarray(frame.uv, dtype=np.float64).reshape(-1, 2)
     stamp = message_class('builtin_interfaces/msg/Time')(*divmod(int(frame.stamp_ns), 10**9))
-    sigma = [] if frame.sigma is None else frame.sigma
+    sigma: Any = [] if frame.sigma is None else frame.sigma
     return message_class(TARGET_OBSERVATIONS)(
         header=message_class('std_msgs/msg/Header')(stamp, frame.frame_id),
         frame_number=int(frame.number),

@@ -128,7 +128,8 @@ def points_on_image(uv: ArrayLike, image_size: tuple[int, int]) -> NDArray[np.bo
     Pixel centres are at integers; NaN is off the image.
     """
     uv = np.asarray(uv)
-    return ((uv >= -0.5) & (uv <= np.asarray(image_size) - 0.5)).all(axis=1)
+    inside = (uv >= -0.5) & (uv <= np.asarray(image_size) - 0.5)
+    return np.all(inside, axis=1)
 
 
 def is_positive(sigma: ArrayLike) -> NDArray[np.bool_]:

@@ -122,6 +122,7 @@ class Network:
         """Corrections (N, 2) [px] by the additional parameters; zeros where there are none."""
         out = np.zeros_like(self.uv)
         for f, additional in enumerate(self.additional):
-            if additional is not None:
-                out[self.rows(f)] = additional.correction(parameters.additional[f])
+            coefficients = parameters.additional[f] if additional is not None else None
+            if additional is not None and coefficients is not None:
+                out[self.rows(f)] = additional.correction(coefficients)
         return out

@@ -145,10 +145,10 @@ class Noise:
             two minus twice its redundancy number.
         """
         squared = np.maximum(np.asarray(squared, dtype=float), 1e-300)
-        unresolved = np.broadcast_to(unresolved, squared.shape)
+        missing = np.broadcast_to(np.asarray(unresolved, dtype=float), squared.shape)
         if self.loss == 'student_t':
-            return self._estimate_student_t(squared, unresolved)
-        redundancy = np.maximum(1 - unresolved / 2, MIN_REDUNDANCY)
+            return self._estimate_student_t(squared, missing)
+        redundancy = np.maximum(1 - missing / 2, MIN_REDUNDANCY)
         if self.loss == 'gaussian':
             variance = np.sum(squared) / (2 * np.sum(redundancy))
         else:

@@ -180,7 +180,7 @@ def _rays(job: CalibrationResult, frames: Mapping[str, Sequence[Frame]]) -> Rays
             frame = by_number[e.exposure]
             n = len(frame.target_id)
             correction = calibration.model.evaluate(frame.uv)
-            sigma = calibration.image_sd
+            sigma: np.ndarray | float = calibration.image_sd
             if frame.sigma is not None:
                 sigma = calibration.sigma0 * frame.sigma
             parts.append(

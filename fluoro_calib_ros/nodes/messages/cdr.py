@@ -105,7 +105,7 @@ def columns_bytes(
     count = UINT32.pack(number)
     if not number:
         return start + count * (1 + len(columns) + len(octets)) + end
-    parts = [start, count, target_id]
+    parts: list[bytes | np.ndarray] = [start, count, target_id]
     # The first float64 is aligned behind its count; the counts of the others are then followed by
     # four bytes of padding.
     before = count + b'\0' * (-(len(start) + 4 + len(target_id)) % 8)

@@ -33,11 +33,11 @@ def point_cloud(message: ReconstructedPoints, good: np.ndarray) -> PointCloud2:
     cloud.fields = [
         PointField(
             name=name,
-            offset=POINT_TYPE.fields[name][1],
-            datatype=_FIELD_TYPES[POINT_TYPE[name].kind],
+            offset=offset,
+            datatype=_FIELD_TYPES[kind.kind],
             count=1,
         )
-        for name in POINT_TYPE.names
+        for name, (kind, offset, *_) in (POINT_TYPE.fields or {}).items()
     ]
     cloud.data = uint8_field(points.view(np.uint8))
     return cloud

@@ -1,3 +1,5 @@
+"""Package fluoro_calib_ros: for colcon, and for pip without ROS."""
+
 from glob import glob
 
 from setuptools import find_packages, setup
@@ -18,9 +20,9 @@ setup(
     python_requires='>=3.10',
     install_requires=[
         'setuptools',
-        'numpy',
-        'scipy',
-        'scikit-learn',
+        'numpy>=1.26',
+        'scipy>=1.11',
+        'scikit-learn>=1.4',
         'matplotlib',
         'mcap',
         'zstandard',
@@ -28,7 +30,7 @@ setup(
         'threadpoolctl',
         'tifffile',
         'PyYAML',
-        'opencv-python-headless',
+        'opencv-python-headless>=4.6',
         'tqdm',
     ],
     extras_require={'test': ['pytest', 'pytest-timeout']},

@@ -4,6 +4,7 @@ and use it.
 
 import csv
 import json
+import pathlib
 from dataclasses import replace
 from pathlib import Path
 
@@ -464,12 +465,12 @@ def test_wrong_files_are_refused_in_a_sentence(tmp_path, found, change, sentence
 def test_damaged_files_are_refused(tmp_path, found):
     """Wherever a byte is wrong or the file ends; and what was there stays when writing fails."""
     path = save_orientation(tmp_path, found)
-    content = open(path, 'rb').read()
+    content = pathlib.Path(path).read_bytes()
     rng = np.random.default_rng(0)
     for place in rng.integers(0, len(content), 60):
         damaged = bytearray(content)
         damaged[place] ^= 0x55
-        open(path, 'wb').write(bytes(damaged))
+        pathlib.Path(path).write_bytes(bytes(damaged))
         try:
             assert (
                 load_orientation(path).orientation_id == found.orientation_id
@@ -477,15 +478,15 @@ def test_damaged_files_are_refused(tmp_path, found):
         except DataError as error:
             assert str(path) in str(error)
     for size in (0, 10, len(content) // 2, len(content) - 1):
-        open(path, 'wb').write(content[:size])
+        pathlib.Path(path).write_bytes(content[:size])
         with pytest.raises(DataError):
             load_orientation(path)
     with pytest.raises(DataError, match='there is no such file'):
         load_orientation(tmp_path / 'missing.npz')
-    open(path, 'wb').write(content)
+    pathlib.Path(path).write_bytes(content)
     with pytest.raises(DataError, match="the fluoroscope is called 'a/b'"):
         save_orientation(tmp_path, replace(found, fluoroscopes=('a/b', 'b')))
-    assert open(path, 'rb').read() == content
+    assert pathlib.Path(path).read_bytes() == content
 
 
 # ---- the commands
@@ -652,7 +653,7 @@ def test_orient_and_reconstruct(folder, tmp_path, capsys):
 
 
 def test_reconstruct_says_what_is_missing(folder, tmp_path, capsys):
-    """A frame without partner, a target without partner, a false match: counted, and empty cells."""
+    """A frame or target without partner and a false match are counted, their cells empty."""
     tracking = simulate_tracking(rig(), 0.05, 60, seed=1)
     frames = {name: list(of_one) for name, of_one in tracking.frames.items()}
     first = frames['b'][0]

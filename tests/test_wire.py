@@ -11,7 +11,7 @@ from fluoro_calib_msgs.msg import CorrectedObservations, ReconstructedPoints, Ta
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
-from fluoro_calib_ros.bags.definitions import typestore
+from fluoro_calib_ros.bags.definitions import from_cdr, typestore
 from fluoro_calib_ros.nodes.messages.corrected_observations import (
     decode_corrected_observations,
     encode_corrected_observations,
@@ -270,3 +270,19 @@ def test_points_are_read_by_rosbags(n, ids):
     assert found.orientation_id == content.orientation_id and list(found.calibration_id) == [*ids]
     for name in ('target_id', 'x', 'y', 'z', 'cov_xx', 'cov_yz', 'residual', 'rays', 'status'):
         assert np.array_equal(getattr(found, name), getattr(expected, name)), name
+
+
+@pytest.mark.parametrize('n', [0, 1, 2, 20, 21])
+@pytest.mark.parametrize('sigma', [True, False])
+def test_bags_read_what_rclpy_writes(n, sigma):
+    """Also without sigma, where Fast DDS pads the message behind its last, empty sequence."""
+    message = TargetObservations(frame_number=7, image_width=8, image_height=9)
+    message.target_id = uint32_field(np.arange(n))
+    message.u = message.v = float64_field(np.arange(n) / 3)
+    if sigma:
+        message.sigma = float64_field(np.full(n, 0.5))
+    found = from_cdr(serialize_message(message), 'fluoro_calib_msgs/msg/TargetObservations')
+    assert found.frame_number == 7
+    np.testing.assert_array_equal(found.target_id, np.arange(n))
+    np.testing.assert_array_equal(found.v, np.arange(n) / 3)
+    np.testing.assert_array_equal(found.sigma, np.full(n if sigma else 0, 0.5))

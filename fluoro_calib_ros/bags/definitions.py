@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterable
+from contextlib import suppress
 from functools import cache
 from importlib.resources import files
 from typing import Any
 
+import numpy as np
 from rosbags.typesys import Stores, get_types_from_idl, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -14,6 +17,8 @@ from ..errors import DataError
 
 PACKAGE = 'fluoro_calib_msgs'
 TARGET_OBSERVATIONS = f'{PACKAGE}/msg/TargetObservations'
+PADDING = 4  # bytes at the end of a message that Fast DDS reserves for an empty float64[]
+MAX_PADDING = 10 * PADDING  # of a message with ten of them
 _SEPARATOR = '=' * 80  # between the definitions of a schema
 
 
@@ -65,12 +70,27 @@ def to_cdr(message: Any, msg_type: str) -> bytes:
 
 
 def from_cdr(data: bytes, msg_type: str) -> Any:
-    """Return CDR as a message dataclass. Raises DataError for other bytes."""
+    """Return CDR as a message dataclass. Raises DataError for other bytes.
+
+    Fast DDS reserves four bytes for the alignment of each empty sequence of float64, such as a
+    sigma that is not given, and leaves them at the end. rosbags takes that for another message.
+    """
     message_class(msg_type)
     try:
         return typestore().deserialize_cdr(data, msg_type)
     except Exception as error:  # generated code raises almost anything for damaged bytes
+        for padding in range(PADDING, MAX_PADDING + 1, PADDING):
+            with suppress(Exception):
+                message = typestore().deserialize_cdr(data[:-padding], msg_type)
+                if padding <= PADDING * _count_empty(message):
+                    return message
         raise DataError(f'the content is not a {msg_type} ({error})') from None
+
+
+def _count_empty(message: Any) -> int:
+    """Return the number of empty sequences of float64 among the fields of a message."""
+    values = (getattr(message, field.name) for field in dataclasses.fields(message))
+    return sum(isinstance(v, np.ndarray) and v.dtype == np.float64 and not len(v) for v in values)
 
 
 def fields_of(msg_type: str, text: str, encoding: str) -> dict[str, Any]:

@@ -144,15 +144,15 @@ class Noise:
             tr(A C A^T) / (scale * sigma)^2 of each image point. For a point of weight one it is
             two minus twice its redundancy number.
         """
-        squared = np.maximum(np.asarray(squared, dtype=float), 1e-300)
-        missing = np.broadcast_to(np.asarray(unresolved, dtype=float), squared.shape)
+        values: np.ndarray = np.maximum(np.asarray(squared, dtype=float), 1e-300)
+        missing = np.broadcast_to(np.asarray(unresolved, dtype=float), values.shape)
         if self.loss == 'student_t':
-            return self._estimate_student_t(squared, missing)
+            return self._estimate_student_t(values, missing)
         redundancy = np.maximum(1 - missing / 2, MIN_REDUNDANCY)
         if self.loss == 'gaussian':
-            variance = np.sum(squared) / (2 * np.sum(redundancy))
+            variance = np.sum(values) / (2 * np.sum(redundancy))
         else:
-            median = _weighted_median(squared / redundancy, redundancy)
+            median = _weighted_median(values / redundancy, redundancy)
             variance = median / (2 * np.log(2))  # median of chi-square, two degrees of freedom
         return replace(self, scale=float(np.sqrt(variance)))
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from struct import Struct
+from typing import Any
 
 import numpy as np
 from rclpy.serialization import deserialize_message, serialize_message
@@ -105,7 +106,7 @@ def columns_bytes(
     count = UINT32.pack(number)
     if not number:
         return start + count * (1 + len(columns) + len(octets)) + end
-    parts: list[bytes | np.ndarray] = [start, count, target_id]
+    parts: list[Any] = [start, count, target_id]
     # The first float64 is aligned behind its count; the counts of the others are then followed by
     # four bytes of padding.
     before = count + b'\0' * (-(len(start) + 4 + len(target_id)) % 8)

@@ -2,7 +2,7 @@
 
     python tools/write_parameters.py
 
-These are config/fluoro_calib.yaml and the tables of docs/nodes.md; tests/test_parameters.py
+These are config/fluoro_calib.yaml and the tables of docs/nodes.md; tests/nodes/test_parameters.py
 compares both with the declarations.
 """
 

@@ -29,7 +29,7 @@ from fluoro_calib_ros.nodes.runtime.parameters import check_timeout, expand_path
 from fluoro_calib_ros.nodes.runtime.refusals import Refused
 
 SIZE = (64, 48)
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope='module')

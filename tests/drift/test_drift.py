@@ -24,7 +24,7 @@ from fluoro_calib_ros.simulation.rig import virtual_rig
 
 pytestmark = pytest.mark.long
 
-sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed
+sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
 from benchmarks.drift import (  # noqa: E402
     BEADS,
     FRAMES,

@@ -15,7 +15,7 @@ from fluoro_calib_ros.nodes.runtime.errors import StartError
 from fluoro_calib_ros.nodes.runtime.parameters import ParameterGroup, descriptor_of, parameters_of
 from fluoro_calib_ros.options import declared, option
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 _spec = importlib.util.spec_from_file_location(
     'write_parameters', ROOT / 'tools' / 'write_parameters.py'
 )

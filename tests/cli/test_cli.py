@@ -20,7 +20,7 @@ from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.files.calibration import load_calibration
 from fluoro_calib_ros.jobs.dataset import write_bag
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 IMAGE = ('--image-size', '1024x1024')
 
 

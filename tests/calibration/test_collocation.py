@@ -69,7 +69,7 @@ from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.simulation.streams import StreamStart
 
-sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed
+sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
 
 SIZE = (1024, 768)
 

@@ -14,7 +14,7 @@ from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, cal
 from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.simulation.distortion import random_field
 
-sys.path.append(str(Path(__file__).resolve().parent.parent))  # benchmarks are not installed
+sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
 from benchmarks import validation
 from benchmarks.experiment import (
     BEFORE,

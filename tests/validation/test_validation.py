@@ -383,7 +383,7 @@ def test_too_few_beads():
 def folder(tmp_path_factory):
     """A folder that calibrate has written: fluoroscope a, eight exposures, few rounds."""
     place = tmp_path_factory.mktemp('validate')
-    root = pathlib.Path(__file__).resolve().parent.parent / 'bags'
+    root = pathlib.Path(__file__).resolve().parents[2] / 'bags'
     lines = (root / 'calibration.csv').read_text().splitlines()
     few = [line for line in lines if not line.startswith('a,') or int(line.split(',')[1]) <= 8]
     (place / 'few.csv').write_text('\n'.join(few) + '\n')

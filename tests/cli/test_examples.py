@@ -9,7 +9,7 @@ import pytest
 import fluoro_calib_ros as fc
 from fluoro_calib_ros import api
 
-ROOT = pathlib.Path(__file__).resolve().parent.parent
+ROOT = pathlib.Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / 'examples'
 
 

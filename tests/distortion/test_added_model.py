@@ -15,7 +15,7 @@ from fluoro_calib_ros.distortion.grid_errors import LIMIT_PX
 from fluoro_calib_ros.files.calibration import load_calibration, save_calibration
 from fluoro_calib_ros.options import declared
 
-DOCUMENT = Path(__file__).resolve().parent.parent / 'docs' / 'models.md'
+DOCUMENT = Path(__file__).resolve().parents[2] / 'docs' / 'models.md'
 NAME = 'inverse_distance'
 
 

@@ -374,7 +374,7 @@ def test_numpy_reads_the_file_without_pickle_and_every_array_is_documented(tmp_p
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
         assert file.files == ['format_version', *ARRAYS]
         assert file['format_version'] == 2
-        docs = Path(__file__).parent.parent / 'docs'
+        docs = Path(__file__).parents[2] / 'docs'
         document = (docs / 'calibration_file.md').read_text()
         for name in file.files:
             dtype = 'text' if file[name].dtype.kind == 'U' else file[name].dtype.name

@@ -17,13 +17,14 @@ extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'sphin
 source_suffix = {'.md': 'markdown', '.rst': 'restructuredtext'}
 exclude_patterns = ['_build']
 # A name such as RigOrientation is found in the module that defines it and in api.
-suppress_warnings = ['ref.python']
+suppress_warnings = ['ref.python', 'ref.term', 'ref.ref']
 html_theme = 'furo'
 html_title = project
 myst_heading_anchors = 4
 
 autodoc_member_order = 'bysource'
 autodoc_typehints = 'signature'
+autodoc_inherit_docstrings = False
 napoleon_google_docstring = False
 napoleon_use_ivar = True
 

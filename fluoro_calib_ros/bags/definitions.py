@@ -44,7 +44,7 @@ def message_class(msg_type: str) -> type[Any]:
 
 @cache
 def type_hash(msg_type: str) -> str:
-    """Return the hash 'RIHS01_...' of a message type (REP-2016)."""
+    """Return the hash ``RIHS01_...`` of a message type (REP-2016)."""
     message_class(msg_type)
     return typestore().hash_rihs01(msg_type)
 

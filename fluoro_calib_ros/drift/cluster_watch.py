@@ -2,9 +2,9 @@
 
 A shift along an epipolar line moves the intersected point in depth, and all rays still meet. If
 one of two beads of a rigid cluster is in the area that has drifted and the other is not, their
-distance d = |P_i - P_j| changes: by e^T dP_i for a shift of bead i and by -e^T dP_j for a shift of
-bead j, where e is the direction from j to i and dP the movement of an intersected point for a
-pixel in an image. So every distance is a measurement of the drift of an area [px], with a
+distance d = norm(P_i - P_j) changes: by e^T dP_i for a shift of bead i and by -e^T dP_j for a
+shift of bead j, where e is the direction from j to i and dP the movement of an intersected point
+for a pixel in an image. So every distance is a measurement of the drift of an area [px], with a
 response, as every epipolar residual is. Where both beads shift alike nothing changes: a drift of
 the whole image along the epipolar lines moves and turns a cluster without deforming it.
 """

@@ -1,6 +1,6 @@
 """Noise models of image points: Student-t, Huber and Gaussian, with estimation of their scale.
 
-An image point has D = 2 coordinates with one scale. q = |r|^2 / (scale * sigma)^2 is its
+An image point has D = 2 coordinates with one scale. q = r^T r / (scale * sigma)^2 is its
 normalised squared residual. Besides the core of the distribution, a share of gross errors (false
 matches) can be estimated, spread evenly over a wide area. If they are left to the tails of the
 Student-t, they make the tails heavy, and good image points are no longer used efficiently.
@@ -139,7 +139,7 @@ class Noise:
         Parameters
         ----------
         squared : (n,) array_like
-            Squared residuals |r|^2 / sigma^2 of the image points.
+            Squared residuals r^T r / sigma^2 of the image points.
         unresolved : (n,) array_like or float
             tr(A C A^T) / (scale * sigma)^2 of each image point. For a point of weight one it is
             two minus twice its redundancy number.

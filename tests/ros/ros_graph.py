@@ -79,9 +79,21 @@ SERVICES = {
 }
 
 
+def has_stale_ports(domain):
+    """Return whether processes have left ports of a ROS domain in shared memory."""
+    first = 7400 + 250 * domain
+    names = {path.name for path in Path('/dev/shm').glob('fastrtps_port*')}
+    return any(f'fastrtps_port{port}' in names for port in range(first, first + 250))
+
+
 def free_domain():
-    """Return an unused ROS domain of this machine, and the open lock file that reserves it."""
-    for domain in (1 + (os.getpid() + i) % 100 for i in range(100)):
+    """Return an unused ROS domain of this machine, and the open lock file that reserves it.
+
+    A domain in which a killed process has left ports in shared memory comes last: Fast DDS may
+    take them for broken ones, and large messages are then lost.
+    """
+    domains = [1 + (os.getpid() + i) % 100 for i in range(100)]
+    for domain in sorted(domains, key=has_stale_ports):
         path = Path(tempfile.gettempdir()) / f'fluoro_calib_test_domain_{domain}.lock'
         lock = open(path, 'a')  # noqa: SIM115 the lock is held by the caller
         try:

@@ -24,7 +24,7 @@ def run(*command):
     [
         ('ruff', 'check', '.', '--no-cache'),
         ('ruff', 'format', '--check', '.', '--no-cache'),
-        ('mypy', '--cache-dir', '/dev/null'),
+        pytest.param(('mypy', '--cache-dir', '/dev/null'), marks=pytest.mark.long),
     ],
     ids=['ruff check', 'ruff format', 'mypy'],
 )

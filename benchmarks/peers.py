@@ -283,7 +283,7 @@ def self_calibrate_with_peers(
         colmap.set_noise(noise)
         colmap.solve()
         parameters = colmap.parameters()
-        residuals = network.uv - correction - project(*parameters.per_image_point(network))
+        residuals = network.uv - correction - project(*network.per_image_point(parameters))
         squared = np.sum(residuals**2, axis=1)
         # The median of chi-square with two degrees of freedom is 2 ln 2.
         noise = replace(noise, scale=float(np.sqrt(np.median(squared) / (2 * np.log(2)))))

@@ -77,7 +77,7 @@ def small_network(exposures=4, targets=30, fluoroscopes=1, seed=0, **options):
         np.full(targets, options.survey_sd_mm),
         np.full(fluoroscopes, options.free),
     )
-    uv = project(*truth.per_image_point(network)) + sigma[:, None] * noise
+    uv = project(*network.per_image_point(truth)) + sigma[:, None] * noise
     return replace(network, uv=uv), truth
 
 
@@ -113,7 +113,7 @@ def design_matrix(network, parameters):
     """Dense derivatives (2N, u) of the image points, in the order of `moved`."""
     count = network.n_image_points
     m, n = network.n_exposures, network.n_points
-    _, d_e, d_p, d_i = project_with_jacobian(*parameters.per_image_point(network))
+    _, d_e, d_p, d_i = project_with_jacobian(*network.per_image_point(parameters))
     out = np.zeros((count, 2, network.n_unknowns))
     column = 6 * m + 3 * n + 3 * (np.cumsum(network.interior_free) - 1)
     for row, (e, p) in enumerate(zip(network.exposure, network.point)):

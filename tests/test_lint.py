@@ -34,7 +34,7 @@ def test_linter_is_content(command):
 
 
 def test_imports_keep_their_contracts():
-    """No import runs up, only the nodes know ROS, the mathematics knows neither files nor ROS."""
+    """No import runs up or in a circle, and only the nodes know ROS; see pyproject.toml."""
     code = (
         'from importlinter.cli import lint_imports; raise SystemExit(lint_imports(no_cache=True))'
     )

@@ -42,7 +42,9 @@ class Regressions:
     steps {fluoroscope: RegressionStep}, in the order of the network.
     """
 
-    def __init__(self, measured: Measured, steps: Mapping[str, RegressionStep]) -> None:
+    def __init__(
+        self, measured: Measured, steps: Mapping[str, RegressionStep[CorrectionModel]]
+    ) -> None:
         self.steps = dict(steps)
         self._rows = {name: measured.network.rows(f) for f, name in enumerate(self.steps)}
 

@@ -15,13 +15,15 @@ from ..photogrammetry.elimination import factorize
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.relative_orientation import (
+    discrepancies,
+    discrepancies_with_jacobian,
+    mean_pose,
+)
+from ..photogrammetry.relative_pose import (
     RIGID_SD_MM,
     RIGID_SD_RAD,
     RelativeConstraint,
     RelativePose,
-    discrepancies,
-    discrepancies_with_jacobian,
-    mean_pose,
 )
 from .initial_network import Measured
 from .options import CalibrationOptions

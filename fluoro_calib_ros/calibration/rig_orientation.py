@@ -34,12 +34,11 @@ from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.relative_orientation import (
-    RelativeConstraint,
-    RelativePose,
     discrepancies,
     discrepancies_with_jacobian,
     mean_pose,
 )
+from ..photogrammetry.relative_pose import RelativeConstraint, RelativePose
 from ..photogrammetry.rig_orientation import (
     ORIENTATION_SIZE,
     RigOrientation,

@@ -11,10 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..distortion.base import CorrectionModel, ModelSource
 from ..distortion.estimation import (
     AdjustedTerms,
     AdjustmentProblem,
-    ModelSource,
     RegressionStep,
     TrainingPoints,
 )
@@ -116,7 +116,7 @@ def _regression_steps(
     options: CalibrationOptions,
     source: ModelSource,
     terms: AdjustedTerms | None,
-) -> dict[str, RegressionStep] | None:
+) -> dict[str, RegressionStep[CorrectionModel]] | None:
     """The regression step of every fluoroscope; None for a model that needs none."""
     network = measured.network
     steps = {}

@@ -15,17 +15,14 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 
+from .estimation import AdjustedTerms, AdjustmentProblem, RegressionStep, TrainingPoints
 from .series import Series, packed
-
-if TYPE_CHECKING:
-    from numpy.typing import ArrayLike
-
-    from .estimation import AdjustedTerms, AdjustmentProblem, RegressionStep, TrainingPoints
 
 BULK_CHUNK = 2048  # pixels evaluated in one call of `evaluate_in_bulk`: some milliseconds
 
@@ -192,12 +189,30 @@ class CorrectionModel(ABC):
         return None
 
     @classmethod
-    def regression(cls, points: TrainingPoints, k: int | None) -> RegressionStep | None:
+    def regression(
+        cls, points: TrainingPoints, k: int | None
+    ) -> RegressionStep[CorrectionModel] | None:
         """Regression of the residuals between adjustments; None: the model needs none.
 
         k: number of neighbours that the user asks for, None: to be chosen.
         """
         return None
+
+
+class ModelSource(Protocol):
+    """What a self-calibration is given: a class of models, or the regressor of a user."""
+
+    kind: str
+
+    def adjusted_terms(self, problem: AdjustmentProblem) -> AdjustedTerms | None:
+        """Terms of the model that are unknowns of the adjustment."""
+        ...
+
+    def regression(
+        self, points: TrainingPoints, k: int | None
+    ) -> RegressionStep[CorrectionModel] | None:
+        """Regression of the residuals between adjustments."""
+        ...
 
 
 def _half_planes(uv: np.ndarray) -> np.ndarray:

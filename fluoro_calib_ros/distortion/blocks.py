@@ -1,4 +1,4 @@
-"""Predictions of a neighbour model at very many pixels, block by block.
+"""Nearest training points of very many pixels, block by block.
 
 All pixels of a block have their k nearest training points among those within r + 2e of its centre,
 where r is the distance of the k-th nearest from the centre and e half the diagonal (triangle
@@ -8,32 +8,22 @@ microseconds: a stream in the same process is not delayed.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Iterator
 
 import numpy as np
-
-if TYPE_CHECKING:
-    from .neighbour_model import NeighbourModel
+from scipy.spatial import cKDTree
 
 BLOCK = 200  # pixels of a block
 MAX_BLOCK_PX = 64.0  # its largest side, for pixels that are far apart
 BLOCKS_PER_QUERY = 32
 
 
-def smooth_in_blocks(
-    model: NeighbourModel, uv: np.ndarray, duv: np.ndarray, norm2: np.ndarray
-) -> None:
-    """Write the neighbours' part of the correction at pixels uv (n, 2) to duv and norm2.
+def blocks_with_candidates(
+    tree: cKDTree, uv: np.ndarray, k: int
+) -> Iterator[tuple[np.ndarray, list[int]]]:
+    """Blocks of pixels uv (n, 2), and the training points among which their k nearest are.
 
-    Parameters
-    ----------
-    model : NeighbourModel
-    uv : (n, 2) ndarray
-        Pixels.
-    duv : (2 or more, n) ndarray
-        Its first two rows receive the corrections [px].
-    norm2 : (n,) ndarray
-        Receives the squared norms of the weights.
+    tree holds the training points. Yields the rows of the pixels and of the training points.
     """
     blocks = _blocks(uv)
     for start in range(0, len(blocks), BLOCKS_PER_QUERY):
@@ -42,13 +32,9 @@ def smooth_in_blocks(
         high = np.array([np.max(uv[block], axis=0) for block in some])
         centre = (low + high) / 2
         diagonal = np.linalg.norm(high - low, axis=1)
-        kth = model.tree.query(centre, k=[model.k])[0][:, 0]
-        found = model.tree.query_ball_point(centre, (kth + diagonal) * (1 + 1e-9) + 1e-9)
-        for block, near in zip(some, found):
-            weights = model.weights_of_candidates(model.train_uv[near], uv[block], model.k)
-            for axis, remainder in enumerate(model.remainder[near].T):
-                duv[axis, block] = np.einsum('nk,k->n', weights, remainder)
-            norm2[block] = np.einsum('nk,nk->n', weights, weights)
+        kth = tree.query(centre, k=[k])[0][:, 0]
+        found = tree.query_ball_point(centre, (kth + diagonal) * (1 + 1e-9) + 1e-9)
+        yield from zip(some, found)
 
 
 def _blocks(uv: np.ndarray) -> list[np.ndarray]:

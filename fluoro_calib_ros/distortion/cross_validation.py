@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .neighbour_model import NeighbourModel
 from .neighbours import Neighbourhoods, NeighbourTable
+from .smoother import NeighbourSmoother
 from .trend import Trend, least_squares_map
 
 MAX_CACHED_WEIGHTS = 12_000_000  # weights that are stored between rounds
@@ -22,7 +22,7 @@ class CrossValidation:
 
     Parameters
     ----------
-    model_type : type of NeighbourModel
+    model_type : type of NeighbourSmoother
     uv : (N, 2) ndarray
         Training pixels.
     fold : (N,) ndarray of int
@@ -40,7 +40,7 @@ class CrossValidation:
 
     def __init__(
         self,
-        model_type: type[NeighbourModel],
+        model_type: type[NeighbourSmoother],
         uv: np.ndarray,
         fold: np.ndarray,
         candidates: ArrayLike,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING, Generic, TypeVar
 
 import numpy as np
 
@@ -16,7 +16,6 @@ if TYPE_CHECKING:
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
     from ..photogrammetry.precision import Precision
-    from .base import CorrectionModel
     from .series import Series
 
 MIN_TRAINING = 60  # inliers of a fluoroscope that a correction model needs
@@ -24,6 +23,8 @@ MIN_TRAINING = 60  # inliers of a fluoroscope that a correction model needs
 # outlier an inlier below half of it.
 STAY_IN = 1.5
 FOLDS = 10  # of the cross-validation
+
+Model_co = TypeVar('Model_co', covariant=True)  # the correction model that a regression gives
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class AdjustedTerms(ABC):
         return self.series(f, coefficients, covariance)
 
 
-class RegressionStep(ABC):
+class RegressionStep(ABC, Generic[Model_co]):
     """Correction model of one fluoroscope through the rounds of a self-calibration.
 
     Attributes
@@ -172,7 +173,7 @@ class RegressionStep(ABC):
         """Fit values (N, 2) [px] at the inliers; return the corrections (N, 2) at all points."""
 
     @abstractmethod
-    def model(self, values: np.ndarray, series: Series | None = None) -> CorrectionModel:
+    def model(self, values: np.ndarray, series: Series | None = None) -> Model_co:
         """Return the correction model of values (N, 2) with its noise and bias.
 
         series: terms that were estimated in the adjustment and are not in the values.
@@ -189,46 +190,6 @@ class RegressionStep(ABC):
             inliers = np.where(self.inliers, q <= STAY_IN * INLIER_Q, q <= INLIER_Q / 2)
         self.changed = self.inliers is None or not np.array_equal(inliers, self.inliers)
         return inliers
-
-
-class NoRegression(RegressionStep):
-    """The regression step of the model that corrects nothing."""
-
-    iterates = False
-
-    def choose(self, values: np.ndarray, q: np.ndarray, information: np.ndarray) -> None:
-        """Update the inliers and sum up their weighted residuals."""
-        self.inliers = self._updated_inliers(q)
-        inside = values[self.inliers]
-        self.score = float(np.einsum('na,nab,nb', inside, information[self.inliers], inside))
-
-    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> np.ndarray:
-        """Return the values."""
-        return values
-
-    def smooth(self, values: np.ndarray) -> np.ndarray:
-        """Return zeros (N, 2)."""
-        return np.zeros_like(values)
-
-    def model(self, values: np.ndarray, series: Series | None = None) -> CorrectionModel:
-        """Return the model that corrects nothing."""
-        from .none import no_correction
-
-        return no_correction()
-
-
-class ModelSource(Protocol):
-    """What a self-calibration is given: a class of models, or the regressor of a user."""
-
-    kind: str
-
-    def adjusted_terms(self, problem: AdjustmentProblem) -> AdjustedTerms | None:
-        """Terms of the model that are unknowns of the adjustment."""
-        ...
-
-    def regression(self, points: TrainingPoints, k: int | None) -> RegressionStep | None:
-        """Regression of the residuals between adjustments."""
-        ...
 
 
 def require_training(count: int) -> None:

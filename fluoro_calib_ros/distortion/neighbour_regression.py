@@ -7,30 +7,30 @@ import numpy as np
 from .cross_validation import CrossValidation
 from .estimation import RegressionStep, TrainingPoints, exposure_folds, require_training
 from .gauge import gauge_basis
-from .neighbour_model import NeighbourModel
 from .neighbours import Neighbourhoods, NeighbourTable
 from .series import Series
+from .smoother import NeighbourSmoother
 from .trend import Trend, least_squares_map
 
 MIN_GAIN = 1e-3  # relative gain in G for which k is changed
 SEARCH_FACTOR = 2.0  # k is looked for within this factor of the last one first
 
 
-class NeighbourRegression(RegressionStep):
+class NeighbourRegression(RegressionStep[NeighbourSmoother]):
     """A neighbour model of one fluoroscope through the rounds of a self-calibration.
 
     The image points do not move, so neighbours are looked up again only when the inliers change.
 
     Parameters
     ----------
-    model_type : type of NeighbourModel
+    model_type : type of NeighbourSmoother
     points : TrainingPoints
     k : int or None
         Number of neighbours; None: chosen by cross-validation.
     """
 
     def __init__(
-        self, model_type: type[NeighbourModel], points: TrainingPoints, k: int | None = None
+        self, model_type: type[NeighbourSmoother], points: TrainingPoints, k: int | None = None
     ) -> None:
         super().__init__(points)
         self.model_type = model_type
@@ -129,7 +129,7 @@ class NeighbourRegression(RegressionStep):
             values = values - basis @ np.linalg.lstsq(flat, fitted.reshape(-1), rcond=None)[0]
         return values
 
-    def model(self, values: np.ndarray, series: Series | None = None) -> NeighbourModel:
+    def model(self, values: np.ndarray, series: Series | None = None) -> NeighbourSmoother:
         """Return the correction model of values (N, 2) with its noise and bias.
 
         For a linear smoother S without bias E|y - S y|^2 = s^2 (1 - 2 tr(S)/N + tr(S S')/N)

@@ -46,7 +46,7 @@ def model_type(kind: str) -> type[CorrectionModel]:
 
 
 def model_source(model: Any) -> Any:
-    """Return what a self-calibration obtains a model from (`estimation.ModelSource`).
+    """Return what a self-calibration obtains a model from (`base.ModelSource`).
 
     model: the name of a model, or a scikit-learn regressor. Raises ValueError for a name that a
     user cannot ask for.

@@ -80,12 +80,12 @@ class UserRegressor:
         """No terms are estimated in the adjustment."""
         return None
 
-    def regression(self, points: TrainingPoints, k: int | None) -> RegressionStep:
+    def regression(self, points: TrainingPoints, k: int | None) -> UserRegression:
         """Return the regression of the residuals with the regressor."""
         return UserRegression(self._regressor, points)
 
 
-class UserRegression(RegressionStep):
+class UserRegression(RegressionStep[LookupModel]):
     """A user's regressor of one fluoroscope through the rounds of a self-calibration.
 
     The correction is always that of the lookup grid, so that the saved model is the one with

@@ -10,15 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Sized
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
-
-if TYPE_CHECKING:
-    from .phantom import Phantom
+from .columns import first_repeated, is_positive
+from .phantom import Phantom
 
 
 @dataclass(frozen=True)
@@ -130,23 +128,6 @@ def points_on_image(uv: ArrayLike, image_size: tuple[int, int]) -> NDArray[np.bo
     uv = np.asarray(uv)
     inside = (uv >= -0.5) & (uv <= np.asarray(image_size) - 0.5)
     return np.all(inside, axis=1)
-
-
-def is_positive(sigma: ArrayLike) -> NDArray[np.bool_]:
-    """Return (n,) whether values are finite and above 0, as a standard deviation must be."""
-    sigma = np.asarray(sigma)
-    return np.isfinite(sigma) & (sigma > 0)
-
-
-def first_repeated(target_id: ArrayLike) -> tuple[int, int] | None:
-    """Return the first two positions of the smallest id that occurs more than once, else None."""
-    ids = np.asarray(target_id)
-    order = np.argsort(ids, kind='stable')
-    ordered = ids[order]
-    repeated = np.flatnonzero(ordered[1:] == ordered[:-1])
-    if not len(repeated):
-        return None
-    return int(order[repeated[0]]), int(order[repeated[0] + 1])
 
 
 def length_error(target_id: Sized, **arrays: Sized) -> str:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
-from .frame import first_repeated, is_positive
+from .columns import first_repeated, is_positive
 
 MIN_TARGETS = 4
 

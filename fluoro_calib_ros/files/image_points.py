@@ -10,7 +10,7 @@ import numpy as np
 from ..calibration.result import CorrectedPoints, FluoroscopeCalibration
 from ..distortion.status import CorrectionStatus
 from ..errors import DataError
-from ..exposures.frame import is_positive
+from ..exposures.columns import is_positive
 from .access import PathLike
 from .atomic import atomic_file
 from .csv_table import Block, format_float, read_blocks, write_rows

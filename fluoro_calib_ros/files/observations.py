@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError
-from ..exposures.frame import Frame, first_repeated, is_positive, points_on_image
+from ..exposures.columns import first_repeated, is_positive
+from ..exposures.frame import Frame, points_on_image
 from .access import check_safe_name
 from .atomic import atomic_file
 from .csv_table import Block, format_float, read_blocks, write_rows

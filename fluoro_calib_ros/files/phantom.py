@@ -7,7 +7,7 @@ import os
 import numpy as np
 
 from ..errors import DataError
-from ..exposures.frame import first_repeated
+from ..exposures.columns import first_repeated
 from ..exposures.phantom import Phantom
 from .atomic import atomic_file
 from .csv_table import read_blocks, write_rows

@@ -166,7 +166,7 @@ class _Problem:
         # tails, stretched steps converge in a third of the iterations.
         stretch = 1 / self.noise.information_factor(iterate.q)
         step = self.elimination.to_unknowns(stretch * x_blocks, stretch * x_rest)
-        return iterate.parameters.updated(self.network, step), predicted
+        return self.network.parameters_after(iterate.parameters, step), predicted
 
 
 class _NielsenDamping:

@@ -13,19 +13,15 @@ in engineering photogrammetry", Photogrammetric Record 10, 1980).
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .relative_orientation import RelativePose
+from .network import DATUM_DEFECT, Network
+from .relative_pose import RelativePose
 from .rotations import cross_matrix
-
-if TYPE_CHECKING:
-    from .network import Network
-    from .unknowns import Parameters, UnknownVector
+from .unknowns import Parameters, UnknownVector
 
 DATUMS = ('survey', 'inner')
-DATUM_DEFECT = 7  # shift, turn and scale
 
 
 @dataclass(frozen=True)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from .additional_parameters import AdditionalParameters
-from .relative_orientation import POSE_SIZE, RelativeConstraint
-from .unknowns import UnknownLayout
+from .relative_orientation import exposures_after_step
+from .relative_pose import POSE_SIZE, RelativeConstraint
+from .rotations import matrix_from_vector
+from .unknowns import INTERIOR_SIZE, Parameters, UnknownLayout, UnknownVector
 
-if TYPE_CHECKING:
-    from .unknowns import Parameters
+DATUM_DEFECT = 7  # unknowns that the datum of a free network fixes: shift, turn and scale
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,13 @@ class Network:
     @cached_property
     def layout(self) -> UnknownLayout:
         """Layout of the unknowns of the network."""
-        return UnknownLayout.of(self)
+        return UnknownLayout.of(
+            (self.n_exposures, self.n_points),
+            np.asarray(self.interior_free, dtype=bool),
+            len(self.relative),
+            [0 if a is None else a.count for a in self.additional],
+            DATUM_DEFECT if self.datum == 'inner' else 0,
+        )
 
     @property
     def n_unknowns(self) -> int:
@@ -126,3 +132,40 @@ class Network:
             if additional is not None and coefficients is not None:
                 out[self.rows(f)] = additional.correction(coefficients)
         return out
+
+    def per_image_point(
+        self, parameters: Parameters
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Rotation, position, object point and interior orientation of every image point."""
+        return (
+            parameters.rotation[self.exposure],
+            parameters.position_mm[self.exposure],
+            parameters.points_mm[self.point],
+            parameters.interior[self.fluoroscope[self.exposure]],
+        )
+
+    def parameters_after(self, parameters: Parameters, step: UnknownVector) -> Parameters:
+        """Parameters after a step; rotations are varied on the left, R -> exp([w]x) R.
+
+        The second exposures of constrained pairs follow their constraint (see
+        relative_orientation.exposures_after_step).
+        """
+        layout = self.layout
+        interior_step = step.globals[layout.all_interiors].reshape(-1, INTERIOR_SIZE)
+        additional = tuple(
+            a if a is None or self.additional[f] is None else a + step.globals[columns]
+            for f, (a, columns) in enumerate(zip(parameters.additional, layout.additional))
+        )
+        relative = tuple(
+            pose.updated(step.globals[columns])
+            for pose, columns in zip(parameters.relative, layout.relative)
+        )
+        moved = Parameters(
+            parameters.interior + interior_step,
+            matrix_from_vector(step.exteriors[:, 3:]) @ parameters.rotation,
+            parameters.position_mm + step.exteriors[:, :3],
+            parameters.points_mm + step.points,
+            additional,
+            relative,
+        )
+        return exposures_after_step(self.relative, layout, parameters, moved, step)

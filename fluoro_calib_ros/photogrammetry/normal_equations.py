@@ -15,7 +15,8 @@ import numpy as np
 from .datum import Gauge, open_gauge
 from .network import Network
 from .noise import Noise
-from .relative_orientation import POSE_SIZE, discrepancies_with_jacobian
+from .relative_orientation import discrepancies_with_jacobian
+from .relative_pose import POSE_SIZE
 from .unknowns import EXTERIOR_SIZE, Parameters
 
 # Image points that are linearised at once: their arrays stay in the cache.

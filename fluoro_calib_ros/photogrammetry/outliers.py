@@ -200,7 +200,7 @@ def _rays_of(network: Network, adjustment: Adjustment, precision: Precision) -> 
     parameters = adjustment.parameters
     e = network.exposure
     f = network.fluoroscope[e]
-    _, d_e, d_p, d_i = project_with_jacobian(*parameters.per_image_point(network))
+    _, d_e, d_p, d_i = project_with_jacobian(*network.per_image_point(parameters))
     shift = (network.survey_mm - parameters.points_mm)[network.point]
     residual = adjustment.residuals - (d_p @ shift[..., None])[..., 0]
     by_interior = np.stack(

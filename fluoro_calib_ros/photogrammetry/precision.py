@@ -136,7 +136,7 @@ def covariance_of_projection(
 ) -> np.ndarray:
     """A C_x A^T (N, 2, 2) [px^2] of the image points; additional parameters are unknowns too."""
     out = np.empty((network.n_image_points, 2, 2))
-    per_image_point = parameters.per_image_point(network)
+    per_image_point = network.per_image_point(parameters)
     for f in range(network.n_fluoroscopes):
         rows = network.rows(f)
         for start in range(0, len(rows), CHUNK):

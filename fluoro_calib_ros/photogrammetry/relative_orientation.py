@@ -10,74 +10,18 @@ rotations: Barfoot, "State Estimation for Robotics", Cambridge 2017, 7.1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
+from .relative_pose import POSE_SIZE, RelativeConstraint, RelativePose
 from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
+from .unknowns import Parameters, UnknownLayout, UnknownVector
 
-if TYPE_CHECKING:
-    from .network import Network
-    from .unknowns import Parameters, UnknownVector
-
-POSE_SIZE = 6  # translation [mm], rotation vector [rad]
-# Standard deviations that stand for a rigid mounting: a thousandth of what one pair of exposures
-# determines from images of 0.25 px noise. The solution is that of the limit within some 1e-5
-# standard deviations, and rounding errors are still far away.
-RIGID_SD_MM = 3e-4
-RIGID_SD_RAD = 1e-7
 # Iterations of the mean pose, and the step [mm, rad] at which they end.
 MEAN_ITERATIONS = 10
 MEAN_TOLERANCE = 1e-12
-
-
-@dataclass(frozen=True)
-class RelativeConstraint:
-    """Constraint that the relative orientation of two fluoroscopes is the same in all pairs.
-
-    Attributes
-    ----------
-    fluoroscopes : (int, int)
-        Numbers of the fluoroscopes a and b.
-    pairs : (k, 2) ndarray of int
-        Rows of the common exposures of a and of b.
-    sd_mm, sd_rad : float
-        Standard deviations of each component of translation and rotation.
-    length_mm : float, optional
-        Distance of the sources at which `sd_mm` holds. It makes the constraint follow the scale of
-        a free network; None where the scale is fixed.
-    """
-
-    fluoroscopes: tuple[int, int]
-    pairs: np.ndarray
-    sd_mm: float
-    sd_rad: float
-    length_mm: float | None = None
-
-    @property
-    def weights(self) -> np.ndarray:
-        """Weights (6,) of the components of the constraint."""
-        return np.repeat([self.sd_mm**-2.0, self.sd_rad**-2.0], 3)
-
-
-@dataclass(frozen=True)
-class RelativePose:
-    """Relative orientation of fluoroscope b with respect to a.
-
-    rotation (3, 3) from the sensor frame of a to that of b; translation_mm (3,) of the source of b
-    in the sensor frame of a.
-    """
-
-    rotation: np.ndarray
-    translation_mm: np.ndarray
-
-    def updated(self, step: np.ndarray) -> RelativePose:
-        """The pose after a step (6,): translation [mm], rotation [rad] on the left."""
-        step = np.asarray(step)
-        return RelativePose(
-            matrix_from_vector(step[3:]) @ self.rotation, self.translation_mm + step[:3]
-        )
 
 
 def inverse_left_jacobian(w: np.ndarray) -> np.ndarray:
@@ -217,17 +161,31 @@ def exposures_from_pose(
 
 
 def exposures_after_step(
-    network: Network, before: Parameters, after: Parameters, step: UnknownVector
+    constraints: Sequence[RelativeConstraint],
+    layout: UnknownLayout,
+    before: Parameters,
+    after: Parameters,
+    step: UnknownVector,
 ) -> Parameters:
     """Parameters after a step, with b's exposures moved along their constraints.
 
     Their discrepancies become what the linearised constraint predicts. To first order they are so
     already, but a stiff constraint is curved, and a straight step would leave it by more than its
     standard deviation.
+
+    Parameters
+    ----------
+    constraints : sequence of RelativeConstraint
+        The constraints of the network.
+    layout : UnknownLayout
+        Layout of its unknowns.
+    before, after : Parameters
+        Parameters before and after the straight step.
+    step : UnknownVector
     """
     rotation = after.rotation.copy()
     position = after.position_mm.copy()
-    for number, (constraint, columns) in enumerate(zip(network.relative, network.layout.relative)):
+    for number, (constraint, columns) in enumerate(zip(constraints, layout.relative)):
         a, b = constraint.pairs.T
         offset, d_a, d_b, d_pose = discrepancies_with_jacobian(
             constraint, before.relative[number], before

@@ -7,18 +7,13 @@ parameters, in this order.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .datum import DATUM_DEFECT
-from .relative_orientation import POSE_SIZE, RelativePose, exposures_after_step
-from .rotations import matrix_from_vector
-
-if TYPE_CHECKING:
-    from .network import Network
+from .relative_pose import POSE_SIZE, RelativePose
 
 EXTERIOR_SIZE = 6  # source T [mm], rotation vector w [rad]
 POINT_SIZE = 3
@@ -92,25 +87,45 @@ class UnknownLayout:
     datum_defect: int
 
     @classmethod
-    def of(cls, network: Network) -> UnknownLayout:
-        """Layout of the unknowns of a network."""
-        sizes = [INTERIOR_SIZE] * network.n_fluoroscopes
-        sizes += [POSE_SIZE] * len(network.relative)
-        sizes += [0 if a is None else a.count for a in network.additional]
+    def of(
+        cls,
+        shape: tuple[int, int],
+        interior_free: np.ndarray,
+        n_relative: int,
+        additional_sizes: Sequence[int],
+        datum_defect: int,
+    ) -> UnknownLayout:
+        """Layout of the unknowns of a network.
+
+        Parameters
+        ----------
+        shape : (int, int)
+            Numbers of exposures and of object points.
+        interior_free : (F,) ndarray of bool
+            Whether the interior orientation of a fluoroscope is estimated.
+        n_relative : int
+            Number of constrained relative orientations.
+        additional_sizes : sequence of int
+            Numbers of additional parameters of the fluoroscopes.
+        datum_defect : int
+            Number of unknowns that the datum of a free network fixes.
+        """
+        n_fluoroscopes = len(interior_free)
+        sizes = [INTERIOR_SIZE] * n_fluoroscopes
+        sizes += [POSE_SIZE] * n_relative
+        sizes += additional_sizes
         stops = np.cumsum(sizes, dtype=int)
         columns = [slice(int(stop - size), int(stop)) for stop, size in zip(stops, sizes)]
-        first_additional = network.n_fluoroscopes + len(network.relative)
+        first_additional = n_fluoroscopes + n_relative
         free = np.ones(sum(sizes), dtype=bool)
-        interior_free = np.asarray(network.interior_free, dtype=bool)
-        free[: INTERIOR_SIZE * network.n_fluoroscopes] = np.repeat(interior_free, INTERIOR_SIZE)
+        free[: INTERIOR_SIZE * n_fluoroscopes] = np.repeat(interior_free, INTERIOR_SIZE)
         return cls(
-            network.n_exposures,
-            network.n_points,
-            tuple(columns[: network.n_fluoroscopes]),
-            tuple(columns[network.n_fluoroscopes : first_additional]),
+            *shape,
+            tuple(columns[:n_fluoroscopes]),
+            tuple(columns[n_fluoroscopes:first_additional]),
             tuple(columns[first_additional:]),
             free,
-            DATUM_DEFECT if network.datum == 'inner' else 0,
+            datum_defect,
         )
 
     @property
@@ -206,41 +221,3 @@ class Parameters:
     points_mm: np.ndarray
     additional: tuple[np.ndarray | None, ...] = ()
     relative: tuple[RelativePose, ...] = ()
-
-    def per_image_point(
-        self, network: Network
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Rotation, position, object point and interior orientation of every image point."""
-        exposure = network.exposure
-        return (
-            self.rotation[exposure],
-            self.position_mm[exposure],
-            self.points_mm[network.point],
-            self.interior[network.fluoroscope[exposure]],
-        )
-
-    def updated(self, network: Network, step: UnknownVector) -> Parameters:
-        """Parameters after a step; rotations are varied on the left, R -> exp([w]x) R.
-
-        The second exposures of constrained pairs follow their constraint (see
-        relative_orientation.exposures_after_step).
-        """
-        layout = network.layout
-        interior_step = step.globals[layout.all_interiors].reshape(-1, INTERIOR_SIZE)
-        additional = tuple(
-            a if a is None or network.additional[f] is None else a + step.globals[columns]
-            for f, (a, columns) in enumerate(zip(self.additional, layout.additional))
-        )
-        relative = tuple(
-            pose.updated(step.globals[columns])
-            for pose, columns in zip(self.relative, layout.relative)
-        )
-        moved = Parameters(
-            self.interior + interior_step,
-            matrix_from_vector(step.exteriors[:, 3:]) @ self.rotation,
-            self.position_mm + step.exteriors[:, :3],
-            self.points_mm + step.points,
-            additional,
-            relative,
-        )
-        return exposures_after_step(network, self, moved, step)

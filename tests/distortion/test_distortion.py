@@ -343,7 +343,7 @@ def test_the_gauge_is_what_a_change_of_orientation_does_to_the_image():
     order.
     """
     network, truth = rigs.small_network(exposures=5, targets=40)
-    rotation, position, points, interior = truth.per_image_point(network)
+    rotation, position, points, interior = network.per_image_point(truth)
     uv = project(rotation, position, points, interior)
     basis = gauge_basis(uv, truth.interior[0])
     assert np.linalg.matrix_rank(basis.reshape(-1, 6)) == 6

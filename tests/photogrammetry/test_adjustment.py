@@ -100,7 +100,7 @@ def test_gaussian_adjustment_equals_scipy_least_squares():
 
     def residuals(x):
         parameters = rigs.moved(network, truth, x)
-        image = (network.uv - project(*parameters.per_image_point(network))) / (
+        image = (network.uv - project(*network.per_image_point(parameters))) / (
             result.noise.scale * network.sigma
         )[:, None]
         survey = (parameters.points_mm - network.survey_mm) / network.survey_sd_mm[:, None]
@@ -371,7 +371,7 @@ def test_image_points_with_small_sigma_dominate():
     )
     rough = network.exposure % 2 == 1
     sigma = np.where(rough, 50.0, 1.0)
-    uv = project(*truth.per_image_point(network))
+    uv = project(*network.per_image_point(truth))
     uv += np.where(rough[:, None], 5.0, 0.0) * np.random.default_rng(1).normal(size=uv.shape)
     uv += 0.01 * np.random.default_rng(2).normal(size=uv.shape)
     interior_held = replace(

@@ -15,7 +15,7 @@ from fluoro_calib_ros.photogrammetry.elimination import EliminateExposures, Elim
 from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
 from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
-from fluoro_calib_ros.photogrammetry.relative_orientation import RelativeConstraint
+from fluoro_calib_ros.photogrammetry.relative_pose import RelativeConstraint
 from fluoro_calib_ros.photogrammetry.rotations import rotation_angle
 
 SHAPES = [
@@ -121,7 +121,7 @@ def test_residuals_and_interior_orientation_equal_a_minimal_datum(shape):
     parameters = replace(truth)
     plain = replace(network, datum='survey')
     for _ in range(30):
-        r = network.uv - project(*parameters.per_image_point(network))
+        r = network.uv - project(*network.per_image_point(parameters))
         a = rigs.design_matrix(plain, parameters)
         weight = np.repeat((0.3 * network.sigma) ** -2.0, 2)
         covariance = bordered_inverse(a.T @ (weight[:, None] * a), dense_b)

@@ -60,7 +60,7 @@ def test_gross_error_of_two_pixels_is_found(loss):
     for seed in range(20):
         network, truth = rigs.small_network(seed=seed, **SHAPE)
         rng = np.random.default_rng(seed)
-        uv = project(*truth.per_image_point(network)) + rng.normal(0, 0.25, network.uv.shape)
+        uv = project(*network.per_image_point(truth)) + rng.normal(0, 0.25, network.uv.shape)
         row = int(rng.integers(len(uv)))
         uv[row] += 2.0 * np.array([np.cos(seed), np.sin(seed)])
         network = replace(network, uv=uv, sigma=np.ones(len(uv)))

@@ -119,7 +119,7 @@ def test_source_and_rotation_are_relative_to_the_phantom():
 
 def test_analytic_derivatives_equal_central_differences():
     network, truth = rigs.small_network(exposures=3, targets=20, fluoroscopes=2)
-    rotation, position, points, interior = truth.per_image_point(network)
+    rotation, position, points, interior = network.per_image_point(truth)
     uv, d_exterior, d_point, d_interior = project_with_jacobian(
         rotation, position, points, interior
     )
@@ -163,7 +163,7 @@ def one_exposure(seed=0, targets=60):
     network, truth = rigs.small_network(exposures=1, targets=targets, seed=seed, seen=1.0)
     return (
         truth.points_mm,
-        project(*truth.per_image_point(network)),
+        project(*network.per_image_point(truth)),
         truth.rotation[0],
         truth.position_mm[0],
         truth.interior[0],

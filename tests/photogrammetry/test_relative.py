@@ -20,15 +20,17 @@ from fluoro_calib_ros.photogrammetry.noise import LOSSES, Noise
 from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import precision
 from fluoro_calib_ros.photogrammetry.relative_orientation import (
-    RIGID_SD_MM,
-    RIGID_SD_RAD,
-    RelativeConstraint,
-    RelativePose,
     discrepancies,
     discrepancies_with_jacobian,
     exposures_from_pose,
     mean_pose,
     relative_poses,
+)
+from fluoro_calib_ros.photogrammetry.relative_pose import (
+    RIGID_SD_MM,
+    RIGID_SD_RAD,
+    RelativeConstraint,
+    RelativePose,
 )
 from fluoro_calib_ros.photogrammetry.rotations import (
     matrix_from_vector,
@@ -69,7 +71,7 @@ def rigid_network(exposures=4, targets=30, sd=SOFT, seed=0, alone=1, nu=np.inf, 
     noise = network.sigma[:, None] * np.random.default_rng(seed + 1).normal(
         0, 0.3, network.uv.shape
     )
-    uv = project(*truth.per_image_point(network)) + noise
+    uv = project(*network.per_image_point(truth)) + noise
     return replace(network, uv=uv, relative=(constraint,)), truth
 
 
@@ -265,7 +267,7 @@ def test_rigid_constraint_equals_a_reparametrisation(shape):
     on = replace(parameters, rotation=rotation, position_mm=position)
     k = reparametrisation(plain, on, constraint)
     normal = k.T @ rigs.dense_normal_matrix(plain, replace(result, parameters=on)) @ k
-    r = network.uv - project(*on.per_image_point(network))
+    r = network.uv - project(*network.per_image_point(on))
     weight = np.repeat((0.3 * network.sigma) ** -2.0, 2)
     a = rigs.design_matrix(plain, on)
     gradient = a.T @ (weight * r.ravel())
@@ -379,7 +381,7 @@ def test_three_fluoroscopes_share_the_first():
         b = constraint.pairs[:, 1]
         rotation[b], position[b] = exposures_from_pose(truth, constraint, pose)
     truth = replace(truth, rotation=rotation, position_mm=position, relative=(POSE, other))
-    uv = project(*truth.per_image_point(network)) + np.random.default_rng(1).normal(
+    uv = project(*network.per_image_point(truth)) + np.random.default_rng(1).normal(
         0, 0.3, network.uv.shape
     )
     network = replace(

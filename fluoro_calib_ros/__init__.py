@@ -17,49 +17,17 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .api import *  # noqa: F403
 
-__all__ = [
-    'CalibrationOptions',
-    'CalibrationOutcome',
-    'CalibrationRequest',
-    'CalibrationResult',
-    'CorrectedPoints',
-    'DataError',
-    'FluoroscopeCalibration',
-    'Frame',
-    'OrientationOutcome',
-    'Phantom',
-    'ReconstructionOptions',
-    'ReconstructionOutcome',
-    'Recording',
-    'RigOrientation',
-    'SimulationOptions',
-    'Validation',
-    'adjust',
-    'calibrate',
-    'correct',
-    'load_orientation',
-    'orient',
-    'read_calibrations',
-    'read_phantom',
-    'read_request',
-    'read_source',
-    'reconstruct',
-    'run_calibration',
-    'save_orientation',
-    'save_outcome',
-    'save_result',
-    'simulate',
-    'validate',
-    'write_reconstruction',
-]
-
 
 def __getattr__(name: str) -> Any:
     """Import the public interface when it is first used: a node needs only a part of it."""
-    if name in __all__:
-        return getattr(import_module('.api', __name__), name)
+    if name == '__all__' or not name.startswith('_'):
+        api = import_module('.api', __name__)
+        if name == '__all__':
+            return api.__all__
+        if name in api.__all__:
+            return getattr(api, name)
     raise AttributeError(f'module {__name__!r} has no attribute {name!r}')
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__getattr__('__all__')})

@@ -89,6 +89,7 @@ class CorrectionModel(ABC):
     min_k: ClassVar[int | None] = None  # smallest number of neighbours; None: it has no neighbours
     has_series: ClassVar[bool] = False
     selectable: ClassVar[bool] = True  # False: a user cannot ask for it by name
+    corrects: ClassVar[bool] = True  # False: it leaves every pixel as it is
     keeps_training_points: ClassVar[bool] = True  # train_uv are image points of exposures
 
     k: int

@@ -15,6 +15,7 @@ class NoCorrection(CorrectionModel):
 
     kind = 'none'
     description = 'no correction'
+    corrects = False
     keeps_training_points = False
 
     def predict(self, uv: ArrayLike) -> np.ndarray:

@@ -52,7 +52,7 @@ def write_figures(result: CalibrationResult, directory: str | os.PathLike[str]) 
 def _figures_of_run(label: str, run: SelfCalibration) -> Iterator[tuple[str, Figure]]:
     """File names and figures of one run."""
     network = run.measured.network
-    if any(model.kind != 'none' for model in run.models.values()):
+    if any(model.corrects for model in run.models.values()):
         yield f'cost_{label}.png', cost_figure(run)
     redundancy = np.maximum(
         geometric_redundancy(network, run.after.parameters, run.after.noise), MIN_REDUNDANCY
@@ -65,7 +65,7 @@ def _figures_of_run(label: str, run: SelfCalibration) -> Iterator[tuple[str, Fig
         yield f'residuals_histogram_{name}.png', histogram
         yield f'residuals_position_{name}.png', position_figure(run, name, rows, image_size)
         model = run.models[name]
-        if model.kind != 'none':
+        if model.corrects:
             interior_estimated = bool(network.interior_free[number])
             distortion = distortion_figure(model, name, image_size, interior_estimated)
             yield f'distortion_{name}.png', distortion

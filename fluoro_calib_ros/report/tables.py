@@ -60,7 +60,7 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
         'Fluoroscope': name if len(name) < COLUMN_WIDTH else name[: COLUMN_WIDTH - 4] + '...',
         **_rmse_rows(figures),
         'correction model': figures.model_kind,
-        'neighbours k': '-' if figures.model_kind == 'none' else str(figures.k),
+        'neighbours k': str(figures.k) if model.corrects else '-',
         'iterations': '-' if run is None else str(len(run.history)),
         'converged': 'yes' if converged else 'NO',
         'observations': str(figures.observations),

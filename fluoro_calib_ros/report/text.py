@@ -11,7 +11,7 @@ TERMINAL_WIDTH = 100  # columns
 
 def model_text(model: CorrectionModel) -> str:
     """A correction model in words."""
-    if model.kind == 'none':
+    if not model.corrects:
         return 'no correction model'
     return f'{model.kind}, k = {model.k}' if model.k else model.kind
 

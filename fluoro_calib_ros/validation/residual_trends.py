@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..distortion.base import CorrectionModel
 from .check import Check, Finding, judge, more_exposures
 from .evidence import CommonTrend, Evidence, Subject
 from .field_comparison import describe_place
@@ -30,7 +31,7 @@ def check_trends(evidence: Evidence, names: Sequence[str]) -> list[Check]:
 
 def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
     trend = common.trend
-    kind = evidence.calibrations[name].model.kind
+    model = evidence.calibrations[name].model
     where = describe_place(trend.place, evidence.calibrations[name].image_size)
     return judge(
         'whiteness',
@@ -41,19 +42,19 @@ def _whiteness(evidence: Evidence, name: str, common: CommonTrend) -> Check:
             'px',
             f'fluoroscope {name}: the residuals have a trend of {trend.size:.2f} px, most at '
             f'{where}',
-            _advice(evidence.request.options.model_name, kind, len(evidence.frames[name])),
+            _advice(evidence.request.options.model_name, model, len(evidence.frames[name])),
             trend.place,
         ),
     )
 
 
-def _advice(requested: str, kind: str, count: int) -> str:
-    """Return what to do about a trend: requested is the model option, kind the model in use."""
-    if kind == 'none':
+def _advice(requested: str, model: CorrectionModel, count: int) -> str:
+    """Return what to do about a trend: requested is the model option, model the one in use."""
+    if not model.corrects:
         return 'calibrate with a correction model (--model auto), it was made without one'
     other = '' if requested == 'auto' else ', or choose another model (--model auto)'
     return (
-        f'the correction model {kind} does not follow the distortion there; '
+        f'the correction model {model.kind} does not follow the distortion there; '
         f'{more_exposures(count)} that show beads there{other}'
     )
 

@@ -1,7 +1,5 @@
 """A self-calibration in parallel to the stream; cancelled or refused it changes nothing."""
 
-import time
-
 import numpy as np
 import pytest
 from fluoro_calib_msgs.msg import CalibrationStatus
@@ -119,10 +117,9 @@ def test_cancelled_job_changes_nothing_and_the_next_one_works(rig):
     handle = client.goal()
     answer = handle.get_result_async()
     client.wait_until(lambda: client.feedback or answer.done(), what='the first feedback')
-    asked = time.monotonic()
     assert client.result_of(handle.cancel_goal_async()).goals_canceling
     assert client.result_of(answer).status == CANCELED
-    assert time.monotonic() - asked < 5
+    assert {f.fluoroscope for f in client.feedback} == {'a'}, 'the job ended before b was begun'
     assert not answer.result().result.success and 'cancelled' in answer.result().result.message
     assert rig.state() == before
     client.wait_for_status(

@@ -109,14 +109,99 @@ class Regressions:
         return out
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Iterate:
-    """State of the iteration: values to be fitted, adjustment and noise of the last round."""
+    """State of the iteration after a round.
+
+    Attributes
+    ----------
+    values : (N, 2) ndarray
+        Values to which the models are fitted [px].
+    information : (N, 2, 2) ndarray
+        Inverse covariance of the residuals [1/px^2].
+    after : Adjustment
+        Adjustment of the round.
+    noise : Noise
+        Noise model that its residuals show.
+    """
 
     values: np.ndarray
     information: np.ndarray
     after: Adjustment
     noise: Noise
+
+
+class _Alternation:
+    """Rounds of regression and adjustment of one network.
+
+    Attributes
+    ----------
+    state : _Iterate
+        After the last round.
+    correction : (N, 2) ndarray
+        Held correction of the last round [px].
+    changed : bool
+        Whether inliers or k changed in the last round.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        start: Adjustment,
+        regressions: Regressions,
+        history: History,
+        raise_if_cancelled: Callable[[], None] | None,
+    ) -> None:
+        self.correction = np.zeros_like(network.uv)
+        self.changed = False
+        self._network = network
+        self._regressions = regressions
+        self._history = history
+        self._raise_if_cancelled = raise_if_cancelled
+        self._acceleration = Anderson()
+        self._image = start.residuals
+        information, _ = _information(network, start, self.correction)
+        self.state = _Iterate(start.residuals, information, start, start.noise)
+
+    def advance(self) -> None:
+        """Make one round: fit the models, adjust with their correction held, and record it."""
+        regressions = self._regressions
+        state = self.state
+        score, self.changed = regressions.choose(state.values, state.after.q, state.information)
+        if self.changed:
+            self._acceleration.restart()
+        values = regressions.without_gauge(state.values, state.after.parameters.interior)
+        correction = regressions.smooth(values)
+        after = adjust(
+            self._network,
+            state.after.parameters,
+            correction,
+            state.noise,
+            SolverOptions(ROUND_TOLERANCE),
+            self._raise_if_cancelled,
+        )
+        information, noise = _information(self._network, after, correction)
+        image = regressions.without_gauge(after.residuals + correction, after.parameters.interior)
+        core = regressions.inliers()
+        change = float(np.sqrt(np.mean((regressions.smooth(image) - correction)[core] ** 2)))
+        self._history.add(after, score, regressions.k, change)
+        self.correction = correction
+        self._image = image
+        self.state = _Iterate(values, information, after, noise)
+
+    def has_settled(self, tolerance: float) -> bool:
+        """Whether another round would give the same."""
+        scale = self.state.noise.scale
+        steady = abs(scale - self.state.after.noise.scale) <= SETTLED * scale
+        return not self.changed and steady and self._history.has_settled(tolerance)
+
+    def accelerate(self) -> None:
+        """Replace the values of the next round by those of Anderson acceleration."""
+        # Outliers follow the acceleration, but do not steer it.
+        values = self._acceleration.next(
+            self.state.values, self._image, self._regressions.inliers()
+        )
+        self.state = replace(self.state, values=values)
 
 
 def calibrate_by_regression(
@@ -160,44 +245,21 @@ def calibrate_by_regression(
         network = terms.with_additional(network)
         after = with_zero_additional(before, terms.zeros())
     history = History(measured, progress)
-    acceleration = Anderson()
-    information = _information(network, after, np.zeros_like(network.uv))[0]
-    state = _Iterate(before.residuals, information, after, before.noise)
+    rounds = _Alternation(network, after, regressions, history, raise_if_cancelled)
     converged = False
     for iteration in range(1, options.max_iterations + 1):
-        g_cost, changed = regressions.choose(state.values, state.after.q, state.information)
-        if changed:
-            acceleration.restart()
-        values = regressions.without_gauge(state.values, state.after.parameters.interior)
-        correction = regressions.smooth(values)
-        after = adjust(
-            network,
-            state.after.parameters,
-            correction,
-            state.noise,
-            SolverOptions(ROUND_TOLERANCE),
-            raise_if_cancelled,
-        )
-        information, noise = _information(network, after, correction)
-        image = regressions.without_gauge(after.residuals + correction, after.parameters.interior)
-        core = regressions.inliers()
-        change = float(np.sqrt(np.mean((regressions.smooth(image) - correction)[core] ** 2)))
-        history.add(after, g_cost, regressions.k, change)
-        state = _Iterate(values, information, after, noise)
-        steady = abs(noise.scale - after.noise.scale) <= SETTLED * noise.scale
-        settled = not changed and steady and history.has_settled(options.tolerance)
-        if settled or not regressions.iterate:
-            converged = after.converged
+        rounds.advance()
+        if rounds.has_settled(options.tolerance) or not regressions.iterate:
+            converged = rounds.state.after.converged
             break
         if iteration < options.max_iterations:
-            # Outliers follow the acceleration, but do not steer it.
-            state.values = acceleration.next(values, image, core)
+            rounds.accelerate()
     # The correction of the last round stays; its adjustment is completed here.
     after, precise = adjusted_with_precision(
         network,
-        after.parameters,
-        correction,
-        noise,
+        rounds.state.after.parameters,
+        rounds.correction,
+        rounds.state.noise,
         raise_if_cancelled=raise_if_cancelled,
         noise_held=True,
     )
@@ -206,9 +268,9 @@ def calibrate_by_regression(
         before,
         after,
         precise,
-        correction + network.additional_correction(after.parameters),
+        rounds.correction + network.additional_correction(after.parameters),
         regressions.inliers(),
-        regressions.models(state.values, terms, after, precise),
+        regressions.models(rounds.state.values, terms, after, precise),
         tuple(history.rounds),
         converged,
     )

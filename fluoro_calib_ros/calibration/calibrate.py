@@ -179,32 +179,23 @@ def calibrate(
     if options.relative_orientation != 'none' and not joint:
         raise ValueError('a relative orientation constraint needs the joint adjustment')
     began = time.perf_counter()
-    groups = [tuple(frames)] if joint else [(name,) for name in frames]
     figures: dict[str, FluoroscopeResult] = {}
     calibrations: dict[str, FluoroscopeCalibration] = {}
     runs: dict[str, SelfCalibration] = {}
     # One thread: faster than two for these sizes, and sums are always made in the same order.
     with threadpool_limits(1):
-        for group in groups:
+        for group in [tuple(frames)] if joint else [(name,) for name in frames]:
             start = time.perf_counter()
             label = '+'.join(group)
-            measured = measured_network(
-                {name: frames[name] for name in group},
-                phantom,
-                principal_distance,
-                raise_if_cancelled,
-            )
+            of_group = {name: frames[name] for name in group}
+            measured = measured_network(of_group, phantom, principal_distance, raise_if_cancelled)
             run = self_calibrate(
                 measured, options, _progress_of(label, progress), raise_if_cancelled
             )
-            runs[label] = run
             seconds = time.perf_counter() - start
-            for f, name in enumerate(group):
-                figures[name] = _figures(
-                    run.measured, run.before, run.after, run.precision, f, run.models[name]
-                )
-                digest = digest_of_sources(frames[name], phantom)
-                calibrations[name] = _calibration(run, f, name, options, digest, seconds)
+            runs[label] = run
+            figures |= _figures_of_run(run)
+            calibrations |= _calibrations_of_run(run, of_group, phantom, options, seconds)
         relative = [
             relative_orientations(run, options.relative_orientation) for run in runs.values()
         ]
@@ -222,6 +213,30 @@ def calibrate(
         _outliers_of_all(runs.values()),
         tuple(one for run in runs.values() for one in correlations_of(run)),
     )
+
+
+def _figures_of_run(run: SelfCalibration) -> dict[str, FluoroscopeResult]:
+    """Figures of the fluoroscopes of a self-calibration."""
+    return {
+        name: _figures(run.measured, run.before, run.after, run.precision, f, run.models[name])
+        for f, name in enumerate(run.measured.fluoroscopes)
+    }
+
+
+def _calibrations_of_run(
+    run: SelfCalibration,
+    frames: Frames,
+    phantom: Phantom,
+    options: CalibrationOptions,
+    seconds: float,
+) -> dict[str, FluoroscopeCalibration]:
+    """Calibrations of the fluoroscopes of a self-calibration that took some seconds."""
+    return {
+        name: _calibration(
+            run, f, name, options, digest_of_sources(frames[name], phantom), seconds
+        )
+        for f, name in enumerate(run.measured.fluoroscopes)
+    }
 
 
 def _progress_of(

@@ -21,7 +21,7 @@ from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
 from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.precision import covariance_blocks, precision
+from ..photogrammetry.precision import Precision, covariance_blocks, precision
 from .initial_network import Measured
 from .robust_adjustment import ADVICE, with_zero_additional
 from .rounds import History, Round, SelfCalibration
@@ -81,28 +81,41 @@ def calibrate_by_adjustment(
             'the exposures do not determine orientation and distortion: '
             f'the normal matrix is singular; {ADVICE}'
         ) from None
-    correction = network.additional_correction(after.parameters)
+    measured = replace(measured, network=network)
+    return SelfCalibration(
+        measured,
+        before,
+        after,
+        precise,
+        network.additional_correction(after.parameters),
+        after.inliers,
+        _models(model_type, terms, measured, after, precise),
+        tuple(history.rounds),
+        converged,
+    )
+
+
+def _models(
+    model_type: type[CorrectionModel],
+    terms: AdjustedTerms,
+    measured: Measured,
+    after: Adjustment,
+    precise: Precision,
+) -> dict[str, CorrectionModel]:
+    """Models by fluoroscope, from the terms that an adjustment has estimated.
+
+    measured is the network with these terms as additional parameters.
+    """
+    network = measured.network
+    values = after.residuals + network.additional_correction(after.parameters)
     models = {}
     for f, name in enumerate(measured.fluoroscopes):
         rows = network.rows(f)
         rows = rows[after.inliers[rows]]
         models[name] = model_type(
-            0,
-            network.uv[rows],
-            (after.residuals + correction)[rows],
-            series=terms.fitted_series(f, after, precise),
+            0, network.uv[rows], values[rows], series=terms.fitted_series(f, after, precise)
         )
-    return SelfCalibration(
-        replace(measured, network=network),
-        before,
-        after,
-        precise,
-        correction,
-        after.inliers,
-        models,
-        tuple(history.rounds),
-        converged,
-    )
+    return models
 
 
 def _require_inliers(measured: Measured, adjustment: Adjustment) -> None:

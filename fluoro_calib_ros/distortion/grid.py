@@ -23,6 +23,7 @@ from .grid_cells import (
     divide_cells,
     write_coefficients,
 )
+from .grid_workspace import LookupWorkspace
 from .status import CorrectionStatus
 
 DIVIDED = 4  # added to the status of a cell that is divided
@@ -31,9 +32,6 @@ CHUNK = 8192  # points that are looked up at once, so that their workspace fits 
 WORKSPACE_STEP = 32
 MAX_STEPPED = 512
 WORKSPACE_SIZES = (*range(0, MAX_STEPPED + 1, WORKSPACE_STEP), 1024, 2048, 4096, CHUNK)
-EDGE = (
-    1e-11  # part of a cell by which the image ends later, so that rounding leaves its edge on it
-)
 CHECKS_OF_DIVIDED = 20  # random points in each divided cell at which its error is measured
 
 
@@ -74,7 +72,7 @@ class CorrectionGrid:
         self.nodes = cells.nodes
         self.cell_px = float(max(np.diff(axis).max() for axis in cells.nodes))
         self._set_tables(cells)
-        self._workspaces: list[list[tuple]] = _no_workspaces()
+        self._workspaces: list[list[LookupWorkspace]] = _no_workspaces()
         self.divided = 0
         errors = cells.errors
         if model.smoothness is not Smoothness.STEPPED:
@@ -151,156 +149,59 @@ class CorrectionGrid:
         """
         n = len(u)
         if n <= CHUNK:
-            return self._look_up(n, u, v, values, status)
+            return self._look_up(u, v, values, status)
         if values is None or status is None:
             values = np.empty((3, n))
             status = np.empty(n, dtype=np.uint8)
         for start in range(0, n, CHUNK):
             part = slice(start, start + CHUNK)
-            self._look_up(min(CHUNK, n - start), u[part], v[part], values[:, part], status[part])
+            self._look_up(u[part], v[part], values[:, part], status[part])
         return values, status
 
     def _look_up(
         self,
-        n: int,
         u: np.ndarray,
         v: np.ndarray,
         values: np.ndarray | None,
         status: np.ndarray | None,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Look up one chunk of n points.
-
-        Few calls between whole arrays of one shape: they are what a frame of 30 points costs.
-        """
+        """Look up at most CHUNK points; see `look_up`."""
+        n = len(u)
         number = (n + 31) // 32 if n <= MAX_STEPPED else 16 + (n - 1 >> 9).bit_length()
         workspaces = self._workspaces[number]
         try:
             workspace = workspaces.pop()  # a thread that pops one has it alone, and puts it back
         except IndexError:
-            workspace = self._workspace(WORKSPACE_SIZES[number])
-        (
-            per_px,
-            shift,
-            low,
-            high,
-            stride,
-            u3,
-            v6,
-            pair,
-            place,
-            cell,
-            index,
-            column,
-            rows,
-            rows_t,
-            found,
-            slopes,
-            rest,
-            half,
-            of_u,
-            of_1,
-            result,
-            state,
-        ) = workspace
-        u3[:, :n] = u
-        v6[:, :n] = v
-        np.multiply(pair, per_px, place)
-        np.add(place, shift, place)
-        np.fmax(place, low, place)  # replaces NaN, too
-        np.fmin(place, high, place)
-        cell[...] = place  # rounds down: it is positive
-        np.multiply(index, stride, index)
-        np.add(index, column, index)
-        self._table.take(index, 0, rows, 'clip')  # it is in range; other modes copy once more
-        self._status.take(index, 0, state, 'clip')
-        found[...] = rows_t
-        np.multiply(slopes, v6, half)  # coefficients + slopes v, of 1 and of u
-        np.add(half, rest, half)
-        np.multiply(of_u, u3, result)
-        np.add(result, of_1, result)
+            workspace = LookupWorkspace(WORKSPACE_SIZES[number], self._shape, self.image_size)
+        workspace.locate(u, v)
+        workspace.interpolate(self._table, self._status)
         if self.divided:
-            self._look_up_parts(pair, place, index, result, state)
+            self._look_up_parts(workspace)
         if values is None or status is None:
-            values = result[:, :n].copy()
-            status = state[:n].copy()
+            values = workspace.result[:, :n].copy()
+            status = workspace.status[:n].copy()
         else:
-            values[...] = result[:, :n]
-            status[...] = state[:n]
+            values[...] = workspace.result[:, :n]
+            status[...] = workspace.status[:n]
         workspaces.append(workspace)
         return values, status
 
-    def _look_up_parts(
-        self,
-        uv: np.ndarray,
-        place: np.ndarray,
-        index: np.ndarray,
-        result: np.ndarray,
-        state: np.ndarray,
-    ) -> None:
-        """Correct the results of points in divided cells.
-
-        Parameters
-        ----------
-        uv : (2, n) ndarray
-            Pixels.
-        place : (2, n) ndarray
-            Pixels in units of cells.
-        index : (n,) ndarray
-            Rows of their cells in the table.
-        result, state : (3, n) and (n,) ndarray
-            Results, changed in place.
-        """
-        which = np.flatnonzero(state >= DIVIDED)
+    def _look_up_parts(self, workspace: LookupWorkspace) -> None:
+        """Replace the results of points in divided cells, whose status is DIVIDED or more."""
+        which = np.flatnonzero(workspace.status >= DIVIDED)
         if not len(which):
             return
-        cell = np.searchsorted(self._divided_cells, index[which])
+        cell = np.searchsorted(self._divided_cells, workspace.row[which])
         parts = self._parts[cell]
-        place = place[:, which]
+        place = workspace.place[:, which]
         column, row = np.minimum(((place - np.floor(place)) * parts).astype(np.intp), parts - 1)
         columns = self._parts_table[self._first[cell] + row * parts + column].T
-        u, v = uv[:, which]
+        u, v = workspace.uv[:, which]
         half = columns[6:] * v + columns[:6]
-        result[:, which] = half[3:] * u + half[:3]
-        state[which] -= DIVIDED
-
-    def _workspace(self, n: int) -> tuple:
-        """Return arrays, and views of them, for the lookup of n points."""
-        rows, columns = self._shape
-        number = np.array([columns, rows])
-        per_px = (number - 2 * EDGE) / np.array(self.image_size)
-        whole = np.ones((2, n))
-        pixels = np.zeros((9, n))
-        place = np.empty((2, n))
-        cell = np.empty((2, n), dtype=np.intp)
-        rows_of_table = np.empty((n, COEFFICIENTS))
-        found = np.empty((COEFFICIENTS, n))
-        half = np.empty((6, n))
-        return (
-            whole * per_px[:, None],
-            whole * (0.5 * per_px + 1 + EDGE)[:, None],
-            whole * 0.5,
-            whole * (number[:, None] + 1.5),
-            np.full(n, columns + 2),
-            pixels[:3],
-            pixels[3:],
-            pixels[2:4],
-            place,
-            cell,
-            cell[1],
-            cell[0],
-            rows_of_table,
-            rows_of_table.T,
-            found,
-            found[6:],
-            found[:6],
-            half,
-            half[3:],
-            half[:3],
-            np.empty((3, n)),
-            np.empty(n, dtype=np.uint8),
-        )
+        workspace.result[:, which] = half[3:] * u + half[:3]
+        workspace.status[which] -= DIVIDED
 
 
-def _no_workspaces() -> list[list[tuple]]:
+def _no_workspaces() -> list[list[LookupWorkspace]]:
     """Empty lists of free workspaces, by WORKSPACE_SIZES."""
     return [[] for _ in WORKSPACE_SIZES]

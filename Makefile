@@ -6,6 +6,8 @@ SHELL := /bin/sh
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
+# processes that run tests
+WORKERS ?= 2
 
 help:
 	@echo 'make demo         calibrate, correct and reconstruct the recorded rig in bags/ over real ROS 2 nodes'
@@ -32,7 +34,7 @@ demo: setup
 	@.venv/bin/fluoro_calib_demo $(ARGS)
 
 test: setup
-	@$(RUN) -m pytest tests $(ARGS)
+	@$(RUN) -m pytest tests -n $(WORKERS) --dist loadfile $(ARGS)
 
 lint: setup
 	@.venv/bin/ruff check .

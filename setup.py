@@ -33,7 +33,7 @@ setup(
         'opencv-python-headless>=4.6',
         'tqdm',
     ],
-    extras_require={'test': ['pytest', 'pytest-timeout']},
+    extras_require={'test': ['pytest', 'pytest-timeout', 'pytest-xdist']},
     zip_safe=False,
     maintainer='fluoro_calib_ros maintainers',
     maintainer_email='maintainers@fluoro-calib.example',

@@ -29,7 +29,12 @@ PLAIN = dict(model='none')
 @pytest.fixture(scope='module')
 def jobs():
     return {
-        way: calibrate(FRAMES, PHANTOM, CalibrationOptions(relative_orientation=way), joint=True)
+        way: calibrate(
+            FRAMES,
+            PHANTOM,
+            CalibrationOptions('local_linear', relative_orientation=way),
+            joint=True,
+        )
         for way in ('none', 'soft', 'hard')
     }
 

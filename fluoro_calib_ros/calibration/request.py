@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from ..exposures.frame import Frame
+from ..exposures.names import Names
 from ..exposures.phantom import Phantom
 from .options import CalibrationOptions
 
@@ -25,6 +26,8 @@ class CalibrationRequest:
         Whether all fluoroscopes are adjusted together; else one after the other.
     principal_distance : float or None
         Start value, or with interior 'fixed' the held value [px]; None: from the observations.
+    names : Names
+        Names of targets, exposures and fluoroscopes in the files that they were read from.
     """
 
     frames: Mapping[str, Sequence[Frame]]
@@ -32,6 +35,7 @@ class CalibrationRequest:
     options: CalibrationOptions = field(default_factory=CalibrationOptions)
     joint: bool = False
     principal_distance: float | None = None
+    names: Names = field(default_factory=Names)
 
     @property
     def groups(self) -> list[tuple[str, ...]]:

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 
 from ..options import declared
-from .arguments import add_calibration, add_option, add_phantom, add_source
-from .output import print_note, print_result
+from .arguments import add_calibration, add_option, add_phantom, add_source, file_settings
+from .output import print_note, print_notes, print_result
 
 NAME = 'adjust'
 HELP = 'Adjust the exposures of a bag or CSV file with the calibration held (out-of-sample test).'
@@ -18,7 +18,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..calibration.options import CalibrationOptions
 
-    add_source(parser, 'image size of a CSV file, which does not contain it [px]')
+    add_source(
+        parser,
+        'image size of a file that does not contain it [px] (default: that of the calibration)',
+    )
     add_phantom(parser)
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
@@ -29,22 +32,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Adjust and write the result folder. Raises DataError."""
-    from ..files.phantom import read_phantom
+    from ..files.names import read_names
     from ..files.result_document import result_document
     from ..jobs.adjustment import adjust
     from ..jobs.result_folder import save_result
-    from ..jobs.sources import read_calibrations, read_source, select_calibrations
+    from ..jobs.sources import read_calibrations, read_source, read_survey, select_calibrations
     from ..report.tables import summary_table
 
-    phantom = read_phantom(arguments.phantom)
     calibrations = read_calibrations(arguments.calibration)
-    frames = read_source(
+    known = read_names(arguments.calibration)
+    survey = read_survey(arguments.phantom, file_settings(arguments, names=known))
+    recording = read_source(
         arguments.source,
-        image_size=arguments.image_size,
+        image_size=arguments.image_size or next(iter(calibrations.values())).image_size,
         fluoroscopes=arguments.fluoroscopes,
-    ).frames
+        settings=file_settings(arguments, names=known.merged(survey.names)),
+    )
+    print_notes((*survey.notes, *recording.notes))
+    frames = recording.frames
     calibrations = select_calibrations(calibrations, frames, arguments.calibration)
-    result = adjust(frames, phantom, calibrations, arguments.loss)
+    result = adjust(frames, survey.phantom, calibrations, arguments.loss)
     save_result(arguments.out, result)
     for sentence in result.left_out:
         print_note(f'not used: {sentence}')

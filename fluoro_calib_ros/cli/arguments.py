@@ -6,9 +6,14 @@ import argparse
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..options import Option
+
+if TYPE_CHECKING:
+    from ..exchange.content import Settings
+
+UNITS = ('mm', 'cm', 'm')
 
 
 def image_size(text: str) -> tuple[int, int]:
@@ -98,10 +103,44 @@ def add_source(parser: argparse.ArgumentParser, image_size_help: str) -> None:
         'source',
         type=Path,
         metavar='SOURCE',
-        help='bag (file or folder), or CSV file fluoroscope,exposure,target_id,u,v[,sigma]',
+        help='bag (file or folder), CSV file fluoroscope,exposure,target_id,u,v[,sigma], or image '
+        'points of another program: XMALab 2-D points or project, .pho (docs/formats.md)',
     )
     parser.add_argument('--image-size', type=image_size, metavar='WxH', help=image_size_help)
     add_fluoroscopes(parser)
+    add_file_options(parser)
+
+
+def add_file_options(parser: argparse.ArgumentParser) -> None:
+    """Add what files of other programs do not say."""
+    group = parser.add_argument_group('files of other programs')
+    group.add_argument(
+        '--units', choices=UNITS, help='unit of lengths, where the format does not say it'
+    )
+    group.add_argument(
+        '--one-based', action='store_true', help='pixels of XMALab points count from 1'
+    )
+    group.add_argument(
+        '--y-up', action='store_true', help='rows of XMALab points count upwards from the bottom'
+    )
+    group.add_argument(
+        '--trial', metavar='NAME', help='trial of an XMALab project (default: its calibration)'
+    )
+
+
+def file_settings(arguments: argparse.Namespace, **changes: Any) -> Settings:
+    """Return the settings of `add_file_options`; changes replace some."""
+    from ..exchange.content import Settings
+
+    settings: dict[str, Any] = {
+        'image_size': getattr(arguments, 'image_size', None),
+        'units': arguments.units,
+        'one_based': arguments.one_based,
+        'y_up': arguments.y_up,
+        'trial': arguments.trial,
+    }
+    settings.update(changes)
+    return Settings(**settings)
 
 
 def add_fluoroscopes(parser: argparse.ArgumentParser, use: str = 'use') -> None:
@@ -119,7 +158,8 @@ def add_phantom(parser: argparse.ArgumentParser, **changes: Any) -> None:
     settings: dict[str, Any] = {
         'required': True,
         'type': Path,
-        'help': 'surveyed coordinates target_id,x,y,z,sd [mm]',
+        'help': 'surveyed coordinates target_id,x,y,z,sd [mm], or an XMALab frame specification, '
+        'project or .xyz file',
     }
     settings.update(changes)
     parser.add_argument('--phantom', **settings)

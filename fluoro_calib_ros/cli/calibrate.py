@@ -13,12 +13,13 @@ from .arguments import (
     add_option,
     add_phantom,
     add_source,
+    file_settings,
     number_in,
 )
-from .output import print_note, print_result, print_round, print_unpaired
+from .output import print_note, print_notes, print_result, print_round, print_unpaired
 
 NAME = 'calibrate'
-HELP = 'Self-calibrate the fluoroscopes of a bag or CSV file.'
+HELP = 'Self-calibrate the fluoroscopes of a bag or file of image points.'
 EXAMPLE = 'fluoro-calib calibrate bags/calibration --phantom bags/phantom.csv --out result'
 INTERNAL = ('tolerance',)  # options that the command does not offer
 
@@ -27,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..calibration.options import CalibrationOptions
 
-    add_source(parser, 'image size of a CSV file, which does not contain it [px]')
+    add_source(parser, 'image size of a file that does not contain it [px]')
     add_phantom(parser)
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
@@ -117,20 +118,21 @@ def run(arguments: argparse.Namespace) -> None:
     """Self-calibrate and write the result folder. Raises DataError."""
     from ..calibration.options import CalibrationOptions
     from ..calibration.request import CalibrationRequest
-    from ..files.phantom import read_phantom
     from ..files.result_document import result_document
     from ..jobs.calibration import run_calibration
     from ..jobs.result_folder import save_outcome
-    from ..jobs.sources import read_source
+    from ..jobs.sources import read_source, read_survey
     from ..report.tables import summary_table
 
-    phantom = read_phantom(arguments.phantom)
+    survey = read_survey(arguments.phantom, file_settings(arguments))
     recording = read_source(
         arguments.source,
         image_size=arguments.image_size,
         fluoroscopes=arguments.fluoroscopes,
         collect=arguments.collect,
+        settings=file_settings(arguments, names=survey.names),
     )
+    print_notes((*survey.notes, *recording.notes))
     print_unpaired(arguments.source, recording.unpaired)
     options = CalibrationOptions(
         **{
@@ -140,7 +142,12 @@ def run(arguments: argparse.Namespace) -> None:
         }
     )
     request = CalibrationRequest(
-        recording.frames, phantom, options, arguments.joint, arguments.principal_distance
+        recording.frames,
+        survey.phantom,
+        options,
+        arguments.joint,
+        arguments.principal_distance,
+        recording.names,
     )
     outcome = run_calibration(request, force=arguments.force, progress=print_round)
     save_outcome(arguments.out, outcome)

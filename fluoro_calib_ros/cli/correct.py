@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import DataError
-from .arguments import add_calibration
-from .output import ProgressBar, print_note, print_result
+from .arguments import add_calibration, add_file_options, file_settings
+from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
     from ..calibration.result import FluoroscopeCalibration
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 NAME = 'correct'
 HELP = 'Correct image points (CSV file) or images (image, TIFF stack, folder or video).'
 EXAMPLE = 'fluoro-calib correct points.csv --calibration result --out corrected.csv'
-POINTS_SUFFIXES = ('.csv', '.txt', '')  # of files with image points
+POINTS_SUFFIXES = ('.csv', '.txt', '.xma', '.pho', '')  # of files with image points
 MAX_NAMES = 5  # of files in a note
 
 
@@ -27,7 +27,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'source',
         type=Path,
         metavar='SOURCE',
-        help='CSV file with columns u, v [px] and optionally fluoroscope, sigma; or a grey image '
+        help='CSV file with columns u, v [px] and optionally fluoroscope, sigma; image points of '
+        'another program (docs/formats.md); or a grey image '
         '(png, tif, jpg, bmp, pgm), a folder of images, or a video (avi, mkv, mp4) such as '
         'recording.avi',
     )
@@ -50,6 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default='linear',
         help='interpolation between the pixels of an image (default: linear)',
     )
+    add_file_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -80,9 +82,14 @@ def run(arguments: argparse.Namespace) -> None:
 def _correct_points(
     arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
 ) -> None:
-    from ..files.image_points import correct_points, read_points, write_points
+    from ..files.image_points import correct_points, write_points
+    from ..jobs.sources import read_point_table
 
-    points = read_points(arguments.source)
+    size = next(iter(calibrations.values())).image_size
+    points, notes = read_point_table(
+        arguments.source, arguments.calibration, file_settings(arguments, image_size=size)
+    )
+    print_notes(notes)
     corrected = correct_points(points, calibrations)
     write_points(arguments.out, points, corrected)
     counts = {

@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 
 from ..errors import DataError
-from .arguments import add_calibration, add_phantom, add_source
-from .output import print_result
+from .arguments import add_calibration, add_phantom, add_source, file_settings
+from .output import print_notes, print_result
 
 NAME = 'orient'
 HELP = 'Orient the rig from a capture of the phantom, which stands still in the rig frame.'
@@ -33,7 +33,7 @@ def exposure_numbers(text: str) -> set[int]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    add_source(parser, 'image size of a CSV file [px] (default: that of the calibration)')
+    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
     add_calibration(parser)
     add_phantom(parser)
     parser.add_argument(
@@ -52,27 +52,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write DIR/rig_orientation.npz. Raises DataError."""
-    from ..files.phantom import read_phantom
+    from ..files.names import read_names
     from ..files.result_document import orientation_document
     from ..files.rig_orientation import save_orientation
     from ..jobs.orientation import orient
-    from ..jobs.sources import read_calibrated_source
+    from ..jobs.sources import read_calibrated_source, read_survey
     from ..report.orientation import orientation_text
 
-    phantom = read_phantom(arguments.phantom)
-    frames, calibrations = read_calibrated_source(
+    known = read_names(arguments.calibration)
+    survey = read_survey(arguments.phantom, file_settings(arguments, names=known))
+    recording, calibrations = read_calibrated_source(
         arguments.source,
         arguments.calibration,
         image_size=arguments.image_size,
         fluoroscopes=arguments.fluoroscopes,
+        settings=file_settings(arguments, names=survey.names),
     )
+    print_notes((*survey.notes, *recording.notes))
+    frames = recording.frames
     if arguments.exposures is not None:
         frames = {
             name: [frame for frame in of_fluoroscope if frame.number in arguments.exposures]
             for name, of_fluoroscope in frames.items()
         }
     try:
-        outcome = orient(frames, phantom, calibrations, arguments.frame_id)
+        outcome = orient(frames, survey.phantom, calibrations, arguments.frame_id)
     except DataError as error:
         raise DataError(f'{arguments.source}: {error}') from None
     path = save_orientation(arguments.calibration, outcome.orientation)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import shutil
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -27,6 +27,12 @@ def print_result(arguments: argparse.Namespace, document: Mapping[str, Any], tex
 def print_note(text: str) -> None:
     """Print a note on standard error."""
     print(text, file=sys.stderr)
+
+
+def print_notes(texts: Iterable[str]) -> None:
+    """Print notes on standard error, each once."""
+    for text in dict.fromkeys(texts):
+        print_note(text)
 
 
 def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from ..errors import DataError
 from ..options import declared
-from .arguments import add_calibration, add_option, add_source
-from .output import print_result, print_unpaired
+from .arguments import add_calibration, add_option, add_source, file_settings
+from .output import print_notes, print_result, print_unpaired
 
 if TYPE_CHECKING:
     from ..jobs.reconstruction import ReconstructionOutcome
@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..jobs.reconstruction import ReconstructionOptions
 
-    add_source(parser, 'image size of a CSV file [px] (default: that of the calibration)')
+    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
     add_calibration(parser)
     parser.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
     parser.add_argument(
@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
     """Read the clusters; call error with a sentence for arguments that exclude each other."""
     from ..drift.clusters import parse_clusters
-    from ..jobs.sources import is_csv
+    from ..jobs.sources import is_bag
 
     try:
         arguments.clusters = parse_clusters(arguments.cluster)
@@ -62,10 +62,10 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
         error(f'--cluster: {fault}')
     if arguments.clusters and arguments.no_drift_watch:
         error('--cluster is for the drift watch, it cannot be used with --no-drift-watch')
-    if arguments.clusters and is_csv(arguments.source):
+    if arguments.clusters and not is_bag(arguments.source):
         error(
-            f'--cluster is for the drift watch, but {arguments.source}, a CSV file, does not '
-            'contain the times of its exposures'
+            f'--cluster is for the drift watch, but {arguments.source}, which is no bag, '
+            'does not contain the times of its exposures'
         )
 
 
@@ -74,24 +74,27 @@ def run(arguments: argparse.Namespace) -> None:
     from ..files.reconstructed_points import write_reconstruction
     from ..files.rig_orientation import load_orientation, orientation_path
     from ..jobs.reconstruction import ReconstructionOptions, check_orientation, reconstruct
-    from ..jobs.sources import is_csv, read_calibrated_source
+    from ..jobs.sources import is_bag, read_calibrated_source
 
     path = arguments.orientation or orientation_path(arguments.calibration)
-    frames, calibrations = read_calibrated_source(
+    recording, calibrations = read_calibrated_source(
         arguments.source,
         arguments.calibration,
         image_size=arguments.image_size,
         fluoroscopes=arguments.fluoroscopes,
         # A frame without points, or with an invalid one, must not reject a recording.
         validate=False,
+        settings=file_settings(arguments),
     )
+    print_notes(recording.notes)
+    frames = recording.frames
     orientation = load_orientation(path)
     options = ReconstructionOptions(
         arguments.pair_by,
         arguments.reject,
         not arguments.no_drift_watch,
         arguments.clusters,
-        not is_csv(arguments.source),
+        is_bag(arguments.source),
     )
     names = [name for name in orientation.fluoroscopes if name in frames]
     try:
@@ -102,7 +105,7 @@ def run(arguments: argparse.Namespace) -> None:
         outcome = reconstruct(frames, calibrations, orientation, options)
     except DataError as error:
         raise DataError(f'{arguments.source}: {error}') from None
-    write_reconstruction(arguments.out, outcome.frames)
+    write_reconstruction(arguments.out, outcome.frames, recording.names)
     print_unpaired(arguments.source, outcome.unpaired)
     _print(arguments, outcome)
 

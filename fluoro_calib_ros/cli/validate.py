@@ -6,8 +6,15 @@ import argparse
 from pathlib import Path
 
 from ..errors import DataError
-from .arguments import add_collect, add_fluoroscopes, add_phantom, image_size
-from .output import print_result, print_step, print_unpaired
+from .arguments import (
+    add_collect,
+    add_file_options,
+    add_fluoroscopes,
+    add_phantom,
+    file_settings,
+    image_size,
+)
+from .output import print_notes, print_result, print_step, print_unpaired
 
 NAME = 'validate'
 HELP = 'Validate a calibration: pass, fail or cannot tell, and what to do.'
@@ -20,17 +27,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--source',
         type=Path,
-        help='bag or CSV file from which the calibration was made (default: DIR/observations.csv)',
+        help='bag or file of image points from which the calibration was made (default: '
+        'DIR/observations.csv)',
     )
     add_phantom(parser, required=False, help='its surveyed coordinates (default: DIR/phantom.csv)')
     parser.add_argument(
         '--image-size',
         type=image_size,
         metavar='WxH',
-        help='image size of a CSV file given as --source [px]',
+        help='image size of a file given as --source [px] (default: that of the calibration)',
     )
     add_fluoroscopes(parser, 'validate')
     add_collect(parser, 'a bag given as --source')
+    add_file_options(parser)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -39,25 +48,30 @@ def run(arguments: argparse.Namespace) -> None:
     Raises DataError, also for the verdict 'fail', after everything is written.
     """
     from ..files.calibration_request import read_request
-    from ..files.phantom import read_phantom
+    from ..files.names import read_names
     from ..files.validation import validation_document, write_validation
-    from ..jobs.sources import read_calibrations, read_source
+    from ..jobs.sources import read_calibrations, read_source, read_survey
     from ..report.verdict import verdict_text
     from ..validation.verdict import validate
 
     calibrations = read_calibrations(arguments.directory, arguments.fluoroscopes)
     frames = phantom = None
+    known = read_names(arguments.directory)
     if arguments.source is not None:
         recording = read_source(
             arguments.source,
-            image_size=arguments.image_size,
+            image_size=arguments.image_size or next(iter(calibrations.values())).image_size,
             fluoroscopes=arguments.fluoroscopes,
             collect=arguments.collect,
+            settings=file_settings(arguments, names=known),
         )
+        print_notes(recording.notes)
         print_unpaired(arguments.source, recording.unpaired)
         frames = recording.frames
     if arguments.phantom is not None:
-        phantom = read_phantom(arguments.phantom)
+        survey = read_survey(arguments.phantom, file_settings(arguments, names=known))
+        print_notes(survey.notes)
+        phantom = survey.phantom
     request = read_request(arguments.directory, calibrations, frames, phantom)
     validation = validate(request, calibrations, print_step)
     write_validation(arguments.directory, validation)

@@ -17,6 +17,7 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from .access import PathLike
 from .json_file import read_json, write_json
+from .names import read_names, write_names
 from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
 from .validation import delete_validation
@@ -43,6 +44,7 @@ def write_request(directory: PathLike, request: CalibrationRequest) -> None:
         'principal_distance': request.principal_distance,
     }
     write_json(directory / OPTIONS, document)
+    write_names(directory, request.names)
 
 
 def read_request(
@@ -92,7 +94,8 @@ def read_request(
                 f'calibration of fluoroscope {name} was made'
             )
     used = {name: frames[name] for name in calibrations}
-    return CalibrationRequest(used, phantom, options, joint, distance)
+    names = read_names(directory)
+    return CalibrationRequest(used, phantom, options, joint, distance, names)
 
 
 def _require_file(path: Path, option: str = '') -> Path:

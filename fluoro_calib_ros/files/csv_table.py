@@ -1,4 +1,8 @@
-"""CSV tables: columns by name, and errors that name the row."""
+"""CSV tables: columns by name, and errors that name the row.
+
+A header with semicolons announces a table with semicolons between the cells and decimal commas, as
+spreadsheets write it in many countries.
+"""
 
 from __future__ import annotations
 
@@ -103,7 +107,7 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
     lines: Iterable[str] = io.StringIO(text, newline='')
     if '#' in text:  # a comment becomes a blank line, so that the numbers of the rows remain
         lines = ('\n' if line.lstrip().startswith('#') else line for line in lines)
-    rows_of_file = _RowReader(path, lines)
+    rows_of_file = _RowReader(path, lines, _separator(text))
     header = rows_of_file.read_header(required)
     is_empty = True
     while not rows_of_file.ended:
@@ -114,6 +118,14 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
             yield Block(path, header, rows, numbers)
     if is_empty:
         raise DataError(f'{path}: the file has a header, but no rows')
+
+
+def decimal_point(cell: str) -> str:
+    """Return a number with a decimal comma as one with a point, any other cell as it is."""
+    if cell.count(',') != 1 or '.' in cell:
+        return cell
+    changed = cell.replace(',', '.')
+    return changed if _is_number(changed, float) else cell
 
 
 def write_rows(file: IO[Any], rows: Iterable[Iterable[Any]]) -> None:
@@ -129,10 +141,11 @@ def format_float(value: float) -> str:
 class _RowReader:
     """Reads the rows of a CSV file that are not blank, with their numbers in the file."""
 
-    def __init__(self, path: PathLike, lines: Iterable[str]) -> None:
+    def __init__(self, path: PathLike, lines: Iterable[str], separator: str = ',') -> None:
         self.ended = False
         self._path = path
-        self._reader = csv.reader(lines, strict=True)
+        self._has_decimal_commas = separator == ';'
+        self._reader = csv.reader(lines, delimiter=separator, strict=True)
 
     def read_header(self, required: Sequence[str]) -> list[str]:
         """Return the column names in the first row that is not blank. Raises DataError."""
@@ -161,7 +174,16 @@ class _RowReader:
         filled = np.array([not _is_blank(row) for row in rows], dtype=bool)
         if not filled.all():
             rows = [row for row, keep in zip(rows, filled) if keep]
+        if self._has_decimal_commas:
+            rows = [[decimal_point(cell.strip()) for cell in row] for row in rows]
         return rows, lines[filled]
+
+
+def _separator(text: str) -> str:
+    """Return the separator of a table: a semicolon where its header has one and no comma."""
+    lines = (line for line in io.StringIO(text) if not line.lstrip().startswith('#'))
+    header = next((line for line in lines if line.strip()), '')
+    return ';' if ';' in header and ',' not in header else ','
 
 
 def _is_blank(row: Sequence[str]) -> bool:

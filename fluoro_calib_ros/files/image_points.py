@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,6 +11,8 @@ from ..calibration.result import CorrectedPoints, FluoroscopeCalibration
 from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 from ..exposures.columns import is_positive
+from ..exposures.frame import Frame
+from ..exposures.names import Names
 from .access import PathLike
 from .atomic import atomic_file
 from .csv_table import Block, format_float, read_blocks, write_rows
@@ -56,12 +58,46 @@ class PointsFile:
         ]
 
 
-def read_points(path: PathLike) -> PointsFile:
+def points_of_frames(
+    path: PathLike, frames: Mapping[str, Sequence[Frame]], names: Names
+) -> PointsFile:
+    """Return the image points of frames as the rows of a CSV file; path is for messages.
+
+    Targets and exposures have their names where they have some.
+    """
+    exposures = names.exposure_names()
+    targets = names.target_names()
+    flat = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
+    if not flat:
+        raise DataError(f'{path}: the file has no image points')
+    rows = [
+        [
+            f.fluoroscope,
+            str(exposures.get(f.number, f.number)),
+            str(targets.get(i, i)),
+            *map(repr, uv),
+        ]
+        for f in flat
+        for i, uv in zip(f.target_id.tolist(), f.uv.tolist())
+    ]
+    return PointsFile(
+        path,
+        ['fluoroscope', 'exposure', 'target_id', 'u', 'v'],
+        rows,
+        np.arange(2, len(rows) + 2),
+        np.concatenate([f.uv for f in flat]),
+        None,
+        np.array([row[0] for row in rows]),
+    )
+
+
+def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> PointsFile:
     """Read a CSV file with the columns u, v [px], optionally fluoroscope and sigma, and others.
 
-    u and v may be empty; such a point will have the status INVALID. Raises DataError that names
-    row and cause.
+    u and v may be empty; such a point will have the status INVALID. known are the ids of
+    fluoroscopes that have names. Raises DataError that names row and cause.
     """
+    known = known or {}
     blocks = list(read_blocks(path, ('u', 'v')))
     header = blocks[0].header
     points = PointsFile(
@@ -71,7 +107,7 @@ def read_points(path: PathLike) -> PointsFile:
         np.concatenate([block.lines for block in blocks]),
         np.concatenate([_uv(block) for block in blocks]),
         np.concatenate([_sigma(block) for block in blocks]) if 'sigma' in header else None,
-        np.array([name for block in blocks for name in block.strings('fluoroscope')])
+        np.array([known.get(n, n) for block in blocks for n in block.strings('fluoroscope')])
         if 'fluoroscope' in header
         else None,
     )

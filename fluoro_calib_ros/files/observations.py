@@ -1,10 +1,13 @@
-"""Observations as CSV: `fluoroscope,exposure,target_id,u,v[,sigma]`, u, v and sigma in pixels."""
+"""Observations as CSV: `fluoroscope,exposure,target_id,u,v[,sigma]`, u, v and sigma in pixels.
+
+Files of a lab may have names instead of ids in the first three columns.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +15,11 @@ import numpy as np
 from ..errors import DataError
 from ..exposures.columns import first_repeated, is_positive
 from ..exposures.frame import Frame, points_on_image
+from ..exposures.names import Names, safe_names, without_trivial
 from .access import check_safe_name
 from .atomic import atomic_file
 from .csv_table import Block, format_float, read_blocks, write_rows
+from .named_column import NamedColumn
 
 COLUMNS = ('fluoroscope', 'exposure', 'target_id', 'u', 'v')
 
@@ -74,13 +79,63 @@ def read_observations_csv(
         For text that is not a number, a point off the image, and a target that occurs twice in a
         frame. The message names the row.
     """
+    return _read(path, image_size, _Columns(None))
+
+
+def read_named_observations(
+    path: PathLike, image_size: tuple[int, int] | None, known: Names
+) -> tuple[dict[str, list[Frame]], Names]:
+    """Read the frames of a CSV file in which fluoroscopes, exposures and targets may have names.
+
+    known are names whose ids are given. Returns the frames by id of the fluoroscope, and the
+    names of the file. Raises DataError as `read_observations_csv` does.
+    """
+    columns = _Columns(known)
+    frames = _read(path, image_size, columns)
+    return frames, columns.names()
+
+
+class _Columns:
+    """What was read of the columns with names; without known names they are ids."""
+
+    def __init__(self, known: Names | None) -> None:
+        self.codes: dict[str, int] = {}
+        self.known = known
+        self.exposure = NamedColumn('exposure', None if known is None else known.exposures)
+        self.target = NamedColumn('target_id', None if known is None else known.targets)
+
+    def fluoroscopes(self) -> list[str]:
+        """Return the ids of the fluoroscopes, in the order of their codes."""
+        if self.known is None:
+            return list(self.codes)
+        ids = safe_names(self.codes, self.known.fluoroscopes)
+        return [ids[name] for name in self.codes]
+
+    def names(self) -> Names:
+        """Return the names that are not ids themselves."""
+        pairs = zip(self.codes, self.fluoroscopes())
+        return Names(
+            without_trivial(self.target.ids()),
+            without_trivial(self.exposure.ids()),
+            {name: identity for name, identity in pairs if name != identity},
+        )
+
+
+def _read(
+    path: PathLike, image_size: tuple[int, int] | None, columns: _Columns
+) -> dict[str, list[Frame]]:
     if image_size is None:
         raise DataError(
             f'{path}: a CSV file does not contain the image size, --image-size WxH is needed'
         )
-    codes: dict[str, int] = {}
-    rows = _concatenate([_parse(block, codes, image_size) for block in read_blocks(path, COLUMNS)])
-    names = list(codes)
+    blocks = read_blocks(path, COLUMNS)
+    rows = _concatenate([_parse(block, columns, image_size) for block in blocks])
+    rows = replace(
+        rows,
+        exposure=columns.exposure.numbers(rows.exposure),
+        target_id=columns.target.numbers(rows.target_id),
+    )
+    names = columns.fluoroscopes()
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(names)}
     for of_frame in _by_frame(rows, names):
         name = names[of_frame.code[0]]
@@ -89,30 +144,55 @@ def read_observations_csv(
 
 
 def write_observations_csv(
-    path: PathLike, frames: Mapping[str, Sequence[Frame]] | Iterable[Frame]
+    path: PathLike,
+    frames: Mapping[str, Sequence[Frame]] | Iterable[Frame],
+    names: Names | None = None,
 ) -> None:
     """Write frames, by fluoroscope or as a sequence, to a CSV file.
 
-    The file has a column sigma if any frame has sigma. Raises DataError where it cannot be
-    written.
+    The file has a column sigma if any frame has sigma. Names are written instead of ids in a
+    column whose ids all have one. Raises DataError where the file cannot be written.
     """
     if isinstance(frames, Mapping):
         frames = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
     frames = list(frames)
     with_sigma = any(frame.sigma is not None for frame in frames)
+    labels = _labels(frames, names or Names())
     with atomic_file(path, 'w') as file:
         write_rows(file, [COLUMNS + ('sigma',) * with_sigma])
         for frame in frames:
             check_safe_name(frame.fluoroscope, path)
-            write_rows(file, _csv_rows(frame, with_sigma))
+            write_rows(file, _csv_rows(frame, with_sigma, labels))
 
 
-def _parse(block: Block, codes: dict[str, int], image_size: tuple[int, int]) -> _Rows:
-    """Return a block of the file as arrays; new fluoroscopes are added to codes."""
+@dataclass(frozen=True)
+class _Labels:
+    """Names to write instead of ids, empty for a column that is written as ids."""
+
+    fluoroscopes: Mapping[str, str]
+    exposures: Mapping[int, str]
+    targets: Mapping[int, str]
+
+
+def _labels(frames: Sequence[Frame], names: Names) -> _Labels:
+    """Return the names of the columns whose ids all have one."""
+    exposures = names.exposure_names()
+    targets = names.target_names()
+    if not all(frame.number in exposures for frame in frames):
+        exposures = {}
+    if not all(int(i) in targets for frame in frames for i in frame.target_id):
+        targets = {}
+    return _Labels(names.fluoroscope_names(), exposures, targets)
+
+
+def _parse(block: Block, columns: _Columns, image_size: tuple[int, int]) -> _Rows:
+    """Return a block of the file as arrays; new names are added to columns."""
     names = block.strings('fluoroscope')
+    codes = columns.codes
     for name in dict.fromkeys(names):
         if name not in codes:
-            check_safe_name(name, f'{block.path}, row {block.lines[names.index(name)]}')
+            if columns.known is None or not name:
+                check_safe_name(name, f'{block.path}, row {block.lines[names.index(name)]}')
             codes[name] = len(codes)
     uv = np.column_stack([block.floats('u'), block.floats('v')])
     on_image = points_on_image(uv, image_size)
@@ -129,7 +209,8 @@ def _parse(block: Block, codes: dict[str, int], image_size: tuple[int, int]) -> 
         is_empty = np.array([cell == '' for cell in block.strings('sigma')])
         block.require('sigma', is_empty | is_positive(sigma), 'not a finite number above 0')
     code = np.array([codes[name] for name in names])
-    return _Rows(code, block.ids('exposure'), block.ids('target_id'), uv, sigma, block.lines)
+    exposure = columns.exposure.read(block)
+    return _Rows(code, exposure, columns.target.read(block), uv, sigma, block.lines)
 
 
 def _concatenate(parts: Sequence[_Rows]) -> _Rows:
@@ -182,12 +263,14 @@ def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) 
     )
 
 
-def _csv_rows(frame: Frame, with_sigma: bool) -> Iterator[list[Any]]:
+def _csv_rows(frame: Frame, with_sigma: bool, labels: _Labels) -> Iterator[list[Any]]:
+    fluoroscope = labels.fluoroscopes.get(frame.fluoroscope, frame.fluoroscope)
+    exposure = labels.exposures.get(int(frame.number), int(frame.number))
     columns: list[Iterable[Any]] = [
-        np.asarray(frame.target_id).tolist(),
+        [labels.targets.get(i, i) for i in np.asarray(frame.target_id).tolist()],
         *(map(repr, np.asarray(column, float).tolist()) for column in frame.uv.T),
     ]
     if with_sigma:
         sigma = np.full(len(frame.target_id), np.nan) if frame.sigma is None else frame.sigma
         columns.append(map(format_float, sigma))
-    return ([frame.fluoroscope, int(frame.number), *cells] for cells in zip(*columns))
+    return ([fluoroscope, exposure, *cells] for cells in zip(*columns))

@@ -1,4 +1,7 @@
-"""The file of the phantom: CSV `target_id,x,y,z,sd`, in millimetres."""
+"""The file of the phantom: CSV `target_id,x,y,z,sd`, in millimetres.
+
+Files of a lab may have names of beads instead of ids.
+"""
 
 from __future__ import annotations
 
@@ -8,9 +11,11 @@ import numpy as np
 
 from ..errors import DataError
 from ..exposures.columns import first_repeated
+from ..exposures.names import Names, without_trivial
 from ..exposures.phantom import Phantom
 from .atomic import atomic_file
 from .csv_table import read_blocks, write_rows
+from .named_column import NamedColumn
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
 
@@ -20,16 +25,27 @@ def read_phantom(path: str | os.PathLike[str]) -> Phantom:
 
     The columns may have any order. Raises DataError that names row and cause.
     """
+    return _read(path, NamedColumn('target_id', None))
+
+
+def read_named_phantom(path: str | os.PathLike[str], known: Names) -> tuple[Phantom, Names]:
+    """Read a Phantom whose targets may have names, and the names. Raises DataError."""
+    column = NamedColumn('target_id', known.targets)
+    phantom = _read(path, column)
+    return phantom, Names(without_trivial(column.ids()))
+
+
+def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
     id_parts = []
     number_parts = []
     line_parts = []
     for block in read_blocks(path, COLUMNS):
         numbers = np.column_stack([block.floats(name) for name in COLUMNS[1:]])
-        id_parts.append(block.ids('target_id'))
+        id_parts.append(column.read(block))
         block.require('sd', numbers[:, 3] > 0, 'not above 0')
         number_parts.append(numbers)
         line_parts.append(block.lines)
-    ids = np.concatenate(id_parts)
+    ids = column.numbers(np.concatenate(id_parts))
     numbers = np.concatenate(number_parts)
     repeated = first_repeated(ids)
     if repeated is not None:
@@ -45,17 +61,23 @@ def read_phantom(path: str | os.PathLike[str]) -> Phantom:
         raise DataError(f'{path}: {error}') from None
 
 
-def write_phantom(path: str | os.PathLike[str], phantom: Phantom) -> None:
+def write_phantom(
+    path: str | os.PathLike[str], phantom: Phantom, names: Names | None = None
+) -> None:
     """Write a Phantom to a CSV file, from which the same values are read again.
 
-    Raises DataError where the file cannot be written.
+    Names are written instead of ids where all targets have one. Raises DataError where the file
+    cannot be written.
     """
+    labels = (names or Names()).target_names()
+    if not all(target in labels for target in phantom.target_id.tolist()):
+        labels = {}
     with atomic_file(path, 'w') as file:
         write_rows(file, [COLUMNS])
         write_rows(
             file,
             (
-                [int(target), *map(repr, xyz), repr(sd)]
+                [labels.get(int(target), int(target)), *map(repr, xyz), repr(sd)]
                 for target, xyz, sd in zip(
                     phantom.target_id, phantom.xyz_mm.tolist(), phantom.sd_mm.tolist()
                 )

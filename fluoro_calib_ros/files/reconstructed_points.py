@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 
+from ..exposures.names import Names
 from ..reconstruction.intersection import STATUS_NAMES
 from ..reconstruction.reconstruct import ReconstructedFrame
 from .atomic import atomic_file
@@ -27,23 +28,28 @@ COLUMNS = (
     'rays',
     'status',
 )
+NAME_COLUMN = 'name'  # the last one, of targets that have names
 
 
 def write_reconstruction(
-    path: str | os.PathLike[str], frames: Iterable[ReconstructedFrame]
+    path: str | os.PathLike[str], frames: Iterable[ReconstructedFrame], names: Names | None = None
 ) -> None:
-    """Write reconstructed frames to a CSV file.
+    """Write reconstructed frames to a CSV file, with a column name where targets have names.
 
     What is unknown, such as the coordinates of a point that only one fluoroscope sees, is an empty
     cell. Raises DataError where the file cannot be written.
     """
+    labels = (names or Names()).target_names()
     with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS])
+        write_rows(file, [(*COLUMNS, NAME_COLUMN) if labels else COLUMNS])
         for frame in frames:
-            write_rows(file, _rows(frame))
+            rows = _rows(frame)
+            if labels:
+                rows = ([*row, labels.get(row[2], '')] for row in rows)
+            write_rows(file, rows)
 
 
-def _rows(frame: ReconstructedFrame) -> Iterator[list[Any]]:
+def _rows(frame: ReconstructedFrame) -> Iterable[list[Any]]:
     points = frame.points
     numbers = np.column_stack([points.xyz_mm, points.sd_mm, points.residual])
     for target, values, rays, status in zip(

@@ -147,7 +147,7 @@ def _drift_watch(
     if not options.has_stamps:
         return None, DriftVerdict(
             'unknown',
-            'a CSV file does not contain the times of its exposures, a drift cannot be detected',
+            'the file does not contain the times of its exposures, a drift cannot be detected',
         )
     sizes = {name: calibrations[name].image_size for name in orientation.fluoroscopes}
     try:

@@ -1,32 +1,96 @@
-"""Read the input of jobs: the frames of a bag or a CSV file, and calibrations."""
+"""Read the input of jobs: frames and phantoms from bags and files of any format, calibrations."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from ..bags.reader import read_frames
 from ..calibration.result import FluoroscopeCalibration
 from ..errors import DataError
+from ..exchange import registry
+from ..exchange.content import PARTS, Content, Settings
 from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
+from ..exposures.names import Names
+from ..exposures.phantom import Phantom
 from ..files.calibration import load_calibrations
-from ..files.observations import read_observations_csv
+from ..files.image_points import PointsFile, points_of_frames, read_points
+from ..files.names import read_names
+
+MAGIC = b'\x89MCAP'  # of a bag
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Frames by fluoroscope, and the numbers of frames without partner that were left out."""
+    """Frames of a source.
+
+    Attributes
+    ----------
+    frames : dict of str to list of Frame
+        By fluoroscope.
+    unpaired : mapping of str to int
+        Numbers of frames without partner that were left out.
+    names : Names
+        The known names and those of the source.
+    notes : tuple of str
+        What a user has to know about the source.
+    """
 
     frames: dict[str, list[Frame]]
     unpaired: Mapping[str, int] = field(default_factory=dict)
+    names: Names = field(default_factory=Names)
+    notes: tuple[str, ...] = ()
 
 
-def is_csv(path: str | os.PathLike[str]) -> bool:
-    """Return whether a source is a CSV file, by its name; else it is a bag."""
-    return Path(path).suffix.lower() == '.csv'
+@dataclass(frozen=True)
+class Survey:
+    """A phantom, the names of its beads, and what a user has to know about them."""
+
+    phantom: Phantom
+    names: Names
+    notes: tuple[str, ...] = ()
+
+
+def is_bag(path: str | os.PathLike[str]) -> bool:
+    """Return whether a source is a bag, which contains times; else it is a file of exposures."""
+    path = Path(path)
+    if path.is_dir() or path.suffix.lower() in ('', '.mcap'):
+        return True
+    try:
+        with path.open('rb') as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except OSError:
+        return False
+
+
+def read_content(
+    path: str | os.PathLike[str], settings: Settings, part: str, default: str
+) -> Content:
+    """Read a part of a file of any format.
+
+    default is the kind of a CSV file that is not recognised, whose reader says what is wrong.
+    Raises DataError for a format without this part.
+    """
+    found = registry.recognised(path)
+    kind = None if found else default if Path(path).suffix.lower() == '.csv' else None
+    if found and part not in found.parts:
+        has = ' and '.join(PARTS[name] for name in found.parts)
+        raise DataError(
+            f'{path}: this looks like {found.title} ({found.kind}), which has {has}, but '
+            f'{PARTS[part]} are needed'.replace('a phantom are', 'a phantom is')
+        )
+    return registry.read(path, replace(settings, wanted=(part,)), kind)
+
+
+def read_survey(path: str | os.PathLike[str], settings: Settings | None = None) -> Survey:
+    """Read a phantom from a file of any format. Raises DataError."""
+    content = read_content(path, settings or Settings(), 'survey', 'phantom')
+    if content.survey is None:
+        raise DataError(f'{path}: the file has no phantom')
+    return Survey(content.survey, content.names, content.notes)
 
 
 def read_source(
@@ -36,22 +100,27 @@ def read_source(
     fluoroscopes: Sequence[str] | None = None,
     collect: str | None = None,
     validate: bool = True,
+    settings: Settings | None = None,
 ) -> Recording:
-    """Read the frames of a bag or a CSV file.
+    """Read the frames of a bag, or of a file with image points of any format.
 
     Parameters
     ----------
     path : path-like
-        A bag (file or folder) or a CSV file `fluoroscope,exposure,target_id,u,v[,sigma]`.
+        A bag (file or folder), a CSV file `fluoroscope,exposure,target_id,u,v[,sigma]`, or a file
+        of another program (docs/formats.md).
     image_size : (int, int), optional
-        Width and height [px]; needed for a CSV file, which does not contain it.
+        Width and height [px]; needed for a file that does not contain it.
     fluoroscopes : sequence of str, optional
-        Names of those to read, in this order; by default all.
+        Names of those to read, in this order; by default all. As many names as there are cameras,
+        none of them in the file, name those that the file only numbers.
     collect : {'auto', 'all', 'still'}, optional
         How exposures are collected from a bag; by default all frames are returned, unpaired ones
         too. A CSV file already consists of exposures.
     validate : bool
         Whether every frame of a bag is validated; else only the lengths of its arrays.
+    settings : exchange.content.Settings, optional
+        What the file does not say, and known names.
 
     Returns
     -------
@@ -62,18 +131,26 @@ def read_source(
     DataError
         For a source that cannot be read, and for a fluoroscope that it does not contain.
     """
-    if is_csv(path):
-        found = read_observations_csv(path, image_size)
-    else:
+    settings = settings or Settings()
+    content = Content()
+    bag = is_bag(path)
+    if bag:
         found = read_frames(path, validate).frames
+    else:
+        settings = replace(settings, image_size=image_size, fluoroscopes=tuple(fluoroscopes or ()))
+        content = read_content(path, settings, 'observations', 'observations')
+        found = {name: list(frames) for name, frames in (content.observations or {}).items()}
+        if not found:
+            raise DataError(f'{path}: the file has no image points')
+    names = settings.names.merged(content.names)
     wanted = list(found) if fluoroscopes is None else list(fluoroscopes)
     for name in wanted:
         if name not in found:
             raise DataError(f'{path}: there is no fluoroscope {name!r}, only {", ".join(found)}')
     frames = {name: found[name] for name in wanted}
-    if collect is None or is_csv(path):
-        return Recording(frames)
-    return Recording(*collect_recorded(frames, collect))
+    if collect is None or not bag:
+        return Recording(frames, {}, names, content.notes)
+    return Recording(*collect_recorded(frames, collect), names)
 
 
 def select_calibrations(
@@ -117,23 +194,24 @@ def read_calibrated_source(
     image_size: tuple[int, int] | None = None,
     fluoroscopes: Sequence[str] | None = None,
     validate: bool = True,
-) -> tuple[dict[str, list[Frame]], dict[str, FluoroscopeCalibration]]:
+    settings: Settings | None = None,
+) -> tuple[Recording, dict[str, FluoroscopeCalibration]]:
     """Read all frames of a source whose fluoroscopes are calibrated, and all calibrations.
 
     Parameters
     ----------
     path : path-like
-        A bag or a CSV file.
+        A bag or a file of any format.
     directory : path-like
-        The result folder with the calibrations.
+        The result folder with the calibrations, whose names are known.
     image_size : (int, int), optional
-        Of a CSV file; by default that of the calibration.
-    fluoroscopes, validate
+        Of a file; by default that of the calibration.
+    fluoroscopes, validate, settings
         As in `read_source`.
 
     Returns
     -------
-    frames : dict of str to list of Frame
+    recording : Recording
     calibrations : dict of str to FluoroscopeCalibration
 
     Raises
@@ -144,8 +222,30 @@ def read_calibrated_source(
     calibrations = read_calibrations(directory)
     if image_size is None:
         image_size = next(iter(calibrations.values())).image_size
-    frames = read_source(
-        path, image_size=image_size, fluoroscopes=fluoroscopes, validate=validate
-    ).frames
-    select_calibrations(calibrations, frames, directory)
-    return frames, calibrations
+    settings = settings or Settings()
+    recording = read_source(
+        path,
+        image_size=image_size,
+        fluoroscopes=fluoroscopes,
+        validate=validate,
+        settings=replace(settings, names=read_names(directory).merged(settings.names)),
+    )
+    select_calibrations(calibrations, recording.frames, directory)
+    return recording, calibrations
+
+
+def read_point_table(
+    path: str | os.PathLike[str], directory: str | os.PathLike[str], settings: Settings
+) -> tuple[PointsFile, tuple[str, ...]]:
+    """Read image points to be corrected with the calibrations in a folder, and notes about them.
+
+    A CSV file with columns u and v keeps its rows and other columns; a file of another program
+    becomes a row a point. Raises DataError.
+    """
+    names = read_names(directory)
+    found = registry.recognised(path)
+    if found is None or found.kind == 'observations' or 'observations' not in found.parts:
+        return read_points(path, names.fluoroscopes), ()
+    content = read_content(path, replace(settings, names=names), 'observations', found.kind)
+    points = points_of_frames(path, content.observations or {}, names.merged(content.names))
+    return points, content.notes

@@ -1,0 +1,120 @@
+"""fluoro-calib convert."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from .arguments import UNITS, add_file_options, add_fluoroscopes, file_settings, image_size
+from .output import print_notes, print_result
+
+NAME = 'convert'
+HELP = 'Convert between this program and others: XMALab, Autoscoper, Anipose, OpenCV, C3D, TRC ...'
+EXAMPLE = 'fluoro-calib convert result --to mayacam2 --out mayacam'
+MAX_RATE = 1e6
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..jobs.conversion import kinds_read, kinds_written
+    from .arguments import number_in
+
+    parser.add_argument(
+        'source',
+        type=Path,
+        metavar='SOURCE',
+        help='result folder, bag, file of any format (docs/formats.md), or folder with a file of '
+        'one format for each camera',
+    )
+    parser.add_argument(
+        '--to',
+        required=True,
+        choices=kinds_written(),
+        metavar='KIND',
+        help=f'format to write: {", ".join(kinds_written())}',
+    )
+    parser.add_argument(
+        '--out',
+        required=True,
+        type=Path,
+        metavar='PATH',
+        help='file to write; for mayacam2, opencv, camera_info and lut a folder with one file a '
+        'fluoroscope, for bundle a folder',
+    )
+    parser.add_argument(
+        '--from',
+        dest='source_kind',
+        choices=kinds_read(),
+        metavar='KIND',
+        help='format of SOURCE (default: as it is recognised)',
+    )
+    parser.add_argument(
+        '--image-size',
+        type=image_size,
+        metavar='WxH',
+        help='where SOURCE does not contain it [px]',
+    )
+    add_fluoroscopes(parser, 'convert')
+    parser.add_argument(
+        '--exposure',
+        type=number_in(0, 2**32 - 1, int),
+        metavar='N',
+        help='position and attitude of the fluoroscopes of a result folder as in this exposure, '
+        'in the frame of the phantom (default: the orientation of the rig)',
+    )
+    parser.add_argument(
+        '--calibration',
+        type=Path,
+        metavar='DIR',
+        help='result folder whose image size and names hold for SOURCE',
+    )
+    parser.add_argument(
+        '--corrected',
+        action='store_true',
+        help='correct image points by the calibration before they are written',
+    )
+    parser.add_argument(
+        '--rate',
+        type=number_in(1e-6, MAX_RATE),
+        metavar='HZ',
+        help='frames per second, where SOURCE does not contain it',
+    )
+    add_file_options(parser)
+    parser.add_argument(
+        '--out-units', choices=UNITS, help='unit of what is written (default: --units, else mm)'
+    )
+
+
+def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+    """Call error with a sentence for arguments that exclude each other."""
+    if arguments.corrected and arguments.calibration is None:
+        error('--corrected needs --calibration')
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Convert. Raises DataError."""
+    from ..jobs.conversion import ConversionRequest, convert
+
+    written = convert(
+        ConversionRequest(
+            arguments.source,
+            arguments.to,
+            arguments.out,
+            arguments.source_kind,
+            arguments.exposure,
+            arguments.calibration,
+            arguments.corrected,
+            tuple(arguments.fluoroscopes or ()),
+            file_settings(arguments, rate_hz=arguments.rate),
+            arguments.out_units,
+        )
+    )
+    print_notes(written.notes)
+    document = {
+        'kind': arguments.to,
+        'out': str(arguments.out),
+        'files': list(written.paths),
+        'notes': list(written.notes),
+    }
+    print_result(arguments, document, '\n'.join(f'written to {path}' for path in written.paths))

@@ -1,0 +1,126 @@
+"""C3D (c3d.org), read and written with ezc3d: points in mm, their residual, rate and names.
+
+The residual of a C3D point is in the unit of the points, and negative where there is no point. It
+is written as the standard deviation of the position, the root of the sum of its variances in x, y
+and z [mm]; 0 where that is unknown. C3D holds float32.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import DataError
+from ..exposures.names import Names, number_names
+from ..files.access import read_bytes
+from ..files.atomic import write_bytes
+from .base import Format, Sample
+from .content import UNITS_MM, Content, Points, Settings, Written
+from .frames_of_points import at_constant_rate, labels
+from .labels import named_targets
+
+MISSING = -1.0
+MAX_FRAME = 65535  # the header counts in uint16
+_MAGIC = 0x50
+
+
+def recognise(sample: Sample) -> bool:
+    """Return whether the second byte is that of C3D."""
+    return sample.suffix == '.c3d' and len(sample.head) > 1 and sample.head[1] == _MAGIC
+
+
+def _ezc3d() -> Any:
+    try:
+        import ezc3d
+    except ImportError:
+        raise DataError(
+            'C3D files need the package ezc3d, which is not installed: pip install ezc3d'
+        ) from None
+    return ezc3d
+
+
+def read(path: Path, settings: Settings) -> Content:
+    """Read points in space. Raises DataError."""
+    if read_bytes(path)[1:2] != bytes([_MAGIC]):
+        raise DataError(f'{path}: this is not a C3D file')
+    try:
+        file = _ezc3d().c3d(os.fspath(path))
+        parameters = file['parameters']['POINT']
+        names = [str(label).strip() for label in parameters['LABELS']['value']]
+        unit = str(parameters['UNITS']['value'][0]).strip()
+        rate = float(file['header']['points']['frame_rate'])
+        first = int(file['header']['points']['first_frame'])
+        xyz = np.asarray(file['data']['points'], dtype=float)[:3].transpose(2, 1, 0)
+        residual = np.asarray(file['data']['meta_points']['residuals'], dtype=float)[0].T
+    except DataError:
+        raise
+    except Exception as error:  # ezc3d raises whatever comes to its mind
+        raise DataError(f'{path}: this C3D file cannot be read ({error})') from None
+    if not xyz.size:
+        raise DataError(f'{path}: the file has no points')
+    mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(unit)
+    if mm is None:
+        raise DataError(f'{path}: the unit of the points is {unit!r}, give it with --units')
+    names = names[: xyz.shape[1]]
+    if len(set(names)) < xyz.shape[1]:
+        raise DataError(f'{path}: {xyz.shape[1]} points, but {len(set(names))} different names')
+    ids = number_names(names, settings.names.targets)
+    xyz = np.where((residual < 0)[..., None], np.nan, xyz * mm)
+    xyz[np.isnan(xyz).any(axis=2)] = np.nan
+    sd = np.where(residual > 0, residual * mm, np.nan)
+    points = Points(
+        np.arange(first + 1, first + 1 + len(xyz)),
+        np.array([ids[name] for name in names], dtype=np.int64),
+        xyz,
+        sd,
+        np.full(sd.shape, np.nan),
+        rate,
+    )
+    return Content(points=points, names=Names(named_targets({n: ids[n] for n in names})))
+
+
+def write(path: Path, content: Content, settings: Settings) -> Written:
+    """Write points in space. Raises DataError."""
+    points = at_constant_rate(path, content, settings)
+    first = int(points.frame[0])
+    if not 1 <= first <= int(points.frame[-1]) <= MAX_FRAME:
+        raise DataError(
+            f'{path}: frames {first} to {points.frame[-1]}, but C3D counts from 1 to {MAX_FRAME}'
+        )
+    unit = settings.units or 'mm'
+    mm = UNITS_MM[unit]
+    file = _ezc3d().c3d()
+    missing = np.isnan(points.xyz_mm).any(axis=2)
+    xyz = np.where(missing[..., None], 0.0, points.xyz_mm / mm)
+    homogeneous = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
+    residual = np.where(missing, MISSING, np.nan_to_num(points.sd_mm / mm))
+    parameters = file['parameters']['POINT']
+    parameters['LABELS']['value'] = labels(content)
+    parameters['UNITS']['value'] = [unit]
+    parameters['RATE']['value'] = [points.rate_hz]
+    file['header']['points']['first_frame'] = first - 1
+    file['data']['points'] = homogeneous.transpose(2, 1, 0)
+    file['data']['meta_points']['residuals'] = residual.T[None]
+    write_bytes(path, _bytes_of(file, path))
+    return Written((str(path),))
+
+
+def _bytes_of(file: Any, path: Path) -> bytes:
+    """Return a C3D file as bytes; ezc3d writes only to a file."""
+    temporary = path.with_name(f'.{path.name[:100]}.{secrets.token_hex(8)}.tmp')
+    try:
+        file.write(os.fspath(temporary))
+        return temporary.read_bytes()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise DataError(f'{path}: cannot be written ({error})') from None
+    finally:
+        with suppress(OSError):
+            temporary.unlink()
+
+
+FORMAT = Format('c3d', 'C3D', ('points',), recognise, read, write, 'a binary file of c3d.org')

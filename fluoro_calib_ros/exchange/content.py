@@ -1,0 +1,262 @@
+"""What files of other programs contain, in the conventions of this package."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import DataError
+from ..exposures.frame import Frame
+from ..exposures.names import Names
+from ..exposures.phantom import Phantom
+
+UNITS_MM = {'mm': 1.0, 'cm': 10.0, 'm': 1000.0}
+# Attributes of a Content, as messages call them.
+PARTS = {
+    'observations': 'image points',
+    'survey': 'a phantom',
+    'cameras': 'cameras',
+    'stations': 'exterior orientations',
+    'points': '3-D points',
+    'bodies': 'poses of rigid bodies',
+    'lookups': 'lookup tables of the distortion',
+    'grids': 'points of a distortion grid',
+}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: what a fluoroscope is once its images are corrected.
+
+    Attributes
+    ----------
+    name : str
+    matrix : (3, 3) ndarray
+        Camera matrix [px]; for a fluoroscope [[c, 0, xp], [0, c, yp], [0, 0, 1]].
+    image_size : (int, int) or None
+        Width and height [px].
+    rotation : (3, 3) ndarray or None
+        World -> sensor; None where the format has no exterior orientation.
+    position_mm : (3,) ndarray or None
+        Position of the source in the world.
+    distortion : tuple of float
+        Coefficients of OpenCV's model (k1, k2, p1, p2, k3, ...), empty without.
+    """
+
+    name: str
+    matrix: np.ndarray
+    image_size: tuple[int, int] | None = None
+    rotation: np.ndarray | None = None
+    position_mm: np.ndarray | None = None
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation (3, 3) and translation (3,) [mm] of X_sensor = R X + t. Raises DataError."""
+        if self.rotation is None or self.position_mm is None:
+            raise DataError(
+                f'camera {self.name} has no position and attitude, which this format needs: '
+                'orient the rig, or choose an exposure of the calibration with --exposure N'
+            )
+        return self.rotation, -self.rotation @ self.position_mm
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]. Raises DataError where they are unknown."""
+        if self.image_size is None:
+            raise DataError(
+                f'camera {self.name}: the source does not contain the image size, --image-size '
+                'WxH is needed'
+            )
+        return self.image_size
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether a coefficient of the distortion is not zero."""
+        return any(self.distortion)
+
+
+def camera_from_translation(
+    name: str,
+    matrix: np.ndarray,
+    image_size: tuple[int, int] | None,
+    rotation: np.ndarray,
+    translation_mm: np.ndarray,
+    distortion: tuple[float, ...] = (),
+) -> Camera:
+    """Return the Camera of X_sensor = rotation X + translation_mm."""
+    position = -rotation.T @ translation_mm
+    return Camera(name, matrix, image_size, rotation, position, distortion)
+
+
+@dataclass(frozen=True)
+class Station:
+    """Exterior orientation of one fluoroscope in one exposure: X = rotation (P - position_mm)."""
+
+    fluoroscope: str
+    exposure: int
+    rotation: np.ndarray
+    position_mm: np.ndarray
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points in space over time; NaN where a point was not seen.
+
+    Attributes
+    ----------
+    frame : (m,) ndarray of int
+        Numbers of the frames, ascending.
+    target_id : (n,) ndarray of int
+    xyz_mm : (m, n, 3) ndarray
+    sd_mm : (m, n) ndarray
+        Standard deviation of the position, the root of the sum of its three variances; NaN where
+        it is unknown.
+    residual_px : (m, n) ndarray
+        RMS of the image residuals; NaN where it is unknown.
+    rate_hz : float or None
+        Frames per second; None where it is unknown.
+    """
+
+    frame: np.ndarray
+    target_id: np.ndarray
+    xyz_mm: np.ndarray
+    sd_mm: np.ndarray
+    residual_px: np.ndarray
+    rate_hz: float | None = None
+
+
+def points_without_precision(
+    frame: np.ndarray, target_id: np.ndarray, xyz_mm: np.ndarray, rate_hz: float | None = None
+) -> Points:
+    """Return Points of which only the coordinates are known."""
+    unknown = np.full(xyz_mm.shape[:2], np.nan)
+    return Points(frame, target_id, xyz_mm, unknown, unknown, rate_hz)
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Poses of rigid bodies over time, P_world = R P_body + t; NaN where there is none.
+
+    Attributes
+    ----------
+    names : tuple of str
+    frame : (m,) ndarray of int
+    rotation : (m, b, 3, 3) ndarray
+    translation_mm : (m, b, 3) ndarray
+    """
+
+    names: tuple[str, ...]
+    frame: np.ndarray
+    rotation: np.ndarray
+    translation_mm: np.ndarray
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a file contains; a part that it does not have is None or empty.
+
+    Attributes
+    ----------
+    observations : mapping of str to sequence of Frame, or None
+        Image points by fluoroscope.
+    survey : Phantom or None
+    cameras : tuple of Camera
+    stations : tuple of Station
+    points : Points or None
+    bodies : Bodies or None
+    lookups : mapping of str to (2, h, w) ndarray
+        By fluoroscope the observed column and row of every pixel of the corrected image [px], NaN
+        without support.
+    grids : mapping of str to (n, 4) ndarray
+        By fluoroscope the observed u, v and the reference u, v of points of a distortion grid.
+    names : Names
+        The names in the file.
+    notes : tuple of str
+        What a user has to know about the conversion.
+    """
+
+    observations: Mapping[str, Sequence[Frame]] | None = None
+    survey: Phantom | None = None
+    cameras: tuple[Camera, ...] = ()
+    stations: tuple[Station, ...] = ()
+    points: Points | None = None
+    bodies: Bodies | None = None
+    lookups: Mapping[str, np.ndarray] = field(default_factory=dict)
+    grids: Mapping[str, np.ndarray] = field(default_factory=dict)
+    names: Names = field(default_factory=Names)
+    notes: tuple[str, ...] = ()
+
+    @property
+    def parts(self) -> list[str]:
+        """Names of the attributes that are not empty."""
+        return [name for name in PARTS if has_content(getattr(self, name))]
+
+
+def has_content(part: Any) -> bool:
+    """Return whether a part of a Content is there."""
+    return part is not None and (not isinstance(part, (tuple, Mapping)) or len(part) > 0)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What a file does not say and a user does.
+
+    Attributes
+    ----------
+    image_size : (int, int) or None
+        Width and height [px].
+    units : {'mm', 'cm', 'm'} or None
+        Unit of lengths in the file; None: what the format says.
+    one_based : bool
+        Whether the file counts pixels from 1.
+    y_up : bool
+        Whether rows of the image are counted upwards in the file.
+    trial : str or None
+        Trial of an XMALab project.
+    rate_hz : float or None
+        Frames per second of 3-D points.
+    names : Names
+        Names with known ids.
+    fluoroscopes : tuple of str
+        Names for cameras that a file only numbers.
+    wanted : tuple of str
+        Parts to read from a format of several, names of PARTS.
+    """
+
+    image_size: tuple[int, int] | None = None
+    units: str | None = None
+    one_based: bool = False
+    y_up: bool = False
+    trial: str | None = None
+    rate_hz: float | None = None
+    names: Names = field(default_factory=Names)
+    fluoroscopes: tuple[str, ...] = ()
+    wanted: tuple[str, ...] = tuple(PARTS)
+
+    def unit_read(self, where: object) -> float:
+        """Return the mm of a unit of a file that does not say it. Raises DataError without."""
+        if self.units is None:
+            raise DataError(
+                f'{where}: this format does not say the unit of its lengths, --units '
+                f'{"|".join(UNITS_MM)} is needed'
+            )
+        return UNITS_MM[self.units]
+
+    def unit_or(self, default: str, what: str) -> tuple[float, tuple[str, ...]]:
+        """Return the mm of a unit, and a note where it is the default of the format."""
+        if self.units is not None:
+            return UNITS_MM[self.units], ()
+        note = f'{what}: lengths in {default}, as the format does not say a unit; change it with '
+        return UNITS_MM[default], (note + '--units',)
+
+
+@dataclass(frozen=True)
+class Written:
+    """Files that were written, and what a user has to know about them."""
+
+    paths: tuple[str, ...]
+    notes: tuple[str, ...] = ()

@@ -1,0 +1,203 @@
+"""The files of this package as formats: observations, phantom, reconstructed points, grid points.
+
+Targets, exposures and fluoroscopes may have names in them.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import DataError
+from ..exposures.names import Names, without_trivial
+from ..files.atomic import atomic_file
+from ..files.csv_table import format_float, read_blocks, write_rows
+from ..files.observations import COLUMNS as OBSERVATIONS
+from ..files.observations import read_named_observations, write_observations_csv
+from ..files.phantom import COLUMNS as PHANTOM
+from ..files.phantom import read_named_phantom, write_phantom
+from ..files.reconstructed_points import COLUMNS as POINTS
+from ..files.reconstructed_points import NAME_COLUMN
+from .base import Format, Sample
+from .content import Content, Points, Settings, Written
+
+GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
+NS = 1e9
+
+
+def _has_columns(sample: Sample, columns: tuple[str, ...]) -> bool:
+    lines = [line for line in sample.lines if not line.startswith('#')]
+    if not lines:
+        return False
+    separator = ';' if ';' in lines[0] else ','
+    return set(columns) <= {cell.strip().strip('"') for cell in lines[0].split(separator)}
+
+
+def _read_observations(path: Path, settings: Settings) -> Content:
+    frames, names = read_named_observations(path, settings.image_size, settings.names)
+    return Content(observations=frames, names=names)
+
+
+def _write_observations(path: Path, content: Content, settings: Settings) -> Written:
+    """Write the ids; names would not be read by programs that know this layout."""
+    assert content.observations is not None
+    write_observations_csv(path, content.observations, content.names)
+    return Written((str(path),))
+
+
+def _read_phantom(path: Path, settings: Settings) -> Content:
+    survey, names = read_named_phantom(path, settings.names)
+    return Content(survey=survey, names=names)
+
+
+def _write_phantom(path: Path, content: Content, settings: Settings) -> Written:
+    assert content.survey is not None
+    write_phantom(path, content.survey, content.names)
+    return Written((str(path),))
+
+
+def _read_points(path: Path, settings: Settings) -> Content:
+    """Read reconstructed points. Raises DataError."""
+    blocks = list(read_blocks(path, ('frame', 'target_id', 'x', 'y', 'z')))
+    frame, target = (
+        np.concatenate([block.ids(name) for block in blocks]) for name in ('frame', 'target_id')
+    )
+    numbers = {
+        name: np.concatenate([block.floats_or_nan(name) for block in blocks])
+        for name in ('x', 'y', 'z', 'sd_x', 'sd_y', 'sd_z', 'residual', 'stamp_ns')
+        if name in blocks[0]
+    }
+    unknown = np.full(len(frame), np.nan)
+    frames, row = np.unique(frame, return_inverse=True)
+    targets, column = np.unique(target, return_inverse=True)
+    cell = row * len(targets) + column
+    if len(np.unique(cell)) < len(cell):
+        index = np.setdiff1d(np.arange(len(cell)), np.unique(cell, return_index=True)[1])[0]
+        line = np.concatenate([block.lines for block in blocks])[index]
+        raise DataError(
+            f'{path}, row {line}: target {target[index]} of frame {frame[index]} is given twice'
+        )
+    shape = (len(frames), len(targets))
+
+    def table(values: np.ndarray) -> np.ndarray:
+        out = np.full(shape, np.nan)
+        out[row, column] = values
+        return out
+
+    xyz = np.stack([table(numbers[axis]) for axis in 'xyz'], axis=2)
+    xyz[np.isnan(xyz).any(axis=2)] = np.nan
+    sd = [numbers.get(f'sd_{axis}', unknown) for axis in 'xyz']
+    points = Points(
+        frames,
+        targets,
+        xyz,
+        table(np.sqrt(sum(values**2 for values in sd))),
+        table(numbers.get('residual', unknown)),
+        _rate(frame, numbers.get('stamp_ns', unknown)),
+    )
+    names = Names()
+    if NAME_COLUMN in blocks[0]:
+        cells = [cell for block in blocks for cell in block.strings(NAME_COLUMN)]
+        names = Names(without_trivial({n: int(i) for n, i in zip(cells, target.tolist()) if n}))
+    return Content(points=points, names=names)
+
+
+def _rate(frame: np.ndarray, stamp_ns: np.ndarray) -> float | None:
+    """Return the frames per second between the first and the last time stamp, None without."""
+    first = int(np.argmin(frame))
+    last = int(np.argmax(frame))
+    seconds = (stamp_ns[last] - stamp_ns[first]) / NS
+    if not seconds > 0:
+        return None
+    rate = (frame[last] - frame[first]) / seconds
+    whole = round(rate)
+    # Stamps are rounded to nanoseconds, clocks to some millionths.
+    return float(whole) if whole and abs(rate - whole) < 1e-5 * whole else float(rate)
+
+
+def _write_points(path: Path, content: Content, settings: Settings) -> Written:
+    """Write the points that were seen, with what is known about them."""
+    points = content.points
+    assert points is not None
+    named = content.names.target_names()
+    rate = settings.rate_hz or points.rate_hz
+    empty = dict.fromkeys(POINTS, '')
+    with atomic_file(path, 'w') as file:
+        write_rows(file, [[*POINTS, NAME_COLUMN]])
+        for row, number in enumerate(points.frame.tolist()):
+            stamp = '' if rate is None else round((number - int(points.frame[0])) / rate * NS)
+            for column, target in enumerate(points.target_id.tolist()):
+                xyz = points.xyz_mm[row, column].tolist()
+                if math.isnan(xyz[0]):
+                    continue
+                cells = {
+                    **empty,
+                    'frame': number,
+                    'stamp_ns': stamp,
+                    'target_id': target,
+                    **dict(zip('xyz', map(repr, xyz))),
+                    'residual': format_float(points.residual_px[row, column]),
+                }
+                write_rows(file, [[*cells.values(), named.get(target, '')]])
+    note = f'{path}: standard deviations of the coordinates are not written, only coordinates'
+    return Written((str(path),), (note,))
+
+
+def _read_grid(path: Path, settings: Settings) -> Content:
+    blocks = list(read_blocks(path, GRID))
+    names = np.array([name for block in blocks for name in block.strings('fluoroscope')])
+    numbers = np.concatenate(
+        [np.column_stack([block.floats(name) for name in GRID[1:]]) for block in blocks]
+    )
+    return Content(grids={str(n): numbers[names == n] for n in dict.fromkeys(names.tolist())})
+
+
+def _write_grid(path: Path, content: Content, settings: Settings) -> Written:
+    with atomic_file(path, 'w') as file:
+        write_rows(file, [GRID])
+        for name, rows in content.grids.items():
+            write_rows(file, ([name, *map(repr, row)] for row in rows.tolist()))
+    return Written((str(path),))
+
+
+_OWN = 'CSV of fluoro_calib_ros'
+FORMATS = (
+    Format(
+        'observations',
+        f'image points, {_OWN}',
+        ('observations',),
+        lambda sample: _has_columns(sample, OBSERVATIONS),
+        _read_observations,
+        _write_observations,
+        ','.join(OBSERVATIONS),
+    ),
+    Format(
+        'phantom',
+        f'phantom, {_OWN}',
+        ('survey',),
+        lambda sample: _has_columns(sample, PHANTOM),
+        _read_phantom,
+        _write_phantom,
+        ','.join(PHANTOM),
+    ),
+    Format(
+        'points',
+        f'reconstructed points, {_OWN}',
+        ('points',),
+        lambda sample: _has_columns(sample, ('frame', 'target_id', 'x', 'y', 'z')),
+        _read_points,
+        _write_points,
+        ','.join(POINTS),
+    ),
+    Format(
+        'grid',
+        f'points of a distortion grid, {_OWN}',
+        ('grids',),
+        lambda sample: _has_columns(sample, GRID),
+        _read_grid,
+        _write_grid,
+        ','.join(GRID),
+    ),
+)

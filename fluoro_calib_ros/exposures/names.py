@@ -1,0 +1,115 @@
+"""Names that targets, exposures and fluoroscopes have in files, and the ids they have inside.
+
+Messages and calculations know ids: whole numbers, and words that are safe in file names and
+topics. Files of a lab know `bead01`, `trial 3.tif` and `cam 1`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from ..errors import DataError
+
+MAX_ID = 2**32 - 1  # ids are uint32 in the messages
+_NUMBERED = re.compile(r'(?P<before>.*?)(?P<number>\d+)(?P<after>\D*)')
+_UNSAFE = re.compile(r'[^A-Za-z0-9_-]')
+_MAX_NAME = 100  # characters of the id of a fluoroscope
+
+
+@dataclass(frozen=True)
+class Names:
+    """Ids by name; a name that is its own id is not listed.
+
+    Attributes
+    ----------
+    targets, exposures : mapping of str to int
+    fluoroscopes : mapping of str to str
+    """
+
+    targets: Mapping[str, int] = field(default_factory=dict)
+    exposures: Mapping[str, int] = field(default_factory=dict)
+    fluoroscopes: Mapping[str, str] = field(default_factory=dict)
+
+    def __bool__(self) -> bool:
+        return bool(self.targets or self.exposures or self.fluoroscopes)
+
+    def merged(self, other: Names) -> Names:
+        """Return the names of both. Raises DataError for one name with two ids."""
+        return Names(
+            _merged('target', self.targets, other.targets),
+            _merged('exposure', self.exposures, other.exposures),
+            _merged('fluoroscope', self.fluoroscopes, other.fluoroscopes),
+        )
+
+    def target_names(self) -> dict[int, str]:
+        """Return the names of targets by id."""
+        return {number: name for name, number in self.targets.items()}
+
+    def exposure_names(self) -> dict[int, str]:
+        """Return the names of exposures by number."""
+        return {number: name for name, number in self.exposures.items()}
+
+    def fluoroscope_names(self) -> dict[str, str]:
+        """Return the names of fluoroscopes by id."""
+        return {identity: name for name, identity in self.fluoroscopes.items()}
+
+
+def _merged(what: str, one: Mapping[str, object], other: Mapping[str, object]) -> dict:
+    for name, identity in other.items():
+        if one.get(name, identity) != identity:
+            raise DataError(f'{what} {name!r} has the id {one[name]}, and the id {identity}')
+    return {**one, **other}
+
+
+def number_names(names: Iterable[str], known: Mapping[str, int] | None = None) -> dict[str, int]:
+    """Return an id for every name of targets or exposures.
+
+    A known name keeps its id. If all others are numbered alike, such as bead01, bead02 or 3.tif,
+    7.tif, the number is the id, so that two files agree that do not know of each other. Otherwise
+    they are counted in their order, from the first number that is free.
+    """
+    known = known or {}
+    new = [name for name in dict.fromkeys(names) if name not in known]
+    taken = set(known.values())
+    ids = _common_numbers(new)
+    if ids is None or taken & set(ids):
+        first = max(taken, default=0) + 1
+        ids = list(range(first, first + len(new)))
+    return {**known, **dict(zip(new, ids))}
+
+
+def _common_numbers(names: Sequence[str]) -> list[int] | None:
+    """Return the numbers in names that differ by nothing else, None for other names."""
+    parts = [_NUMBERED.fullmatch(name) for name in names]
+    found = [part for part in parts if part is not None]
+    if len(found) < len(names):
+        return None
+    around = {(part['before'], part['after']) for part in found}
+    numbers = [int(part['number']) for part in found]
+    if len(around) > 1 or len(set(numbers)) < len(numbers) or max(numbers, default=0) > MAX_ID:
+        return None
+    return numbers
+
+
+def safe_names(names: Iterable[str], known: Mapping[str, str] | None = None) -> dict[str, str]:
+    """Return an id for every name of a fluoroscope: letters, digits, _ and -, each once."""
+    out = dict(known or {})
+    for name in dict.fromkeys(names):
+        if name in out:
+            continue
+        stem = _UNSAFE.sub('_', name.strip())[: _MAX_NAME - 4] or 'fluoroscope'
+        taken = set(out.values())
+        identity = stem
+        number = 2
+        while identity in taken:
+            identity = f'{stem}_{number}'
+            number += 1
+        out[name] = identity
+    return out
+
+
+def without_trivial(ids: Mapping[str, int]) -> dict[str, int]:
+    """Return the ids of the names that are not just the number itself."""
+    return {name: number for name, number in ids.items() if name != str(number)}

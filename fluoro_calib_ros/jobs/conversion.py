@@ -1,0 +1,350 @@
+"""The conversion job: a bag, a result folder or a file of any format into another format."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..bags.reader import read_frames
+from ..calibration.result import FluoroscopeCalibration
+from ..distortion.status import CorrectionStatus
+from ..errors import DataError
+from ..exchange import registry
+from ..exchange.content import PARTS, Bodies, Camera, Content, Settings, Station, Written
+from ..exposures.frame import Frame
+from ..files.calibration import SUFFIX, load_calibrations
+from ..files.calibration_request import OBSERVATIONS
+from ..files.calibration_request import PHANTOM as PHANTOM_FILE
+from ..files.json_file import read_json
+from ..files.names import read_names
+from ..files.observations import read_observations_csv
+from ..files.phantom import read_phantom
+from ..files.rig_orientation import load_orientation, orientation_path
+from ..images.corrector import ImageCorrector
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.rotations import matrix_from_quaternion
+from .dataset import write_bag
+from .result_folder import RESULT, belongs_to
+from .sources import is_bag
+
+BAG = 'bag'
+PHANTOM_BODY = 'phantom'  # name of the phantom as a rigid body
+
+
+@dataclass(frozen=True)
+class ConversionRequest:
+    """What to convert.
+
+    Attributes
+    ----------
+    source : path-like
+        Bag, result folder, file of any format, or folder with a file of one format a camera.
+    kind : str
+        Format to write, of `kinds_written`.
+    out : path-like
+        File, or for formats with one file a fluoroscope folder, to write.
+    source_kind : str or None
+        Format of the source; None: as it is recognised.
+    exposure : int or None
+        Exposure of a result folder whose exterior orientations the cameras have, in the frame of
+        the phantom; None: the orientation of the rig.
+    calibration : path-like or None
+        Result folder whose image size and names hold for the source.
+    corrected : bool
+        Whether image points are corrected by this calibration.
+    fluoroscopes : sequence of str
+        Those to convert, in this order; empty: all.
+    settings : Settings
+        What files do not say. Its unit holds for the source and what is written, pixels from 1 and
+        rows upwards for the source if it is of another program, else for what is written.
+    out_units : {'mm', 'cm', 'm'} or None
+        Unit of what is written.
+    """
+
+    source: str | os.PathLike[str]
+    kind: str
+    out: str | os.PathLike[str]
+    source_kind: str | None = None
+    exposure: int | None = None
+    calibration: str | os.PathLike[str] | None = None
+    corrected: bool = False
+    fluoroscopes: Sequence[str] = ()
+    settings: Settings = field(default_factory=Settings)
+    out_units: str | None = None
+
+
+def kinds_written() -> tuple[str, ...]:
+    """Return the formats that can be written."""
+    return (BAG, *registry.kinds(lambda format_: format_.write))
+
+
+def kinds_read() -> tuple[str, ...]:
+    """Return the formats that a file can have."""
+    return registry.kinds(lambda format_: format_.read)
+
+
+def convert(request: ConversionRequest) -> Written:
+    """Convert a source into another format.
+
+    Raises DataError for a source that cannot be read or does not contain what the format needs,
+    and where it cannot be written.
+    """
+    known = request.settings
+    calibrations: Mapping[str, FluoroscopeCalibration] = {}
+    if request.calibration is not None:
+        calibrations = load_calibrations(request.calibration)
+        size = known.image_size or next(iter(calibrations.values())).image_size
+        names = read_names(request.calibration).merged(known.names)
+        known = replace(known, image_size=size, names=names)
+    wanted = ('observations',) if request.kind == BAG else registry.FORMATS[request.kind].parts
+    reading = replace(known, wanted=wanted, fluoroscopes=tuple(request.fluoroscopes))
+    content, is_own = _read(request, reading)
+    content = replace(content, names=known.names.merged(content.names))
+    content = _selected(content, request)
+    if request.corrected:
+        content = replace(content, observations=_corrected(content, calibrations, request.source))
+    written = _write(request, content, is_own)
+    return Written(written.paths, (*content.notes, *written.notes))
+
+
+def _read(request: ConversionRequest, settings: Settings) -> tuple[Content, bool]:
+    """Return the content of the source, and whether it is in the conventions of this package."""
+    source = Path(request.source)
+    if is_result_folder(source):
+        return result_content(source, settings.wanted, request.exposure), True
+    if request.exposure is not None:
+        raise DataError(f'{source}: --exposure is for a result folder')
+    if not registry_reads(source) and request.source_kind is None and is_bag(source):
+        return Content(observations=read_frames(source).frames), True
+    content = registry.read(source, settings, request.source_kind)
+    own = request.source_kind
+    if own is None and source.is_file():
+        found = registry.recognised(source)
+        own = found.kind if found else ''
+    return content, own in ('observations', 'phantom', 'points', 'grid')
+
+
+def is_result_folder(path: Path) -> bool:
+    """Return whether a path is a folder with calibrations."""
+    return path.is_dir() and any(name.name.endswith(SUFFIX) for name in path.iterdir())
+
+
+def registry_reads(path: Path) -> bool:
+    """Return whether a path is a folder of files that are not of a bag."""
+    if not path.is_dir():
+        return False
+    names = [p.name for p in path.iterdir()]
+    return 'metadata.yaml' not in names and not any(name.endswith('.mcap') for name in names)
+
+
+def _selected(content: Content, request: ConversionRequest) -> Content:
+    """Return the content of the fluoroscopes that were asked for. Raises DataError."""
+    wanted = list(request.fluoroscopes)
+    if not wanted:
+        return content
+    has = {camera.name: camera for camera in content.cameras}
+    of_name: list[Mapping[str, Any]] = [has, content.lookups, content.grids]
+    of_name.append(content.observations or {})
+    present = list(dict.fromkeys(name for table in of_name for name in table))
+    for name in wanted:
+        if present and name not in present:
+            raise DataError(
+                f'{request.source}: there is no fluoroscope {name!r}, only {", ".join(present)}'
+            )
+    cameras, lookups, grids, observations = (
+        {name: table[name] for name in wanted if name in table} for table in of_name
+    )
+    return replace(
+        content,
+        cameras=tuple(cameras.values()),
+        lookups=lookups,
+        grids=grids,
+        observations=observations or None,
+        stations=tuple(s for s in content.stations if s.fluoroscope in wanted),
+    )
+
+
+def _write(request: ConversionRequest, content: Content, is_own: bool) -> Written:
+    settings = request.settings
+    if request.kind == BAG:
+        if not content.observations:
+            has = ' and '.join(PARTS[name] for name in content.parts) or 'nothing of that kind'
+            raise DataError(f'a bag needs image points, but the source has {has}')
+        write_bag(request.out, content.observations)
+        return Written((str(request.out),))
+    keeps_unit = not registry.FORMATS[request.kind].says_units
+    units = request.out_units or (settings.units if keeps_unit else None)
+    if not is_own:
+        settings = replace(settings, one_based=False, y_up=False)
+    return registry.write(request.out, request.kind, content, replace(settings, units=units))
+
+
+def _corrected(
+    content: Content, calibrations: Mapping[str, FluoroscopeCalibration], where: object
+) -> dict[str, list[Frame]]:
+    """Return the frames of a content with the image points that could be corrected."""
+    out: dict[str, list[Frame]] = {}
+    for name, frames in (content.observations or {}).items():
+        if name not in calibrations:
+            raise DataError(
+                f'{where}: there is no calibration of fluoroscope {name!r}, only of '
+                f'{", ".join(calibrations)}'
+            )
+        out[name] = []
+        for frame in frames:
+            points = calibrations[name].correct(frame.uv, frame.sigma)
+            kept = points.status != CorrectionStatus.INVALID
+            out[name].append(
+                replace(
+                    frame,
+                    target_id=frame.target_id[kept],
+                    uv=points.uv[kept],
+                    sigma=points.sigma[kept],
+                )
+            )
+    return out
+
+
+# ---- result folders
+
+
+def result_content(
+    directory: str | os.PathLike[str], wanted: Iterable[str], exposure: int | None = None
+) -> Content:
+    """Return what a result folder contains of some parts, names of `exchange.content.PARTS`.
+
+    exposure: that whose exterior orientations the cameras have. Raises DataError.
+    """
+    directory = Path(directory)
+    wanted = set(wanted)
+    calibrations = load_calibrations(directory)
+    found: dict[str, Any] = {'names': read_names(directory)}
+    stations: tuple[Station, ...] = ()
+    if {'stations', 'bodies'} & wanted or exposure is not None:
+        stations = tuple(_stations(directory / RESULT))
+        found['stations'] = stations
+    orientation = _orientation(directory, calibrations)
+    if 'cameras' in wanted:
+        poses = _poses(directory, stations, orientation, exposure)
+        found['cameras'] = tuple(_camera(c, poses) for c in calibrations.values())
+    if 'bodies' in wanted:
+        found['bodies'] = _phantom_poses(directory, stations, orientation)
+    if 'lookups' in wanted:
+        found['lookups'] = {name: _lookup(c) for name, c in calibrations.items()}
+    if 'survey' in wanted and (directory / PHANTOM_FILE).exists():
+        found['survey'] = read_phantom(directory / PHANTOM_FILE)
+    if 'observations' in wanted and (directory / OBSERVATIONS).exists():
+        found['observations'] = _observations(directory, calibrations)
+    return Content(**found)
+
+
+def _orientation(
+    directory: Path, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> RigOrientation | None:
+    """Return the orientation of the rig if it is there. Raises DataError for a foreign one."""
+    path = Path(orientation_path(directory))
+    if not path.exists():
+        return None
+    orientation = load_orientation(path)
+    if not belongs_to(orientation, calibrations):
+        raise DataError(
+            f'{path}: the orientation belongs to other calibrations than those in the folder'
+        )
+    return orientation
+
+
+def _stations(path: Path) -> Iterable[Station]:
+    """Yield the exterior orientations of a result.json. Raises DataError."""
+    document = read_json(path)
+    try:
+        for name, fluoroscope in document['fluoroscopes'].items():
+            for entry in fluoroscope['exposures']:
+                quaternion = np.array(entry['quaternion_wxyz'], dtype=float)
+                position = np.array(entry['position_mm'], dtype=float)
+                if not math.isclose(float(np.linalg.norm(quaternion)), 1, abs_tol=1e-6):
+                    raise ValueError
+                rotation = matrix_from_quaternion(quaternion)
+                yield Station(str(name), int(entry['exposure']), rotation, position)
+    except (AttributeError, KeyError, TypeError, ValueError):
+        raise DataError(f'{path}: this is not the result of a calibration') from None
+
+
+Poses = Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+
+def _poses(
+    directory: Path,
+    stations: Sequence[Station],
+    orientation: RigOrientation | None,
+    exposure: int | None,
+) -> Poses:
+    """Return rotation and position of every fluoroscope that has one. Raises DataError."""
+    if exposure is None:
+        if orientation is None:
+            return {}
+        poses = zip(orientation.rotation, orientation.position_mm)
+        return dict(zip(orientation.fluoroscopes, poses))
+    found = {
+        s.fluoroscope: (s.rotation, s.position_mm) for s in stations if s.exposure == exposure
+    }
+    if not found:
+        raise DataError(f'{directory / RESULT}: there is no exposure {exposure}')
+    return found
+
+
+def _camera(calibration: FluoroscopeCalibration, poses: Poses) -> Camera:
+    """Return the camera of the corrected images of a fluoroscope."""
+    xp, yp, c = calibration.interior.tolist()
+    rotation, position = poses.get(calibration.fluoroscope, (None, None))
+    return Camera(
+        calibration.fluoroscope,
+        np.array([[c, 0, xp], [0, c, yp], [0, 0, 1]]),
+        calibration.image_size,
+        rotation,
+        position,
+    )
+
+
+def _lookup(calibration: FluoroscopeCalibration) -> np.ndarray:
+    """Return the observed pixel (2, h, w) of every corrected one, NaN outside the support."""
+    corrector = ImageCorrector(calibration)
+    return np.where(corrector.status == CorrectionStatus.OK, corrector.source, np.float32(np.nan))
+
+
+def _observations(
+    directory: Path, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> dict[str, list[Frame]]:
+    """Return the frames that the calibrations were made from."""
+    sizes = [c.image_size for c in calibrations.values()]
+    largest = (max(w for w, _ in sizes), max(h for _, h in sizes))
+    found = read_observations_csv(directory / OBSERVATIONS, largest)
+    return {
+        name: [replace(f, image_size=calibrations[name].image_size) for f in frames]
+        for name, frames in found.items()
+        if name in calibrations
+    }
+
+
+def _phantom_poses(
+    directory: Path, stations: Sequence[Station], orientation: RigOrientation | None
+) -> Bodies:
+    """Return the poses of the phantom in the rig frame, as the first fluoroscope saw it.
+
+    Without orientation of the rig they are in the optical frame of the fluoroscope.
+    """
+    first = stations[0].fluoroscope if orientation is None else orientation.fluoroscopes[0]
+    own = sorted((s for s in stations if s.fluoroscope == first), key=lambda s: s.exposure)
+    if not own:
+        raise DataError(f'{directory / RESULT}: there are no exposures of fluoroscope {first}')
+    to_rig = np.eye(3) if orientation is None else orientation.rotation[0].T
+    origin = np.zeros(3) if orientation is None else orientation.position_mm[0]
+    rotation = np.array([to_rig @ s.rotation for s in own])
+    translation = np.array([origin - to_rig @ s.rotation @ s.position_mm for s in own])
+    numbers = np.array([s.exposure for s in own])
+    return Bodies((PHANTOM_BODY,), numbers, rotation[:, None], translation[:, None])

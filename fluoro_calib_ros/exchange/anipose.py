@@ -20,7 +20,14 @@ from ..files.atomic import write_text
 from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from .base import Format, Sample
 from .camera_files import check_matrix
-from .content import Camera, Content, Settings, Written, camera_from_translation
+from .content import (
+    Camera,
+    Content,
+    Settings,
+    Written,
+    from_units,
+    in_units,
+)
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -59,12 +66,12 @@ def _camera(where: str, table: Mapping[str, Any], mm: float) -> Camera:
     check_matrix(where, matrix)
     size = numbers_of(where, table, 'size', (2,))
     distortion = numbers_of(where, table, 'distortions', None).ravel()
-    return camera_from_translation(
+    return Camera(
         str(table.get('name', where)),
         matrix,
         (int(size[0]), int(size[1])),
         matrix_from_vector(numbers_of(where, table, 'rotation', (3,))),
-        numbers_of(where, table, 'translation', (3,)) * mm,
+        from_units(numbers_of(where, table, 'translation', (3,)), mm),
         tuple(distortion.tolist()) if distortion.any() else (),
     )
 
@@ -100,7 +107,7 @@ def write(path: Path, content: Content, settings: Settings) -> Written:
             f'matrix = {camera.matrix.tolist()}',
             f'distortions = {list(distortion)}',
             f'rotation = {vector_from_matrix(rotation).tolist()}',
-            f'translation = {(translation / mm).tolist()}',
+            f'translation = {in_units(translation, mm).tolist()}',
             '',
         ]
     lines += ['[metadata]', 'adjusted = false']

@@ -27,8 +27,8 @@ from ..files.access import make_folder
 from ..files.atomic import write_text
 from .base import Format, Sample
 from .camera_files import common_focal_length, refuse_distortion
-from .content import Camera, Content, Settings, Station, Written
-from .text import Row, joined, number_text, read_table, require_width
+from .content import Camera, Content, Settings, Station, Written, from_units, in_units
+from .text import Row, joined, read_table, require_width
 from .xmalab_points import camera_order
 
 NAME = 'bundle'  # of the files written
@@ -190,7 +190,7 @@ def _station(row: Row, cameras: _Cameras, mm: float) -> Station:
         cameras.fluoroscope(number),
         cameras.exposures[number],
         _AXES @ turn,
-        np.array(values[:3]) * mm,
+        from_units(np.array(values[:3]), mm),
     )
 
 
@@ -199,7 +199,7 @@ def _survey(path: Path, rows: Sequence[Row], mm: float) -> Phantom:
     sd = np.sqrt(np.mean(values[:, 4:] ** 2, axis=1))
     ids = [row.whole(0, 'the target') for row in rows]
     try:
-        return Phantom(np.array(ids), values[:, 1:4] * mm, sd * mm)
+        return Phantom(np.array(ids), from_units(values[:, 1:4], mm), from_units(sd, mm))
     except DataError as error:
         raise DataError(f'{path}: {error}') from None
 
@@ -280,16 +280,15 @@ def _eop(station: Station, numbering: _Numbering, mm: float) -> str:
     angles = Rotation.from_matrix(turn).as_euler('XYZ', degrees=True)
     number = numbering.station(station.fluoroscope, station.exposure)
     camera = numbering.camera[station.fluoroscope]
-    return f'{number} {camera} {joined([*(station.position_mm / mm), *angles], " ")}'
+    return f'{number} {camera} {joined([*in_units(station.position_mm, mm), *angles], " ")}'
 
 
 def _xyz(survey: Phantom | None, mm: float) -> list[str]:
     if survey is None:
         return []
-    return [
-        f'{target} {joined(xyz / mm, " ")} {" ".join([number_text(sd / mm)] * 3)}'
-        for target, xyz, sd in zip(survey.target_id.tolist(), survey.xyz_mm, survey.sd_mm)
-    ]
+    sd = in_units(np.repeat(survey.sd_mm[:, None], 3, axis=1), mm)
+    table = np.column_stack([in_units(survey.xyz_mm, mm), sd])
+    return [f'{i} {joined(row, " ")}' for i, row in zip(survey.target_id.tolist(), table)]
 
 
 FORMAT = Format(

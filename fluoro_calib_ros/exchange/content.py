@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from decimal import Decimal
 from typing import Any
 
 import numpy as np
@@ -27,6 +29,26 @@ PARTS = {
 }
 
 
+def from_units(values: np.ndarray, mm: float) -> np.ndarray:
+    """Return lengths in mm of lengths in units of mm, with the same decimal digits."""
+    return _shifted(values, mm, 1)
+
+
+def in_units(values_mm: np.ndarray, mm: float) -> np.ndarray:
+    """Return lengths in units of mm of lengths in mm, with the same decimal digits."""
+    return _shifted(values_mm, mm, -1)
+
+
+def _shifted(values: np.ndarray, mm: float, sign: int) -> np.ndarray:
+    """Move the decimal point: 11.39205 cm are 113.9205 mm, not 113.92050000000002."""
+    values = np.asarray(values, dtype=float)
+    digits = sign * round(math.log10(mm))
+    if not digits:
+        return values
+    moved = [float(Decimal(repr(value)).scaleb(digits)) for value in values.ravel().tolist()]
+    return np.array(moved).reshape(values.shape)
+
+
 @dataclass(frozen=True)
 class Camera:
     """A pinhole camera: what a fluoroscope is once its images are corrected.
@@ -40,8 +62,8 @@ class Camera:
         Width and height [px].
     rotation : (3, 3) ndarray or None
         World -> sensor; None where the format has no exterior orientation.
-    position_mm : (3,) ndarray or None
-        Position of the source in the world.
+    translation_mm : (3,) ndarray or None
+        t of X_sensor = rotation P + t.
     distortion : tuple of float
         Coefficients of OpenCV's model (k1, k2, p1, p2, k3, ...), empty without.
     """
@@ -50,18 +72,18 @@ class Camera:
     matrix: np.ndarray
     image_size: tuple[int, int] | None = None
     rotation: np.ndarray | None = None
-    position_mm: np.ndarray | None = None
+    translation_mm: np.ndarray | None = None
     distortion: tuple[float, ...] = ()
 
     @property
     def pose(self) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (3, 3) and translation (3,) [mm] of X_sensor = R X + t. Raises DataError."""
-        if self.rotation is None or self.position_mm is None:
+        if self.rotation is None or self.translation_mm is None:
             raise DataError(
                 f'camera {self.name} has no position and attitude, which this format needs: '
                 'orient the rig, or choose an exposure of the calibration with --exposure N'
             )
-        return self.rotation, -self.rotation @ self.position_mm
+        return self.rotation, self.translation_mm
 
     @property
     def size(self) -> tuple[int, int]:
@@ -79,17 +101,15 @@ class Camera:
         return any(self.distortion)
 
 
-def camera_from_translation(
+def camera_at(
     name: str,
     matrix: np.ndarray,
     image_size: tuple[int, int] | None,
     rotation: np.ndarray,
-    translation_mm: np.ndarray,
-    distortion: tuple[float, ...] = (),
+    position_mm: np.ndarray,
 ) -> Camera:
-    """Return the Camera of X_sensor = rotation X + translation_mm."""
-    position = -rotation.T @ translation_mm
-    return Camera(name, matrix, image_size, rotation, position, distortion)
+    """Return the Camera whose source is at position_mm (3,)."""
+    return Camera(name, matrix, image_size, rotation, -rotation @ position_mm)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from ..errors import DataError
 from ..files.atomic import write_text
 from .base import Format, Sample
 from .camera_files import refuse_distortion
-from .content import Camera, Content, Settings, Written
+from .content import Camera, Content, Settings, Written, camera_at
 from .text import joined, read_table, require_width
 
 ROWS = 11
@@ -83,7 +83,7 @@ def _camera(name: str, coefficients: np.ndarray, size: tuple[int, int], mm: floa
     matrix = upper @ signs
     rotation = signs @ rotation
     matrix = matrix / matrix[2, 2]
-    return Camera(name, matrix, size, rotation, position * mm)
+    return camera_at(name, matrix, size, rotation, position * mm)
 
 
 def write(path: Path, content: Content, settings: Settings) -> Written:

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import DataError
 from .base import Format, Sample
 from .camera_files import name_of_file
-from .content import Camera, Content, Settings
+from .content import Content, Settings, camera_at, from_units
 from .text import Row, read_table, require_width
 
 ENDING = '_MayaCam.csv'
@@ -50,12 +50,12 @@ def read(path: Path, settings: Settings) -> Content:
     # x, y, z of the camera in the world as columns: extrinsic rotations about x, y and z.
     axes = Rotation.from_euler('xyz', angles, degrees=True).as_matrix()
     matrix = np.array([[abs(z), 0, u0 - 1], [0, abs(z), size[1] - 1 - (v0 - 1)], [0, 0, 1]])
-    camera = Camera(
+    camera = camera_at(
         name_of_file(path, ENDING),
         matrix,
         size,
         (axes @ _AXES).T,
-        np.array(position) * settings.unit_read(path),
+        from_units(np.array(position), settings.unit_read(path)),
     )
     return Content(cameras=(camera,))
 

@@ -19,7 +19,14 @@ from ..errors import DataError
 from ..files.access import read_text
 from .base import Format, Sample
 from .camera_files import check_matrix, check_rotation, name_of_file, write_cameras
-from .content import Camera, Content, Settings, Written, camera_from_translation
+from .content import (
+    Camera,
+    Content,
+    Settings,
+    Written,
+    from_units,
+    in_units,
+)
 from .text import Row, joined, number_text
 
 ENDING = '_MayaCam2.txt'
@@ -54,12 +61,12 @@ def read(path: Path, settings: Settings) -> Content:
     if len(lines) >= _UNDISTORTION and lines[_UNDISTORTION - 1].strip() == 'undistortion':
         numbers = range(_UNDISTORTION + 1, _UNDISTORTION + 1 + _COEFFICIENTS)
         distortion = tuple(_numbers(path, lines, number, 1)[0] for number in numbers)
-    camera = camera_from_translation(
+    camera = Camera(
         name_of_file(path, ENDING),
         matrix,
         (int(width), int(height)),
         rotation,
-        translation * settings.unit_read(path),
+        from_units(translation, settings.unit_read(path)),
         distortion,
     )
     return Content(cameras=(camera,))
@@ -101,7 +108,7 @@ def _text(camera: Camera, mm: float) -> str:
         *map(joined, rotation),
         '',
         'translation',
-        *map(number_text, translation / mm),
+        *map(number_text, in_units(translation, mm)),
     ]
     if camera.is_distorted:
         padded = [*camera.distortion, *[0.0] * _COEFFICIENTS][:_COEFFICIENTS]

@@ -16,7 +16,14 @@ from ..errors import DataError
 from ..files.access import read_text
 from .base import Format, Sample
 from .camera_files import check_matrix, check_rotation, name_of_file, write_cameras
-from .content import Camera, Content, Settings, Written, camera_from_translation
+from .content import (
+    Camera,
+    Content,
+    Settings,
+    Written,
+    from_units,
+    in_units,
+)
 
 ENDING = '_opencv.yaml'
 MATRIX_NAMES = ('camera_matrix', 'Camera_Matrix', 'cameraMatrix', 'K')
@@ -70,9 +77,7 @@ def _camera(path: Path, storage: cv2.FileStorage, settings: Settings) -> Camera:
     if translation.size != 3:
         raise DataError(f'{path}: T has {translation.size} numbers, not 3')
     mm = settings.unit_read(path)
-    return camera_from_translation(
-        name, matrix, size, rotation, translation.ravel() * mm, coefficients
-    )
+    return Camera(name, matrix, size, rotation, from_units(translation.ravel(), mm), coefficients)
 
 
 def _matrix(path: Path, storage: cv2.FileStorage, names: tuple[str, ...]) -> np.ndarray | None:
@@ -107,7 +112,7 @@ def _text(camera: Camera, mm: float) -> str:
     if camera.rotation is not None:
         rotation, translation = camera.pose
         storage.write('R', rotation)
-        storage.write('T', (translation / mm).reshape(3, 1))
+        storage.write('T', in_units(translation, mm).reshape(3, 1))
     return storage.releaseAndGetString()
 
 

@@ -18,7 +18,15 @@ from ..exposures.names import Names, number_names
 from ..files.access import read_text
 from ..files.atomic import atomic_file
 from .base import Format, Sample
-from .content import UNITS_MM, Content, Settings, Written, points_without_precision
+from .content import (
+    UNITS_MM,
+    Content,
+    Settings,
+    Written,
+    from_units,
+    in_units,
+    points_without_precision,
+)
 from .frames_of_points import at_constant_rate, labels
 from .labels import named_targets
 from .text import Row, number_text
@@ -68,7 +76,7 @@ def read(path: Path, settings: Settings) -> Content:
         points=points_without_precision(
             np.array(frame),
             np.array([ids[name] for name in names], dtype=np.int64),
-            np.array(xyz) * mm,
+            from_units(np.array(xyz), mm),
             rate,
         ),
         names=Names(named_targets({name: ids[name] for name in names})),
@@ -103,7 +111,7 @@ def write(path: Path, content: Content, settings: Settings) -> Written:
         file.write('\t'.join(_NAMES) + '\n' + '\t'.join(values) + '\n')
         file.write('Frame#\tTime\t' + '\t\t\t'.join(names) + '\t\t\n')
         file.write('\t\t' + '\t'.join(axes) + '\n\n')
-        for number, xyz in zip(points.frame.tolist(), points.xyz_mm / UNITS_MM[unit]):
+        for number, xyz in zip(points.frame.tolist(), in_units(points.xyz_mm, UNITS_MM[unit])):
             time = (number - first) / points.rate_hz  # type: ignore[operator]
             cells = ['' if math.isnan(value) else repr(value) for value in xyz.ravel().tolist()]
             file.write('\t'.join([str(number), repr(time), *cells]) + '\n')

@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import DataError
 from ..files.atomic import atomic_file
 from .base import Format, Sample
-from .content import Bodies, Content, Settings, Written
+from .content import Bodies, Content, Settings, Written, from_units, in_units
 from .text import Row, joined, read_table, require_width
 
 COLUMNS = (
@@ -52,7 +52,7 @@ def read(path: Path, settings: Settings) -> Content:
         _check(row, of_row, names)
     missing = np.isnan(matrices).any(axis=(2, 3))
     rotation = matrices[..., :3, :3].copy()
-    translation = matrices[..., :3, 3] * mm
+    translation = from_units(matrices[..., :3, 3], mm)
     rotation[missing] = np.nan
     translation[missing] = np.nan
     return Content(bodies=Bodies(tuple(names), np.array(frame), rotation, translation))
@@ -97,7 +97,7 @@ def write(path: Path, content: Content, settings: Settings) -> Written:
     mm, notes = settings.unit_or('mm', str(path))
     matrices = np.zeros((*bodies.rotation.shape[:2], 4, 4))
     matrices[..., :3, :3] = bodies.rotation
-    matrices[..., :3, 3] = bodies.translation_mm / mm
+    matrices[..., :3, 3] = in_units(bodies.translation_mm, mm)
     matrices[..., 3, 3] = 1.0
     matrices[np.isnan(matrices).any(axis=(2, 3))] = np.nan
     header = ['Frame', *(f'{name}_{column}' for name in bodies.names for column in COLUMNS)]

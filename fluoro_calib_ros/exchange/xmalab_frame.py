@@ -19,7 +19,7 @@ from ..exposures.phantom import Phantom
 from ..files.access import read_text
 from ..files.atomic import write_text
 from .base import Format, Sample
-from .content import Content, Settings, Written
+from .content import Content, Settings, Written, from_units, in_units
 from .text import Row, joined, separator_of, table_of
 
 DEFAULT_SD_MM = 0.1  # the format has no standard deviation
@@ -47,7 +47,7 @@ def content_of(path: Path, text: str, settings: Settings) -> Content:
     if not beads:
         raise DataError(f'{path}: the file has a header, but no beads')
     mm, notes = settings.unit_or('cm', str(path))
-    xyz = np.array([_coordinates(row) for row in beads]) * scale * mm
+    xyz = from_units(np.array([_coordinates(row) for row in beads]) * scale, mm)
     given = [row.cells[3] if len(row.cells) > 3 else '' for row in beads]
     if any(given) and not all(given):
         index = given.index('')
@@ -88,7 +88,7 @@ def write(path: Path, content: Content, settings: Settings) -> Written:
     mm, notes = settings.unit_or('cm', str(path))
     named = content.names.target_names()
     lines = ['x y z']
-    for target, xyz in zip(survey.target_id.tolist(), survey.xyz_mm / mm):
+    for target, xyz in zip(survey.target_id.tolist(), in_units(survey.xyz_mm, mm)):
         name = named.get(target, str(target))
         if set(name) & set(',;\n'):
             raise DataError(f'{path}: a bead cannot be called {name!r} in this format')

@@ -16,7 +16,14 @@ from ..errors import DataError
 from ..exposures.names import Names, number_names
 from ..files.atomic import atomic_file
 from .base import Format, Sample
-from .content import Content, Settings, Written, points_without_precision
+from .content import (
+    Content,
+    Settings,
+    Written,
+    from_units,
+    in_units,
+    points_without_precision,
+)
 from .labels import default_name, named_targets
 from .text import Row, joined, read_table, require_width
 
@@ -49,7 +56,8 @@ def read(path: Path, settings: Settings) -> Content:
     for before, row, number in zip(frame, body[1:], frame[1:]):
         if number <= before:
             row.fail(f'frame {number} comes after frame {before}')
-    xyz = np.array([row.numbers_or_nan(first) for row in body]).reshape(len(body), -1, 3) * mm
+    values = np.array([row.numbers_or_nan(first) for row in body])
+    xyz = from_units(values.reshape(len(body), -1, 3), mm)
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
     target_id = np.array([ids[name] for name in targets], dtype=np.int64)
     points = points_without_precision(np.array(frame), target_id, xyz, settings.rate_hz)
@@ -84,7 +92,7 @@ def write(path: Path, content: Content, settings: Settings) -> Written:
     header = ['Frame', *(f'{name}_{axis}' for name in labels for axis in 'XYZ')]
     with atomic_file(path, 'w') as file:
         file.write(','.join(header) + '\n')
-        for number, xyz in zip(points.frame.tolist(), points.xyz_mm / mm):
+        for number, xyz in zip(points.frame.tolist(), in_units(points.xyz_mm, mm)):
             file.write(f'{number},{joined(xyz.ravel())}\n')
     return Written((str(path),), notes)
 

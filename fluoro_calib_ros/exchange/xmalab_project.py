@@ -26,7 +26,7 @@ from ..files.access import os_error_reason
 from . import xmalab_frame
 from .base import Format, Sample
 from .camera_files import check_matrix, check_rotation
-from .content import Camera, Content, Settings, Station, camera_from_translation
+from .content import Camera, Content, Settings, Station
 from .labels import default_name, named_targets
 from .text import Row, table_of
 
@@ -390,9 +390,7 @@ class _Project:
             for station in stations:
                 if (station.fluoroscope, station.exposure) == (name, reference):
                     translation = -station.rotation @ station.position_mm
-                    yield camera_from_translation(
-                        name, matrix, size, station.rotation, translation, distortion
-                    )
+                    yield Camera(name, matrix, size, station.rotation, translation, distortion)
                     break
             else:
                 yield Camera(name, matrix, size, distortion=distortion)

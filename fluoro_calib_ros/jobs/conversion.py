@@ -16,7 +16,16 @@ from ..calibration.result import FluoroscopeCalibration
 from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 from ..exchange import registry
-from ..exchange.content import PARTS, Bodies, Camera, Content, Settings, Station, Written
+from ..exchange.content import (
+    PARTS,
+    Bodies,
+    Camera,
+    Content,
+    Settings,
+    Station,
+    Written,
+    camera_at,
+)
 from ..exposures.frame import Frame
 from ..files.calibration import SUFFIX, load_calibrations
 from ..files.calibration_request import OBSERVATIONS
@@ -301,14 +310,11 @@ def _poses(
 def _camera(calibration: FluoroscopeCalibration, poses: Poses) -> Camera:
     """Return the camera of the corrected images of a fluoroscope."""
     xp, yp, c = calibration.interior.tolist()
-    rotation, position = poses.get(calibration.fluoroscope, (None, None))
-    return Camera(
-        calibration.fluoroscope,
-        np.array([[c, 0, xp], [0, c, yp], [0, 0, 1]]),
-        calibration.image_size,
-        rotation,
-        position,
-    )
+    matrix = np.array([[c, 0, xp], [0, c, yp], [0, 0, 1]])
+    name = calibration.fluoroscope
+    if name not in poses:
+        return Camera(name, matrix, calibration.image_size)
+    return camera_at(name, matrix, calibration.image_size, *poses[name])
 
 
 def _lookup(calibration: FluoroscopeCalibration) -> np.ndarray:

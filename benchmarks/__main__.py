@@ -5,10 +5,13 @@ python -m benchmarks                      all tables, written to docs/performanc
 python -m benchmarks scaling adjustment   these only, printed
 """
 
+from __future__ import annotations
+
 import argparse
 import os
 import platform
 import sys
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 
@@ -17,16 +20,17 @@ from threadpoolctl import threadpool_limits
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.initial_network import measured_network
 from fluoro_calib_ros.calibration.options import CalibrationOptions, model_choices
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
 
 from . import adjustments, profiling, scaling
 from .lookup import lookup_section
-from .peers import self_calibrate_with_peers
+from .peers import PeerCalibration, self_calibrate_with_peers
 from .timing import section, timed
 
 
-def exposures():
+def exposures() -> tuple[VirtualRig, dict[str, list[Frame]]]:
     """Virtual rig and 15 exposures of it by fluoroscope a, of about 132 targets each."""
     rig = virtual_rig(1)
     return rig, {
@@ -34,12 +38,12 @@ def exposures():
     }
 
 
-def models():
+def models() -> list[CalibrationOptions]:
     """CalibrationOptions of all correction models."""
     return [CalibrationOptions(model) for model in model_choices()]
 
 
-def calibration_section():
+def calibration_section() -> str:
     """Compare the self-calibration of every model with a loop of COLMAP and scikit-learn."""
     rig, frames = exposures()
     ours = []
@@ -47,7 +51,7 @@ def calibration_section():
         job, seconds = timed(lambda: calibrate(frames, rig.phantom, options), 3)
         ours.append((options.model, job, seconds))
 
-    def with_peers():
+    def with_peers() -> PeerCalibration:
         measured = measured_network(frames, rig.phantom)
         return self_calibrate_with_peers(measured.network, measured.start)
 
@@ -101,7 +105,7 @@ def calibration_section():
     )
 
 
-def adjustment_section():
+def adjustment_section() -> str:
     """Compare one adjustment with COLMAP."""
     return section(
         'One adjustment compared with COLMAP',
@@ -114,7 +118,7 @@ def adjustment_section():
     )
 
 
-def scaling_section():
+def scaling_section() -> str:
     """Time and memory by the number of exposures."""
     return section(
         'Many exposures',
@@ -125,7 +129,7 @@ def scaling_section():
     )
 
 
-def profile_section():
+def profile_section() -> str:
     """Where the time of the self-calibration goes."""
     rig, frames = exposures()
     calibrate(frames, rig.phantom)  # what only the first call does is not counted
@@ -149,7 +153,7 @@ SECTIONS = {
 }
 
 
-def machine():
+def machine() -> str:
     """The machine and the versions that the figures belong to, in one sentence."""
     cpu = platform.processor() or platform.machine()
     information = Path('/proc/cpuinfo')
@@ -170,7 +174,7 @@ def machine():
     )
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print the tables; with all of them, write docs/performance.md."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks', description=__doc__.splitlines()[0]

@@ -2,11 +2,15 @@
 converged.
 """
 
+from __future__ import annotations
+
 import argparse
 import multiprocessing
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -23,7 +27,7 @@ from fluoro_calib_ros.simulation.rig import virtual_rig
 LIMITS = {'xp': 25.0, 'yp': 25.0, 'c': 25.0, 'T': 9.0, 'q': 9.0, 'object points': 1.6}
 
 
-def random_case(seed):
+def random_case(seed: int) -> dict[str, Any]:
     """Strength of the distortion, number of exposures, share of false matches and start of the
     principal distance.
     """
@@ -36,7 +40,7 @@ def random_case(seed):
     }
 
 
-def outcome(seed):
+def outcome(seed: int) -> dict[str, Any]:
     """One case: its values, 'converged', 'not converged' or 'refused', the normalised errors, and
     what is wrong.
     """
@@ -82,7 +86,7 @@ Median and maximum of the mean normalised squared errors of the converged calibr
 {cases}"""
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point; exit status 1 where a wrong answer was called converged."""
     parser = argparse.ArgumentParser(prog='python -m benchmarks.convergence', description=__doc__)
     parser.add_argument('--count', type=int, default=200, help='number of rigs (default: 200)')
@@ -112,7 +116,7 @@ def main(arguments=None):
     sys.exit(any(r['end'] == 'converged' and r['wrong'] for r in results))
 
 
-def report(results):
+def report(results: Sequence[dict[str, Any]]) -> str:
     """The document of all outcomes."""
     lines = ['| outcome | cases | correct | wrong |', '|---|---:|---:|---:|']
     for end in ('converged', 'not converged', 'refused'):

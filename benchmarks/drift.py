@@ -6,17 +6,22 @@ intersected as in the stream. The motions repeat, the noise does not. Frames are
 by block, which makes no difference to the watch and is faster than real time.
 """
 
+from __future__ import annotations
+
 import argparse
 import copy
 import multiprocessing
 import sys
 import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
 from fluoro_calib_ros.calibration.rig_orientation import (
     orientation_of_capture,
     orientation_of_exposures,
@@ -25,8 +30,9 @@ from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.drift.clusters import Cluster
 from fluoro_calib_ros.drift.observations import EpipolarObservations, PointObservations
 from fluoro_calib_ros.drift.options import DriftOptions
-from fluoro_calib_ros.drift.state import ERROR, OK, WARN
+from fluoro_calib_ros.drift.state import ERROR, OK, WARN, DriftState
 from fluoro_calib_ros.drift.watch import DriftWatch
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
 from fluoro_calib_ros.reconstruction.intersection import Intersector
@@ -54,7 +60,13 @@ QUARTERS = {
 }
 WHOLE = 'whole image'
 WITHIN_S = 5.0  # in which a drift is to be found
-AFTER_S = 20.0  # after which it is given up
+AFTER_S = 20.0  # after which it counts as not found
+
+# Shift (k, 2) [px] of pixels (k, 2) of a fluoroscope at a time [s].
+Shift = Callable[[str, np.ndarray, float], np.ndarray]
+# Observed pixels, corrected points and their systematic sd by fluoroscope, and stamps [ns].
+Block = tuple[dict[str, np.ndarray], dict[str, np.ndarray], dict[str, np.ndarray], np.ndarray]
+Result = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -64,21 +76,20 @@ class Scene:
     pixels: observed pixels (frames, markers, 2) without noise, by fluoroscope.
     """
 
-    names: tuple
-    calibrations: dict
-    orientation: object
+    names: tuple[str, ...]
+    calibrations: Mapping[str, FluoroscopeCalibration]
+    orientation: RigOrientation
     geometry: EpipolarGeometry
     intersector: Intersector
-    pixels: dict
+    pixels: dict[str, np.ndarray]
 
     @property
-    def clusters(self):
+    def clusters(self) -> tuple[Cluster, ...]:
         """The Clusters, their distances unknown."""
-        return tuple(
-            Cluster(f'bone {i + 1}', IDS[BEADS * i : BEADS * (i + 1)]) for i in range(CLUSTERS)
-        )
+        ids = IDS.reshape(CLUSTERS, BEADS).tolist()
+        return tuple(Cluster(f'bone {i + 1}', tuple(own)) for i, own in enumerate(ids))
 
-    def watch(self, options=None, clusters=True):
+    def watch(self, options: DriftOptions | None = None, clusters: bool = True) -> DriftWatch:
         """A DriftWatch of the scene."""
         return DriftWatch(
             dict.fromkeys(self.names, (SIZE, SIZE)),
@@ -88,7 +99,7 @@ class Scene:
         )
 
 
-def markers(rng, beads, seconds):
+def markers(rng: np.random.Generator, beads: np.ndarray, seconds: float) -> np.ndarray:
     """Positions (frames, 30, 3) [mm] of rigid clusters on the bones of a moving joint.
 
     beads (5, 6, 3): shapes of the clusters [mm].
@@ -119,7 +130,7 @@ def markers(rng, beads, seconds):
     return np.concatenate(out, axis=1)
 
 
-def scene(seed, source='exposures'):
+def scene(seed: int, source: str = 'exposures') -> Scene:
     """Scene of a rig.
 
     Its orientation comes from the 'exposures' of the calibration, or a 'capture' of the phantom.
@@ -149,14 +160,16 @@ def scene(seed, source='exposures'):
     )
 
 
-def false_matches(rng, uv):
+def false_matches(rng: np.random.Generator, uv: np.ndarray) -> np.ndarray:
     """Pixels, a fraction FALSE_MATCHES of them displaced as by another bead."""
     wrong = rng.random(uv.shape[:2]) < FALSE_MATCHES
     uv[wrong] += rng.uniform(-12, 12, (int(wrong.sum()), 2))
     return uv
 
 
-def blocks(scene_, rng, first, count, drift=None):
+def blocks(
+    scene_: Scene, rng: np.random.Generator, first: int, count: int, drift: Shift | None = None
+) -> Iterator[Block]:
     """Blocks of the stream: pixels, corrected points, their systematic sd, and stamps.
 
     first: number of the block to begin with; drift(name, uv, time_s): shift (k, 2) [px] of
@@ -189,7 +202,7 @@ def blocks(scene_, rng, first, count, drift=None):
         )
 
 
-def feed(scene_, watch, block, clusters=True):
+def feed(scene_: Scene, watch: DriftWatch, block: Block, clusters: bool = True) -> DriftState:
     """Hand a block of the stream to the watch; returns its state."""
     seen, corrected, systematic, stamps = block
     a, b = scene_.names
@@ -255,16 +268,16 @@ class Drift:
     ramp_s: float = 0.0
 
     @property
-    def vector(self):
+    def vector(self) -> np.ndarray:
         """Shift (2,) at full size [px]."""
         angle = np.deg2rad(self.direction)
         return self.size * np.array([np.cos(angle), np.sin(angle)])
 
-    def fraction(self, time_s):
+    def fraction(self, time_s: float) -> float:
         """Fraction of its size at a time after its begin [s]."""
         return min(1.0, time_s / self.ramp_s) if self.ramp_s else 1.0
 
-    def shift(self, name, uv, time_s):
+    def shift(self, name: str, uv: np.ndarray, time_s: float) -> np.ndarray:
         """Shift (k, 2) [px] of observed pixels (k, 2) at a time after its begin [s]."""
         if name != self.fluoroscope or time_s < 0:
             return np.zeros_like(uv)
@@ -275,7 +288,13 @@ class Drift:
         return inside[:, None] * self.vector * self.fraction(time_s)
 
 
-def false_alarms(seed, hours=0.5, source='exposures', options=None, clusters=True):
+def false_alarms(
+    seed: int,
+    hours: float = 0.5,
+    source: str = 'exposures',
+    options: DriftOptions | None = None,
+    clusters: bool = True,
+) -> Result:
     """Alarms of a stream without drift.
 
     Returns hours, the number of WARNs and ERRORs that began, the largest evidence over the
@@ -307,7 +326,7 @@ def false_alarms(seed, hours=0.5, source='exposures', options=None, clusters=Tru
     }
 
 
-def right_place(state, quarter):
+def right_place(state: DriftState, quarter: str) -> bool:
     """Whether the area of a state is the quarter, or a part of it."""
     u0, v0, u1, v1 = np.array(state.area) / SIZE
     if quarter == WHOLE:
@@ -319,7 +338,15 @@ def right_place(state, quarter):
     )
 
 
-def detection(scene_, watch, first, drift, rng, clusters=True, after_s=AFTER_S):
+def detection(
+    scene_: Scene,
+    watch: DriftWatch,
+    first: int,
+    drift: Drift,
+    rng: np.random.Generator,
+    clusters: bool = True,
+    after_s: float = AFTER_S,
+) -> Result:
     """Result of one drift: delays of WARN and ERROR [s] (inf: not found), and what is reported.
 
     Parameters
@@ -336,7 +363,7 @@ def detection(scene_, watch, first, drift, rng, clusters=True, after_s=AFTER_S):
         Time after which the drift counts as not found.
     """
     begin_s = first * FRAMES / RATE_HZ
-    out = {
+    out: Result = {
         'fluoroscope': drift.fluoroscope,
         'quarter': drift.quarter,
         'size': drift.size,
@@ -346,7 +373,7 @@ def detection(scene_, watch, first, drift, rng, clusters=True, after_s=AFTER_S):
         'message': '',
     }
 
-    def shift(name, uv, time_s):
+    def shift(name: str, uv: np.ndarray, time_s: float) -> np.ndarray:
         return drift.shift(name, uv, time_s - begin_s)
 
     stream = blocks(scene_, rng, first, round(after_s * RATE_HZ / FRAMES), shift)
@@ -365,7 +392,7 @@ def detection(scene_, watch, first, drift, rng, clusters=True, after_s=AFTER_S):
     return out
 
 
-def _reported(state, drift, delay):
+def _reported(state: DriftState, drift: Drift, delay: float) -> Result:
     """What the state of an alarm says of a drift, delay [s] after its begin."""
     along = float(drift.vector @ state.direction) * drift.fraction(delay)
     if ' or ' in state.fluoroscope:  # down in one is up in the other
@@ -381,7 +408,9 @@ def _reported(state, drift, delay):
     }
 
 
-def started(seed, clusters=True, source='exposures'):
+def started(
+    seed: int, clusters: bool = True, source: str = 'exposures'
+) -> tuple[Scene, DriftWatch, np.random.Generator, int]:
     """Scene, its watch after the start, the generator, and the number of blocks of the start."""
     scene_ = scene(seed, source)
     watch = scene_.watch(clusters=clusters)
@@ -393,8 +422,13 @@ def started(seed, clusters=True, source='exposures'):
 
 
 def detections(
-    seed, size=0.5, clusters=True, source='exposures', quarters=tuple(QUARTERS), directions=8
-):
+    seed: int,
+    size: float = 0.5,
+    clusters: bool = True,
+    source: str = 'exposures',
+    quarters: Sequence[str] = tuple(QUARTERS),
+    directions: int = 8,
+) -> list[Result]:
     """Results of `detection` for drifts over all quarters of both images."""
     scene_, watch, rng, learned = started(seed, clusters, source)
     out = []
@@ -409,7 +443,7 @@ def detections(
     return out
 
 
-def from_the_start(seed, size=0.5, directions=8):
+def from_the_start(seed: int, size: float = 0.5, directions: int = 8) -> list[Result]:
     """Results for drifts that exist before the watch starts: only the calibration shows them."""
     scene_ = scene(seed)
     rng = np.random.default_rng([seed, 8])
@@ -423,7 +457,7 @@ def from_the_start(seed, size=0.5, directions=8):
     return out
 
 
-def slow(seed, size=0.5, hours=1.0):
+def slow(seed: int, size: float = 0.5, hours: float = 1.0) -> list[Result]:
     """Result for a drift that takes hours to its size, in a random quarter and direction."""
     scene_, watch, rng, learned = started(seed)
     quarter = str(rng.choice(list(QUARTERS)))
@@ -434,7 +468,7 @@ def slow(seed, size=0.5, hours=1.0):
 
 
 # Title of a row, function, its arguments but the seed.
-CASES = (
+CASES: tuple[tuple[str, Callable[..., list[Result]], dict[str, Any]], ...] = (
     ('0.5 px, with clusters', detections, {}),
     ('0.5 px, orientation from one capture', detections, {'source': 'capture'}),
     ('0.5 px, without clusters', detections, {'clusters': False}),
@@ -467,17 +501,17 @@ HEADER = [
 ]
 
 
-def row(title, sector, found):
+def row(title: str, sector: str, found: Sequence[Result]) -> list[str]:
     """A line of the table of detections: of dicts of `detection`."""
     delay = np.array([f['error'] for f in found])
     reported = [f for f in found if 'named' in f]
     error = np.array([f['size_error'] for f in reported])
     normalised = error / np.array([f['sd'] for f in reported])
 
-    def part(values):
+    def part(values: Sequence[bool] | np.ndarray) -> str:
         return f'{100 * np.mean(values):.0f} %' if len(values) else '-'
 
-    def figure(value):
+    def figure(value: float) -> str:
         return f'{value:.2f}' if np.isfinite(value) else '-'
 
     return [
@@ -497,20 +531,26 @@ def row(title, sector, found):
     ]
 
 
-def _call(task):
+def _call(task: tuple[Callable[..., Any], dict[str, Any]]) -> Any:
     function, arguments = task
     with threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter('error')
         return function(**arguments)
 
 
-def measure(rigs=3, alarm_rigs=10, hours=0.5, processes=1, chosen=None):
+def measure(
+    rigs: int = 3,
+    alarm_rigs: int = 10,
+    hours: float = 0.5,
+    processes: int = 1,
+    chosen: Sequence[str] | None = None,
+) -> Result:
     """All figures: {'alarms': dicts of false_alarms, 'cases': {title: dicts of detection}}.
 
     rigs: of each case of drifts; alarm_rigs: without drift, hours [h] each, every third with the
     orientation of a capture; chosen: titles of cases, None: all.
     """
-    tasks = [
+    tasks: list[tuple[str, Callable[..., Any], dict[str, Any]]] = [
         (
             'alarms',
             false_alarms,
@@ -529,14 +569,14 @@ def measure(rigs=3, alarm_rigs=10, hours=0.5, processes=1, chosen=None):
         for n, result in enumerate(pool.imap(_call, [(f, a) for _, f, a in tasks])):
             results.append(result)
             print(f'{n + 1} of {len(tasks)}: {tasks[n][0]}', file=sys.stderr, flush=True)
-    cases = {}
+    cases: dict[str, list[Result]] = {}
     for (title, *_), result in zip(tasks, results):
         if title != 'alarms':
             cases.setdefault(title, []).extend(result)
     return {'alarms': [r for t, r in zip(tasks, results) if t[0] == 'alarms'], 'cases': cases}
 
 
-def report(figures):
+def report(figures: Result) -> str:
     """The figures of `measure` as text."""
     options = DriftOptions()
     alarms = figures['alarms']
@@ -560,7 +600,7 @@ def report(figures):
     return '\n'.join(lines) + '\n\n' + table(HEADER, rows)
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks.drift', description=__doc__.splitlines()[0]

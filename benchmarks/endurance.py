@@ -9,13 +9,17 @@ fraction of a queue ahead of the points that come out. Every minute of the strea
 memory of both nodes is noted.
 """
 
+from __future__ import annotations
+
 import argparse
 import itertools
 import os
 import signal
 import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import rclpy
@@ -34,12 +38,12 @@ AHEAD = OBSERVATION_DEPTH // 4
 PAGE_MB = os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
-def resident_mb(process):
+def resident_mb(process: subprocess.Popen) -> float:
     """Resident memory [MB] of a process."""
     return int(Path(f'/proc/{process.pid}/statm').read_text().split()[1]) * PAGE_MB
 
 
-def stream(reader, frames, rate_hz, note):
+def stream(reader: Reader, frames: int, rate_hz: float, note: Callable[[int], None]) -> None:
     """Publish frames exposures in step with the points that come out; note(number) at every minute
     of the stream.
     """
@@ -78,7 +82,7 @@ def stream(reader, frames, rate_hz, note):
     reader.wait(lambda: len(came) >= frames, 30, 'the last points')
 
 
-def run(hours, rate_hz):
+def run(hours: float, rate_hz: float) -> dict[str, Any]:
     """Figures: exposures, frames in and out, seconds, and memory {node: [MB by minute]}."""
     isolate_ros_graph()
     rclpy.init(args=[])
@@ -87,9 +91,9 @@ def run(hours, rate_hz):
     processes = {
         node: subprocess.Popen(_command(node), stderr=subprocess.DEVNULL) for node in NODES
     }
-    memory = {node: [] for node in NODES}
+    memory: dict[str, list[float]] = {node: [] for node in NODES}
 
-    def note(number):
+    def note(number: int) -> None:
         for node, process in processes.items():
             memory[node].append(resident_mb(process))
         print(
@@ -110,14 +114,14 @@ def run(hours, rate_hz):
             process.send_signal(signal.SIGINT)
         for process in processes.values():
             process.wait(20)
-        reader.reader.stop()
+        reader.stop()
     out = {key: len({number for number, _ in of_one}) for key, of_one in reader.came.items()}
     reader.destroy_node()
     rclpy.shutdown()
     return {'exposures': frames, 'out': out, 'seconds': seconds, 'memory': memory}
 
 
-def text_of(figures):
+def text_of(figures: dict[str, Any]) -> str:
     """Sentences of the figures."""
     frames = figures['exposures']
     lines = [

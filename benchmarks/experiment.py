@@ -6,32 +6,44 @@ the observations were made from. A Case says what is done, an Outcome what came 
 only, so that cases can be run in processes of their own.
 """
 
+from __future__ import annotations
+
 import functools
 import time
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.calibrate import CalibrationResult, calibrate
 from fluoro_calib_ros.calibration.held_calibration import (
     held_corrections,
     too_few_rays_for_noise,
 )
-from fluoro_calib_ros.calibration.initial_network import KnownSensor, network_of_known_sensors
+from fluoro_calib_ros.calibration.initial_network import (
+    KnownSensor,
+    Measured,
+    network_of_known_sensors,
+)
 from fluoro_calib_ros.calibration.options import AUTO, CalibrationOptions
+from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
 from fluoro_calib_ros.calibration.robust_adjustment import start_noise
+from fluoro_calib_ros.distortion.base import CorrectionModel
 from fluoro_calib_ros.distortion.registry import selectable_models
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.exposures.frame import points_on_image
+from fluoro_calib_ros.exposures.frame import Frame, points_on_image
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 from fluoro_calib_ros.report.cost_figure import relative_costs
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
+from fluoro_calib_ros.simulation.distortion import DistortionField
+from fluoro_calib_ros.simulation.exposures import Detection, SimulatedExposures, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 NOISE_PX = 0.25
@@ -59,7 +71,7 @@ class Case:
 
     seed: int
     variant: str
-    fluoroscopes: tuple = ('a',)
+    fluoroscopes: tuple[str, ...] = ('a',)
     training: int | None = None
     strength: float = 1.0
     false_matches: float = 0.01
@@ -72,7 +84,7 @@ class Case:
     detail: bool = field(default=False, compare=False)
 
     @property
-    def scene(self):
+    def scene(self) -> tuple[int, float, float, int, int, float]:
         """Key of the rig and its recording."""
         return (
             self.seed,
@@ -98,19 +110,19 @@ class Residuals:
     weight: np.ndarray
     inlier: np.ndarray
 
-    def cost(self):
+    def cost(self) -> float:
         """r^T C_r^-1 r, robustly weighted, in units of the simulated noise."""
         return float(np.sum(self.weight[:, None] * (self.residual / self.sd[:, None]) ** 2))
 
-    def raw(self):
+    def raw(self) -> np.ndarray:
         """RMSE (2,) [px] of the inlier residuals."""
         return np.sqrt(np.mean(self.residual[self.inlier] ** 2, axis=0))
 
-    def reweighted(self):
+    def reweighted(self) -> np.ndarray:
         """RMSE (2,) [px] of all residuals times the square root of their robust weight."""
         return np.sqrt(np.mean(self.weight[:, None] * self.residual**2, axis=0))
 
-    def together(self, other):
+    def together(self, other: Residuals) -> Residuals:
         """The residuals of two fluoroscopes as one set."""
         return Residuals(
             *(
@@ -132,17 +144,17 @@ class Outcome:
     """
 
     failed: str = ''
-    inside: np.ndarray = None
-    outside: np.ndarray = None
-    error_map: dict = field(default_factory=dict)
-    model: dict = field(default_factory=dict)
+    inside: np.ndarray = None  # type: ignore[assignment]
+    outside: np.ndarray = None  # type: ignore[assignment]
+    error_map: dict[str, np.ndarray] = field(default_factory=dict)
+    model: dict[str, tuple[str, int]] = field(default_factory=dict)
     seconds: float = np.nan
     rounds: int = 0
     converged: bool = False
-    residuals: dict = field(default_factory=dict)
-    costs: tuple = ()
+    residuals: dict[str, Residuals] = field(default_factory=dict)
+    costs: tuple[np.ndarray, ...] = ()
 
-    def image_px(self, name, within=None):
+    def image_px(self, name: str, within: np.ndarray | None = None) -> float:
         """RMSE [px] of a coordinate of the correction over the calibrated area; within: map that
         covers less.
         """
@@ -151,30 +163,30 @@ class Outcome:
             errors = errors[np.isfinite(errors) & np.isfinite(within)]
         return float(np.sqrt(np.nanmean(errors**2)))
 
-    def covered(self, name):
+    def covered(self, name: str) -> float:
         """Part of the image inside the calibrated area."""
         return float(np.mean(np.isfinite(self.error_map[name][..., 0])))
 
-    def points_mm(self):
+    def points_mm(self) -> float:
         """3-D RMSE [mm] of the object points out of sample."""
         return float(np.linalg.norm(self.outside[:3]))
 
-    def source_mm(self):
+    def source_mm(self) -> float:
         """3-D RMSE [mm] of the sources out of sample."""
         return float(np.linalg.norm(self.outside[3:]))
 
 
-def available_models():
+def available_models() -> tuple[str, ...]:
     """Correction models that CalibrationOptions takes, in the order of the tables."""
     return tuple(name for name in MODELS if _accepted(model=name))
 
 
-def available_relative():
+def available_relative() -> tuple[str, ...]:
     """Relative orientation constraints of CalibrationOptions, except 'none'."""
     return tuple(name for name in RELATIVE[1:] if _accepted(relative_orientation=name))
 
 
-def _accepted(**options):
+def _accepted(**options: Any) -> bool:
     try:
         CalibrationOptions(**options)
     except (TypeError, ValueError):
@@ -182,14 +194,16 @@ def _accepted(**options):
     return True
 
 
-def options_of(case):
+def options_of(case: Case) -> CalibrationOptions:
     """CalibrationOptions of the calibration of a case."""
     model, interior = {
         BEFORE: ('none', 'fixed'),
         HELD: ('knn', 'fixed'),
         KNOWN: ('none', 'estimated'),
     }.get(case.variant, (case.variant, 'estimated'))
-    relative = {} if case.relative == 'none' else {'relative_orientation': case.relative}
+    relative: dict[str, Any] = {}
+    if case.relative != 'none':
+        relative['relative_orientation'] = case.relative
     return CalibrationOptions(
         model=model, interior=interior, max_iterations=case.rounds, **relative
     )
@@ -202,7 +216,15 @@ def options_of(case):
 class Scene:
     """A virtual rig with its exposures for calibration and test."""
 
-    def __init__(self, seed, strength, false_matches, exposures, every, survey):
+    def __init__(
+        self,
+        seed: int,
+        strength: float,
+        false_matches: float,
+        exposures: int,
+        every: int,
+        survey: float,
+    ) -> None:
         rig = virtual_rig(seed, strength)
         self.rig = replace(rig, phantom=replace(rig.phantom, sd_mm=survey * rig.phantom.sd_mm))
         self._seed = seed
@@ -211,9 +233,11 @@ class Scene:
         self.recording = simulate_exposures(
             self.rig, exposures, seed, Detection(NOISE_PX, false_matches)
         )
-        self._tested = {}
+        self._tested: dict[tuple[tuple[str, ...], bool], Measured] = {}
 
-    def training(self, count, known):
+    def training(
+        self, count: int | None, known: bool
+    ) -> tuple[dict[str, list[Frame]], SimulatedExposures]:
         """Frames by fluoroscope for the calibration: count of their own, None: some of the
         recording.
         """
@@ -227,7 +251,7 @@ class Scene:
         )
         return self._frames(own, known), own
 
-    def test_network(self, fluoroscopes, known):
+    def test_network(self, fluoroscopes: tuple[str, ...], known: bool) -> Measured:
         """Measured network of the exposures for the test; the start values are those of the true
         calibration.
         """
@@ -243,7 +267,12 @@ class Scene:
             )
         return self._tested[key]
 
-    def _frames(self, simulated, known, chosen=lambda i: True):
+    def _frames(
+        self,
+        simulated: SimulatedExposures,
+        known: bool,
+        chosen: Callable[[int], bool] = lambda i: True,
+    ) -> dict[str, list[Frame]]:
         """Frames by fluoroscope; known: with the true distortion taken off."""
         out = {}
         for name, frames in simulated.frames.items():
@@ -254,11 +283,17 @@ class Scene:
             ]
         return out
 
-    def field(self, name):
+    def field(self, name: str) -> DistortionField:
         """True distortion of a fluoroscope."""
         return next(f.distortion for f in self.rig.fluoroscopes if f.name == name)
 
-    def errors(self, targets_id, xyz_mm, exposures, simulated):
+    def errors(
+        self,
+        targets_id: np.ndarray,
+        xyz_mm: np.ndarray,
+        exposures: Iterable[tuple[str, int, np.ndarray]],
+        simulated: SimulatedExposures,
+    ) -> np.ndarray:
         """RMSE (6,) [mm] of object points and of sources; exposures: (fluoroscope, number,
         position_mm).
         """
@@ -273,14 +308,14 @@ class Scene:
         return np.sqrt(np.concatenate([np.mean(points**2, axis=0), np.mean(sources**2, axis=0)]))
 
 
-def _undistorted(frame, uv):
+def _undistorted(frame: Frame, uv: np.ndarray) -> Frame:
     """A frame with other image points, without those that fall off the image."""
     on = points_on_image(uv, frame.image_size)
     return replace(frame, target_id=frame.target_id[on], uv=uv[on])
 
 
 @functools.lru_cache(maxsize=2)
-def scene_of(*key):
+def scene_of(*key: Any) -> Scene:
     """The Scene with this key: cases of one scene should be run one after the other."""
     return Scene(*key)
 
@@ -289,7 +324,7 @@ def scene_of(*key):
 # cases
 
 
-def run_case(case):
+def run_case(case: Case) -> Outcome:
     """Outcome of a case."""
     known = case.variant == KNOWN
     scene = scene_of(*case.scene)
@@ -340,7 +375,9 @@ def run_case(case):
     )
 
 
-def errors_of_test(scene, case, calibrations):
+def errors_of_test(
+    scene: Scene, case: Case, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> np.ndarray:
     """RMSE (6,) [mm] of the test exposures, adjusted with the calibrations held.
 
     The same as adjust_with_calibrations, except for the start values, and without covariances and
@@ -369,7 +406,7 @@ def errors_of_test(scene, case, calibrations):
     return scene.errors(measured.target_id, after.parameters.points_mm, exposures, scene.recording)
 
 
-def with_interior(measured, interior):
+def with_interior(measured: Measured, interior: np.ndarray) -> Parameters:
     """Start values of a network for other interior orientations (F, 3), which show nearly the same
     image.
 
@@ -390,10 +427,10 @@ def with_interior(measured, interior):
     return replace(start, interior=interior, rotation=rotation, position_mm=position)
 
 
-def _details(job):
+def _details(job: CalibrationResult) -> dict[str, Any]:
     """Residuals by fluoroscope and relative costs of a calibration."""
     residuals = {}
-    costs = ()
+    costs: tuple[np.ndarray, ...] = ()
     for run in job.runs.values():
         network = run.measured.network
         after = run.after
@@ -420,7 +457,12 @@ def _details(job):
 # correction itself
 
 
-def error_over_image(model, true_field, training_uv, image_size):
+def error_over_image(
+    model: CorrectionModel,
+    true_field: Callable[[np.ndarray], np.ndarray],
+    training_uv: np.ndarray,
+    image_size: tuple[int, int],
+) -> np.ndarray:
     """Errors (rows, columns, 2) [px] of corrected coordinates on a grid of pixels, NaN outside the
     calibrated area.
 
@@ -440,7 +482,7 @@ def error_over_image(model, true_field, training_uv, image_size):
     return out.reshape(*u.shape, 2).astype(np.float32)
 
 
-def projective_residuals(uv, ideal):
+def projective_residuals(uv: np.ndarray, ideal: np.ndarray) -> np.ndarray:
     """What is left (n, 2) of uv - ideal after the projective map of uv (8 parameters) that fits
     ideal best.
     """

@@ -1,10 +1,15 @@
 """Pictures of the validation experiment: Figures 1-10 of Chow et al. in their manner, and more."""
 
+from __future__ import annotations
+
 import io
 import os
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 from matplotlib import style
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter
 from PIL import Image
 
@@ -12,7 +17,8 @@ from fluoro_calib_ros.files.atomic import write_bytes
 from fluoro_calib_ros.report.style import BLACK, BLUE, GREY, RED, STYLE, new_figure, png_bytes
 from fluoro_calib_ros.simulation.rig import IMAGE_SIZE
 
-from .experiment import BEFORE, GRID_PX, HELD, KNOWN
+from .experiment import BEFORE, GRID_PX, HELD, KNOWN, Residuals
+from .experiment_plan import Outcomes, Plan
 
 # Okabe and Ito: colour-blind people can tell them apart, and the markers differ too.
 LOOK = {
@@ -33,15 +39,17 @@ PANEL = {
 }
 STRIPES = 24
 LIMIT = 10.0  # standard deviations shown to either side
+# F and G by round, in percent of the first.
+Costs = tuple[np.ndarray, ...]
 COLOURS = 96  # of a picture: as good to the eye, at a third of the size
 
 
-def title_of(variant):
+def title_of(variant: str) -> str:
     """Title of a panel: the paper's name of the variant, or the model."""
     return PANEL.get(variant, f'{variant}\n(interior estimated)')
 
 
-def write_all(plan, outcomes, folder):
+def write_all(plan: Plan, outcomes: Outcomes, folder: str | os.PathLike[str]) -> dict[str, str]:
     """Write all pictures of the experiment; returns their paths by key: 'figure 1' to 'figure 10',
     'curves', 'map'.
     """
@@ -55,7 +63,7 @@ def write_all(plan, outcomes, folder):
     return paths
 
 
-def _small(png, colours):
+def _small(png: bytes, colours: int) -> bytes:
     """The same picture with a palette."""
     buffer = io.BytesIO()
     picture = Image.open(io.BytesIO(png)).convert('RGB')
@@ -63,7 +71,7 @@ def _small(png, colours):
     return buffer.getvalue()
 
 
-def _figures(plan, outcomes):
+def _figures(plan: Plan, outcomes: Outcomes) -> Iterator[tuple[str, Figure]]:
     """Keys and figures of the experiment."""
     shown = tuple(dict.fromkeys((HELD, 'knn', plan.default)))
     of = {
@@ -97,7 +105,7 @@ def _figures(plan, outcomes):
 # Figures 1 and 2
 
 
-def cost_figure(costs):
+def cost_figure(costs: Mapping[str, Costs]) -> Figure:
     """F and G of every round in percent of the first; a panel for each variant."""
     figure = new_figure(
         4.4 * len(costs), 4.6, 'Figure 1: relative cost at every iteration, fluoroscopic system 1'
@@ -113,7 +121,7 @@ def cost_figure(costs):
     return figure
 
 
-def total_cost_figure(costs):
+def total_cost_figure(costs: Mapping[str, Costs]) -> Figure:
     """Mean of F and G of every round, one line for each variant."""
     figure = new_figure(9, 4.4, 'Figure 2: weighted average of both costs, fluoroscopic system 1')
     axes = figure.subplots()
@@ -138,7 +146,7 @@ def total_cost_figure(costs):
     return figure
 
 
-def _percent(axes, values):
+def _percent(axes: Axes, values: Sequence[float]) -> None:
     """Plain numbers on a logarithmic axis of percents."""
     shown = [v for v in values if v > 0]
     axes.set_ylim(0.8 * min(shown), 1.25 * max(shown))
@@ -152,7 +160,7 @@ def _percent(axes, values):
 # Figures 3 to 10
 
 
-def histogram_figure(residuals, system, axis):
+def histogram_figure(residuals: Mapping[str, Residuals], system: str, axis: int) -> Figure:
     """Histograms of the normalised residuals of one coordinate, with the unit normal."""
     number = (3 if system == '1' else 7) + axis
     figure = new_figure(
@@ -201,7 +209,7 @@ def histogram_figure(residuals, system, axis):
     return figure
 
 
-def position_figure(residuals, system, axis):
+def position_figure(residuals: Mapping[str, Residuals], system: str, axis: int) -> Figure:
     """Residuals of one coordinate over that coordinate; the first panel has its own scale."""
     number = (5 if system == '1' else 9) + axis
     figure = new_figure(
@@ -232,7 +240,7 @@ def position_figure(residuals, system, axis):
     return figure
 
 
-def _scatter(axes, r, axis, limit, colour):
+def _scatter(axes: Axes, r: Residuals, axis: int, limit: float, colour: str) -> None:
     """Dots of inliers, crosses of outliers (at the rim if beyond), and what the inliers do by
     stripes.
     """
@@ -271,7 +279,7 @@ def _scatter(axes, r, axis, limit, colour):
 # beyond the paper
 
 
-def map_figure(maps):
+def map_figure(maps: Mapping[str, np.ndarray]) -> Figure:
     """Size of the error of the correction over the image, one panel for each variant to one colour
     scale.
     """
@@ -310,7 +318,7 @@ def map_figure(maps):
     return figure
 
 
-def curve_figure(plan, outcomes):
+def curve_figure(plan: Plan, outcomes: Outcomes) -> Figure:
     """Accuracy over the number of training exposures: object points, source, and the correction
     itself.
     """
@@ -358,7 +366,7 @@ def curve_figure(plan, outcomes):
     return figure
 
 
-def curves(plan, outcomes, variant):
+def curves(plan: Plan, outcomes: Outcomes, variant: str) -> np.ndarray:
     """Three arrays (counts,) of a variant: object points [mm], source [mm], correction [px]; rms
     over the rigs.
     """

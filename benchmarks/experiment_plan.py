@@ -1,18 +1,33 @@
 """Which cases the validation experiment consists of, and how they are run on two processes."""
 
+from __future__ import annotations
+
 import multiprocessing
 import os
 import sys
 import time
 from collections import defaultdict
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
+from typing import Any
 
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 
-from .experiment import BEFORE, HELD, KNOWN, Case, available_models, available_relative, run_case
+from .experiment import (
+    BEFORE,
+    HELD,
+    KNOWN,
+    Case,
+    Outcome,
+    available_models,
+    available_relative,
+    run_case,
+)
 
 PROCESSES = 2
+
+Outcomes = dict[Case, Outcome]
 
 
 @dataclass(frozen=True)
@@ -37,25 +52,32 @@ class Plan:
     of the survey in the paper's tables.
     """
 
-    models: tuple
+    models: tuple[str, ...]
     default: str
-    relative: tuple
+    relative: tuple[str, ...]
     exposures: int
     every: int
-    curve: tuple
-    curve_seeds: tuple
-    seeds: tuple
-    joint_seeds: tuple
-    settings: tuple
+    curve: tuple[int, ...]
+    curve_seeds: tuple[int, ...]
+    seeds: tuple[int, ...]
+    joint_seeds: tuple[int, ...]
+    settings: tuple[Setting, ...]
     rounds: int
     paper_survey: float
 
     @property
-    def trained(self):
+    def trained(self) -> int:
         """Number of training exposures of the paper's experiment."""
         return len(range(0, self.exposures, self.every))
 
-    def case(self, seed, variant, fluoroscopes=('a',), training=None, **more):
+    def case(
+        self,
+        seed: int,
+        variant: str,
+        fluoroscopes: tuple[str, ...] = ('a',),
+        training: int | None = None,
+        **more: Any,
+    ) -> Case:
         """A case of this size."""
         training = None if training == self.trained else training
         return Case(
@@ -69,11 +91,11 @@ class Plan:
             **more,
         )
 
-    def paper_variants(self):
+    def paper_variants(self) -> tuple[str, ...]:
         """Variants of the paper's tables and beyond, in order."""
         return (BEFORE, HELD, *self.models, KNOWN)
 
-    def paper_cases(self, system):
+    def paper_cases(self, system: str) -> dict[str, Case]:
         """Cases by variant of system 'a', 'b' or 'a+b' (joint)."""
         names = tuple(system.split('+'))
         return {
@@ -88,7 +110,7 @@ class Plan:
             for v in self.paper_variants()
         }
 
-    def cost_cases(self):
+    def cost_cases(self) -> dict[str, Case]:
         """Cases of system 1 whose rounds are shown, by variant. The survey counts fully: where it
         hardly does, C_r of a bead that is seen once or twice is nearly singular, and G is that of
         these few beads.
@@ -98,7 +120,7 @@ class Plan:
             for v in dict.fromkeys((HELD, 'knn', self.default))
         }
 
-    def curve_cases(self):
+    def curve_cases(self) -> dict[tuple[str, int, int], Case]:
         """Cases by variant, count of training exposures and seed."""
         return {
             (v, count, seed): self.case(seed, v, training=count)
@@ -107,7 +129,7 @@ class Plan:
             for seed in self.curve_seeds
         }
 
-    def setting_cases(self, setting):
+    def setting_cases(self, setting: Setting) -> dict[tuple[str, int], Case]:
         """Cases by variant and seed."""
         return {
             (v, seed): self.case(
@@ -121,9 +143,9 @@ class Plan:
             for seed in self.seeds
         }
 
-    def joint_cases(self):
+    def joint_cases(self) -> dict[tuple[str, int], Case]:
         """Cases of the default model by label and seed."""
-        kinds = {'separate': {}, 'joint': {'joint': True}}
+        kinds: dict[str, dict[str, Any]] = {'separate': {}, 'joint': {'joint': True}}
         kinds.update(
             {
                 f'joint, relative orientation {r}': {'joint': True, 'relative': r}
@@ -136,20 +158,18 @@ class Plan:
             for seed in self.joint_seeds
         }
 
-    def cases(self):
+    def cases(self) -> list[Case]:
         """All cases, each once."""
         listed = [c for system in ('a', 'b', 'a+b') for c in self.paper_cases(system).values()]
-        for more in (
-            self.cost_cases(),
-            self.curve_cases(),
-            self.joint_cases(),
-            *map(self.setting_cases, self.settings),
-        ):
-            listed += more.values()
+        listed += self.cost_cases().values()
+        listed += self.curve_cases().values()
+        listed += self.joint_cases().values()
+        for setting in self.settings:
+            listed += self.setting_cases(setting).values()
         return list(dict.fromkeys(listed))  # the first of equals has its details
 
 
-def full_plan():
+def full_plan() -> Plan:
     """The experiment of docs/accuracy.md."""
     return Plan(
         available_models(),
@@ -178,7 +198,7 @@ def full_plan():
     )
 
 
-def quick_plan():
+def quick_plan() -> Plan:
     """The same in small: every section is there, but the figures tell little."""
     default = CalibrationOptions().model
     hard = Setting(
@@ -204,7 +224,7 @@ def quick_plan():
 # running
 
 
-def run(cases, processes=PROCESSES):
+def run(cases: Sequence[Case], processes: int = PROCESSES) -> Outcomes:
     """Outcomes by case. Cases of one recording run in one process, the longest groups first."""
     groups = defaultdict(list)
     for case in cases:
@@ -212,7 +232,7 @@ def run(cases, processes=PROCESSES):
     ordered = sorted(groups.values(), key=lambda group: -sum(map(_effort, group)))
     for name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS', 'MKL_NUM_THREADS'):
         os.environ[name] = '1'  # for the processes that are started below
-    out = {}
+    out: Outcomes = {}
     began = time.monotonic()
     with ProcessPoolExecutor(processes, multiprocessing.get_context('spawn')) as pool:
         running = {pool.submit(_run_group, group): group for group in ordered}
@@ -225,7 +245,7 @@ def run(cases, processes=PROCESSES):
     return out
 
 
-def _run_group(group):
+def _run_group(group: Sequence[Case]) -> list[Outcome]:
     """Outcomes of cases, each told on the standard error output."""
     outcomes = []
     for case in group:
@@ -242,7 +262,7 @@ def _run_group(group):
     return outcomes
 
 
-def _effort(case):
+def _effort(case: Case) -> float:
     """Time of a case, roughly, in units of one fluoroscope with 15 exposures."""
     size = len(case.fluoroscopes)
     return size * size + size * (case.training or case.exposures / case.every) / 15

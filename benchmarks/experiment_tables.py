@@ -2,12 +2,17 @@
 comparisons over rigs.
 """
 
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+
 import numpy as np
 
 from fluoro_calib_ros.report.tables import markdown_table
 
-from .experiment import BEFORE, HELD, KNOWN
+from .experiment import BEFORE, HELD, KNOWN, Outcome
 from .experiment_figures import curves
+from .experiment_plan import Outcomes, Plan, Setting
 
 AXES = ('X', 'Y', 'Z', 'Xo', 'Yo', 'Zo')
 PAPER_ROWS = ('before', 'after', 'after w/ IOP')
@@ -60,17 +65,19 @@ NAMES = {
 }
 
 
-def label_of(variant):
+def label_of(variant: str) -> str:
     """First cell of a row of ours."""
     return NAMES.get(variant, f'ours: {variant}')
 
 
-def gains(values, first):
+def gains(values: Iterable[float], first: Iterable[float]) -> list[str]:
     """Improvements [%] over the row before, as text."""
     return [f'{100 * (1 - v / b):.1f}' for v, b in zip(values, first)]
 
 
-def object_table(outcomes, paper, which):
+def object_table(
+    outcomes: Mapping[str, Outcome], paper: Sequence[Sequence[float]], which: str
+) -> str:
     """Tables 2, 3, 5, 6, 8, 9: RMSE of object points and sources; which: 'inside' or 'outside'."""
     rows = []
     for label, values in zip(PAPER_ROWS, paper):
@@ -98,7 +105,7 @@ def object_table(outcomes, paper, which):
     return markdown_table(['', *(f'{a} [mm]' for a in AXES), *(f'{a} [%]' for a in AXES)], rows)
 
 
-def reprojection_table(outcomes, paper):
+def reprojection_table(outcomes: Mapping[str, Outcome], paper: Sequence[Sequence[float]]) -> str:
     """Tables 1, 4, 7: cost and RMSE of the in-sample residuals."""
     header = [
         '',
@@ -128,7 +135,7 @@ def reprojection_table(outcomes, paper):
                 '-',
             ]
         )
-    first = None
+    first: list[float] = []
     for variant, outcome in outcomes.items():
         if outcome.failed:
             rows.append([label_of(variant), *['-'] * 10])
@@ -146,7 +153,7 @@ def reprojection_table(outcomes, paper):
     return markdown_table(header, rows)
 
 
-def reprojection(outcome):
+def reprojection(outcome: Outcome) -> list[float]:
     """Cost, reweighted RMSE x, y and raw RMSE x, y [px] of all fluoroscopes of an outcome."""
     residuals = list(outcome.residuals.values())
     both = residuals[0]
@@ -159,7 +166,7 @@ def reprojection(outcome):
 # beyond the paper
 
 
-def curve_table(plan, outcomes, which, digits):
+def curve_table(plan: Plan, outcomes: Outcomes, which: int, digits: int) -> str:
     """One figure for each variant and count of training exposures; which: 0 points, 1 source, 2
     correction.
     """
@@ -173,21 +180,21 @@ def curve_table(plan, outcomes, which, digits):
 class Comparison:
     """Figures of a comparison over several rigs, by variant; failed cases are left out."""
 
-    def __init__(self, plan, outcomes, setting):
+    def __init__(self, plan: Plan, outcomes: Outcomes, setting: Setting) -> None:
         self._outcomes = {key: outcomes[case] for key, case in plan.setting_cases(setting).items()}
         self.plan = plan
         self.setting = setting
 
-    def __getitem__(self, key):
+    def __getitem__(self, key: tuple[str, int]) -> Outcome:
         return self._outcomes[key]
 
-    def seeds(self, variant):
+    def seeds(self, variant: str) -> list[int]:
         """Seeds for which neither this variant nor known distortion failed."""
         return [
             s for s in self.plan.seeds if not (self[variant, s].failed or self[KNOWN, s].failed)
         ]
 
-    def rms(self, variant, figure):
+    def rms(self, variant: str, figure: str) -> float:
         """Root mean square over the rigs of a method of Outcome."""
         return float(
             np.sqrt(
@@ -195,7 +202,7 @@ class Comparison:
             )
         )
 
-    def ratios(self, variant, figure='points_mm'):
+    def ratios(self, variant: str, figure: str = 'points_mm') -> np.ndarray:
         """Ratios to known distortion, one for each rig."""
         return np.array(
             [
@@ -204,7 +211,7 @@ class Comparison:
             ]
         )
 
-    def image_px(self, variant, within=None):
+    def image_px(self, variant: str, within: str | None = None) -> float:
         """RMSE [px] of the correction, rms over the rigs; within: over the area that this variant
         covers too.
         """
@@ -225,7 +232,7 @@ class Comparison:
             )
         )
 
-    def table(self):
+    def table(self) -> str:
         """Means over the rigs, a row for each variant."""
         header = [
             'model',
@@ -243,7 +250,7 @@ class Comparison:
         ]
         return markdown_table(header, [self._row(v) for v in (BEFORE, *self.plan.models, KNOWN)])
 
-    def _row(self, variant):
+    def _row(self, variant: str) -> list[str]:
         seeds = self.seeds(variant)
         if not seeds:
             return [variant, *['-'] * 11]
@@ -276,7 +283,7 @@ class Comparison:
             else f'{np.median([self[variant, s].seconds for s in seeds]):.1f}'
         ]
 
-    def by_rig(self):
+    def by_rig(self) -> str:
         """Ratio to known distortion for each rig and model, and what the default chose."""
         rows = []
         for s in self.plan.seeds:
@@ -293,7 +300,7 @@ class Comparison:
         )
 
 
-def chosen(outcome):
+def chosen(outcome: Outcome) -> str:
     """Kind, k and rounds of a calibration, in words."""
     if outcome.failed:
         return 'failed'
@@ -303,7 +310,7 @@ def chosen(outcome):
     return f'{kinds}; {outcome.rounds} rounds{"" if outcome.converged else ", not converged"}'
 
 
-def joint_table(plan, outcomes):
+def joint_table(plan: Plan, outcomes: Outcomes) -> str:
     """Separate and joint calibration, tested alike; gains over the separate one in percent."""
     cases = plan.joint_cases()
     rows = []
@@ -340,10 +347,10 @@ def joint_table(plan, outcomes):
     )
 
 
-def joint_figures(found):
+def joint_figures(found: Sequence[Outcome]) -> tuple[float, float, float, float]:
     """RMS over the rigs of points 3-D, source 3-D [mm] and correction [px]; mean time [s]."""
 
-    def rms(values):
+    def rms(values: Sequence[float]) -> float:
         return float(np.sqrt(np.mean(np.square(values))))
 
     return (

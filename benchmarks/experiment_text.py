@@ -2,12 +2,17 @@
 follow from them.
 """
 
+from __future__ import annotations
+
 import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from .experiment import BEFORE, HELD, KNOWN, NOISE_PX
+from .experiment import BEFORE, HELD, KNOWN, NOISE_PX, Case
 from .experiment_figures import curves
+from .experiment_plan import Outcomes, Plan
 from .experiment_tables import (
     PAPER_INSIDE,
     PAPER_OUTSIDE,
@@ -19,6 +24,8 @@ from .experiment_tables import (
     object_table,
     reprojection_table,
 )
+
+Paths = Mapping[str, str]  # of the pictures, by key
 
 AIM = 1.04  # 3-D RMSE of object points over that of perfectly known distortion, 15 exposures
 SYSTEMS = {
@@ -81,7 +88,7 @@ FIGURE_TEXT = {
 }
 
 
-def picture(paths, key, document, caption):
+def picture(paths: Paths, key: str, document: Path, caption: str) -> str:
     """Markdown of a picture with its caption."""
     if key not in paths:
         return ''
@@ -93,7 +100,7 @@ def picture(paths, key, document, caption):
 # The experiment of the paper
 
 
-def paper_section(plan, outcomes, paths, document):
+def paper_section(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) -> str:
     """Figures 1-10 and Tables 1-9."""
     datum = (
         ''
@@ -128,7 +135,7 @@ def paper_section(plan, outcomes, paths, document):
     return '\n'.join(parts)
 
 
-def tables_of(plan, outcomes, system, first):
+def tables_of(plan: Plan, outcomes: Outcomes, system: str, first: int) -> list[str]:
     """Three tables of a system, numbered as in the paper."""
     of = {v: outcomes[c] for v, c in plan.paper_cases(system).items()}
     name = SYSTEMS[system]
@@ -149,7 +156,7 @@ def tables_of(plan, outcomes, system, first):
     ]
 
 
-def convergence(plan, outcomes):
+def convergence(plan: Plan, outcomes: Outcomes) -> str:
     """How many rounds each calibration of system 1 took."""
     of = {v: outcomes[c] for v, c in plan.cost_cases().items()}
     said = [
@@ -167,7 +174,7 @@ def convergence(plan, outcomes):
 # Beyond the paper
 
 
-def curve_section(plan, outcomes, paths, document):
+def curve_section(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) -> str:
     """Accuracy as a function of the number of training exposures."""
     tested = plan.exposures - plan.trained
     rigs = f'rig{"s" * (len(plan.curve_seeds) > 1)} {", ".join(map(str, plan.curve_seeds))}'
@@ -196,7 +203,7 @@ def curve_section(plan, outcomes, paths, document):
     )
 
 
-def rigs_section(comparisons, paths, document):
+def rigs_section(comparisons: Sequence[Comparison], paths: Paths, document: Path) -> str:
     """Comparison of the models over several rigs."""
     plan = comparisons[0].plan
     parts = [
@@ -220,7 +227,7 @@ def rigs_section(comparisons, paths, document):
     return '\n'.join(parts)
 
 
-def joint_section(plan, outcomes):
+def joint_section(plan: Plan, outcomes: Outcomes) -> str:
     """Compare joint and separate calibration, and the relative orientation constraint."""
     text = [
         '## 4. Joint calibration and relative orientation\n',
@@ -238,7 +245,7 @@ def joint_section(plan, outcomes):
     return '\n'.join(text)
 
 
-def summary_section(plan, comparisons):
+def summary_section(plan: Plan, comparisons: Sequence[Comparison]) -> str:
     """The most important figures."""
     lines = ['## Summary\n']
     for c in comparisons:
@@ -271,7 +278,7 @@ def summary_section(plan, comparisons):
 # Shortcomings
 
 
-def shortcomings(plan, outcomes, comparisons):
+def shortcomings(plan: Plan, outcomes: Outcomes, comparisons: Sequence[Comparison]) -> list[str]:
     """Sentences on unmet aims and other shortcomings; each one follows from the figures."""
     return [
         *_of_settings(plan, comparisons),
@@ -282,7 +289,7 @@ def shortcomings(plan, outcomes, comparisons):
     ]
 
 
-def _of_settings(plan, comparisons):
+def _of_settings(plan: Plan, comparisons: Sequence[Comparison]) -> Iterator[str]:
     for c in comparisons:
         if not c.seeds(plan.default):
             continue
@@ -326,7 +333,7 @@ def _of_settings(plan, comparisons):
             )
 
 
-def _of_paper(plan, outcomes):
+def _of_paper(plan: Plan, outcomes: Outcomes) -> Iterator[str]:
     for system, name in SYSTEMS.items():
         of = {v: outcomes[c] for v, c in plan.paper_cases(system).items()}
         if any(of[v].failed for v in (BEFORE, 'knn', plan.default, KNOWN) if v in of):
@@ -346,7 +353,7 @@ def _of_paper(plan, outcomes):
             )
 
 
-def _of_curves(plan, outcomes):
+def _of_curves(plan: Plan, outcomes: Outcomes) -> Iterator[str]:
     values = {v: curves(plan, outcomes, v)[0] for v in (*plan.models, KNOWN)}
     ratio = values[plan.default] / values[KNOWN]
     late = [f'{count} ({r:.2f} times)' for count, r in zip(plan.curve, ratio) if r > AIM]
@@ -357,7 +364,7 @@ def _of_curves(plan, outcomes):
         )
 
 
-def _of_costs(plan, outcomes):
+def _of_costs(plan: Plan, outcomes: Outcomes) -> Iterator[str]:
     for variant, case in plan.cost_cases().items():
         if not len(outcomes[case].costs):
             continue
@@ -371,7 +378,7 @@ def _of_costs(plan, outcomes):
             )
 
 
-def _of_cases(outcomes):
+def _of_cases(outcomes: Outcomes) -> Iterator[str]:
     failed = [c for c, o in outcomes.items() if o.failed]
     for case in failed:
         yield f'{_named(case)} failed: {outcomes[case].failed}'
@@ -395,7 +402,7 @@ def _of_cases(outcomes):
         )
 
 
-def _named(case):
+def _named(case: Case) -> str:
     settings = f', distortion times {case.strength:g}' if case.strength != 1 else ''
     count = f'{case.training} exposures, ' if case.training else ''
     joint = ', joint' if case.joint else ''
@@ -403,7 +410,7 @@ def _named(case):
     return f'`{case.variant}` ({count}rig {case.seed}, {fluoroscopes}{joint}{settings})'
 
 
-def document_text(plan, outcomes, paths, document):
+def document_text(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) -> str:
     """The whole text of docs/accuracy.md."""
     comparisons = [Comparison(plan, outcomes, setting) for setting in plan.settings]
     models = ''.join(

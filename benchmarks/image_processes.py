@@ -7,6 +7,8 @@ The camera publishes bytes that are serialised already, as a driver that does no
 would: what the machine has is left to the node under test.
 """
 
+from __future__ import annotations
+
 import struct
 import sys
 import threading
@@ -49,7 +51,7 @@ class CameraParameters:
 class Camera(Node):
     """Publishes images of the phantom on a/image_raw at a rate, stamped just before."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('camera')
         self._settings = ParameterGroup(CameraParameters).declare(self)
         encoding = self._settings.encoding
@@ -72,7 +74,7 @@ class Camera(Node):
         self._worker = threading.Thread(target=self._run, daemon=True)
         self._worker.start()
 
-    def _run(self):
+    def _run(self) -> None:
         wait_for_readers(self, [self._output], self._settings.wait_for_readers, self._ending)
         began = time.monotonic()
         for number in range(self._settings.frames):
@@ -91,7 +93,7 @@ class Camera(Node):
         wait_until_acknowledged([self._output], self._ending)
         rclpy.try_shutdown()
 
-    def stop(self):
+    def stop(self) -> None:
         """End publishing."""
         self._ending.set()
         self._worker.join(2.0)
@@ -100,20 +102,21 @@ class Camera(Node):
 class Relay(ManagedNode):
     """Publishes every image of a/image_raw on a/relayed."""
 
-    def __init__(self):
+    def __init__(self) -> None:
         super().__init__('relay')
-        self._reader = None
+        self._reader: StreamReader | None = None
 
-    def activate(self):
+    def activate(self) -> None:
         """Begin to relay."""
-        self._reader = StreamReader(self, all_fatal(self))
+        reader = StreamReader(self, all_fatal(self))
         publisher = self.create_publisher(Image, 'a/relayed', images_qos())
-        self._reader.subscribe(
+        reader.subscribe(
             Image, 'a/image_raw', lambda message, _: publisher.publish(message), images_qos()
         )
-        self._reader.start()
+        reader.start()
+        self._reader = reader
 
-    def deactivate(self):
+    def deactivate(self) -> None:
         """Stop relaying."""
         if self._reader is not None:
             self._reader.stop()

@@ -11,6 +11,8 @@ of Fast DDS is smaller than an image by default: the cases `wide` are measured w
 as docs/images.md tells to make it.
 """
 
+from __future__ import annotations
+
 import argparse
 import json
 import os
@@ -20,7 +22,9 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -28,12 +32,17 @@ from matplotlib.figure import Figure
 from scipy.ndimage import map_coordinates
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 from .timing import table, timed
+
+if TYPE_CHECKING:
+    from fluoro_calib_ros.nodes.runtime.stream_reader import StreamReader
 
 TICK = os.sysconf('SC_CLK_TCK')
 WIDE = """<?xml version="1.0" encoding="UTF-8"?>
@@ -62,7 +71,7 @@ CASES = {  # name: (encoding, rate, node)
 OUTPUTS = {'image_node': 'a/image_corrected', 'relay': 'a/relayed'}
 
 
-def calibration_of_the_rig():
+def calibration_of_the_rig() -> tuple[FluoroscopeCalibration, list[Frame]]:
     """Calibration and frames of fluoroscope a of the rig that the camera shows."""
     rig = virtual_rig(1)
     frames = simulate_exposures(rig, 15, 1).frames['a']
@@ -72,7 +81,9 @@ def calibration_of_the_rig():
 # ---- one core
 
 
-def on_one_core(calibration, frames, repeats=200):
+def on_one_core(
+    calibration: FluoroscopeCalibration, frames: Sequence[Frame], repeats: int = 200
+) -> list[dict[str, Any]]:
     """Times of the correction alone, and of scipy's map_coordinates with the same map.
 
     ms: median wall time; rate: images per second of CPU.
@@ -111,7 +122,7 @@ def on_one_core(calibration, frames, repeats=200):
 class Reader:
     """Publishes the calibration, and records the outputs of the nodes."""
 
-    def __init__(self, calibration):
+    def __init__(self, calibration: FluoroscopeCalibration) -> None:
         import rclpy
         from fluoro_calib_msgs.msg import FluoroscopeCalibration
 
@@ -125,10 +136,10 @@ class Reader:
             FluoroscopeCalibration, 'a/calibration', latched_qos()
         )
         self._latched.publish(message_from_calibration(calibration))
-        self.came = []
-        self.reader = None
+        self.came: list[tuple[int, int]] = []
+        self._reader: StreamReader | None = None
 
-    def listen(self, topic):
+    def listen(self, topic: str) -> None:
         """Collect (stamp, latency) [ns] of a topic, without decoding the images."""
         from sensor_msgs.msg import Image
 
@@ -137,20 +148,26 @@ class Reader:
 
         from .online import logged
 
-        came = []
+        came: list[tuple[int, int]] = []
         self.came = came
 
-        def take(data, info):
+        def take(data: bytes, info: dict[str, int]) -> None:
             seconds, nanoseconds = struct.unpack_from('<iI', data, 4)
             stamp = seconds * 10**9 + nanoseconds
             came.append((stamp, info['source_timestamp'] - stamp))
 
-        self.reader = StreamReader(self.node, logged(self.node))
-        self.reader.subscribe(Image, topic, take, images_qos(), decode=bytes)
-        self.reader.start()
+        reader = StreamReader(self.node, logged(self.node))
+        reader.subscribe(Image, topic, take, images_qos(), decode=bytes)
+        reader.start()
+        self._reader = reader
+
+    def stop(self) -> None:
+        """Stop recording."""
+        if self._reader is not None:
+            self._reader.stop()
 
 
-def wait(condition, seconds, what):
+def wait(condition: Callable[[], Any], seconds: float, what: str) -> None:
     """Wait until condition() is true."""
     end = time.monotonic() + seconds
     while not condition():
@@ -159,13 +176,13 @@ def wait(condition, seconds, what):
         time.sleep(0.02)
 
 
-def _cpu(process):
+def _cpu(process: subprocess.Popen) -> float:
     """CPU time [s] that a process has used, all its threads together."""
     fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / TICK
 
 
-def _start(*command, log, **parameters):
+def _start(*command: str, log: IO[bytes], **parameters: Any) -> subprocess.Popen:
     arguments = [word for key, value in parameters.items() for word in ('-p', f'{key}:={value}')]
     return subprocess.Popen(
         [sys.executable, '-m', *command, '--ros-args', '-p', 'fluoroscopes:=[a]', *arguments],
@@ -174,7 +191,9 @@ def _start(*command, log, **parameters):
     )
 
 
-def measured(reader, encoding, rate, node, seconds, log):
+def measured(
+    reader: Reader, encoding: str, rate: float, node: str, seconds: float, log: IO[bytes]
+) -> dict[str, Any]:
     """Figures of a node at a rate: losses, latencies [ms] and CPU time per image [ms]."""
     frames = round(rate * seconds)
     command = (
@@ -217,14 +236,14 @@ def measured(reader, encoding, rate, node, seconds, log):
             if process.poll() is None:
                 process.send_signal(signal.SIGINT)
             process.wait(20)
-        reader.reader.stop()
+        reader.stop()
     return {
         **_stream_figures(np.array(reader.came), frames),
         'cpu_ms': 1e3 * used / max(counted, 1),
     }
 
 
-def _stream_figures(came, frames):
+def _stream_figures(came: np.ndarray, frames: int) -> dict[str, Any]:
     """Losses, rate [Hz] and latencies [ms] of the stamps and latencies (n, 2) [ns] that came."""
     latency = came[:, 1] * 1e-6
     span = (came[-1, 0] - came[0, 0]) * 1e-9
@@ -238,7 +257,9 @@ def _stream_figures(came, frames):
     }
 
 
-def live(calibration, seconds, only=''):
+def live(
+    calibration: FluoroscopeCalibration, seconds: float, only: str = ''
+) -> dict[str, dict[str, Any]]:
     """Figures of the cases whose name contains `only`, by case, with the present transports."""
     import rclpy
 
@@ -257,7 +278,7 @@ def live(calibration, seconds, only=''):
     return out
 
 
-def live_wide(seconds, only=''):
+def live_wide(seconds: float, only: str = '') -> dict[str, dict[str, Any]]:
     """The same in another process, with large segments of shared memory."""
     with tempfile.NamedTemporaryFile('w', suffix='.xml') as profile:
         profile.write(WIDE)
@@ -280,7 +301,9 @@ def live_wide(seconds, only=''):
     return {f'{case}, wide': figures for case, figures in json.loads(done.stdout).items()}
 
 
-def run(seconds=10.0, only=''):
+def run(
+    seconds: float = 10.0, only: str = ''
+) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
     """Figures of one core, and live figures by case."""
     calibration, frames = calibration_of_the_rig()
     return on_one_core(calibration, frames), live(calibration, seconds, only) | live_wide(
@@ -288,7 +311,7 @@ def run(seconds=10.0, only=''):
     )
 
 
-def draw(path, lines=15):
+def draw(path: str, lines: int = 15) -> None:
     """Draw a square pattern of beads as observed and as corrected, with straight lines."""
     fluoroscope = virtual_rig(1).fluoroscopes[0]
     calibration = calibration_of_the_rig()[0]
@@ -313,7 +336,7 @@ def draw(path, lines=15):
     figure.savefig(path)
 
 
-def text_of(core, cases):
+def text_of(core: Sequence[dict[str, Any]], cases: dict[str, dict[str, Any]]) -> str:
     """The tables."""
     rows = [
         [

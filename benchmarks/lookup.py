@@ -5,10 +5,14 @@ python -m benchmarks.lookup             all correction models
 python -m benchmarks.lookup knn auto    these only
 """
 
+from __future__ import annotations
+
 import argparse
 import sys
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from sklearn.neighbors import KNeighborsRegressor
@@ -63,7 +67,7 @@ class Figures:
     ratio: float
 
 
-def mean_time(function, calls):
+def mean_time(function: Callable[[], Any], calls: int) -> float:
     """Mean wall time [s] of a call."""
     began = time.perf_counter()
     for _ in range(calls):
@@ -71,7 +75,9 @@ def mean_time(function, calls):
     return (time.perf_counter() - began) / calls
 
 
-def beside_each_other(ours, correct, theirs):
+def beside_each_other(
+    ours: Callable[[], Any], correct: Callable[[], Any], theirs: Callable[[], Any]
+) -> tuple[float, float, float, float]:
     """Median times [s] of calls of three functions, and median ratio of the third to the first, in
     rounds of all three: what else the machine does hits all of them.
     """
@@ -84,7 +90,7 @@ def beside_each_other(ours, correct, theirs):
     return *np.median(rounds, axis=0), float(np.median(rounds[:, 2] / rounds[:, 0]))
 
 
-def points_per_second(grid, rng):
+def points_per_second(grid: CorrectionGrid, rng: np.random.Generator) -> float:
     """Points of a large array that are looked up in a second of a core: du, dv, standard deviation
     and status of pixels in random order, which is the worst for the cache. Median of 15.
     """
@@ -99,7 +105,7 @@ def points_per_second(grid, rng):
     return float(POINTS / np.median(seconds))
 
 
-def measure(model):
+def measure(model: str) -> Figures:
     """Figures of a correction model (of CalibrationOptions) for a calibration of the virtual rig
     with 15 exposures.
     """
@@ -139,7 +145,7 @@ def measure(model):
     )
 
 
-def row(f):
+def row(f: Figures) -> list[str]:
     """The row of the table for Figures."""
     return [
         f'{f.kind}, k = {f.k}' if f.k else f.kind,
@@ -154,7 +160,7 @@ def row(f):
     ]
 
 
-def lookup_section(models=MODELS):
+def lookup_section(models: Sequence[str] = MODELS) -> str:
     """The lookup grid by correction model."""
     return section(
         'Lookup of the correction',
@@ -171,7 +177,7 @@ def lookup_section(models=MODELS):
     )
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> None:
     """Print the table."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks.lookup', description=__doc__.splitlines()[0]

@@ -11,6 +11,8 @@ the stamp of the simulator, set just before it publishes, to the time stamp that
 output when it is published, with the way through DDS in it.
 """
 
+from __future__ import annotations
+
 import argparse
 import os
 import signal
@@ -18,7 +20,9 @@ import struct
 import subprocess
 import sys
 import time
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 import rclpy
@@ -35,12 +39,14 @@ from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.result import FluoroscopeCalibration as Calibration
 from fluoro_calib_ros.calibration.rig_orientation import orientation_of_exposures
 from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orientation
 from fluoro_calib_ros.nodes.runtime.qos import latched_qos, observations_qos
 from fluoro_calib_ros.nodes.runtime.stream_reader import FaultHandlers, StreamReader
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation as Orientation
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
@@ -72,7 +78,7 @@ OUTPUTS = {
 TICK = os.sysconf('SC_CLK_TCK')
 
 
-def logged(node):
+def logged(node: Node) -> FaultHandlers:
     """Log every fault of a stream reader of this process."""
     fatal = node.get_logger().fatal
     return FaultHandlers(fatal, lambda topic, error: fatal(f'{topic}: {error!r}'), fatal)
@@ -81,7 +87,7 @@ def logged(node):
 class Reader(Node):
     """Publishes the calibration, and counts what the nodes put out."""
 
-    def __init__(self, calibrations, orientation):
+    def __init__(self, calibrations: Mapping[str, Calibration], orientation: Orientation) -> None:
         super().__init__('reader')
         self.spinner = SingleThreadedExecutor()
         self.spinner.add_node(self)
@@ -92,7 +98,7 @@ class Reader(Node):
         self.create_publisher(RigOrientation, 'rig_orientation', latched_qos()).publish(
             message_from_orientation(orientation)
         )
-        self.ready = set()  # fluoroscopes that are corrected
+        self.ready: set[str] = set()  # fluoroscopes that are corrected
         for name in NAMES:
             self.create_subscription(
                 CameraInfo,
@@ -100,12 +106,13 @@ class Reader(Node):
                 lambda _, name=name: self.ready.add(name),
                 latched_qos(),
             )
-        self.within = {}  # node: [(p50, p99), ...] [ms]
+        self.within: dict[str, list[tuple[float, float]]] = {}  # node: [(p50, p99), ...] [ms]
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
-        self.came = {}  # (node, fluoroscope): [(frame number, latency [ns]), ...]
-        self.reader = None
+        # (node, fluoroscope): [(frame number, latency [ns]), ...]
+        self.came: dict[tuple[str, str], list[tuple[int, int]]] = {}
+        self.reader: StreamReader | None = None
 
-    def _on_diagnostics(self, array):
+    def _on_diagnostics(self, array: DiagnosticArray) -> None:
         for status in array.status:
             values = {v.key: v.value for v in status.values}
             if 'latency p50 [ms]' in values:
@@ -113,25 +120,30 @@ class Reader(Node):
                     (float(values['latency p50 [ms]']), float(values['latency p99 [ms]']))
                 )
 
-    def listen(self, nodes):
+    def listen(self, nodes: Sequence[str]) -> None:
         """Start to count the outputs of nodes."""
         self.came = {}
         self.within = {}
-        self.reader = StreamReader(self, logged(self))
+        reader = StreamReader(self, logged(self))
         for node in nodes:
             if node == 'reconstruction_node':
                 self._listen(
-                    node, 'ab', 'reconstruction/points_with_covariance', ReconstructedPoints
+                    reader,
+                    node,
+                    'ab',
+                    'reconstruction/points_with_covariance',
+                    ReconstructedPoints,
                 )
                 continue
             topic, kind = OUTPUTS[node]
             for name in NAMES:
-                self._listen(node, name, f'{name}/{topic}', kind)
-        self.reader.start()
+                self._listen(reader, node, name, f'{name}/{topic}', kind)
+        reader.start()
+        self.reader = reader
 
-    def _listen(self, node, name, topic, kind):
+    def _listen(self, reader: StreamReader, node: str, name: str, topic: str, kind: type) -> None:
         came = self.came[node, name] = []
-        self.reader.subscribe(
+        reader.subscribe(
             kind,
             topic,
             lambda data, info: came.append(_number_and_latency(data, info)),
@@ -139,7 +151,12 @@ class Reader(Node):
             decode=bytes,
         )
 
-    def wait(self, condition, seconds, what):
+    def stop(self) -> None:
+        """Stop counting."""
+        if self.reader is not None:
+            self.reader.stop()
+
+    def wait(self, condition: Callable[[], Any], seconds: float, what: str) -> None:
         """Spin until condition() is true."""
         end = time.monotonic() + seconds
         while not condition():
@@ -148,7 +165,7 @@ class Reader(Node):
             self.spinner.spin_once(timeout_sec=0.1)
 
 
-def _number_and_latency(data, info):
+def _number_and_latency(data: bytes, info: dict[str, int]) -> tuple[int, int]:
     """Frame number and latency [ns] of the CDR bytes of a message that begins with header and
     frame_number.
     """
@@ -159,13 +176,13 @@ def _number_and_latency(data, info):
     ] - seconds * 10**9 - nanoseconds
 
 
-def _cpu(process):
+def _cpu(process: subprocess.Popen) -> float:
     """CPU time [s] that a process has used, all its threads together."""
     fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / TICK
 
 
-def _command(node, **parameters):
+def _command(node: str, **parameters: Any) -> list[str]:
     module = (
         ['benchmarks.relay', node.removeprefix('relay_')]
         if node.startswith('relay')
@@ -177,7 +194,15 @@ def _command(node, **parameters):
     return command
 
 
-def measured(reader, scene, rate, nodes, seconds, log, parameters):
+def measured(
+    reader: Reader,
+    scene: str,
+    rate: float,
+    nodes: Sequence[str],
+    seconds: float,
+    log: IO[bytes],
+    parameters: Mapping[str, Any],
+) -> list[dict[str, Any]]:
     """[{node, lost, p50, p99, max [ms], cpu [us a message]}] of a case."""
     processes = {
         node: subprocess.Popen(_command(node, **parameters), stdout=log, stderr=log)
@@ -220,18 +245,20 @@ def measured(reader, scene, rate, nodes, seconds, log, parameters):
                 process.send_signal(signal.SIGINT)
         for process in (*processes.values(), simulator):
             process.wait(20)
-        reader.reader.stop()
+        reader.stop()
     return [_figures(reader, node, frames, used[node], counted) for node in nodes]
 
 
-def _nearly(came, frames):
+def _nearly(came: Mapping[Any, Sequence[tuple[int, int]]], frames: int) -> bool:
     """Whether the stream is over but for its last frames: the CPU of what is ending is not that of
     the stream.
     """
     return all(of_one[-1][0] >= frames - 10 for of_one in came.values())
 
 
-def _figures(reader, node, frames, used, counted):
+def _figures(
+    reader: Reader, node: str, frames: int, used: float, counted: Mapping[Any, int]
+) -> dict[str, Any]:
     of_node = {key: np.array(of_one) for key, of_one in reader.came.items() if key[0] == node}
     latency = np.concatenate([of_one[:, 1] for of_one in of_node.values()]) * 1e-6
     lost = sum(frames - len(np.unique(of_one[:, 0])) for of_one in of_node.values())
@@ -252,7 +279,7 @@ def _figures(reader, node, frames, used, counted):
     }
 
 
-def rig_of_the_simulator():
+def rig_of_the_simulator() -> tuple[dict[str, Calibration], Orientation]:
     """Calibrations and orientation of the rig that the simulator shows."""
     rig = virtual_rig(1)
     frames = simulate_exposures(rig, 15, 1).frames
@@ -260,7 +287,7 @@ def rig_of_the_simulator():
     return job.calibrations, orientation_of_exposures(frames, rig.phantom, job.calibrations)
 
 
-def run(seconds, only=''):
+def run(seconds: float, only: str = '') -> dict[str, list[dict[str, Any]]]:
     """{case: figures of its nodes}."""
     isolate_ros_graph()
     rclpy.init(args=[])
@@ -289,7 +316,7 @@ def run(seconds, only=''):
     return out
 
 
-def text_of(results):
+def text_of(results: Mapping[str, Sequence[dict[str, Any]]]) -> str:
     """Markdown table of the results."""
     rows = []
     for case, figures in results.items():

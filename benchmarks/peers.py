@@ -134,7 +134,8 @@ class ColmapAdjustment:
         self._adjuster = pycolmap.create_default_ceres_bundle_adjuster(
             self._options, self._config, self._reconstruction
         )
-        return self._adjuster.solve().ceres_summary
+        summary: Any = self._adjuster.solve()
+        return summary.ceres_summary
 
     def cost(self, summary: Any) -> float:
         """F of the image points at the solution, with the constant of the distribution."""
@@ -165,7 +166,7 @@ class ColmapAdjustment:
         options = pycolmap.BACovarianceOptions()
         options.params = pycolmap.BACovarianceOptionsParams.ALL
         options.damping = 0.0
-        found = pycolmap.estimate_ba_covariance(options, self._reconstruction, self._adjuster)
+        found: Any = pycolmap.estimate_ba_covariance(options, self._reconstruction, self._adjuster)
         order = [1, 2, 0]  # COLMAP's order is f, cx, cy
         covariance = found.get_other_params_cov(self._reconstruction.camera(1).params)[
             np.ix_(order, order)

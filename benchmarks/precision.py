@@ -7,28 +7,33 @@ distortion, so the true distortion is turned, shifted and scaled by the projecti
 it as orthogonal to the gauge as the estimated one is.
 """
 
+from __future__ import annotations
+
 import argparse
 import multiprocessing
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.calibrate import CalibrationResult, calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.distortion.gauge import gauge_coefficients
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion, matrix_from_vector
-from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.exposures import Detection, SimulatedExposures, simulate_exposures
+from fluoro_calib_ros.simulation.rig import VirtualFluoroscope, VirtualRig, virtual_rig
 
 QUANTITIES = ('xp', 'yp', 'c', 'T', 'q', 'object points')
 MARGIN_PX = 8.0  # of the grid from the edge of the image
 
 
-def truth_in_gauge(fluoroscope, uv, interior):
+def truth_in_gauge(
+    fluoroscope: VirtualFluoroscope, uv: np.ndarray, interior: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """Interior orientation (3,), turn (3, 3) of the sensor and correction of the truth in the
     gauge of a calibration.
 
@@ -36,12 +41,12 @@ def truth_in_gauge(fluoroscope, uv, interior):
     (3,).
     """
 
-    def camera(k):
+    def camera(k: np.ndarray) -> np.ndarray:
         return np.array([[k[2], 0, k[0]], [0, k[2], k[1]], [0, 0, 1.0]])
 
     back = np.linalg.inv(camera(fluoroscope.interior))
 
-    def correction(x, pixels):
+    def correction(x: np.ndarray, pixels: np.ndarray) -> np.ndarray:
         ideal = np.column_stack([pixels - fluoroscope.distortion(pixels), np.ones(len(pixels))])
         turned = ideal @ (camera(x[:3]) @ matrix_from_vector(x[3:]) @ back).T
         return pixels - turned[:, :2] / turned[:, 2:]
@@ -55,7 +60,7 @@ def truth_in_gauge(fluoroscope, uv, interior):
     return found.x[:3], matrix_from_vector(found.x[3:]), lambda pixels: correction(found.x, pixels)
 
 
-def normalised(seed, exposures=15, model='auto'):
+def normalised(seed: int, exposures: int = 15, model: str = 'auto') -> dict[str, float]:
     """One calibration: mean normalised squared error by quantity, share of the correction within
     its 95 % interval.
     """
@@ -68,7 +73,9 @@ def normalised(seed, exposures=15, model='auto'):
     )
 
 
-def errors_of(job, rig, simulated):
+def errors_of(
+    job: CalibrationResult, rig: VirtualRig, simulated: SimulatedExposures
+) -> dict[str, float]:
     """Mean normalised squared errors of a calibration of fluoroscope a, and its correction against
     the truth.
     """
@@ -79,7 +86,7 @@ def errors_of(job, rig, simulated):
         fluoroscope, run.measured.network.uv, run.after.parameters.interior[0]
     )
     out = dict(zip(QUANTITIES, ((figures.interior - interior) / figures.interior_sd) ** 2))
-    squares = {'T': [], 'q': []}
+    squares: dict[str, list[np.ndarray]] = {'T': [], 'q': []}
     for e in figures.exposures:
         rotation, position = fluoroscope.exterior(simulated.poses[e.exposure - 1])
         squares['T'].append(((e.position_mm - position) / e.sd_mm) ** 2)
@@ -124,7 +131,7 @@ calibrations converged.
 """
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point."""
     parser = argparse.ArgumentParser(prog='python -m benchmarks.precision', description=__doc__)
     parser.add_argument(
@@ -173,7 +180,7 @@ def main(arguments=None):
     print(f'{time.monotonic() - start:.0f} s', file=sys.stderr)
 
 
-def _one(arguments):
+def _one(arguments: tuple[int, int, str]) -> dict[str, float]:
     return normalised(*arguments)
 
 

@@ -7,12 +7,16 @@ constant as their predicted standard deviations; normalised squared errors of th
 mean of 0.9 to 1.1.
 """
 
+from __future__ import annotations
+
 import argparse
 import sys
 import timeit
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
@@ -22,9 +26,9 @@ from fluoro_calib_ros.calibration.rig_orientation import (
 )
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.reconstruction.intersection import Intersector
-from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
+from fluoro_calib_ros.reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
 from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
 from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 EXPOSURES = 15
@@ -74,7 +78,7 @@ class Outcome:
     sd_orientation_mm: float
 
 
-def capture(rig, seed, count=CAPTURED):
+def capture(rig: VirtualRig, seed: int, count: int = CAPTURED) -> dict[str, list[Frame]]:
     """Return {fluoroscope: [Frame, ...]} of the phantom in the rig frame, count frames of each."""
     rng = np.random.default_rng([seed, 4])
     return {
@@ -91,7 +95,7 @@ def capture(rig, seed, count=CAPTURED):
     }
 
 
-def undistorted(rig, frames):
+def undistorted(rig: VirtualRig, frames: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]]:
     """Remove the true distortion from frames; the images get a margin."""
     field = {f.name: f.distortion for f in rig.fluoroscopes}
     return {
@@ -99,7 +103,10 @@ def undistorted(rig, frames):
             replace(
                 frame,
                 uv=frame.uv - field[name](frame.uv) + MARGIN_PX,
-                image_size=tuple(size + 2 * MARGIN_PX for size in frame.image_size),
+                image_size=(
+                    frame.image_size[0] + 2 * MARGIN_PX,
+                    frame.image_size[1] + 2 * MARGIN_PX,
+                ),
             )
             for frame in of_one
         ]
@@ -107,7 +114,13 @@ def undistorted(rig, frames):
     }
 
 
-def measure(seed, ways=tuple(WAYS), seconds=4.0, rate_hz=60.0, captured=CAPTURED):
+def measure(
+    seed: int,
+    ways: Sequence[str] = tuple(WAYS),
+    seconds: float = 4.0,
+    rate_hz: float = 60.0,
+    captured: int = CAPTURED,
+) -> dict[str, Outcome]:
     """Outcomes of one virtual rig, by way.
 
     Each way also comes with the orientation from the exposures of the calibration.
@@ -135,7 +148,9 @@ def measure(seed, ways=tuple(WAYS), seconds=4.0, rate_hz=60.0, captured=CAPTURED
     return out
 
 
-def _outcome(found, truth, in_rig_frame):
+def _outcome(
+    found: Sequence[ReconstructedFrame], truth: np.ndarray, in_rig_frame: bool
+) -> Outcome:
     """Outcome of ReconstructedFrames against the true points (frames, n, 3) [mm]."""
     xyz, covariance, noise, standardised = (
         np.array([getattr(frame.points, name) for frame in found])
@@ -174,7 +189,7 @@ def _outcome(found, truth, in_rig_frame):
     )
 
 
-def _fitted(points, truth):
+def _fitted(points: np.ndarray, truth: np.ndarray) -> np.ndarray:
     """Points (n, 3) moved as a rigid body onto the truth (Kabsch 1976), for another rig frame."""
     a = points.mean(axis=0)
     b = truth.mean(axis=0)
@@ -183,7 +198,7 @@ def _fitted(points, truth):
     return (points - a) @ turn + b
 
 
-def _distances(xyz, truth, noise):
+def _distances(xyz: np.ndarray, truth: np.ndarray, noise: np.ndarray) -> tuple[float, float]:
     """Constancy and RMSE [mm] of the distances in a rigid cluster (frames, k, 3).
 
     Constancy is the standard deviation over time over the predicted one.
@@ -201,7 +216,7 @@ def _distances(xyz, truth, noise):
     )
 
 
-def table(outcomes):
+def table(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
     """Markdown table of {way: [Outcome of every rig]}.
 
     Squares are averaged over the rigs; +- is the standard error.
@@ -234,7 +249,7 @@ def table(outcomes):
     return '\n'.join(lines)
 
 
-def cluster_table(outcomes):
+def cluster_table(outcomes: Mapping[str, Sequence[Outcome]]) -> str:
     """Markdown table of the constancy of the distances, by cluster."""
     lines = [
         '| correction | '
@@ -252,11 +267,11 @@ def cluster_table(outcomes):
     return '\n'.join(lines)
 
 
-def _rms(values):
+def _rms(values: ArrayLike) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def speed(points=30, repeats=2000):
+def speed(points: int = 30, repeats: int = 2000) -> float:
     """Time [s] of one intersection of points in two views, the least of ten means."""
     rig = virtual_rig(1)
     calibrations = calibrate(
@@ -276,7 +291,7 @@ def speed(points=30, repeats=2000):
     )
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point: the tables on standard output."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks.reconstruction', description=__doc__
@@ -290,7 +305,7 @@ def main(arguments=None):
         help=f'frames of the standing phantom for the orientation (default: {CAPTURED})',
     )
     options = parser.parse_args(arguments)
-    outcomes = {}
+    outcomes: dict[str, list[Outcome]] = {}
     for seed in range(options.first, options.first + options.count):
         for way, outcome in measure(seed, captured=options.captured).items():
             outcomes.setdefault(way, []).append(outcome)

@@ -4,17 +4,20 @@ Writes docs/accuracy.md and its pictures. What is done is in experiment_plan, wh
 experiment_text.
 """
 
+from __future__ import annotations
+
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 from .experiment_figures import write_all
-from .experiment_plan import full_plan, quick_plan, run
+from .experiment_plan import Outcomes, Plan, full_plan, quick_plan, run
 from .experiment_text import document_text
 
 
-def make(plan, document):
+def make(plan: Plan, document: Path) -> Outcomes:
     """Run a plan, write the document (a Path) and its pictures; returns the outcomes by case."""
     began = time.monotonic()
     outcomes = run(plan.cases())
@@ -26,7 +29,7 @@ def make(plan, document):
     return outcomes
 
 
-def main(arguments=None):
+def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point: exit status 1 where a calibration failed."""
     parser = argparse.ArgumentParser(prog='python -m benchmarks.validation', description=__doc__)
     parser.add_argument(

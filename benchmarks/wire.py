@@ -11,6 +11,7 @@ from __future__ import annotations
 import time
 from array import array
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
@@ -73,7 +74,7 @@ def cases(count: int) -> dict[tuple[str, str], Callable[[], object]]:
     corrected = encode_corrected_observations(source, CALIBRATION_ID, (*columns, status))
     store = typestore()
     kind = message_class(CORRECTED)
-    rosbags_source = store.deserialize_cdr(data, OBSERVED)
+    rosbags_source: Any = store.deserialize_cdr(data, OBSERVED)
     rclpy_source = deserialize_message(data, TargetObservations)
 
     def encode_rosbags() -> object:

@@ -18,7 +18,8 @@ for name, calibration in outcome.calibrations.items():
     xp, yp, c = calibration.interior
     rmse = calibration.rmse_after
     print(f'{name}: xp {xp:.2f}, yp {yp:.2f}, c {c:.1f} px; RMSE {rmse[0]:.3f}, {rmse[1]:.3f} px')
-print(f'verdict: {outcome.validation.verdict}')
-for sentence in outcome.validation.findings:
-    print(f'  {sentence}')
+if outcome.validation is not None:
+    print(f'verdict: {outcome.validation.verdict}')
+    for sentence in outcome.validation.findings:
+        print(f'  {sentence}')
 print(f'saved to {out}')

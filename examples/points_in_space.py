@@ -28,4 +28,5 @@ print(f'{len(outcome.frames)} exposures: {outcome.status_counts}')
 for target, xyz, sd in zip(outcome.frames[0].target_id[:5], points.xyz_mm, points.sd_mm):
     x, y, z = xyz
     print(f'target {target}: {x:.3f} {y:.3f} {z:.3f} mm (sd {sd.max():.3f} mm)')
-print(f'drift watch: {outcome.drift.message}')
+if outcome.drift is not None:
+    print(f'drift watch: {outcome.drift.message}')

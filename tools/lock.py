@@ -8,11 +8,14 @@ a marker wherever the Pythons differ. Run it with ALL supported Pythons, then `m
 test`.
 """
 
+from __future__ import annotations
+
 import json
 import pathlib
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping, Sequence
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 HEAD = """\
@@ -21,7 +24,7 @@ HEAD = """\
 """
 
 
-def resolve(python):
+def resolve(python: str) -> tuple[str, dict[str, str]]:
     """Return the minor version, and {name: version} as pip of this Python resolves them."""
     with tempfile.TemporaryDirectory() as folder:
         subprocess.run([python, '-m', 'venv', folder], check=True)
@@ -51,7 +54,7 @@ def resolve(python):
     return data['environment']['python_version'], pins
 
 
-def marker(pythons, known):
+def marker(pythons: Sequence[str], known: Sequence[str]) -> str:
     """Return the environment marker that picks these Python versions out of the known ones."""
     if pythons == known[-len(pythons) :]:
         return f'python_version >= "{pythons[0]}"'
@@ -60,11 +63,11 @@ def marker(pythons, known):
     return ' or '.join(f'python_version == "{python}"' for python in pythons)
 
 
-def merge(answers):
+def merge(answers: Mapping[str, Mapping[str, str]]) -> list[str]:
     """Return the lines of the lock for {python version: {name: version}}."""
     lines = []
     for name in sorted({name for pins in answers.values() for name in pins}):
-        by_version = {}
+        by_version: dict[str, list[str]] = {}
         for python, pins in answers.items():
             if name in pins:
                 by_version.setdefault(pins[name], []).append(python)
@@ -76,7 +79,7 @@ def merge(answers):
     return lines
 
 
-def main():
+def main() -> None:
     """Resolve for the Pythons of the command line and write the lock."""
     if len(sys.argv) < 2:
         sys.exit(__doc__)

@@ -8,6 +8,8 @@ none. Deleting .venv, moving the folder, another PYTHON, a changed lock file or 
 are therefore all noticed.
 """
 
+from __future__ import annotations
+
 import contextlib
 import fcntl
 import glob
@@ -23,6 +25,7 @@ import subprocess
 import sys
 import sysconfig
 import time
+from collections.abc import Callable, Iterator
 
 ROOT = pathlib.Path(__file__).resolve().parent.parent
 VENV = ROOT / '.venv'
@@ -79,7 +82,7 @@ class SetupError(Exception):
     """Something is wrong that the user can put right; the text says what."""
 
 
-def environment():
+def environment() -> dict[str, str]:
     """Return the environment for every program this script starts."""
     env = {name: value for name, value in os.environ.items() if not name.startswith(FOREIGN)}
     env['PATH'] = os.pathsep.join([str(VENV / 'bin'), env.get('PATH', os.defpath)])
@@ -90,7 +93,7 @@ def environment():
     return env
 
 
-def run(*command):
+def run(*command: str) -> None:
     """Run a program with its output in the log; raise SetupError if it fails."""
     with open(LOG, 'a') as log:
         log.write('\n$ ' + ' '.join(shlex.quote(word) for word in command) + '\n')
@@ -116,7 +119,7 @@ def run(*command):
         raise SetupError(f'{pathlib.Path(command[0]).name} failed with exit status {code}')
 
 
-def digest(*parts):
+def digest(*parts: str | pathlib.Path) -> str:
     """Return one digest of texts, and of files and folders (names and contents) below ROOT."""
     total = hashlib.sha256()
     for part in parts:
@@ -137,21 +140,23 @@ def digest(*parts):
 class Step:
     """One step: what it is made from, and whether that has been done."""
 
-    def __init__(self, name, title, action, *inputs):
+    def __init__(
+        self, name: str, title: str, action: Callable[[], None], *inputs: str | pathlib.Path
+    ) -> None:
         """Take a name for the stamp, a title for the user, and the inputs as for digest()."""
         self.stamp = STAMPS / name
         self.title = title
         self.action = action
         self.wanted = digest(name, *inputs)
 
-    def is_done(self):
+    def is_done(self) -> bool:
         """Tell whether the stamp says that this was done from just these inputs."""
         try:
             return self.stamp.read_text() == self.wanted
         except OSError:
             return False
 
-    def do(self):
+    def do(self) -> None:
         """Carry the step out, with one line for the user."""
         start = time.monotonic()
         print(f'setup: {self.title} ... ', end='', flush=True)
@@ -170,7 +175,7 @@ class Step:
 # the steps
 
 
-def check_machine():
+def check_machine() -> None:
     """Raise SetupError with one sentence for each thing that is missing."""
     missing = []
     version = f'{sys.version_info.major}.{sys.version_info.minor}'
@@ -220,7 +225,7 @@ def check_machine():
         raise SetupError('\n'.join(missing))
 
 
-def compiles():
+def compiles() -> bool:
     """Tell whether a C and a C++ compiler turn a trivial source into a shared library."""
     sources = (
         ('CC', ('cc', 'gcc', 'clang'), 'c', '#include <stdio.h>\n'),
@@ -249,7 +254,7 @@ def compiles():
     return True
 
 
-def make_venv():
+def make_venv() -> None:
     """Make .venv anew with every package of the lock file."""
     if VENV.is_symlink():
         VENV.unlink()
@@ -269,7 +274,7 @@ def make_venv():
     (STAMPS / 'python').write_text(BASE_PYTHON + '\n')
 
 
-def rewrite_cmake_files():
+def rewrite_cmake_files() -> None:
     """Point the wheels' exported CMake files, which name their builder's Python, to this Python
     and its numpy.
     """
@@ -294,7 +299,7 @@ def rewrite_cmake_files():
             path.write_text(new)
 
 
-def install_hook():
+def install_hook() -> None:
     """Let every Python of .venv start with the environment that ROS needs."""
     shutil.copyfile(HOOK, SITE_PACKAGES / 'fluoro_calib_venv.py')
     # .pth files are read in the order of their names: before ros_wheels_bootstrapper.pth
@@ -302,7 +307,7 @@ def install_hook():
     run(VENV_PYTHON, '-c', 'import rclpy')
 
 
-def build_messages():
+def build_messages() -> None:
     """Build the messages with colcon and install them into .venv."""
     for package in MESSAGES:
         for pattern in (
@@ -351,7 +356,7 @@ def build_messages():
     )
 
 
-def install_package():
+def install_package() -> None:
     """Install this package into .venv so that its sources are used where they are."""
     run(
         VENV_PYTHON,
@@ -374,7 +379,7 @@ def install_package():
         link.symlink_to(target)
 
 
-def steps():
+def steps() -> list[Step]:
     """Return the steps in their order, each naming what it depends on."""
     venv = Step(
         'packages',
@@ -404,7 +409,7 @@ def steps():
 
 
 @contextlib.contextmanager
-def only_one():
+def only_one() -> Iterator[None]:
     """Hold a lock file, so that two set-ups in one folder follow each other."""
     with open(BUILD / 'setup.lock', 'w') as stream:
         try:
@@ -415,7 +420,7 @@ def only_one():
         yield
 
 
-def set_up():
+def set_up() -> None:
     """Do what is not done yet."""
     plan = steps()
     if all(step.is_done() for step in plan):
@@ -427,7 +432,7 @@ def set_up():
             step.do()
 
 
-def main():
+def main() -> int:
     """Run, and turn every failure into something to act upon."""
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     BUILD.mkdir(exist_ok=True)

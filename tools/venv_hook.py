@@ -8,6 +8,8 @@ another venv's process for its own, and leaves to chance which ROS comes first w
 sourced.
 """
 
+from __future__ import annotations
+
 import os
 import sys
 import tempfile
@@ -15,16 +17,16 @@ import tempfile
 MARK = '_ROS_WHEELS_BOOTSTRAP_COMPLETE'  # the wheels' own: set, their bootstrap does nothing
 
 
-def environment(old, prefix):
+def environment(old: dict[str, str], prefix: str) -> dict[str, str]:
     """Return the environment in which a Python of the venv `prefix` finds its own ROS and no
     other.
     """
     new = dict(old)
 
-    def entries(name):
+    def entries(name: str) -> list[str]:
         return [entry for entry in old.get(name, '').split(os.pathsep) if entry]
 
-    def below(entry, folders):
+    def below(entry: str, folders: list[str]) -> bool:
         return any((entry + '/').startswith(folder.rstrip('/') + '/') for folder in folders)
 
     # What else has been sourced is another ROS with its workspaces, or workspaces that were built
@@ -72,4 +74,4 @@ def environment(old, prefix):
 
 
 if os.environ.get(MARK) != sys.prefix:
-    os.execve(sys.executable, sys.orig_argv, environment(os.environ, sys.prefix))
+    os.execve(sys.executable, sys.orig_argv, environment(dict(os.environ), sys.prefix))

@@ -51,8 +51,11 @@ def _orientation(entry: Any, where: str) -> KnownOrientation:
             raise DataError(f'{where}: {key} is missing')
     try:
         return KnownOrientation.from_matrices(
-            *(np.array(entry[key], dtype=float) for key in KEYS[:3]),
-            *(entry.get(key) for key in KEYS[3:]),
+            np.array(entry['K'], dtype=float),
+            np.array(entry['R'], dtype=float),
+            np.array(entry['t_mm'], dtype=float),
+            entry.get('interior_sd_px'),
+            entry.get('exterior_sd'),
         )
     except (TypeError, ValueError) as error:
         # DataError is a ValueError.

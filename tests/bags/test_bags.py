@@ -1,6 +1,4 @@
-"""Bags: as rosbag2 writes them, the same bytes each time, readable by others, and every fault
-told.
-"""
+"""Bags: written as by rosbag2, reproducible, readable by others, and every fault reported."""
 
 import io
 import os

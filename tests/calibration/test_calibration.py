@@ -1,6 +1,4 @@
-"""The self-calibration on the virtual rig: accuracy, repeatability, refusals, and what it hands
-over.
-"""
+"""Self-calibration of the virtual rig: accuracy, repeatability, invalid input, and results."""
 
 from dataclasses import replace
 
@@ -39,8 +37,8 @@ NOISE_PX = 0.25
 
 
 def field_error(job, name='a'):
-    """RMS [px] of the correction against the true distortion over the calibrated area, but for the
-    gauge.
+    """RMS difference [px] of the correction from the true distortion in the calibrated area,
+    without the gauge.
     """
     calibration = job.calibrations[name]
     fluoroscope = next(f for f in rigs.rig().fluoroscopes if f.name == name)
@@ -56,7 +54,7 @@ def field_error(job, name='a'):
 
 
 def target_error(targets):
-    """RMSE [mm] of object points against the truth."""
+    """RMSE [mm] of the object points against the truth."""
     return float(
         np.sqrt(
             np.mean((targets.xyz_mm - rigs.rig().true_mm[PHANTOM.index(targets.target_id)]) ** 2)
@@ -65,12 +63,12 @@ def target_error(targets):
 
 
 def frames_of(name='a', count=15):
-    """{name: [Frame, ...]}, a list of one's own."""
+    """Frames by fluoroscope, in lists of their own."""
     return {name: list(rigs.exposures()[name][:count])}
 
 
 def short(**options):
-    """Two rounds with the first eight exposures, made once."""
+    """Calibration of two rounds with the first eight exposures, shared by the tests."""
     return rigs.calibrated(count=8, max_iterations=2, **options)
 
 
@@ -79,7 +77,7 @@ def rounds(count, **options):
 
 
 def assert_same_bits(one, other):
-    """Two JobResults are the same to the last bit, but for their run time."""
+    """Assert that two results are equal to the last bit, except for their run times."""
     for name in one.fluoroscopes:
         a = one.fluoroscopes[name]
         b = other.fluoroscopes[name]
@@ -107,9 +105,9 @@ def assert_same_bits(one, other):
 # ---- accuracy
 
 
-def test_self_calibration_of_the_rig_finds_the_distortion():
-    """15 exposures: converged, residuals down to the noise, correction field and object points
-    near the truth.
+def test_self_calibration_estimates_the_distortion():
+    """15 exposures: it converges, the residuals are noise, the correction and the object points
+    are near the truth.
     """
     job = rigs.calibrated()
     figures = job.fluoroscopes['a']
@@ -126,13 +124,13 @@ def test_self_calibration_of_the_rig_finds_the_distortion():
     )
 
 
-def test_local_linear_is_nearer_to_the_truth_than_knn():
+def test_local_linear_is_more_accurate_than_knn():
     knn = rigs.calibrated(model='knn')
     assert knn.fluoroscopes['a'].rmse_after.max() < NOISE_PX
     assert 2.5 * field_error(rigs.calibrated()) < field_error(knn) < 1.2
 
 
-def test_without_a_model_one_round_is_all():
+def test_without_a_model_there_is_one_round():
     job = rigs.calibrated(model='none')
     assert job.converged and len(job.history['a']) == 1
     calibration = job.calibrations['a']
@@ -143,9 +141,9 @@ def test_without_a_model_one_round_is_all():
     assert job.fluoroscopes['a'].rmse_after.min() > 4 * NOISE_PX
 
 
-def test_calibration_holds_for_exposures_it_has_not_seen():
-    """Adjusted with the calibration held: residuals near the noise, and nothing of the calibration
-    changes.
+def test_calibration_corrects_unused_exposures():
+    """With the calibration held, the residuals are near the noise and the calibration does not
+    change.
     """
     test = simulate_exposures(rigs.rig(), 8, seed=77, start=StreamStart(number=100)).frames['a']
     calibration = rigs.calibrated().calibrations['a']
@@ -172,8 +170,8 @@ def test_a_single_exposure_can_be_adjusted():
     assert job.fluoroscopes['a'].rmse_after.min() > 0.05 and target_error(job.targets) < 0.1
 
 
-def test_frames_of_another_image_size_are_not_adjusted_with_a_calibration():
-    """Its correction is a function of the pixel of its own image."""
+def test_adjustment_refuses_frames_of_another_image_size():
+    """The correction is a function of the pixels of its own image."""
     other = [replace(frame, image_size=(2048, 1024)) for frame in frames_of()['a']]
     with pytest.raises(
         DataError,
@@ -183,7 +181,7 @@ def test_frames_of_another_image_size_are_not_adjusted_with_a_calibration():
 
 
 @pytest.mark.long
-def test_both_fluoroscopes_share_their_object_points_in_a_joint_adjustment():
+def test_joint_adjustment_has_common_object_points():
     frames = {name: list(rigs.exposures()[name][:6]) for name in 'ab'}
     joint = calibrate(frames, PHANTOM, rounds(1), joint=True)
     apart = calibrate(frames, PHANTOM, rounds(1))
@@ -204,9 +202,9 @@ def test_both_fluoroscopes_share_their_object_points_in_a_joint_adjustment():
 
 
 @pytest.mark.parametrize('model', ['auto', 'local_linear', 'hybrid', 'knn', 'parametric'])
-def test_the_fitted_correction_has_no_part_in_the_gauge(model):
-    """While the interior orientation is estimated: neither a shift nor a scale nor a turn is left
-    in it.
+def test_fitted_correction_is_orthogonal_to_the_gauge(model):
+    """While the interior orientation is estimated, no shift, scale or rotation remains in the
+    correction.
     """
     run = rigs.calibrated(model=model).runs['a']
     uv = run.measured.network.uv
@@ -222,8 +220,8 @@ def test_the_fitted_correction_has_no_part_in_the_gauge(model):
         assert np.max(np.abs(part)) < (0.05 if whole else 1e-3)  # of several px
 
 
-def test_adjustment_and_model_belong_to_one_round():
-    """The correction that the last adjustment held is that of the model; the last round tells its
+def test_adjustment_and_model_are_of_the_same_round():
+    """The correction held in the last adjustment is that of the model; the last round reports its
     cost.
     """
     job = rigs.calibrated()
@@ -242,8 +240,8 @@ def test_adjustment_and_model_belong_to_one_round():
     assert last.quadratic == pytest.approx(expected, rel=1e-3)
 
 
-def test_convergence_is_what_the_options_ask_for():
-    """F and G change by less than the tolerance at the end, and by more before."""
+def test_convergence_follows_the_tolerance():
+    """F and G change by less than the tolerance in the last round, and by more before."""
     history = rigs.calibrated(model='local_linear').history['a']
 
     def change(now, before):
@@ -255,12 +253,12 @@ def test_convergence_is_what_the_options_ask_for():
     assert history[-1].F < history[0].F
 
 
-def test_rounds_that_run_out_are_told():
+def test_maximum_number_of_rounds_is_reported():
     job = short()
     assert not job.converged and not job.calibrations['a'].converged and len(job.history['a']) == 2
 
 
-def test_progress_is_reported_round_by_round():
+def test_progress_is_reported_after_every_round():
     told = []
     job = calibrate(
         frames_of(count=6), PHANTOM, rounds(3), progress=lambda name, r: told.append((name, r))
@@ -273,8 +271,8 @@ def test_progress_is_reported_round_by_round():
 
 
 @pytest.mark.parametrize('when', ['resection', 'first adjustment', 'second round'])
-def test_check_stops_a_calibration_at_once(when):
-    """No step and no round follows the one before which it raises."""
+def test_cancellation_stops_a_calibration_before_the_next_step(when):
+    """No step and no round follows the call that raises."""
     calls = []
     told = []
 
@@ -335,15 +333,13 @@ def test_options_reach_the_calculation(options):
         {'tolerance': float('nan')},
     ],
 )
-def test_options_that_do_not_exist_are_refused(options):
+def test_unknown_options_are_refused(options):
     with pytest.raises(ValueError, match=next(iter(options))):
         CalibrationOptions(**options)
 
 
-def test_a_fixed_interior_orientation_is_held_and_learned_by_the_model():
-    """Middle of the image and the given principal distance, to the last bit; no standard
-    deviation.
-    """
+def test_fixed_interior_orientation_is_held_and_the_model_compensates():
+    """Image centre and given principal distance to the last bit, without standard deviation."""
     job = calibrate(
         frames_of(count=8), PHANTOM, rounds(2, interior='fixed'), principal_distance=4000.0
     )
@@ -358,9 +354,9 @@ def test_a_fixed_interior_orientation_is_held_and_learned_by_the_model():
     assert np.max(np.abs(part)) > 0.1, 'the gauge is not taken out of the correction'
 
 
-def test_the_principal_distance_is_a_start_value():
-    """Given or found from the observations, the estimated interior orientation ends in the same
-    place.
+def test_principal_distance_is_only_a_start_value():
+    """Whether given or derived from the observations, the estimated interior orientation is the
+    same.
     """
     measured = measured_network(frames_of(), PHANTOM, principal_distance=3900.0)
     np.testing.assert_array_equal(
@@ -381,7 +377,9 @@ def test_the_principal_distance_is_a_start_value():
 
 
 def test_start_values_are_near_the_truth():
-    """Exteriors by resection within what distortion does to them, whatever the exposure."""
+    """Resected exterior orientations are as near the truth as the distortion allows, in every
+    exposure.
+    """
     frames = frames_of()
     simulated = simulate_exposures(rigs.rig(), 15, 1)
     measured = measured_network(frames, PHANTOM)
@@ -394,7 +392,7 @@ def test_start_values_are_near_the_truth():
 
 
 def test_exterior_orientations_are_those_of_the_rig():
-    """Quaternion phantom -> sensor, and source in the frame of the phantom [mm]."""
+    """Quaternion phantom -> sensor, and position of the source in the phantom frame [mm]."""
     fluoroscope = rigs.rig().fluoroscopes[0]
     poses = simulate_exposures(rigs.rig(), 15, 1).poses
     for found, pose in zip(rigs.calibrated().fluoroscopes['a'].exposures, poses, strict=True):
@@ -410,13 +408,13 @@ def test_exterior_orientations_are_those_of_the_rig():
 # ---- repeatability
 
 
-def test_the_same_observations_give_the_same_bits():
+def test_same_observations_give_the_same_bits():
     assert_same_bits(calibrate(frames_of(count=8), PHANTOM, rounds(2)), short())
 
 
 @pytest.mark.parametrize('options', [{}, {'model': 'local_linear', 'k': 60}])
-def test_the_order_of_frames_and_targets_does_not_matter(options):
-    """To the last bit, over rounds that the acceleration has mixed."""
+def test_order_of_frames_and_targets_does_not_matter(options):
+    """To the last bit, also over accelerated rounds."""
     rng = np.random.default_rng(1)
     frames = frames_of(count=6)['a']
     shuffled = []
@@ -429,7 +427,7 @@ def test_the_order_of_frames_and_targets_does_not_matter(options):
     )
 
 
-def test_the_digest_follows_the_observations():
+def test_digest_depends_on_the_observations():
     frames = frames_of(count=3)['a']
     digest = digest_of_sources(frames, PHANTOM)
     assert digest == digest_of_sources(frames[::-1], PHANTOM)
@@ -440,7 +438,7 @@ def test_the_digest_follows_the_observations():
     assert digest != digest_of_sources(frames, replace(PHANTOM, sd_mm=PHANTOM.sd_mm * 2))
 
 
-def test_sigma_of_one_is_no_sigma():
+def test_sigma_of_one_changes_nothing():
     frames = [replace(f, sigma=np.ones(len(f.target_id))) for f in frames_of(count=8)['a']]
     job = calibrate({'a': frames}, PHANTOM, rounds(2))
     np.testing.assert_array_equal(
@@ -448,9 +446,9 @@ def test_sigma_of_one_is_no_sigma():
     )
 
 
-def test_sigma_of_the_observations_weighs_them():
-    """Every other exposure is blurred by 2.5 px, which only sigma tells: object points are better
-    with it.
+def test_observations_are_weighted_by_sigma():
+    """Every other exposure is blurred by 2.5 px, which only sigma shows: object points are more
+    accurate with it.
     """
     straight = virtual_rig(1, strength=0.0)
     frames = simulate_exposures(straight, 15, 1, detection=Detection(false_matches=0.0)).frames[
@@ -490,7 +488,7 @@ def with_value(frame, value):
 
 
 def one_pose(frames):
-    """The first exposure again and again, with new noise."""
+    """Repeat the first exposure with new noise."""
     rng = np.random.default_rng(3)
     return [
         replace(frames[0], number=n, uv=frames[0].uv + rng.normal(0, 0.2, frames[0].uv.shape))
@@ -552,8 +550,8 @@ def shuffled_ids(frame, seed=4):
         ),
     ],
 )
-def test_observations_that_do_not_suffice_are_refused_by_name(spoil, said):
-    """One sentence with the fluoroscope, where it helps the exposure, and the cause."""
+def test_insufficient_observations_are_refused(spoil, said):
+    """One sentence with the fluoroscope, the exposure where it helps, and the cause."""
     with pytest.raises(DataError, match=said) as caught:
         calibrate({'a': spoil(frames_of()['a'])}, PHANTOM, rounds(1))
     assert '\n' not in str(caught.value)
@@ -562,8 +560,8 @@ def test_observations_that_do_not_suffice_are_refused_by_name(spoil, said):
 @pytest.mark.parametrize(
     'degrees, mm, accepted', [(5.0, 0.0, True), (0.0, 30.0, True), (1.0, 10.0, False)]
 )
-def test_turns_and_shifts_are_poses_of_their_own(degrees, mm, accepted):
-    """Either is enough for a calibration to begin with; too little of both is one pose."""
+def test_rotations_and_shifts_make_different_poses(degrees, mm, accepted):
+    """Either is enough to begin a calibration; too little of both is one pose."""
     fluoroscope = rigs.rig().fluoroscopes[0]
     rng = np.random.default_rng(8)
     frames = []
@@ -581,8 +579,8 @@ def test_turns_and_shifts_are_poses_of_their_own(degrees, mm, accepted):
             measured_network({'a': frames}, PHANTOM)
 
 
-def test_a_frame_that_does_not_fit_the_phantom_is_left_out_with_a_sentence():
-    """As is one with too few targets; the others give the result they give without it."""
+def test_frame_that_does_not_fit_the_phantom_is_left_out_and_reported():
+    """So is a frame with too few targets; the result is that without them."""
     frames = frames_of(count=8)['a']
     spoilt = frames[:3] + [shuffled_ids(frames[3])] + frames[4:7] + [cut(frames[7], 9)]
     job = calibrate({'a': spoilt}, PHANTOM, rounds(1))
@@ -598,7 +596,7 @@ def test_a_frame_that_does_not_fit_the_phantom_is_left_out_with_a_sentence():
     )
 
 
-def test_a_fault_of_the_second_fluoroscope_is_told_by_its_name():
+def test_fault_of_the_second_fluoroscope_is_reported_with_its_name():
     frames = {'a': frames_of()['a'], 'b': rigs.exposures()['b'][:2]}
     with pytest.raises(DataError, match=r'^fluoroscope b: 2 exposures are too few'):
         calibrate(frames, PHANTOM, rounds(1), joint=True)
@@ -607,7 +605,7 @@ def test_a_fault_of_the_second_fluoroscope_is_told_by_its_name():
 # ---- what is handed over
 
 
-def test_a_calibration_corrects_observed_points():
+def test_calibration_corrects_observed_points():
     """Undistorted = observed - correction; OK inside, OUTSIDE beyond the calibrated area, INVALID
     off the image.
     """
@@ -644,7 +642,7 @@ def test_a_calibration_corrects_observed_points():
     assert calibration.correct(np.full((2, 2), np.nan)).status.tolist() == [INVALID, INVALID]
 
 
-def test_the_calibration_id_follows_from_the_content():
+def test_calibration_id_depends_on_the_content():
     calibration = rigs.calibrated().calibrations['a']
     assert calibration.calibration_id.startswith('a-')
     assert replace(calibration, seconds=1.0, nu=9.0).calibration_id == calibration.calibration_id
@@ -660,7 +658,7 @@ def test_the_calibration_id_follows_from_the_content():
         )
 
 
-def test_the_calibration_tells_where_it_comes_from():
+def test_calibration_records_its_source():
     job = rigs.calibrated()
     calibration = job.calibrations['a']
     frames = frames_of()['a']
@@ -680,8 +678,8 @@ def test_the_calibration_tells_where_it_comes_from():
     )
 
 
-def test_combined_targets_are_those_of_one_estimation():
-    """Two estimations that share the survey, put together, equal one from survey and both
+def test_combined_targets_equal_one_estimation():
+    """Two estimates that share the survey, combined, equal one estimate from the survey and both
     observations.
     """
     rng = np.random.default_rng(5)
@@ -725,7 +723,9 @@ def test_combined_targets_are_those_of_one_estimation():
 
 
 def test_anderson_acceleration_is_much_faster_than_plain_iteration():
-    """On a linear contraction by 0.98: thirty rounds gain five digits, plain iteration not one."""
+    """For a linear contraction by 0.98, thirty rounds gain five digits; the plain iteration gains
+    none.
+    """
     rng = np.random.default_rng(6)
     turn, _ = np.linalg.qr(rng.normal(size=(40, 40)))
     matrix = turn @ np.diag(np.append(np.linspace(0, 0.5, 36), [0.8, 0.9, 0.95, 0.98])) @ turn.T
@@ -747,10 +747,8 @@ def test_anderson_acceleration_is_much_faster_than_plain_iteration():
     )
 
 
-def test_anderson_acceleration_can_leave_entries_out():
-    """Entries that are not counted are mixed along, but what they do has no influence on the
-    others.
-    """
+def test_anderson_acceleration_can_ignore_entries():
+    """Ignored entries follow the mixing but do not influence the others."""
     rng = np.random.default_rng(7)
     matrix = np.diag([0.9, 0.5, 0.2, 0.7])
     counted = np.array([True, True, True, False])
@@ -764,16 +762,16 @@ def test_anderson_acceleration_can_leave_entries_out():
         np.testing.assert_allclose(y[:3], x, atol=1e-9)
 
 
-def test_anderson_acceleration_bears_a_standstill():
-    """Equal iterates, as at the end of a calibration, give no division by zero."""
+def test_anderson_acceleration_accepts_equal_iterates():
+    """Equal iterates, as at the end of a calibration, do not divide by zero."""
     accelerated = Anderson(depth=3)
     x = np.arange(5.0)
     for _ in range(6):
         np.testing.assert_allclose(accelerated.next(x, x), x)
 
 
-def test_a_network_can_be_calibrated_as_it_was_measured():
-    """self_calibrate takes what measured_network gives; the job adds nothing to the numbers."""
+def test_self_calibrate_gives_the_numbers_of_calibrate():
+    """self_calibrate takes the output of measured_network."""
     with threadpool_limits(1):
         run = self_calibrate(measured_network(frames_of(count=8), PHANTOM), rounds(2))
     np.testing.assert_allclose(

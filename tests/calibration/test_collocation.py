@@ -1,5 +1,5 @@
-"""Models that are adjusted with the network: series, signal and trend, additional parameters,
-stepwise terms, auto.
+"""Models that are adjusted with the network: series, collocation, additional parameters, stepwise
+terms, auto.
 """
 
 import sys
@@ -88,8 +88,8 @@ def pixels(count=400, seed=0, size=SIZE):
 # ---- series
 
 
-def test_functions_are_those_of_the_document():
-    """Written out one by one, as docs/calibration_file.md has them."""
+def test_functions_agree_with_the_documentation():
+    """Written out one by one from docs/calibration_file.md."""
     functions = Functions(SIZE, 2, 3)
     uv = pixels(20)
     w, h = SIZE
@@ -110,7 +110,7 @@ def test_functions_are_those_of_the_document():
     assert len(functions) == len(columns)
 
 
-def test_a_series_is_packed_and_unpacked_to_the_last_bit():
+def test_packing_of_a_series_is_exact():
     functions = Functions(SIZE, 3, 5)
     rng = np.random.default_rng(1)
     series = Series(
@@ -133,7 +133,7 @@ def test_a_series_is_packed_and_unpacked_to_the_last_bit():
         ({3: np.zeros((33, 32))}, 'standard deviations, not'),
     ],
 )
-def test_a_damaged_series_is_refused(changes, said):
+def test_damaged_series_is_refused(changes, said):
     parts = [3, 0, np.zeros((2, 10)), np.zeros((SD_GRID, SD_GRID))]
     for at, value in changes.items():
         parts[at] = value
@@ -141,7 +141,7 @@ def test_a_damaged_series_is_refused(changes, said):
         unpacked(SIZE, *parts)
 
 
-def test_standard_deviation_over_the_image_is_that_of_the_coefficients():
+def test_standard_deviation_over_the_image_follows_from_the_coefficients():
     functions = Functions(SIZE, 3, 6)
     root = np.random.default_rng(2).normal(size=(2 * len(functions), 50))
     sd = sd_over_image(functions, root @ root.T)
@@ -152,7 +152,7 @@ def test_standard_deviation_over_the_image_is_that_of_the_coefficients():
     np.testing.assert_allclose(series.sd_at(nodes), sd.ravel(), rtol=1e-9)
 
 
-def test_a_model_with_a_series_knows_what_lies_outside():
+def test_model_with_a_series_has_a_calibrated_area():
     functions = Functions(SIZE, 3)
     uv = pixels(size=(500, 500))
     model = create_model(
@@ -176,9 +176,9 @@ def test_a_model_with_a_series_knows_what_lies_outside():
 
 
 @pytest.mark.parametrize('sd, reach', [(0.5, 180.0), (1.2, 100.0)])
-def test_the_sines_have_the_covariance_function_of_matern(sd, reach):
+def test_sines_have_the_matern_covariance_function(sd, reach):
     """Against the closed form with a Bessel function (Rasmussen and Williams 2006, Eq. 4.14), away
-    from the rim, where the sines come to an end.
+    from the edge, where the sines vanish.
     """
     functions = Functions((1024, 1024), -1, 40)
     uv = pixels(40, size=(500, 500)) + 262
@@ -190,8 +190,8 @@ def test_the_sines_have_the_covariance_function_of_matern(sd, reach):
 
 
 def drawn_field(functions, prior, seed, uv, noise):
-    """Coefficients drawn from a Prior and noisy values of the field at pixels, as information and
-    right side.
+    """Coefficients drawn from a Prior, and noisy values of the field at pixels as information and
+    right-hand side.
     """
     rng = np.random.default_rng(seed)
     m = len(functions)
@@ -218,9 +218,9 @@ def drawn_field(functions, prior, seed, uv, noise):
     return information, (values.T @ observed / noise**2).T.ravel()
 
 
-def test_the_prior_of_a_signal_is_found_from_the_observations():
-    """Standard deviation and reach within a fifth, mean of some fields; terms that are not there
-    get no variance.
+def test_prior_of_a_signal_is_estimated():
+    """Standard deviation and correlation length within a fifth, mean of several fields; absent
+    terms get no variance.
     """
     functions = Functions((1024, 1024), 3, 18)
     uv = pixels(2500, 3, (1024, 1024))
@@ -275,7 +275,7 @@ def network_with_additional(scalar, seed=0, **shape):
 
 
 def dense_normal(network, result):
-    """Dense normal matrix of all unknowns, additional parameters last, by central differences of
+    """Dense normal matrix of all unknowns, additional parameters last, from central differences of
     the residuals.
     """
     m, n = network.n_exposures, network.n_points
@@ -321,9 +321,7 @@ def dense_normal(network, result):
 @pytest.mark.parametrize('scalar', [True, False])
 @pytest.mark.parametrize('shape', [dict(exposures=3, targets=30), dict(exposures=7, targets=20)])
 def test_covariances_with_additional_parameters_equal_the_dense_inverse(scalar, shape):
-    """Of all unknowns and of the projection, and the information of the additional parameters of
-    each fluoroscope.
-    """
+    """Of all unknowns and of the projection, and the information of the additional parameters."""
     network, truth = network_with_additional(scalar, **shape)
     result = adjust(
         network,
@@ -413,7 +411,7 @@ def rig_with(field, seed=1):
 
 
 def whole(rig, model, count=10, seed=1):
-    """SelfCalibration as a whole of fluoroscope a and the state of its model."""
+    """SelfCalibration of fluoroscope a, and the state of its model."""
     measured = measured_network(
         {'a': simulate_exposures(rig, count, seed).frames['a']}, rig.phantom
     )
@@ -429,9 +427,9 @@ def whole(rig, model, count=10, seed=1):
 
 
 @pytest.mark.long
-def test_stepwise_takes_the_terms_that_are_there():
-    """Pincushion and spiral alone: radial and spiral are found, and next to nothing else; nothing
-    where nothing is.
+def test_stepwise_selects_the_true_terms():
+    """Pincushion and spiral alone give radial and spiral terms and hardly any other; no distortion
+    gives none.
     """
 
     def smooth(field):
@@ -447,9 +445,9 @@ def test_stepwise_takes_the_terms_that_are_there():
 
 
 @pytest.mark.long
-def test_auto_takes_collocation_unless_held_out_exposures_speak_against_it():
-    """Steps of the distortion in small squares are no smooth signal: their neighbours tell them
-    better.
+def test_auto_selects_collocation_unless_cross_validation_is_worse():
+    """Steps of the distortion in small squares are no smooth signal: a neighbour model predicts
+    them better.
     """
     run, state = whole(virtual_rig(1), 'collocation', 15)
     assert better_model(run, state) is None
@@ -462,9 +460,7 @@ def test_auto_takes_collocation_unless_held_out_exposures_speak_against_it():
 @pytest.mark.long
 @pytest.mark.parametrize('model, most', [('auto', 1.1), ('hybrid', 1.15), ('parametric', 1.8)])
 def test_out_of_sample_error_is_near_that_of_known_distortion(model, most):
-    """40 exposures that the calibration has not seen; 3-D error of the object points over that of
-    known distortion.
-    """
+    """40 unused exposures: 3-D error of the object points relative to known distortion."""
     rig = rigs.rig()
     test = simulate_exposures(rig, 40, 10**6, start=StreamStart(number=1001))
     train = simulate_exposures(rig, 15, 1)
@@ -492,7 +488,7 @@ def test_out_of_sample_error_is_near_that_of_known_distortion(model, most):
 
 
 @pytest.mark.long
-def test_precision_is_honest():
+def test_errors_agree_with_standard_deviations():
     """Some calibrations of `make precision`: object points 0.9 to 1.1, intervals of the correction
     near 95 %.
     """

@@ -39,7 +39,7 @@ def jobs():
     }
 
 
-def test_the_result_tells_the_relative_orientation(jobs):
+def test_result_contains_the_relative_orientation(jobs):
     found = {way: result_document(job)['relative_orientation'] for way, job in jobs.items()}
     a, b = rigs.rig().fluoroscopes
     rotation = b.rotation @ a.rotation.T
@@ -98,10 +98,8 @@ def test_exposures_are_paired_by_number():
 
 @pytest.mark.long
 @pytest.mark.parametrize('model', ['none', 'collocation', 'local_linear'])
-def test_a_free_network_is_calibrated(model):
-    """Its shape is that of the phantom; targets that it does not determine are left out, with a
-    sentence.
-    """
+def test_free_network_is_calibrated(model):
+    """Its shape is that of the phantom; undetermined targets are left out and reported."""
     job = calibrate(
         FRAMES,
         PHANTOM,
@@ -118,7 +116,7 @@ def test_a_free_network_is_calibrated(model):
         assert np.median(np.linalg.norm(points[good], axis=1)) < 0.2
 
 
-def test_known_interior_orientation_weighs():
+def test_prior_of_the_interior_orientation_has_weight():
     free, weighted = (
         calibrate(
             {'a': FRAMES['a']},
@@ -144,14 +142,14 @@ def test_known_interior_orientation_weighs():
         dict(interior='fixed', interior_sd=(1, 1, 1)),
     ],
 )
-def test_wrong_options_are_refused(options):
+def test_invalid_options_are_refused(options):
     with pytest.raises(ValueError):
         CalibrationOptions(**options)
 
 
 @pytest.mark.long
 def test_false_matches_and_a_moved_bead_are_in_the_result(jobs):
-    """Image points of wrong number: those far off by the truth are found, and hardly others."""
+    """Wrong ids: image points far from the truth are found, and hardly any others."""
     survey = PHANTOM.xyz_mm.copy()
     rays = np.bincount(
         np.concatenate([f.target_id for of in FRAMES.values() for f in of]), minlength=504
@@ -207,13 +205,13 @@ def files(tmp_path):
         ['--relative-sd', '0,1'],
     ],
 )
-def test_wrong_usage(files, arguments):
+def test_wrong_usage_is_refused(files, arguments):
     with pytest.raises(SystemExit) as status:
         main(['calibrate', *files[0], *arguments])
     assert status.value.code == 2
 
 
-def test_the_command_line_constrains(files):
+def test_command_line_constrains_the_relative_orientation(files):
     main(
         [
             'calibrate',

@@ -1,6 +1,4 @@
-"""Orientation of a rig: from a capture and from exposures, its file, and the commands that make
-and use it.
-"""
+"""Orientation of a rig from a capture or exposures, its file, and the commands that use it."""
 
 import csv
 import json
@@ -52,7 +50,7 @@ NOISE_PX = 0.25
 
 
 def capture(of_rig=None, count=1, seed=3, pose=(np.eye(3), np.zeros(3)), false_matches=0.01):
-    """{fluoroscope: [Frame, ...]} of the phantom standing in a pose."""
+    """Frames by fluoroscope of the phantom standing in a pose."""
     of_rig = of_rig or rig()
     rng = np.random.default_rng(seed)
     points = of_rig.true_mm @ pose[0].T + pose[1]
@@ -80,7 +78,7 @@ def calibrations():
 
 
 def without_distortion(seed=1):
-    """A virtual rig without distortion, its survey drawn anew with the seed."""
+    """A virtual rig without distortion; the seed draws a new survey."""
     still = virtual_rig(1, strength=0.0)
     survey = still.true_mm + np.random.default_rng(seed).normal(0, 0.1, still.true_mm.shape)
     return VirtualRig(
@@ -91,8 +89,8 @@ def without_distortion(seed=1):
 
 
 def drawn_calibrations(of_rig, seed):
-    """Calibrations of fluoroscopes without distortion, with interior orientations as uncertain as
-    they say.
+    """Calibrations without distortion whose interior orientations scatter by their standard
+    deviations.
     """
     rng = np.random.default_rng([seed, 8])
     out = {}
@@ -119,10 +117,8 @@ def normalised(step, covariance):
 # ---- from a capture
 
 
-def test_points_after_a_capture_have_honest_errors():
-    """Markers in motion with the learned corrections: errors as large as claimed, false matches
-    few.
-    """
+def test_errors_of_points_after_a_capture_agree_with_their_covariances():
+    """Moving markers with estimated corrections; few false matches remain."""
     orientation = orientation_of_capture(capture(), rig().phantom, calibrations())
     assert (
         orientation.source == 'capture'
@@ -145,9 +141,7 @@ def test_points_after_a_capture_have_honest_errors():
 
 
 def test_covariance_of_a_capture_against_monte_carlo():
-    """Noise, survey and the interior orientations that are held: all 18 unknowns with their full
-    covariance.
-    """
+    """Noise, survey and held interior orientations: full covariance of all 18 unknowns."""
     squares = []
     for seed in range(40):
         still = without_distortion(seed)
@@ -193,7 +187,7 @@ def test_frames_of_a_capture_are_averaged():
     np.testing.assert_array_equal(again.uv[~which], merged.uv[~which])
 
 
-def test_a_phantom_that_moves_is_refused():
+def test_moving_phantom_is_refused():
     frames = capture(count=3)
     later = capture(pose=(np.eye(3), np.array([0.0, 0.0, 2.0])))
     frames['b'][2] = replace(later['b'][0], number=3)
@@ -205,8 +199,8 @@ def test_a_phantom_that_moves_is_refused():
         orientation_of_capture(frames, rig().phantom, calibrations())
 
 
-def test_better_known_targets_make_a_better_orientation():
-    """A Phantom of the object points of the calibration."""
+def test_more_precise_targets_give_a_more_precise_orientation():
+    """The phantom consists of the object points of the calibration."""
     targets = calibrated('a').targets
     better = phantom_of(targets)
     assert isinstance(targets, Targets) and np.median(better.sd_mm) < 0.08
@@ -259,7 +253,7 @@ def test_better_known_targets_make_a_better_orientation():
         ),
     ],
 )
-def test_a_capture_that_will_not_do_is_refused_in_a_sentence(change, sentence):
+def test_invalid_capture_is_refused_in_one_sentence(change, sentence):
     frames, held = change(capture(), calibrations())
     with pytest.raises(DataError, match=sentence):
         orientation_of_capture(frames, rig().phantom, held)
@@ -269,8 +263,8 @@ def test_a_capture_that_will_not_do_is_refused_in_a_sentence(change, sentence):
 
 
 def test_covariance_of_a_relative_orientation_against_monte_carlo():
-    """In the datum of points where the phantom was: 12 of the 18 unknowns are left when their
-    frame is fixed.
+    """In the datum of points at the place of the phantom: 12 of the 18 unknowns remain in a fixed
+    frame.
     """
     squares = []
     points = np.random.default_rng(0).uniform(-100, 100, (60, 3)) + [0, 0, 1500]
@@ -301,9 +295,9 @@ def test_covariance_of_a_relative_orientation_against_monte_carlo():
     assert np.mean(squares) == pytest.approx(1, abs=0.3)
 
 
-def test_the_datum_takes_out_what_moves_points_together_and_nothing_else():
-    """Distances keep their variances, and the points' centre and attitude have none; once is as
-    good as twice.
+def test_datum_removes_only_the_common_motion_of_points():
+    """Distances keep their variances, centre and attitude of the points have none; a second
+    transformation changes nothing.
     """
     found = orientation_of_exposures(exposures(), rig().phantom, calibrations())
     rng = np.random.default_rng(1)
@@ -367,7 +361,7 @@ def test_orientation_of_the_exposures_of_a_calibration():
     assert np.nanmean(apart - true) == pytest.approx(0, abs=0.03)
 
 
-def test_exposures_that_do_not_belong_together():
+def test_exposures_that_do_not_belong_together_are_refused():
     frames = exposures()
     apart = {'a': frames['a'], 'b': [replace(f, number=f.number + 100) for f in frames['b']]}
     with pytest.raises(
@@ -378,8 +372,8 @@ def test_exposures_that_do_not_belong_together():
         orientation_of_exposures(apart, rig().phantom, calibrations())
 
 
-def test_many_exposures_are_thinned_out_evenly():
-    """Those that all fluoroscopes have come first."""
+def test_many_exposures_are_thinned_evenly():
+    """Exposures that all fluoroscopes have take precedence."""
     frame = exposures()['a'][0]
     frames = {
         name: [replace(frame, fluoroscope=name, number=n) for n in range(*numbers)]
@@ -407,8 +401,8 @@ def found():
     return orientation_of_capture(capture(), rig().phantom, calibrations())
 
 
-def test_file_gives_the_same_orientation(tmp_path, found):
-    """To the last bit, and the same bytes again."""
+def test_file_round_trip_is_exact(tmp_path, found):
+    """Orientation and bytes are the same after reading and writing."""
     path = save_orientation(tmp_path / 'new' / 'folder', found)
     content = Path(path).read_bytes()
     again = load_orientation(path)
@@ -453,7 +447,7 @@ def test_file_gives_the_same_orientation(tmp_path, found):
         ({'position_mm': np.zeros((2, 3))}, 'the content does not belong to its orientation_id'),
     ],
 )
-def test_wrong_files_are_refused_in_a_sentence(tmp_path, found, change, sentence):
+def test_invalid_files_are_refused_in_one_sentence(tmp_path, found, change, sentence):
     path = save_orientation(tmp_path, found)
     with np.load(path) as file:
         arrays = {**file, **change}
@@ -463,7 +457,7 @@ def test_wrong_files_are_refused_in_a_sentence(tmp_path, found, change, sentence
 
 
 def test_damaged_files_are_refused(tmp_path, found):
-    """Wherever a byte is wrong or the file ends; and what was there stays when writing fails."""
+    """A wrong byte or a truncation anywhere; a failed write keeps the earlier file."""
     path = save_orientation(tmp_path, found)
     content = pathlib.Path(path).read_bytes()
     rng = np.random.default_rng(0)
@@ -494,8 +488,8 @@ def test_damaged_files_are_refused(tmp_path, found):
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """A rig's files, calibrations of both fluoroscopes with an orientation, and a bag of the
-    phantom standing in the rig frame.
+    """Calibrations of both fluoroscopes with an orientation, and a bag of the phantom standing in
+    the rig frame.
     """
     path = tmp_path_factory.mktemp('orient')
     assert run('simulate', '--out', path, '--seconds', 0.1) == 0
@@ -523,7 +517,9 @@ def said(capsys, *arguments):
 
 
 def test_calibrate_writes_an_orientation(folder, tmp_path, capsys):
-    """Of exposures that belong together; that of a capture which still fits is left."""
+    """From exposures that belong together; a capture whose calibrations did not change keeps its
+    orientation.
+    """
     assert run('simulate', '--out', tmp_path / 'rig', '--exposures', 4, '--seconds', 0) == 0
     write = (
         'calibrate',
@@ -591,8 +587,8 @@ def test_calibrate_writes_an_orientation(folder, tmp_path, capsys):
 
 
 def test_orient_and_reconstruct(folder, tmp_path, capsys):
-    """Of a bag: points in the frame of the standing phantom, near the true ones by their standard
-    deviations.
+    """From a bag: points in the frame of the standing phantom agree with the truth within their
+    standard deviations.
     """
     result = folder / 'result'
     out = tmp_path / 'points.csv'
@@ -652,8 +648,8 @@ def test_orient_and_reconstruct(folder, tmp_path, capsys):
     assert 0.6 < np.mean(((np.array(xyz) - true) / sd) ** 2) < 1.6
 
 
-def test_reconstruct_says_what_is_missing(folder, tmp_path, capsys):
-    """A frame or target without partner and a false match are counted, their cells empty."""
+def test_reconstruct_reports_what_is_missing(folder, tmp_path, capsys):
+    """Frames and targets without partner and false matches are counted; their cells are empty."""
     tracking = simulate_tracking(rig(), 0.05, 60, seed=1)
     frames = {name: list(of_one) for name, of_one in tracking.frames.items()}
     first = frames['b'][0]
@@ -701,8 +697,8 @@ def test_reconstruct_says_what_is_missing(folder, tmp_path, capsys):
     assert rows_of(tmp_path / 'out.csv')[1]['status'] in ('OK', 'OUTSIDE')
 
 
-def test_reconstruct_refuses_in_a_sentence(folder, tmp_path, capsys):
-    """And writes nothing."""
+def test_reconstruct_refuses_invalid_input_in_one_sentence(folder, tmp_path, capsys):
+    """It writes nothing."""
     result = folder / 'result'
     out = tmp_path / 'out.csv'
     other = tmp_path / 'other'
@@ -734,8 +730,8 @@ def test_reconstruct_refuses_in_a_sentence(folder, tmp_path, capsys):
     assert run(*source) == 0 and len(rows_of(out)) == 1
 
 
-def test_orient_refuses_in_a_sentence(folder, capsys):
-    """And leaves the orientation that is there."""
+def test_orient_refuses_invalid_input_in_one_sentence(folder, capsys):
+    """The existing orientation stays."""
     result = folder / 'result'
     before = (result / 'rig_orientation.npz').read_bytes()
     given = ('--phantom', folder / 'phantom.csv', '--calibration', result)
@@ -751,8 +747,8 @@ def test_orient_refuses_in_a_sentence(folder, capsys):
     capsys.readouterr()
 
 
-def test_a_pose_among_the_exposures_can_be_the_rig_frame(folder, tmp_path):
-    """One exposure is enough; its frame is where the phantom stood in it."""
+def test_one_exposure_can_define_the_rig_frame(folder, tmp_path):
+    """The frame is that of the phantom in this exposure."""
     copy = tmp_path / 'result'
     copy.mkdir()
     for path in (folder / 'result').glob('*.calibration.npz'):

@@ -1,6 +1,4 @@
-"""The command fluoro-calib: what it writes, what it prints, and what it says when something is
-wrong.
-"""
+"""The command fluoro-calib: its files, its output, and its error messages."""
 
 import csv
 import filecmp
@@ -163,7 +161,7 @@ NUMBERS = {
 
 
 def check_result(document, names, exposures):
-    """The contract of DESIGN, section 6."""
+    """Check the layout of result.json."""
     assert {*NUMBERS, 'relative_orientation'} <= document.keys()
     assert all(isinstance(document[key], kind) for key, kind in NUMBERS.items())
     assert list(document['fluoroscopes']) == names
@@ -224,7 +222,7 @@ def test_calibrate_writes_result_and_calibrations(result):
 
 @pytest.mark.long
 def test_bag_and_csv_give_the_same_numbers(rig, tmp_path):
-    """To the last digit, and again as a process of its own with two threads."""
+    """To the last digit, also in a process of its own with two threads."""
     more = ('--max-iterations', 1, '--fluoroscopes', 'a')
     assert run(*calibrate(rig, tmp_path / 'bag', *more)) == 0
     assert run(*calibrate(rig, tmp_path / 'csv', *more, *IMAGE, source='calibration.csv')) == 0
@@ -307,9 +305,7 @@ def test_options_of_calibrate_reach_the_result(rig, tmp_path, options, check):
 
 
 def test_adjust_holds_the_calibration(rig, result, tmp_path):
-    """Residuals of exposures it has not seen come down; the calibrations beside the result are the
-    same bytes.
-    """
+    """Residuals of unused exposures decrease; the calibrations of the folder do not change."""
     assert (
         run(
             'adjust',

@@ -21,7 +21,7 @@ NAME = 'inverse_distance'
 
 @pytest.fixture
 def added(tmp_path, monkeypatch):
-    """The model of the document, written to a file and entered in the registry."""
+    """The model of the documentation, written to a file and entered in the registry."""
     blocks = re.findall(r'```python\n(.*?)```', DOCUMENT.read_text(), re.S)
     (code,) = (block for block in blocks if f"kind = '{NAME}'" in block)
     path = tmp_path / f'{NAME}.py'
@@ -34,7 +34,7 @@ def added(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures('added')
-def test_it_calibrates_saves_loads_and_looks_up(tmp_path):
+def test_added_model_calibrates_saves_loads_and_looks_up(tmp_path):
     frames = {'a': rigs.exposures()['a'][:8]}
     result = calibrate(frames, rigs.rig().phantom, CalibrationOptions(NAME))
     calibration = result.calibrations['a']
@@ -57,24 +57,24 @@ def test_it_calibrates_saves_loads_and_looks_up(tmp_path):
 
 
 @pytest.mark.usefixtures('added')
-def test_its_number_of_neighbours_can_be_given():
+def test_number_of_neighbours_of_an_added_model_can_be_given():
     frames = {'a': rigs.exposures()['a'][:8]}
     options = CalibrationOptions(NAME, k=5, max_iterations=1)
     assert calibrate(frames, rigs.rig().phantom, options).calibrations['a'].model.k == 5
 
 
 @pytest.mark.usefixtures('added')
-def test_it_is_in_the_help_of_the_command(capsys):
+def test_added_model_is_in_the_help_of_the_command(capsys):
     assert rigs.run('calibrate', '--help') == 0
     assert NAME in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures('added')
-def test_the_options_declare_it():
+def test_options_declare_an_added_model():
     """Parameters of nodes, config and documentation are made from the declaration."""
     assert NAME in declared(CalibrationOptions)['model'].choices
 
 
-def test_a_model_that_is_not_in_the_registry_is_refused():
+def test_model_that_is_not_registered_is_refused():
     with pytest.raises(ValueError, match=f"model is one of auto, .*, not '{NAME}'"):
         CalibrationOptions(NAME)

@@ -1,4 +1,4 @@
-"""Correction models, their frame-rate form, the choice of k, the gauge and the regression step."""
+"""Correction models, the choice of k, the gauge and the regression step."""
 
 from dataclasses import replace
 
@@ -34,9 +34,7 @@ def training(n=600, seed=0, noise=0.2):
 
 
 def pixels(n=2000, seed=1):
-    """Pixels of the image: anywhere, its four corners, its rim, and borders of cells of every
-    size.
-    """
+    """Pixels of the image: random, the corners, the edge, and borders of cells of every size."""
     rng = np.random.default_rng(seed)
     uv = rng.uniform(-0.5, np.array(SIZE) - 0.5, (n, 2))
     uv[: n // 4] = np.clip(np.round(uv[: n // 4] / 8) * 8 - 0.5, -0.5, np.array(SIZE) - 0.5)
@@ -69,7 +67,7 @@ def test_knn_equals_scikit_learn(k):
 
 @pytest.mark.parametrize('k', [6, 20, 150])
 def test_local_linear_equals_a_weighted_least_squares_plane_for_each_pixel(k):
-    """On what a cubic polynomial leaves: tricube weights, bandwidth to the k-th neighbour."""
+    """On the remainder of a cubic polynomial: tricube weights, bandwidth to the k-th neighbour."""
     uv, duv = training()
     query = pixels(200)
     powers = [(i, j) for i in range(4) for j in range(4 - i)]
@@ -100,10 +98,8 @@ def test_local_linear_equals_a_weighted_least_squares_plane_for_each_pixel(k):
 
 
 @pytest.mark.parametrize('k', [6, 30, 200])
-def test_local_planes_reproduce_planes_also_beyond_the_rim(k):
-    """Without the trend: the smoother's own weights sum to one and have no first moment about the
-    pixel.
-    """
+def test_local_planes_reproduce_planes_beyond_the_edge(k):
+    """Without the trend: the weights sum to one and have no first moment about the pixel."""
     uv, _ = training()
     query = np.concatenate([pixels(100), [[-40.0, -40.0], [700.0, 500.0]]])
     order = np.argsort(np.linalg.norm(uv[None] - query[:, None], axis=2), axis=1)[:, :k]
@@ -117,7 +113,7 @@ def test_local_planes_reproduce_planes_also_beyond_the_rim(k):
 
 
 def test_local_linear_reproduces_cubic_polynomials():
-    """The trend takes them up whole: no error, wherever the pixel lies."""
+    """The trend is exact for them, wherever the pixel lies."""
     uv, _ = training(noise=0)
     rng = np.random.default_rng(3)
     coefficients = rng.normal(size=(10, 2))
@@ -135,14 +131,14 @@ def test_local_linear_reproduces_cubic_polynomials():
 
 
 def test_knn_has_no_trend_and_local_linear_a_cubic_one():
-    """A mean of neighbours is the paper's model: nothing is added to it."""
+    """A mean of neighbours is the paper's model, without a trend."""
     assert KnnModel.trend_degree is None and len(Trend(None, training()[0])) == 0
     assert len(Trend(LocalLinearModel.trend_degree, training()[0])) == 10
     assert least_squares_map(np.zeros((5, 0))).shape == (0, 5)
 
 
-def test_local_linear_beats_the_mean_at_the_rim():
-    """Without noise: the mean of neighbours that lie to one side is off, the plane is not."""
+def test_local_linear_is_better_than_the_mean_at_the_edge():
+    """Without noise: the mean of neighbours on one side is biased, the plane is not."""
     uv, duv = training(noise=0)
     corner = np.array([[0.0, 0.0], [639.0, 479.0], [0.0, 479.0], [639.0, 0.0]])
     error = {
@@ -154,7 +150,7 @@ def test_local_linear_beats_the_mean_at_the_rim():
     assert error['local_linear'] < 0.25 * error['knn']
 
 
-def test_no_correction_corrects_nothing_and_knows_no_outside():
+def test_no_correction_is_zero_and_has_no_outside():
     found = no_correction().evaluate(pixels(50))
     assert not found.duv.any() and not found.sd.any() and not found.outside.any()
 
@@ -185,12 +181,12 @@ def test_no_correction_corrects_nothing_and_knows_no_outside():
         (('knn', 2, np.zeros((9, 2)), np.full((9, 2), np.inf)), 'is not a number'),
     ],
 )
-def test_an_impossible_model_is_refused(arguments, said):
+def test_impossible_model_is_refused(arguments, said):
     with pytest.raises(ValueError, match=said):
         create_model(*arguments)
 
 
-def test_outside_is_what_lies_beyond_the_convex_hull():
+def test_outside_is_beyond_the_convex_hull():
     rng = np.random.default_rng(4)
     uv = rng.normal([320, 240], 60, (300, 2))
     model = create_model('knn', 3, uv, np.zeros((300, 2)))
@@ -212,8 +208,8 @@ def test_training_points_on_a_line_enclose_nothing():
 
 @pytest.mark.parametrize('kind, k', [('knn', 9), ('local_linear', 40)])
 def test_standard_deviations_against_monte_carlo(kind, k):
-    """600 times new noise in the training values: predictions scatter as sd says; bias_px comes on
-    top.
+    """600 times new noise in the training values: predictions scatter by their standard deviation;
+    bias_px is added to it.
     """
     uv, duv = training(noise=0)
     query = np.random.default_rng(5).uniform([60, 60], [580, 420], (40, 2))
@@ -257,7 +253,7 @@ def test_scores_of_knn_equal_a_loop_with_scikit_learn(weighted):
 
 
 def test_k_of_knn_is_that_of_grid_search():
-    """Same folds, unweighted: the k that scikit-learn's GridSearchCV finds, and its scores."""
+    """Same folds, no weights: k and scores of scikit-learn's GridSearchCV."""
     uv, duv = training(300, noise=1.0)
     groups = np.random.default_rng(10).integers(0, 12, 300)
     fold = np.empty(300, dtype=int)
@@ -284,7 +280,7 @@ def test_k_of_knn_is_that_of_grid_search():
 
 
 def test_scores_of_local_linear_equal_a_loop_with_models():
-    """The trend is that of the other folds too: nothing of a held-out exposure is used."""
+    """The trend is that of the other folds, too: nothing of a held-out exposure is used."""
     uv, duv = training(300)
     rng = np.random.default_rng(11)
     information = random_information(rng, 300)
@@ -319,7 +315,7 @@ def test_folds_hold_whole_exposures():
     assert set(exposure_folds(np.array([4, 4, 9, 9]))) == {0, 1}, 'fewer exposures than folds'
 
 
-def test_candidates_stay_within_what_the_training_points_allow():
+def test_candidates_are_limited_by_the_training_points():
     assert KnnModel.candidate_k(2000).tolist() == list(range(3, 101))
     assert KnnModel.candidate_k(50).tolist() == list(range(3, 21))
     steps = LocalLinearModel.candidate_k(2000)
@@ -338,10 +334,8 @@ def test_candidates_stay_within_what_the_training_points_allow():
 # ---- gauge
 
 
-def test_the_gauge_is_what_a_change_of_orientation_does_to_the_image():
-    """Changes of xp, yp, c and turns of the sensor that are common to all exposures, to first
-    order.
-    """
+def test_gauge_is_the_effect_of_a_change_of_orientation():
+    """Changes of xp, yp, c and rotations of the sensor common to all exposures, to first order."""
     network, truth = rigs.small_network(exposures=5, targets=40)
     rotation, position, points, interior = network.per_image_point(truth)
     uv = project(rotation, position, points, interior)
@@ -395,7 +389,7 @@ def regressor_and_values(kind='local_linear', interior_held=False, k=None, n=600
 
 
 def chosen(kind='local_linear', interior_held=False, k=None):
-    """A regressor after its first choice, with 20 outliers, and the values."""
+    """A regression step after its first choice, with 20 outliers, and its values."""
     regressor, values = regressor_and_values(kind, interior_held, k)
     q = np.ones(len(values))
     q[::30] = 2 * INLIER_Q
@@ -405,8 +399,8 @@ def chosen(kind='local_linear', interior_held=False, k=None):
 
 
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])
-def test_the_regressor_smooths_as_its_model_predicts(kind):
-    """Fitted to the inliers only, evaluated at all image points; outliers leave no trace."""
+def test_regression_smooths_as_its_model_predicts(kind):
+    """Fitted to the inliers only, evaluated at all image points; outliers have no influence."""
     regressor, values = chosen(kind)
     inside = regressor.inliers
     np.testing.assert_array_equal(inside, np.arange(600) % 30 != 0)
@@ -422,7 +416,7 @@ def test_the_regressor_smooths_as_its_model_predicts(kind):
     assert np.abs(regressor.smooth(values)).max() < 10
 
 
-def test_the_chosen_k_has_the_smallest_score():
+def test_chosen_k_has_the_smallest_score():
     regressor, values = chosen('knn')
     inside = regressor.inliers
     validation = CrossValidation(
@@ -436,13 +430,13 @@ def test_the_chosen_k_has_the_smallest_score():
     assert regressor.score == pytest.approx(scores.min(), rel=1e-12)
 
 
-def test_a_given_k_is_kept():
+def test_given_k_is_kept():
     for kind in ('knn', 'local_linear'):
         assert chosen(kind, k=17)[0].k == 17
 
 
-def test_a_change_is_told_and_inliers_do_not_flicker():
-    """Who has gone out comes back only when well inside; a repeated round changes nothing."""
+def test_changes_are_reported_and_inliers_have_hysteresis():
+    """An outlier returns only when well inside the limit; a repeated round changes nothing."""
     regressor, values = chosen()
     information = np.tile(np.eye(2), (600, 1, 1))
     q = np.where(np.arange(600) % 30 == 0, 2 * INLIER_Q, 1.0)
@@ -462,9 +456,9 @@ def test_a_change_is_told_and_inliers_do_not_flicker():
 
 @pytest.mark.parametrize('interior_held', [False, True])
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])
-def test_the_fitted_correction_is_made_orthogonal_to_the_gauge(kind, interior_held):
-    """To shift, scale and turns of the sensor; to the turns alone where the interior orientation
-    is held.
+def test_fitted_correction_is_made_orthogonal_to_the_gauge(kind, interior_held):
+    """To shift, scale and rotations of the sensor; only to the rotations while the interior
+    orientation is held.
     """
     interior = np.array([320.0, 240.0, 2000.0])
     regressor, values = chosen(kind, interior_held)
@@ -480,9 +474,9 @@ def test_the_fitted_correction_is_made_orthogonal_to_the_gauge(kind, interior_he
     assert size[0] > 0.3 and size[1] < (1e-9 if kind == 'local_linear' else 2e-2) * size[0]
 
 
-def test_a_held_interior_orientation_leaves_the_scale_to_the_correction():
-    """An error of the principal distance is learned by the model; estimated, it is not its
-    business.
+def test_scale_is_part_of_the_correction_while_the_interior_orientation_is_held():
+    """The model then learns an error of the principal distance; otherwise the adjustment estimates
+    it.
     """
     interior = np.array([320.0, 240.0, 2000.0])
     for held, part in ((True, 1.0), (False, 0.0)):
@@ -496,9 +490,7 @@ def test_a_held_interior_orientation_leaves_the_scale_to_the_correction():
 
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])
 def test_noise_and_bias_of_a_model_are_estimated(kind):
-    """Pure noise of 0.3 px on a plane field: that noise, hardly a bias. A fast wave: a bias that
-    is seen.
-    """
+    """Noise of 0.3 px on a plane field: hardly any bias. A short wave: a clear bias."""
     rng = np.random.default_rng(13)
     uv = rng.uniform(-0.5, np.array(SIZE) - 0.5, (1500, 2))
     exposure = np.repeat(np.arange(15), 100)
@@ -514,7 +506,7 @@ def test_noise_and_bias_of_a_model_are_estimated(kind):
     assert regressor.model(waves).bias_px > 0.1
 
 
-def test_a_model_equals_its_copy_with_other_quality_figures():
+def test_copy_with_other_noise_keeps_the_predictions():
     """replace() keeps the training points: predictions stay, standard deviations scale."""
     model = create_model('local_linear', 20, *training(), noise_px=0.1)
     twice = replace(model, noise_px=0.2)
@@ -523,10 +515,8 @@ def test_a_model_equals_its_copy_with_other_quality_figures():
     np.testing.assert_allclose(twice.evaluate(query).sd, 2 * model.evaluate(query).sd, rtol=1e-12)
 
 
-def test_neighbours_among_changing_points_are_those_of_a_search():
-    """NeighbourTable: the nearest allowed, in order, also where most are not allowed, and after a
-    restriction.
-    """
+def test_neighbour_table_equals_a_search_among_the_allowed_points():
+    """In order of distance, also where few points are allowed, and after a restriction."""
     uv, _ = training(400)
     rng = np.random.default_rng(14)
     table = NeighbourTable(uv, 12)
@@ -544,7 +534,7 @@ def test_neighbours_among_changing_points_are_those_of_a_search():
     np.testing.assert_array_equal(smaller.nearest(np.arange(kept.sum()), all_of_it, 30), near)
 
 
-def test_an_impossible_k_is_refused():
+def test_impossible_k_is_refused():
     for kind, k in (('local_linear', 5), ('knn', 581)):
         with pytest.raises(
             ValueError, match=f'{kind} with k = {k} is not possible with 580 inliers'

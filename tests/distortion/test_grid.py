@@ -1,4 +1,4 @@
-"""The lookup grid of the correction: accuracy, status, odd points, sizes and threads."""
+"""The lookup grid of the correction: accuracy, status, invalid points, image sizes and threads."""
 
 import copy
 import functools
@@ -30,7 +30,7 @@ SIZE = (120, 93)
 
 
 def calibration_of(kind):
-    """A calibration of the virtual rig, its grid built."""
+    """A calibration of the virtual rig with its grid."""
     return rigs.calibrated('a', model=kind).calibrations['a']
 
 
@@ -41,8 +41,8 @@ def looked_up(grid, uv):
 
 
 def any_pixels(grid, n=6000, seed=0):
-    """Pixels anywhere, and where cells are worst: corners, middles of their edges, middles, and
-    their borders.
+    """Random pixels, and the corners, edge midpoints, centres and borders of cells, where errors
+    are largest.
     """
     rng = np.random.default_rng(seed)
     uv = rng.uniform(-0.5, np.array(grid.image_size) - 0.5, (n, 2))
@@ -60,7 +60,9 @@ def difference(grid, model, uv):
 
 
 def corners_of(grid, uv):
-    """The four corners (4, n, 2) of the cells of pixels; a pixel on a border is in either cell."""
+    """The four corners (4, n, 2) of the cells of pixels; a pixel on a border belongs to either
+    cell.
+    """
     place = []
     for line, x in zip(grid.nodes, uv.T):
         i = np.clip(np.searchsorted(line, x - 1e-9, side='right') - 1, 0, len(line) - 2)
@@ -78,10 +80,8 @@ def training(n=300, seed=0, noise=0.1, size=SIZE):
 
 
 @pytest.mark.parametrize('kind', SMOOTH)
-def test_the_correction_is_the_models_but_for_a_hundredth_of_a_pixel(kind):
-    """Anywhere, where cells are worst by design, and around the pixels that were found to be
-    worst.
-    """
+def test_lookup_agrees_with_the_model_within_a_hundredth_of_a_pixel(kind):
+    """At random pixels, where cells are least accurate, and near the worst pixels found."""
     calibration = calibration_of(kind)
     grid = calibration.grid
     model = calibration.model
@@ -102,7 +102,7 @@ def test_the_correction_is_the_models_but_for_a_hundredth_of_a_pixel(kind):
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_at_corners_of_cells_the_values_are_the_models(kind):
+def test_lookup_is_exact_at_the_corners_of_cells(kind):
     calibration = calibration_of(kind)
     rng = np.random.default_rng(2)
     uv = np.stack([rng.choice(line, 3000) for line in calibration.grid.nodes], axis=1)
@@ -112,10 +112,8 @@ def test_at_corners_of_cells_the_values_are_the_models(kind):
     np.testing.assert_allclose(sd, exact.sd, rtol=0, atol=1e-8)
 
 
-def test_nearest_neighbours_are_answered_from_within_their_cell():
-    """Piecewise constant: the lookup lies between the values at the corners of the cell, which is
-    small.
-    """
+def test_lookup_of_nearest_neighbours_lies_between_the_corners_of_the_cell():
+    """The model knn is piecewise constant, and its cells are small."""
     calibration = calibration_of('knn')
     grid = calibration.grid
     assert grid.cell_px == min(grid_cells.CELL_PX)
@@ -141,7 +139,7 @@ def test_standard_deviations(kind):
     'kind, k', [('knn', 1), ('knn', 7), ('local_linear', 6), ('local_linear', 40)]
 )
 @pytest.mark.parametrize('points', ['even', 'few', 'clusters', 'duplicates', 'beside'])
-def test_corners_have_the_models_neighbours_however_training_points_lie(kind, k, points):
+def test_corners_have_the_neighbours_of_the_model_for_any_training_points(kind, k, points):
     rng = np.random.default_rng(7)
     uv, duv = training()
     if points == 'few':
@@ -173,7 +171,7 @@ def test_corners_have_the_models_neighbours_however_training_points_lie(kind, k,
         np.testing.assert_allclose(sd[certain], exact.sd[certain], rtol=1e-6, atol=1e-8)
 
 
-def test_a_grid_that_does_not_reach_the_accuracy_says_so():
+def test_insufficient_accuracy_is_reported():
     """Rough values, few neighbours: no cell is small enough."""
     uv, duv = training(noise=3.0)
     model = create_model('local_linear', 6, uv, duv)
@@ -186,7 +184,7 @@ def test_a_grid_that_does_not_reach_the_accuracy_says_so():
 
 @pytest.mark.parametrize('k, noise, height', [(12, 0.1, 0.1), (30, 0.3, 0.3)])
 def test_cells_that_are_not_accurate_enough_are_divided(k, noise, height):
-    """Few neighbours, so kinks; pixels in the divided cells, on their edges and on the edges of
+    """Few neighbours give kinks; pixels in divided cells, on their edges, and on the edges of
     their parts.
     """
     uv, duv = training(1500, noise=noise, size=(500, 400))
@@ -224,7 +222,7 @@ def test_cells_are_as_large_as_the_accuracy_allows():
     assert calibration_of('none').grid.error_px == 0
 
 
-def test_a_large_image_gets_larger_cells(monkeypatch):
+def test_large_image_has_larger_cells(monkeypatch):
     uv, duv = training()
     model = create_model('local_linear', 40, uv, duv)
     found = []
@@ -240,7 +238,7 @@ def test_a_large_image_gets_larger_cells(monkeypatch):
 
 @pytest.mark.parametrize('size', [(1, 1), (3, 2), (17, 33), (130, 7), (121, 94)])
 def test_images_of_any_size(size):
-    """Cells are from edge to edge, whatever is left over by their size."""
+    """Cells reach from edge to edge, whatever the image size."""
     model = create_model('local_linear', 40, *training())
     grid = CorrectionGrid(model, size)
     uv = any_pixels(grid, 800)
@@ -254,7 +252,7 @@ def test_images_of_any_size(size):
 
 
 @pytest.mark.parametrize('kind', KINDS)
-def test_ok_is_a_promise_and_outside_begins_less_than_a_cell_before(kind):
+def test_ok_is_inside_and_outside_begins_at_most_one_cell_early(kind):
     calibration = calibration_of(kind)
     grid = calibration.grid
     model = calibration.model
@@ -346,7 +344,7 @@ def test_points_at_the_edge_and_off_the_image(kind):
 # ---- the same numbers from every way in
 
 
-def test_frames_and_large_arrays_get_the_same_bits():
+def test_frames_and_large_arrays_give_the_same_bits():
     calibration = calibration_of('collocation')
     uv = np.random.default_rng(5).uniform(-20, 1040, (6 * CHUNK + 77, 2))
     sigma = np.random.default_rng(6).uniform(0.1, 2, len(uv))
@@ -392,7 +390,7 @@ def test_frames_and_large_arrays_get_the_same_bits():
     assert start < len(uv)
 
 
-def test_results_are_put_where_they_are_wanted():
+def test_results_are_written_into_given_arrays():
     grid = calibration_of('parametric').grid
     u, v = np.random.default_rng(7).uniform(0, 1000, (2, CHUNK + 500))
     values = np.empty((3, len(u)))
@@ -407,7 +405,7 @@ def test_results_are_put_where_they_are_wanted():
 
 
 def test_two_grids_of_one_calibration_are_the_same():
-    """Live and offline: each process builds its own."""
+    """Live and offline processes build their own."""
     for kind in ('local_linear', 'collocation'):
         calibration = calibration_of(kind)
         other = replace(calibration)
@@ -419,7 +417,7 @@ def test_two_grids_of_one_calibration_are_the_same():
         assert other.correct(uv).uv.tobytes() == calibration.correct(uv).uv.tobytes()
 
 
-def test_a_grid_survives_a_copy():
+def test_copy_of_a_grid_gives_the_same():
     calibration = calibration_of('parametric')
     uv = any_pixels(calibration.grid, 100)
     calibration.correct(uv[::-1])
@@ -427,7 +425,7 @@ def test_a_grid_survives_a_copy():
     assert looked_up(other, uv)[0].tobytes() == looked_up(calibration.grid, uv)[0].tobytes()
 
 
-def test_sigma_is_that_of_observation_and_correction_together():
+def test_sigma_includes_observation_and_correction():
     calibration = calibration_of('collocation')
     uv = np.array([[300.0, 400.0], [700.5, 500.25]])
     sd = looked_up(calibration.grid, uv)[1]
@@ -448,8 +446,8 @@ def test_sigma_is_that_of_observation_and_correction_together():
 
 
 def test_threads_share_a_grid():
-    """Frames of different lengths at the same time, first lookups included: everyone gets their
-    own numbers.
+    """Frames of different lengths at the same time, first lookups included, give the right
+    numbers.
     """
     grid = CorrectionGrid(calibration_of('collocation').model, (1024, 1024))
     rng = np.random.default_rng(8)
@@ -506,12 +504,12 @@ def test_no_correction():
 
 @functools.cache
 def sparse(kind):
-    """A calibration of five exposures, which leave large parts of the image uncovered."""
+    """A calibration of five exposures, which leaves large parts of the image uncovered."""
     return rigs.calibrated('a', 5, model=kind).calibrations['a']
 
 
 @pytest.mark.parametrize('kind', ['local_linear', 'hybrid', 'collocation'])
-def test_the_accuracy_holds_with_few_exposures(kind):
+def test_accuracy_holds_with_few_exposures(kind):
     calibration = sparse(kind)
     uv = any_pixels(calibration.grid)
     status = looked_up(calibration.grid, uv)[2]

@@ -1,4 +1,4 @@
-"""The regressors: scikit-learn's checks, agreement with the models, and users' own regressors."""
+"""The regressors: scikit-learn's checks, agreement with the models, and regressors of users."""
 
 import json
 from dataclasses import replace
@@ -52,7 +52,7 @@ def training(n=600, seed=0, noise=0.2):
 
 
 @pytest.mark.parametrize('regressor', [KnnRegressor, LocalLinearRegressor])
-def test_checks_of_scikit_learn(regressor):
+def test_regressors_pass_check_estimator(regressor):
     results = check_estimator(
         regressor(), expected_failed_checks=EXPECTED_FAILURES[regressor], on_skip=None
     )
@@ -84,7 +84,7 @@ def test_the_faster_search_gives_the_numbers_of_scikit_learn(k, options):
 
 
 @pytest.mark.parametrize('regressor', [KnnRegressor, LocalLinearRegressor])
-def test_a_sample_of_weight_zero_is_left_out(regressor):
+def test_sample_of_weight_zero_is_ignored(regressor):
     uv, duv, _ = training()
     weight = np.random.default_rng(3).choice([0.0, 2.0], len(uv))
     weighted = regressor(10).fit(uv, duv, sample_weight=weight)
@@ -126,7 +126,7 @@ def lookup_model(size=(100, 60)):
     return LookupModel(0, uv, duv, 0.3, 0.1), inside
 
 
-def test_a_lookup_is_bilinear_and_keeps_the_calibrated_area():
+def test_lookup_is_bilinear_and_keeps_the_calibrated_area():
     model, inside = lookup_model()
     query = np.random.default_rng(5).uniform(-0.5, [99.5, 59.5], (400, 2))
     expected = np.stack([0.1 * query[:, 0] - 2, 0.01 * query[:, 0] + 0.2 * query[:, 1]], axis=1)
@@ -140,7 +140,7 @@ def test_a_lookup_is_bilinear_and_keeps_the_calibrated_area():
 
 
 @pytest.mark.parametrize('change', ['no points', 'shuffled', 'one column', 'uneven'])
-def test_a_lookup_without_a_grid_is_refused(change):
+def test_lookup_without_a_grid_is_refused(change):
     model, _ = lookup_model()
     uv = model.train_uv.copy()
     if change == 'no points':
@@ -168,8 +168,8 @@ def calibrated_with(model, **options):
     return calibrate(frames, rigs.rig().phantom, CalibrationOptions(model, **options))
 
 
-def test_calibration_with_a_users_regressor(tmp_path):
-    """It converges, has no part in the gauge, and is saved as a lookup grid."""
+def test_calibration_with_a_user_regressor(tmp_path):
+    """It converges, is orthogonal to the gauge, and is saved as a lookup grid."""
     result = calibrated_with(cubic())
     calibration = result.calibrations['a']
     run = result.runs['a']
@@ -197,15 +197,15 @@ def test_calibration_with_a_users_regressor(tmp_path):
     assert loaded.grid.error_px < 1e-9 and loaded.grid.cell_px == 8
 
 
-def test_the_same_observations_give_the_same_bits_with_a_random_regressor():
-    """A single-output regressor with random_state=None is fitted to each output, seeded."""
+def test_random_regressor_gives_reproducible_results():
+    """A single-output regressor with random_state=None is seeded and fitted to each output."""
     regressor = DecisionTreeRegressor(max_features=1, min_samples_leaf=10)
     one, other = (calibrated_with(regressor, max_iterations=2).calibrations['a'] for _ in range(2))
     assert one.calibration_id == other.calibration_id
     assert regressor.random_state is None
 
 
-def test_a_users_regressor_is_named_by_module_and_class():
+def test_user_regressor_is_named_by_module_and_class():
     found = resolve_model('sklearn.tree:DecisionTreeRegressor')
     assert isinstance(found, DecisionTreeRegressor)
     assert resolve_model('knn') == 'knn'
@@ -223,13 +223,13 @@ def test_a_users_regressor_is_named_by_module_and_class():
         ('collections:OrderedDict', 'is not a scikit-learn regressor'),
     ],
 )
-def test_a_name_that_is_no_regressor_is_refused(name, message):
+def test_name_that_is_no_regressor_is_refused(name, message):
     with pytest.raises(ValueError, match=message):
         resolve_model(name)
 
 
 def test_names_of_classes_are_refused_from_files_and_messages(tmp_path):
-    """They would run code of whoever wrote the file or sent the message."""
+    """They would run code of the author of the file or message."""
     with pytest.raises(ValueError, match='only on the command line and in Python') as error:
         CalibrationOptions('sklearn.tree:DecisionTreeRegressor')
     assert '\n' not in str(error.value)
@@ -243,7 +243,7 @@ def test_names_of_classes_are_refused_from_files_and_messages(tmp_path):
 
 
 @pytest.mark.parametrize('model', [DecisionTreeRegressor, 5, None, {}])
-def test_a_model_that_is_no_regressor_is_refused(model):
+def test_model_that_is_no_regressor_is_refused(model):
     with pytest.raises(ValueError, match='model is a name or a scikit-learn regressor'):
         CalibrationOptions(model)
 
@@ -255,14 +255,14 @@ def test_options_with_a_regressor_exclude_k():
         CalibrationOptions(cubic(), max_iterations=0)
 
 
-def test_lookup_cannot_be_asked_for():
+def test_lookup_cannot_be_selected():
     assert 'lookup' in MODELS
     with pytest.raises(ValueError, match='model is one of'):
         CalibrationOptions('lookup')
 
 
-def test_the_command_calibrates_with_a_users_regressor(tmp_path, capsys):
-    """The result folder names it; nothing that reads the folder runs it."""
+def test_command_calibrates_with_a_user_regressor(tmp_path, capsys):
+    """The result folder names it; reading the folder never runs it."""
     write_observations_csv(tmp_path / 'points.csv', {'a': rigs.exposures()['a'][:6]})
     write_phantom(tmp_path / 'phantom.csv', rigs.rig().phantom)
     source = ['--phantom', tmp_path / 'phantom.csv', '--image-size', '1024x1024']

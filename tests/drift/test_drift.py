@@ -1,4 +1,4 @@
-"""The drift watch: the rate of false alarms, and place and size of the drifts that it finds."""
+"""The drift watch: rate of false alarms, and place and size of the drifts found."""
 
 import copy
 import functools
@@ -67,7 +67,7 @@ def moving(rng, count, seconds, rate_hz):
 
 
 def autoregressive(rng, shape, correlation):
-    """Noise (T, n) of variance 1 with that correlation of successive rows."""
+    """Noise (T, n) of variance 1 with a given correlation of successive rows."""
     noise = rng.normal(size=shape)
     for k in range(1, len(noise) if correlation else 0):
         noise[k] = correlation * noise[k - 1] + np.sqrt(1 - correlation**2) * noise[k]
@@ -75,7 +75,7 @@ def autoregressive(rng, shape, correlation):
 
 
 def residuals(ids, uv_a, uv_b, residual, systematic=SYSTEMATIC_PX):
-    """EpipolarObservations of residuals (n,) of ids (n,)."""
+    """EpipolarObservations with residuals (n,) of ids (n,)."""
     n = len(ids)
     normal = np.broadcast_to(NORMAL, (n, 2))
     factor = np.full(n, FACTOR)
@@ -228,7 +228,7 @@ def test_correlated_noise_raises_the_variance():
     assert np.median(watch._epipolar.charts.variance_factor()) >= 0.95 * (1 + r) / (1 - r)
 
 
-def test_systematic_errors_within_what_the_calibration_claims_are_no_drift():
+def test_systematic_errors_within_the_stated_precision_are_no_drift():
     def residual(t, a, b):  # 2.5 standard deviations, another in every place
         return 2.5 * SYSTEMATIC_PX * np.sin(a[:, 0] / 90) * np.cos(b[:, 0] / 120 + a[:, 1] / 100)
 
@@ -246,7 +246,7 @@ def test_systematic_errors_within_what_the_calibration_claims_are_no_drift():
 def first_times(
     size, side=0, quarter='upper left', begin_s=20.0, seconds=32.0, seed=5, drift=None, **more
 ):
-    """Times of WARN and ERROR after the begin of a drift [s], and the last state."""
+    """Times of WARN and ERROR after the start of a drift [s], and the last state."""
     at = {WARN: np.inf, ERROR: np.inf}
 
     def note(t, state):
@@ -268,7 +268,7 @@ def first_times(
         (1, 'lower left', -0.35),
     ],
 )
-def test_a_drift_over_a_quarter_is_found_within_five_seconds_and_described(side, quarter, size):
+def test_drift_of_a_quarter_is_found_within_five_seconds_and_described(side, quarter, size):
     warn, error, state = first_times(size, side, quarter, seconds=27.0, count=30, rate_hz=120)
     assert 0 < warn <= error <= 5.0
     assert state.level == ERROR and state.fluoroscope == 'ab'[side] and quarter in state.place
@@ -287,7 +287,7 @@ def test_a_drift_over_a_quarter_is_found_within_five_seconds_and_described(side,
         assert part in state.message
 
 
-def test_a_drift_of_the_whole_image_is_found_and_both_images_are_named():
+def test_drift_of_the_whole_image_is_found_and_both_images_are_named():
     _, error, state = first_times(0, drift=lambda t, a, b: 0.35 * (t >= 20) * np.ones(len(a)))
     assert (
         error <= 5.0 and state.fluoroscope in ('a or b', 'b or a') and state.place == 'whole image'
@@ -295,7 +295,7 @@ def test_a_drift_of_the_whole_image_is_found_and_both_images_are_named():
     assert abs(state.size - 0.35 / FACTOR) <= 3 * state.sd
 
 
-def test_a_slow_drift_is_found_before_it_has_its_size():
+def test_slow_drift_is_found_before_it_reaches_its_size():
     at = 20.0
 
     def growing(t, a, b):  # 0.5 px in 100 s
@@ -305,7 +305,7 @@ def test_a_slow_drift_is_found_before_it_has_its_size():
     assert warn < error < 85 and 0.15 < state.size < 0.6 and state.level == ERROR
 
 
-def test_a_drift_before_the_start_is_held_against_the_calibration():
+def test_drift_before_the_start_is_compared_with_the_calibration():
     at = []
     state = state_after(
         DriftWatch(SIZES),
@@ -320,10 +320,8 @@ def test_a_drift_before_the_start_is_held_against_the_calibration():
     )
 
 
-def test_a_calibration_that_claims_less_accuracy_gets_a_wider_band():
-    """The same step of 0.35 px against the calibration: seen at 0.05 px, and within what 0.2 px
-    allow.
-    """
+def test_less_precise_calibration_has_a_wider_dead_band():
+    """The same step of 0.35 px against the calibration is a drift at 0.05 px, none at 0.2 px."""
     found = []
     for systematic in (0.05, 0.2):
         watch = DriftWatch(SIZES)
@@ -341,7 +339,7 @@ def test_a_calibration_that_claims_less_accuracy_gets_a_wider_band():
     assert found == [ERROR, OK]
 
 
-def test_an_alarm_ends_with_the_drift_and_with_a_reset():
+def test_alarm_ends_with_the_drift_and_with_a_reset():
     levels = {}
 
     def passing(t, a, b):
@@ -367,7 +365,7 @@ def test_an_alarm_ends_with_the_drift_and_with_a_reset():
 # ---- odd input
 
 
-def test_frames_with_nan_without_markers_late_or_from_the_past():
+def test_nan_empty_late_and_earlier_frames_are_accepted():
     watch = DriftWatch(SIZES)
     rng = np.random.default_rng(12)
     uv_a, uv_b = moving(rng, 12, 30, 24)
@@ -391,7 +389,7 @@ def test_one_or_two_markers_raise_no_alarm(count):
     assert state.level == OK and state.evidence == 0
 
 
-def test_a_lasting_false_match_of_one_marker_is_no_drift():
+def test_lasting_false_match_of_one_marker_is_no_drift():
     def residual(t, a, b):
         return np.where(np.arange(len(a)) == 3, 0.95 * (t > 14), 0.0)
 
@@ -456,7 +454,7 @@ def test_areas_cover_the_image_and_have_names(n):
     assert areas.cell(uv, (1000, 800)).tolist() == [0, n * n - 1, n - 1]
 
 
-def test_the_field_of_systematic_errors_is_learned():
+def test_field_of_systematic_errors_is_estimated():
     rng = np.random.default_rng(15)
     field = SystematicErrorField([(1024, 1024)] * 2)
 
@@ -504,8 +502,8 @@ class Known:
 
 @functools.cache
 def perfect(learned_s=12):
-    """Scene of a rig without distortion whose orientation is known, its watch after the start, the
-    blocks of that.
+    """Scene of a rig without distortion and with known orientation, its watch after the start, and
+    the blocks of the start.
     """
     rig = virtual_rig(3, strength=0.0)
     f = rig.fluoroscopes
@@ -558,10 +556,8 @@ def test_clusters_see_a_drift_along_the_epipolar_lines(name, quarter, direction)
     assert missed['warn'] == np.inf
 
 
-def test_what_clusters_cannot_see_is_not_claimed():
-    """A shift of a whole image along the epipolar lines moves all points alike; without a drift
-    nothing is told.
-    """
+def test_undetectable_drift_is_not_reported():
+    """A shift of a whole image along the epipolar lines moves all points alike."""
     scene, watch, first = perfect()
     for size in (0.5, 0.0):
         found = detection(
@@ -575,7 +571,7 @@ def test_what_clusters_cannot_see_is_not_claimed():
         assert found['warn'] == np.inf
 
 
-def test_a_moved_bead_is_named_as_a_possible_cause():
+def test_moved_bead_is_named_as_a_possible_cause():
     scene, watch, first = perfect()
     watch = copy.deepcopy(watch)
     rng = np.random.default_rng(19)
@@ -594,7 +590,7 @@ def test_a_moved_bead_is_named_as_a_possible_cause():
     assert 'a bead may have moved, as no other cluster shows it' in state.message
 
 
-def test_distances_may_be_declared():
+def test_distances_can_be_declared():
     scene, watch, first = perfect()
     rng = np.random.default_rng(16)
     beads = rng.uniform(-22, 22, (5, BEADS, 3))
@@ -632,7 +628,7 @@ def test_invalid_clusters_are_refused(arguments, sentence):
 
 
 def points(n, views=2, **arrays):
-    """PointObservations of zeros, but for the arrays given."""
+    """PointObservations of zeros, except for the given arrays."""
     zeros = {
         'xyz_mm': np.zeros((n, 3)),
         'covariance': np.zeros((n, 3, 3)),

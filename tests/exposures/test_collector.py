@@ -70,7 +70,7 @@ def test_frames_are_paired_by_stamp_within_the_tolerance():
 
 
 def test_number_of_waiting_frames_is_limited():
-    """What drops out alone is counted, and finds no partner any more."""
+    """A frame dropped without a partner is counted and not paired later."""
     pairer = CompletePairer('ab', PairingOptions(waiting=3))
     for number in range(1, 6):
         assert completed(pairer, frame('a', number)) is None
@@ -115,7 +115,7 @@ def test_unknown_kind_of_pairing_is_refused():
 
 
 def test_displacement_is_the_median_of_common_targets():
-    """Some false matches do not count; with too few targets in common two frames are different."""
+    """Some false matches have no effect; frames with too few common targets count as different."""
     one = frame()
     other = frame(shift=3.0)
     other.uv[:5] += 400
@@ -160,9 +160,7 @@ def test_movement_seen_by_one_fluoroscope_counts():
 
 
 def test_every_single_shot_in_a_new_pose_is_collected():
-    """Frames further apart than the still time have nothing to be compared with but the collected
-    poses.
-    """
+    """Frames further apart than the still time can only be compared with the collected poses."""
     collector = ExposureCollector('ab', StillOptions(still_time_s=0.1, new_px=10))
     assert collector.offer(pair(1, 0, 0)) == ''
     assert collector.offer(pair(2, 500, 9.9)) == 'this pose of the phantom is already collected'
@@ -170,7 +168,7 @@ def test_every_single_shot_in_a_new_pose_is_collected():
 
 
 def test_moving_phantom_after_a_gap_in_a_stream_is_not_collected():
-    """A busy machine loses frames of a stream; what comes behind the gap is no single shot."""
+    """A busy machine loses frames of a stream; a frame after the gap is no single shot."""
     collector = ExposureCollector('ab')
     taken = []
     times = [

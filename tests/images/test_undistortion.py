@@ -1,6 +1,4 @@
-"""Corrected images: where the beads of an image go, rims, folds, depths, and images that are not
-such.
-"""
+"""Corrected images: positions of beads, edges, folds, pixel depths, and invalid images."""
 
 import functools
 import threading
@@ -88,8 +86,8 @@ def off(image, light, uv, reach=9):
 
 @pytest.mark.long
 @pytest.mark.parametrize('kind', ['auto', 'local_linear', 'parametric'])
-def test_the_source_of_a_pixel_corrected_is_that_pixel(kind):
-    """The source is corrected as points are."""
+def test_corrected_source_of_a_pixel_is_the_pixel(kind):
+    """The map of sources is the inverse of the correction of points."""
     this = corrector(kind=kind)
     corrected = calibration(kind).correct(this.source[:, this.mask].T)
     v, u = np.nonzero(this.mask)
@@ -106,9 +104,9 @@ def test_the_source_of_a_pixel_corrected_is_that_pixel(kind):
 
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
 @pytest.mark.parametrize('dtype', DEPTHS)
-def test_beads_go_where_points_go(dtype, interpolation):
-    """Blobs drawn at observed positions lie, in the corrected image, where calibration.correct
-    puts them: the true distortion moves them by up to 17 px.
+def test_beads_move_as_points_do(dtype, interpolation):
+    """Blobs drawn at observed positions lie where calibration.correct puts them; the distortion is
+    up to 17 px.
     """
     at = np.stack(np.meshgrid(np.arange(62, 980, 60), np.arange(62, 980, 60)), axis=-1).reshape(
         -1, 2
@@ -127,9 +125,7 @@ def test_beads_go_where_points_go(dtype, interpolation):
 
 @pytest.mark.parametrize('interpolation, limit', [('linear', 1 / 64), ('cubic', 1 / 45)])
 def test_map_is_as_accurate_as_documented(interpolation, limit):
-    """On an image that tells where its pixels are: within what OpenCV's 1/32 px leave, and
-    rounding.
-    """
+    """On an image of coordinates: within OpenCV's 1/32 px and rounding."""
     this = corrector(interpolation)
     inner = this.mask & np.all((this.source > 1) & (this.source < 1022), axis=0)
     for axis, ramp in enumerate(np.mgrid[:1024, :1024][::-1] * 60):
@@ -142,9 +138,8 @@ def test_map_is_as_accurate_as_documented(interpolation, limit):
 @pytest.mark.parametrize('interpolation, order', [('linear', 1), ('cubic', 3)])
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_against_scipy(dtype, interpolation, order):
-    """map_coordinates at the same sources gives the same image, but for 1/64 px of its slope. Its
-    cubic is a spline through the pixels, OpenCV's a convolution: on a smooth image the two are
-    alike.
+    """map_coordinates at the same sources gives the same image within 1/64 px of its slope. Its
+    cubic is a spline through the pixels, OpenCV's a convolution: they agree on a smooth image.
     """
     image = random_image(dtype)
     this = corrector(interpolation)
@@ -158,8 +153,8 @@ def test_against_scipy(dtype, interpolation, order):
 
 @pytest.mark.parametrize('interpolation, limit', [('linear', 0.02), ('cubic', 0.005)])
 def test_distorted_and_corrected_image_is_the_original(interpolation, limit):
-    """An image bent by the correction, and corrected, is the image again, but for what
-    interpolation takes.
+    """An image distorted by the correction and corrected again is the original, except for
+    interpolation errors.
     """
     this = corrector(interpolation)
     image = random_image(np.uint16)
@@ -183,7 +178,7 @@ def test_distorted_and_corrected_image_is_the_original(interpolation, limit):
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_constant_image_stays_constant(dtype, interpolation):
-    """Up to the rim of what was seen, where nothing of the border is mixed in; beyond it is the
+    """Up to the edge of the observed area, without mixing with the border; beyond it is the
     border.
     """
     this = ImageCorrector(calibration(), interpolation, border=7)
@@ -200,8 +195,8 @@ def test_constant_image_stays_constant(dtype, interpolation):
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
 @pytest.mark.parametrize('dtype', DEPTHS)
 @pytest.mark.parametrize('size', [(37, 20), (1, 1), (16, 33)])
-def test_without_distortion_nothing_changes(size, dtype, interpolation):
-    """To the bit, up to the last pixel, on images of any size."""
+def test_identity_without_distortion(size, dtype, interpolation):
+    """To the bit, up to the last pixel, for images of any size."""
     uv = lattice((40, 40))
     calibration_of_none = with_model(model_of(uv, 0 * uv, 'none', 0), size)
     image = np.random.default_rng(0).integers(
@@ -211,8 +206,8 @@ def test_without_distortion_nothing_changes(size, dtype, interpolation):
     assert this.mask.all() and np.array_equal(this.correct(image), image)
 
 
-def test_shift():
-    """A correction of whole pixels moves the image, and what was not seen is left empty."""
+def test_shift_by_whole_pixels():
+    """The image moves, and unobserved pixels stay empty."""
     size = (64, 48)
     uv = lattice((64, 48))
     this = ImageCorrector(with_model(model_of(uv, np.tile([5.0, -3.0], (len(uv), 1))), size))
@@ -224,7 +219,7 @@ def test_shift():
 
 
 def test_source_in_the_outer_half_of_a_pixel():
-    """It is on the image, and has the value of that pixel."""
+    """It is on the image and has the value of that pixel."""
     size = (32, 32)
     uv = lattice((32, 32))
     this = ImageCorrector(with_model(model_of(uv, np.tile([0.4, 0.0], (len(uv), 1))), size))
@@ -233,7 +228,7 @@ def test_source_in_the_outer_half_of_a_pixel():
 
 
 def test_fold_is_left_empty():
-    """A correction that grows faster than the image itself would show it mirrored."""
+    """A correction that grows faster than the image coordinate would show the image mirrored."""
     size = (96, 96)
     uv = lattice((96, 96), 4)
     duv = np.zeros_like(uv)
@@ -248,7 +243,7 @@ def test_fold_is_left_empty():
 
 
 def test_steps_of_nearest_neighbours_leave_few_holes():
-    """Knn is piecewise constant: its sources exist all the same."""
+    """The model knn is piecewise constant, but nearly all pixels have a source."""
     this = corrector(kind='knn')
     assert np.mean(this.mask[100:-100, 100:-100]) > 0.99
 
@@ -257,7 +252,7 @@ def test_steps_of_nearest_neighbours_leave_few_holes():
 
 
 def test_sixteen_bits_are_preserved():
-    """Values that eight bits could not tell apart."""
+    """Values that differ by less than eight bits resolve."""
     image = np.full(SIZE[::-1], 40_000, np.uint16)
     image[:, ::2] += 1
     got = corrector().correct(image)
@@ -265,9 +260,7 @@ def test_sixteen_bits_are_preserved():
 
 
 def test_cubic_does_not_wrap_around():
-    """Beside a step from black to white cubic interpolation overshoots: values are cut off, not
-    wrapped round.
-    """
+    """Cubic interpolation overshoots next to an edge from black to white: values are clipped."""
     image = np.zeros(SIZE[::-1], np.uint8)
     image[:, 500:] = 255
     for dtype in DEPTHS:
@@ -278,9 +271,7 @@ def test_cubic_does_not_wrap_around():
 
 
 def test_output_array_and_rows_with_gaps():
-    """The same numbers into an array that is there, from rows with a gap behind them, and from
-    what cannot be written.
-    """
+    """The same numbers with a given output array, with strided rows, and from read-only input."""
     this = corrector()
     image = random_image(np.uint16)
     wanted = this.correct(image)
@@ -296,7 +287,7 @@ def test_output_array_and_rows_with_gaps():
 
 
 def test_invalid_images_are_refused():
-    """One sentence for each."""
+    """In one sentence each."""
     this = corrector()
     image = np.zeros(SIZE[::-1], np.uint8)
     for wrong, sentence in (
@@ -321,7 +312,7 @@ def test_invalid_images_are_refused():
 
 
 def test_threads_share_a_corrector():
-    """The same numbers in each."""
+    """All threads get the same numbers."""
     image = random_image(np.uint8)
     results = {}
 
@@ -344,8 +335,8 @@ def test_threads_share_a_corrector():
 
 @pytest.mark.parametrize('dtype', DEPTHS)
 def test_virtual_image(dtype):
-    """Beads lie where they are asked for, the background is smooth, noise is as given and the same
-    again.
+    """Beads lie at the given positions, the background is smooth, the noise is as given and
+    reproducible.
     """
     uv = np.array([[100.3, 80.7], [200.0, 40.25], [-3.0, 50.0], [1000.0, 1000.0], [np.nan, 3.0]])
     size = (256, 200)

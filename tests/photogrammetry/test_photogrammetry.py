@@ -208,9 +208,7 @@ def test_direct_linear_transformation_uses_its_weights():
 
 @pytest.mark.parametrize('seed', range(4))
 def test_resection_is_robust_to_false_matches_and_distortion(seed):
-    """A fifth of the targets bear the id of another one, the image is distorted by 10 px and
-    noisy.
-    """
+    """A fifth of the targets have wrong ids; the image is distorted by 10 px and noisy."""
     xyz, uv, rotation, position, interior = one_exposure(seed, targets=100)
     rng = np.random.default_rng(seed)
     x = (uv - 511.5) / 512
@@ -365,7 +363,7 @@ def test_scale_and_degrees_of_freedom_equal_direct_maximum_likelihood(nu):
 @pytest.mark.parametrize('loss', LOSSES)
 def test_scale_is_estimated_from_residuals_of_unequal_redundancy(loss):
     """Residuals are smaller than the noise by the root of their redundancy numbers; the scale is
-    the noise's.
+    that of the noise.
     """
     rng = np.random.default_rng(8)
     share = rng.choice([0.2, 0.9], 60_000)
@@ -396,8 +394,8 @@ def test_estimated_gross_errors_do_not_affect_the_core(nu):
 
 
 def test_robust_scale_is_robust_to_false_matches():
-    """A tenth of huge residuals: Student-t and Huber keep the scale within some ten percent, Gauss
-    does not.
+    """With a tenth of huge residuals, Student-t and Huber keep the scale within some ten percent,
+    Gauss does not.
     """
     rng = np.random.default_rng(9)
     squared = np.sum(rng.normal(0, 0.25, (5000, 2)) ** 2, axis=1)

@@ -1,4 +1,4 @@
-"""The validation experiment in small, end to end, and the parts of it that carry the figures."""
+"""The validation experiment at a small size, end to end, and its figures."""
 
 import os
 import re
@@ -142,7 +142,7 @@ def test_comparison_counts_from_known_distortion(experiment):
     assert np.isnan(curves(plan, outcomes, KNOWN)[2]).all()
 
 
-def test_failed_case_is_told(experiment, tmp_path):
+def test_failed_case_is_reported(experiment, tmp_path):
     """A failed calibration leaves a dash in the tables, and its reason among the shortcomings."""
     plan, outcomes, _ = experiment
     broken = dict(outcomes)
@@ -161,8 +161,8 @@ def test_failed_case_is_told(experiment, tmp_path):
     assert 'failed on every rig' in text and text.count('no such luck') >= 3
 
 
-def test_tested_is_adjust_with():
-    """The test of a calibration gives what a user gets from adjust_with_calibrations."""
+def test_out_of_sample_test_equals_adjust_with_calibrations():
+    """The test of a calibration gives the numbers of adjust_with_calibrations."""
     case = Case(2, 'knn', ('a',), **SMALL)
     scene = scene_of(*case.scene)
     frames, _ = scene.training(None, False)
@@ -178,8 +178,8 @@ def test_tested_is_adjust_with():
     np.testing.assert_allclose(errors_of_test(scene, case, job.calibrations), expected, rtol=5e-3)
 
 
-def test_training_and_test_exposures_do_not_meet():
-    """Training and test exposures are disjoint; other counts are separate recordings."""
+def test_training_and_test_exposures_are_disjoint():
+    """Other counts are separate recordings."""
     case = Case(2, 'knn', **SMALL)
     scene = scene_of(*case.scene)
     frames, _ = scene.training(None, False)
@@ -194,14 +194,14 @@ def test_training_and_test_exposures_do_not_meet():
     assert 3 < moved.max() < 40
 
 
-def test_case_that_cannot_be_done_is_an_outcome():
+def test_impossible_case_is_an_outcome_with_a_reason():
     """Too few exposures: no numbers, but the reason."""
     outcome = run_case(Case(2, 'knn', training=2, **SMALL))
     assert 'exposures' in outcome.failed and outcome.outside is None
 
 
-def test_projective_map_is_taken_out():
-    """A shift, scale, rotation and tilt leave nothing; a distortion leaves its size."""
+def test_projective_map_is_removed():
+    """A shift, scale, rotation and tilt leave nothing; a distortion keeps its size."""
     rng = np.random.default_rng(0)
     ideal = rng.uniform(0, 1023, (400, 2))
     h = np.array([[1.01, 0.02, 5.0], [-0.02, 0.99, -7.0], [2e-5, -1e-5, 1.0]])
@@ -215,9 +215,7 @@ def test_projective_map_is_taken_out():
 
 
 def test_error_over_image_stays_in_the_calibrated_area():
-    """Without a correction the error is the distortion, and nothing is said beyond the image
-    points.
-    """
+    """Without a correction the error is the distortion; beyond the image points it is NaN."""
     field = random_field(np.random.default_rng(3))
     training = np.array([[200, 200], [800, 200], [800, 800], [200, 800.0]])
     errors = error_over_image(no_correction(), field, training, (1024, 1024))
@@ -229,7 +227,9 @@ def test_error_over_image_stays_in_the_calibrated_area():
 
 
 def test_residual_figures():
-    """Raw RMSE is of inliers, the reweighted one and the cost of all with their weights."""
+    """The raw RMSE is that of the inliers; the reweighted RMSE and the cost are of all points with
+    their weights.
+    """
     residual = np.array([[1.0, 0], [-1, 2], [10, 10]])
     one = Residuals(
         np.zeros((3, 2)),
@@ -245,8 +245,8 @@ def test_residual_figures():
     assert both.cost() == pytest.approx(2 * one.cost()) and both.inlier.sum() == 2
 
 
-def test_full_plan_is_the_papers():
-    """150 exposures of two fluoroscopes, every tenth for the calibration; no case is run twice."""
+def test_full_plan_is_that_of_the_paper():
+    """150 exposures of two fluoroscopes, every tenth for the calibration; no case runs twice."""
     plan = full_plan()
     cases = plan.cases()
     assert (plan.exposures, plan.trained, plan.default) == (

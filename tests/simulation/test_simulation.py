@@ -1,4 +1,4 @@
-"""The virtual rig: repeatable, of the promised geometry, and with a truth that fits the
+"""The virtual rig: reproducible, with the documented geometry and a truth that agrees with the
 observations.
 """
 
@@ -38,7 +38,7 @@ def same_frames(one, other):
     )
 
 
-def test_the_same_seed_gives_the_same_numbers():
+def test_same_seed_gives_the_same_numbers():
     """To the last bit; another seed gives another rig and other exposures."""
     one = virtual_rig(3)
     other = virtual_rig(3)
@@ -82,9 +82,7 @@ def test_the_sources_are_where_the_documentation_says(seed):
 
 
 def test_rigs_of_more_fluoroscopes():
-    """The default is what it was; of three, neighbours look across each other by the angle that is
-    given.
-    """
+    """The default is unchanged; of three, neighbouring axes differ by the given angle."""
     same = virtual_rig(3, between_deg=84.0).fluoroscopes
     for one, other in zip(virtual_rig(3).fluoroscopes, same):
         np.testing.assert_array_equal(one.rotation, other.rotation)
@@ -135,8 +133,8 @@ def test_the_phantom_is_a_cube_of_503_beads_with_a_survey(seed):
 
 
 @pytest.mark.parametrize('seed', range(20))
-def test_distortion_is_large_at_the_rim_and_small_in_the_middle(seed):
-    """14 to 17 px along the rim, 26 to 35 px in the corners; smooth; scaled by its strength, down
+def test_distortion_is_large_at_the_edge_and_small_in_the_middle(seed):
+    """14 to 17 px along the edge, 26 to 35 px in the corners; smooth; scaled by its strength, down
     to none.
     """
     field = random_field(np.random.default_rng(seed))
@@ -185,7 +183,7 @@ def test_number_and_size_of_the_exposures():
 
 
 def errors_of_image_points(rig, simulated):
-    """Observed less true image points (N, 2), by the truth of rig and poses."""
+    """Observed minus true image points (N, 2), from the truth of rig and poses."""
     out = []
     for f in rig.fluoroscopes:
         for frame, (rotation, shift) in zip(simulated.frames[f.name], simulated.poses):

@@ -234,7 +234,7 @@ def test_hostile_numbers_end_in_one_sentence(kind):
 
 
 @pytest.mark.filterwarnings('error')
-def test_an_exposure_on_a_line_does_not_spoil_the_others():
+def test_exposure_on_a_line_does_not_affect_the_others():
     outcome = run_calibration(CalibrationRequest({'a': flattened(1)}, PHANTOM, FAST))
     assert len(outcome.result.fluoroscopes['a'].exposures) == 5
     assert 'exposure 1: all image points lie on one line' in outcome.result.left_out[0]
@@ -262,18 +262,18 @@ RIGHT = {
 
 
 @pytest.mark.parametrize('kind', RIGHT)
-def test_difficult_input_is_not_accused(kind):
+def test_difficult_input_is_accepted(kind):
     assert find_wrong_input({'a': RIGHT[kind]()}, PHANTOM) == {}
     assert copied_exposures(RIGHT[kind]()) == []
 
 
 @pytest.mark.parametrize('seed', range(10))
-def test_no_random_rig_with_strong_distortion_is_accused(seed):
+def test_random_rigs_with_strong_distortion_are_accepted(seed):
     strong = virtual_rig(seed, 2.0)
     assert find_wrong_input(simulate_exposures(strong, 5, seed).frames, strong.phantom) == {}
 
 
-def test_a_few_wrong_exposures_are_left_out_and_named():
+def test_few_wrong_exposures_are_left_out_and_named():
     wrong = simulate_exposures(virtual_rig(2), 2, 9).frames['a']
     mixed = frames(8) + [replace(f, number=f.number + 100) for f in wrong]
     mixed.append(replace(frames()[0], number=200))
@@ -283,8 +283,8 @@ def test_a_few_wrong_exposures_are_left_out_and_named():
     assert 'exposure 200: the image points are those of exposure 1' in outcome.result.left_out[0]
 
 
-def test_an_impossible_result_is_refused_unless_it_is_forced():
-    """Beads are labelled as ones nearby: half of them fit by chance, the rest bend the result."""
+def test_impossible_result_is_refused_unless_forced():
+    """Beads have the ids of neighbours: half of them fit by chance, the others bend the result."""
     request = CalibrationRequest({'a': frames(10, false_matches=0.45)}, PHANTOM, FAST)
     with pytest.raises(DataError, match='fluoroscope a: the residuals are too large: RMSE'):
         run_calibration(request)

@@ -86,9 +86,9 @@ def _correct_points(
     from ..jobs.sources import read_point_table
 
     size = next(iter(calibrations.values())).image_size
-    points, notes = read_point_table(
-        arguments.source, arguments.calibration, file_settings(arguments, image_size=size)
-    )
+    names = () if arguments.fluoroscope is None else (arguments.fluoroscope,)
+    settings = file_settings(arguments, image_size=size, fluoroscopes=names)
+    points, notes = read_point_table(arguments.source, arguments.calibration, settings)
     print_notes(notes)
     corrected = correct_points(points, calibrations)
     write_points(arguments.out, points, corrected)

@@ -2,15 +2,14 @@
 
 The residual of a C3D point is in the unit of the points, and negative where there is no point. It
 is written as the standard deviation of the position, the root of the sum of its variances in x, y
-and z [mm]; 0 where that is unknown. C3D holds float32.
+and z [mm]; 0 where that is unknown. C3D holds coordinates as float32, and residuals in 255 steps.
 """
 
 from __future__ import annotations
 
 import os
-import secrets
-from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -25,6 +24,7 @@ from .frames_of_points import at_constant_rate, labels
 from .labels import named_targets
 
 MISSING = -1.0
+STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
 MAX_FRAME = 65535  # the header counts in uint16
 _MAGIC = 0x50
 
@@ -51,7 +51,7 @@ def read(path: Path, settings: Settings) -> Content:
     try:
         file = _ezc3d().c3d(os.fspath(path))
         parameters = file['parameters']['POINT']
-        names = [str(label).strip() for label in parameters['LABELS']['value']]
+        names = [str(label).strip() for label in _labels(parameters)]
         unit = str(parameters['UNITS']['value'][0]).strip()
         rate = float(file['header']['points']['frame_rate'])
         first = int(file['header']['points']['first_frame'])
@@ -84,6 +84,16 @@ def read(path: Path, settings: Settings) -> Content:
     return Content(points=points, names=Names(named_targets({n: ids[n] for n in names})))
 
 
+def _labels(parameters: Any) -> list[str]:
+    """Return the names of all points: a parameter holds 255, the others follow in LABELS2, ..."""
+    found = list(parameters['LABELS']['value'])
+    number = 2
+    while f'LABELS{number}' in parameters:
+        found += parameters[f'LABELS{number}']['value']
+        number += 1
+    return found
+
+
 def write(path: Path, content: Content, settings: Settings) -> Written:
     """Write points in space. Raises DataError."""
     points = at_constant_rate(path, content, settings)
@@ -98,11 +108,15 @@ def write(path: Path, content: Content, settings: Settings) -> Written:
     missing = np.isnan(points.xyz_mm).any(axis=2)
     xyz = np.where(missing[..., None], 0.0, points.xyz_mm / mm)
     homogeneous = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
-    residual = np.where(missing, MISSING, np.nan_to_num(points.sd_mm / mm))
+    sd = np.nan_to_num(points.sd_mm / mm)
+    step = max(float(sd.max(initial=0.0)) / STEPS, 1e-6)
+    # The byte of a residual is cut off, not rounded.
+    residual = np.where(missing, MISSING, (np.round(sd / step) + 0.01) * step)
     parameters = file['parameters']['POINT']
     parameters['LABELS']['value'] = labels(content)
     parameters['UNITS']['value'] = [unit]
     parameters['RATE']['value'] = [points.rate_hz]
+    parameters['SCALE']['value'] = [-step]
     file['header']['points']['first_frame'] = first - 1
     file['data']['points'] = homogeneous.transpose(2, 1, 0)
     file['data']['meta_points']['residuals'] = residual.T[None]
@@ -111,16 +125,14 @@ def write(path: Path, content: Content, settings: Settings) -> Written:
 
 
 def _bytes_of(file: Any, path: Path) -> bytes:
-    """Return a C3D file as bytes; ezc3d writes only to a file."""
-    temporary = path.with_name(f'.{path.name[:100]}.{secrets.token_hex(8)}.tmp')
-    try:
-        file.write(os.fspath(temporary))
-        return temporary.read_bytes()
-    except (OSError, RuntimeError, ValueError) as error:
-        raise DataError(f'{path}: cannot be written ({error})') from None
-    finally:
-        with suppress(OSError):
-            temporary.unlink()
+    """Return a C3D file as bytes; ezc3d writes only to files, and its errors have no type."""
+    with TemporaryDirectory() as folder:
+        temporary = Path(folder) / 'points.c3d'
+        try:
+            file.write(os.fspath(temporary))
+            return temporary.read_bytes()
+        except Exception as error:
+            raise DataError(f'{path}: cannot be written ({error})') from None
 
 
 FORMAT = Format('c3d', 'C3D', ('points',), recognise, read, write, 'a binary file of c3d.org')

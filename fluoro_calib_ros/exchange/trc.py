@@ -2,8 +2,9 @@
 
 Header of five rows: PathFileType, names and values of DataRate, CameraRate, NumFrames, NumMarkers,
 Units, OrigDataRate, OrigDataStartFrame, OrigNumFrames; names of the markers; X1 Y1 Z1 and so on.
-Then a row a frame: its number, time [s] and coordinates, between tabulators; empty where a marker
-is not seen. TRC has no residuals.
+Then a row a frame: its number, time [s] and coordinates, between tabulators. Where a marker is not
+seen, OpenSim writes and reads NaN; other programs leave the cell empty, which is read, too. TRC
+has no residuals.
 """
 
 from __future__ import annotations
@@ -29,9 +30,10 @@ from .content import (
 )
 from .frames_of_points import at_constant_rate, labels
 from .labels import named_targets
-from .text import Row, number_text
+from .text import Row, joined, number_text
 
 _HEADER_ROWS = 5
+TAB = '\t'
 _NAMES = (
     *('DataRate', 'CameraRate', 'NumFrames', 'NumMarkers'),
     *('Units', 'OrigDataRate', 'OrigDataStartFrame', 'OrigNumFrames'),
@@ -113,8 +115,7 @@ def write(path: Path, content: Content, settings: Settings) -> Written:
         file.write('\t\t' + '\t'.join(axes) + '\n\n')
         for number, xyz in zip(points.frame.tolist(), in_units(points.xyz_mm, UNITS_MM[unit])):
             time = (number - first) / points.rate_hz  # type: ignore[operator]
-            cells = ['' if math.isnan(value) else repr(value) for value in xyz.ravel().tolist()]
-            file.write('\t'.join([str(number), repr(time), *cells]) + '\n')
+            file.write(f'{number}\t{time!r}\t{joined(xyz.ravel(), TAB)}\n')
     return Written((str(path),), (f'{path}: TRC has no residuals',))
 
 

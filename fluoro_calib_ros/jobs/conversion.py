@@ -40,7 +40,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .dataset import write_bag
 from .result_folder import RESULT, belongs_to
-from .sources import is_bag
+from .sources import is_bag, select_calibrations
 
 BAG = 'bag'
 PHANTOM_BODY = 'phantom'  # name of the phantom as a rigid body
@@ -126,7 +126,7 @@ def _read(request: ConversionRequest, settings: Settings) -> tuple[Content, bool
     """Return the content of the source, and whether it is in the conventions of this package."""
     source = Path(request.source)
     if is_result_folder(source):
-        return result_content(source, settings.wanted, request.exposure), True
+        return result_content(source, settings, request.exposure), True
     if request.exposure is not None:
         raise DataError(f'{source}: --exposure is for a result folder')
     if not registry_reads(source) and request.source_kind is None and is_bag(source):
@@ -224,14 +224,17 @@ def _corrected(
 
 
 def result_content(
-    directory: str | os.PathLike[str], wanted: Iterable[str], exposure: int | None = None
+    directory: str | os.PathLike[str],
+    settings: Settings | None = None,
+    exposure: int | None = None,
 ) -> Content:
-    """Return what a result folder contains of some parts, names of `exchange.content.PARTS`.
+    """Return the wanted parts of a result folder, of the fluoroscopes that settings name.
 
     exposure: that whose exterior orientations the cameras have. Raises DataError.
     """
     directory = Path(directory)
-    wanted = set(wanted)
+    settings = settings or Settings()
+    wanted = set(settings.wanted)
     calibrations = load_calibrations(directory)
     found: dict[str, Any] = {'names': read_names(directory)}
     stations: tuple[Station, ...] = ()
@@ -245,7 +248,8 @@ def result_content(
     if 'bodies' in wanted:
         found['bodies'] = _phantom_poses(directory, stations, orientation)
     if 'lookups' in wanted:
-        found['lookups'] = {name: _lookup(c) for name, c in calibrations.items()}
+        names = select_calibrations(calibrations, settings.fluoroscopes or calibrations, directory)
+        found['lookups'] = {name: _lookup(c) for name, c in names.items()}
     if 'survey' in wanted and (directory / PHANTOM_FILE).exists():
         found['survey'] = read_phantom(directory / PHANTOM_FILE)
     if 'observations' in wanted and (directory / OBSERVATIONS).exists():

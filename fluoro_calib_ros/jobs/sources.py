@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -169,9 +170,16 @@ def select_calibrations(
         if name not in calibrations:
             raise DataError(
                 f'{place}there is no calibration of fluoroscope {name!r}, '
-                f'only of {", ".join(calibrations)}'
+                f'only of {", ".join(calibrations)}{_numbered_hint(name, calibrations)}'
             )
     return {name: calibrations[name] for name in fluoroscopes}
+
+
+def _numbered_hint(name: str, calibrations: Mapping[str, FluoroscopeCalibration]) -> str:
+    """Return what to do about a camera that its file only numbers."""
+    if not re.fullmatch(r'cam\d+', name):
+        return ''
+    return f'; name the cameras of the file with --fluoroscopes {",".join(calibrations)}'
 
 
 def read_calibrations(

@@ -181,7 +181,7 @@ def test_mayacam1_of_xmalab_is_read(tmp_path):
 
 
 def test_dlt_gives_pixels_from_one_upwards(tmp_path):
-    """x = (L1 X + L2 Y + L3 Z + L4) / (L9 X + L10 Y + L11 Z + 1), as XMALab and DLTdv define it."""
+    """By the eleven coefficients of XMALab and DLTdv: L1 X + L2 Y + L3 Z + L4 over the third."""
     path = tmp_path / 'dlt.csv'
     registry.write(path, 'dlt', Content(cameras=cameras()), MM)
     table = np.loadtxt(path, delimiter=',')

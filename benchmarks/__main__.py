@@ -1,5 +1,4 @@
-"""Speed, side by side in one run and on one thread: ours, COLMAP's bundle adjuster and
-scikit-learn.
+"""Speed on one thread, side by side with COLMAP's bundle adjuster and scikit-learn.
 
 python -m benchmarks                      all tables, written to docs/performance.md
 python -m benchmarks scaling adjustment   these only, printed
@@ -132,7 +131,7 @@ def scaling_section() -> str:
 def profile_section() -> str:
     """Where the time of the self-calibration goes."""
     rig, frames = exposures()
-    calibrate(frames, rig.phantom)  # what only the first call does is not counted
+    calibrate(frames, rig.phantom)  # the first call does more, and is not counted
     rows = list(profiling.rows(lambda: calibrate(frames, rig.phantom)))
     return section(
         'Where the time of a self-calibration goes',
@@ -154,7 +153,7 @@ SECTIONS = {
 
 
 def machine() -> str:
-    """The machine and the versions that the figures belong to, in one sentence."""
+    """The machine and the versions of the packages, in one sentence."""
     cpu = platform.processor() or platform.machine()
     information = Path('/proc/cpuinfo')
     if information.exists():

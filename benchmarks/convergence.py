@@ -1,5 +1,6 @@
-"""Convergence: random rigs, bad start values and false matches; no wrong answer may be called
-converged.
+"""Convergence on random rigs with bad start values and false matches.
+
+No wrong result may be reported as converged.
 """
 
 from __future__ import annotations
@@ -21,16 +22,14 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
-# A mean normalised squared error beyond which an answer is wrong. A single coordinate is off by
-# more than 5 standard deviations once in a million; sources and attitudes of one calibration err
-# together, object points hardly.
+# Mean normalised squared error above which a result is wrong. A single coordinate exceeds 5
+# standard deviations once in a million; the errors of sources and attitudes of one calibration are
+# correlated, those of object points hardly.
 LIMITS = {'xp': 25.0, 'yp': 25.0, 'c': 25.0, 'T': 9.0, 'q': 9.0, 'object points': 1.6}
 
 
 def random_case(seed: int) -> dict[str, Any]:
-    """Strength of the distortion, number of exposures, share of false matches and start of the
-    principal distance.
-    """
+    """Random distortion strength, exposures, false matches and start value of c of a case."""
     rng = np.random.default_rng([seed, 77])
     return {
         'strength': rng.uniform(0, 2),
@@ -41,8 +40,9 @@ def random_case(seed: int) -> dict[str, Any]:
 
 
 def outcome(seed: int) -> dict[str, Any]:
-    """One case: its values, 'converged', 'not converged' or 'refused', the normalised errors, and
-    what is wrong.
+    """Result of one case.
+
+    'end' is 'converged', 'not converged' or 'refused'; 'wrong' lists the wrong quantities.
     """
     case = random_case(seed)
     rig = virtual_rig(seed, case['strength'])
@@ -87,7 +87,7 @@ Median and maximum of the mean normalised squared errors of the converged calibr
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Entry point; exit status 1 where a wrong answer was called converged."""
+    """Entry point; exit status 1 if a wrong result was reported as converged."""
     parser = argparse.ArgumentParser(prog='python -m benchmarks.convergence', description=__doc__)
     parser.add_argument('--count', type=int, default=200, help='number of rigs (default: 200)')
     parser.add_argument(
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def report(results: Sequence[dict[str, Any]]) -> str:
-    """The document of all outcomes."""
+    """The text of docs/convergence.md."""
     lines = ['| outcome | cases | correct | wrong |', '|---|---:|---:|---:|']
     for end in ('converged', 'not converged', 'refused'):
         these = [r for r in results if r['end'] == end]

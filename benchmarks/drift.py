@@ -161,7 +161,7 @@ def scene(seed: int, source: str = 'exposures') -> Scene:
 
 
 def false_matches(rng: np.random.Generator, uv: np.ndarray) -> np.ndarray:
-    """Pixels, a fraction FALSE_MATCHES of them displaced as by another bead."""
+    """Pixels of which a fraction FALSE_MATCHES is displaced, as by another bead."""
     wrong = rng.random(uv.shape[:2]) < FALSE_MATCHES
     uv[wrong] += rng.uniform(-12, 12, (int(wrong.sum()), 2))
     return uv
@@ -172,7 +172,7 @@ def blocks(
 ) -> Iterator[Block]:
     """Blocks of the stream: pixels, corrected points, their systematic sd, and stamps.
 
-    first: number of the block to begin with; drift(name, uv, time_s): shift (k, 2) [px] of
+    first: number of the first block; drift(name, uv, time_s): shift (k, 2) [px] of
     observed pixels (k, 2) at a time [s].
     """
     total = next(iter(scene_.pixels.values())).shape[0] // FRAMES
@@ -274,11 +274,11 @@ class Drift:
         return self.size * np.array([np.cos(angle), np.sin(angle)])
 
     def fraction(self, time_s: float) -> float:
-        """Fraction of its size at a time after its begin [s]."""
+        """Fraction of its size at a time after its start [s]."""
         return min(1.0, time_s / self.ramp_s) if self.ramp_s else 1.0
 
     def shift(self, name: str, uv: np.ndarray, time_s: float) -> np.ndarray:
-        """Shift (k, 2) [px] of observed pixels (k, 2) at a time after its begin [s]."""
+        """Shift (k, 2) [px] of observed pixels (k, 2) at a time after its start [s]."""
         if name != self.fluoroscope or time_s < 0:
             return np.zeros_like(uv)
         inside = np.ones(len(uv), dtype=bool)
@@ -393,7 +393,7 @@ def detection(
 
 
 def _reported(state: DriftState, drift: Drift, delay: float) -> Result:
-    """What the state of an alarm says of a drift, delay [s] after its begin."""
+    """The report of an alarm about a drift, delay [s] after its start."""
     along = float(drift.vector @ state.direction) * drift.fraction(delay)
     if ' or ' in state.fluoroscope:  # down in one is up in the other
         along = abs(along)
@@ -444,7 +444,7 @@ def detections(
 
 
 def from_the_start(seed: int, size: float = 0.5, directions: int = 8) -> list[Result]:
-    """Results for drifts that exist before the watch starts: only the calibration shows them."""
+    """Results for drifts that exist before the start: only the calibration reveals them."""
     scene_ = scene(seed)
     rng = np.random.default_rng([seed, 8])
     out = []
@@ -458,7 +458,7 @@ def from_the_start(seed: int, size: float = 0.5, directions: int = 8) -> list[Re
 
 
 def slow(seed: int, size: float = 0.5, hours: float = 1.0) -> list[Result]:
-    """Result for a drift that takes hours to its size, in a random quarter and direction."""
+    """Result for a drift that grows for hours, in a random quarter and direction."""
     scene_, watch, rng, learned = started(seed)
     quarter = str(rng.choice(list(QUARTERS)))
     direction = 45 * int(rng.integers(8))
@@ -502,7 +502,7 @@ HEADER = [
 
 
 def row(title: str, sector: str, found: Sequence[Result]) -> list[str]:
-    """A line of the table of detections: of dicts of `detection`."""
+    """A row of the table of detections, from results of `detection`."""
     delay = np.array([f['error'] for f in found])
     reported = [f for f in found if 'named' in f]
     error = np.array([f['size_error'] for f in reported])
@@ -545,7 +545,7 @@ def measure(
     processes: int = 1,
     chosen: Sequence[str] | None = None,
 ) -> Result:
-    """All figures: {'alarms': dicts of false_alarms, 'cases': {title: dicts of detection}}.
+    """All results: {'alarms': dicts of false_alarms, 'cases': {title: dicts of detection}}.
 
     rigs: of each case of drifts; alarm_rigs: without drift, hours [h] each, every third with the
     orientation of a capture; chosen: titles of cases, None: all.
@@ -577,7 +577,7 @@ def measure(
 
 
 def report(figures: Result) -> str:
-    """The figures of `measure` as text."""
+    """The results of `measure` as text."""
     options = DriftOptions()
     alarms = figures['alarms']
     hours = sum(a['hours'] for a in alarms)

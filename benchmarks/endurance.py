@@ -1,12 +1,11 @@
-"""An hour of the stream, faster than real time: what comes in comes out, and memory stays what it
-was.
+"""An hour of the stream, faster than real time: no frame is lost, and memory does not grow.
 
     python -m benchmarks.endurance [--hours 1] [--rate 120]
 
 The frames of 2 x 120 Hz x 30 markers of an hour go through correction and reconstruction (with the
-drift watch and a subscriber of the point cloud) as fast as they are taken: never more than a
-fraction of a queue ahead of the points that come out. Every minute of the stream the resident
-memory of both nodes is noted.
+drift watch and a subscriber of the point cloud) as fast as the nodes accept them: never more than
+a fraction of a queue ahead of the published points. The resident memory of both nodes is recorded
+every minute of the stream.
 """
 
 from __future__ import annotations
@@ -44,8 +43,9 @@ def resident_mb(process: subprocess.Popen) -> float:
 
 
 def stream(reader: Reader, frames: int, rate_hz: float, note: Callable[[int], None]) -> None:
-    """Publish frames exposures in step with the points that come out; note(number) at every minute
-    of the stream.
+    """Publish exposures in step with the published points.
+
+    note(number of exposures) is called at every minute of the stream.
     """
     outputs = {
         n: reader.create_publisher(
@@ -83,7 +83,7 @@ def stream(reader: Reader, frames: int, rate_hz: float, note: Callable[[int], No
 
 
 def run(hours: float, rate_hz: float) -> dict[str, Any]:
-    """Figures: exposures, frames in and out, seconds, and memory {node: [MB by minute]}."""
+    """Results: exposures, frames in and out, seconds, and memory {node: [MB by minute]}."""
     isolate_ros_graph()
     rclpy.init(args=[])
     reader = Reader(*rig_of_the_simulator())
@@ -122,7 +122,7 @@ def run(hours: float, rate_hz: float) -> dict[str, Any]:
 
 
 def text_of(figures: dict[str, Any]) -> str:
-    """Sentences of the figures."""
+    """The results as text."""
     frames = figures['exposures']
     lines = [
         f'{frames} exposures of 2 x 30 markers in {figures["seconds"]:.0f} s.',

@@ -1,9 +1,8 @@
-"""One case of the validation experiment: calibrate on some exposures of a virtual rig, test on
-others.
+"""A case of the validation experiment: calibrate with some exposures of a rig, test with others.
 
-The reference is the truth of the rig: bead coordinates, source positions and distortion field that
-the observations were made from. A Case says what is done, an Outcome what came of it, in numbers
-only, so that cases can be run in processes of their own.
+The reference is the ground truth of the virtual rig: bead coordinates, source positions and
+distortion field. A Case describes what is done, an Outcome contains the resulting numbers, so that
+cases can run in other processes.
 """
 
 from __future__ import annotations
@@ -48,9 +47,9 @@ from fluoro_calib_ros.simulation.rig import virtual_rig
 
 NOISE_PX = 0.25
 BEFORE = 'before'
-HELD = 'knn, interior held'
+HELD = 'knn, interior fixed'
 KNOWN = 'known distortion'
-# In the order of the tables; what this version's CalibrationOptions does not take is left out.
+# In the order of the tables; models that CalibrationOptions refuses are left out.
 MODELS = tuple(name for name in (*selectable_models(), AUTO) if name != 'none')
 RELATIVE = ('none', 'soft', 'hard')
 TEST_TOLERANCE = 1e-4  # decrease of F left by the adjustment of a test: a hundredth of a sigma
@@ -59,7 +58,7 @@ GRID_PX = 16  # spacing of the pixels at which the correction is compared with t
 
 @dataclass(frozen=True)
 class Case:
-    """What is calibrated, and from what.
+    """A calibration of the experiment.
 
     seed of the rig; variant: BEFORE, HELD, KNOWN or a model (interior orientation estimated);
     exposures: of the recording, of which every so many (10: every tenth) are for the calibration,
@@ -134,7 +133,7 @@ class Residuals:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case; failed: the reason where it has no numbers.
+    """Result of a case; failed: the reason if it has no numbers.
 
     inside and outside (6,): RMSE [mm] in and out of sample of object points X, Y, Z and sources
     Xo, Yo, Zo; error_map (rows, columns, 2) [px] by fluoroscope: error of the correction over the
@@ -155,8 +154,9 @@ class Outcome:
     costs: tuple[np.ndarray, ...] = ()
 
     def image_px(self, name: str, within: np.ndarray | None = None) -> float:
-        """RMSE [px] of a coordinate of the correction over the calibrated area; within: map that
-        covers less.
+        """RMSE [px] of a coordinate of the correction over the calibrated area.
+
+        within: error map to whose area it is restricted.
         """
         errors = self.error_map[name]
         if within is not None:
@@ -238,8 +238,9 @@ class Scene:
     def training(
         self, count: int | None, known: bool
     ) -> tuple[dict[str, list[Frame]], SimulatedExposures]:
-        """Frames by fluoroscope for the calibration: count of their own, None: some of the
-        recording.
+        """Frames by fluoroscope for the calibration.
+
+        count: number of separate exposures; None: every so many of the recording.
         """
         if count is None:
             return self._frames(
@@ -252,9 +253,7 @@ class Scene:
         return self._frames(own, known), own
 
     def test_network(self, fluoroscopes: tuple[str, ...], known: bool) -> Measured:
-        """Measured network of the exposures for the test; the start values are those of the true
-        calibration.
-        """
+        """Network of the test exposures, with start values from the true calibration."""
         key = fluoroscopes, known
         if key not in self._tested:
             frames = self._frames(self.recording, known, lambda i: i % self._every != 0)
@@ -273,7 +272,7 @@ class Scene:
         known: bool,
         chosen: Callable[[int], bool] = lambda i: True,
     ) -> dict[str, list[Frame]]:
-        """Frames by fluoroscope; known: with the true distortion taken off."""
+        """Frames by fluoroscope; known: with the true distortion removed."""
         out = {}
         for name, frames in simulated.frames.items():
             out[name] = [
@@ -294,8 +293,9 @@ class Scene:
         exposures: Iterable[tuple[str, int, np.ndarray]],
         simulated: SimulatedExposures,
     ) -> np.ndarray:
-        """RMSE (6,) [mm] of object points and of sources; exposures: (fluoroscope, number,
-        position_mm).
+        """RMSE (6,) [mm] of object points and of sources.
+
+        exposures: (fluoroscope, number, position_mm).
         """
         points = xyz_mm - self.rig.true_mm[targets_id - self.rig.phantom.target_id[0]]
         rigs = {f.name: f for f in self.rig.fluoroscopes}
@@ -340,7 +340,7 @@ def run_case(case: Case) -> Outcome:
         seconds = time.perf_counter() - began
         with threadpool_limits(1):
             outside = errors_of_test(scene, case, job.calibrations)
-    except (DataError, np.linalg.LinAlgError) as error:  # a result too, and to be told as such
+    except (DataError, np.linalg.LinAlgError) as error:  # a failure is a result, too
         return Outcome(failed=f'{type(error).__name__}: {error}')
     exposures = [
         (name, e.exposure, e.position_mm)
@@ -407,11 +407,10 @@ def errors_of_test(
 
 
 def with_interior(measured: Measured, interior: np.ndarray) -> Parameters:
-    """Start values of a network for other interior orientations (F, 3), which show nearly the same
-    image.
+    """Start values of a network with other interior orientations (F, 3) for the same image.
 
-    A shift of the principal point looks like a turn of the sensor, and another principal distance
-    like another distance of the source.
+    A shift of the principal point is compensated by a rotation of the sensor, and another
+    principal distance by another distance of the source.
     """
     start = measured.start
     network = measured.network
@@ -463,8 +462,7 @@ def error_over_image(
     training_uv: np.ndarray,
     image_size: tuple[int, int],
 ) -> np.ndarray:
-    """Errors (rows, columns, 2) [px] of corrected coordinates on a grid of pixels, NaN outside the
-    calibrated area.
+    """Errors (rows, columns, 2) [px] of corrected coordinates on a grid, NaN if not calibrated.
 
     After the best projective map between corrected and true coordinates: a shift, scale, rotation
     and tilt of the image plane belong to the orientation of the fluoroscope, not to its
@@ -483,9 +481,7 @@ def error_over_image(
 
 
 def projective_residuals(uv: np.ndarray, ideal: np.ndarray) -> np.ndarray:
-    """What is left (n, 2) of uv - ideal after the projective map of uv (8 parameters) that fits
-    ideal best.
-    """
+    """Residuals (n, 2) of the least-squares projective map (8 parameters) of uv onto ideal."""
     centre = np.mean(ideal, axis=0)
     half = np.max(np.ptp(ideal, axis=0)) / 2
     x, y = ((uv - centre) / half).T

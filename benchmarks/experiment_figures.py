@@ -1,4 +1,4 @@
-"""Pictures of the validation experiment: Figures 1-10 of Chow et al. in their manner, and more."""
+"""Figures of the validation experiment: Figures 1-10 of Chow et al., and further ones."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ LOOK = {
 }
 PANEL = {
     BEFORE: 'before',
-    HELD: 'after\n(kNN, interior held)',
+    HELD: 'after\n(kNN, interior fixed)',
     'knn': 'after w/ IOP\n(kNN, interior estimated)',
 }
 STRIPES = 24
 LIMIT = 10.0  # standard deviations shown to either side
 # F and G by round, in percent of the first.
 Costs = tuple[np.ndarray, ...]
-COLOURS = 96  # of a picture: as good to the eye, at a third of the size
+COLOURS = 96  # of a picture: no visible difference at a third of the size
 
 
 def title_of(variant: str) -> str:
@@ -50,8 +50,9 @@ def title_of(variant: str) -> str:
 
 
 def write_all(plan: Plan, outcomes: Outcomes, folder: str | os.PathLike[str]) -> dict[str, str]:
-    """Write all pictures of the experiment; returns their paths by key: 'figure 1' to 'figure 10',
-    'curves', 'map'.
+    """Write all pictures of the experiment.
+
+    Returns their paths by key: 'figure 1' to 'figure 10', 'curves', 'map'.
     """
     os.makedirs(folder, exist_ok=True)
     paths = {}
@@ -161,7 +162,7 @@ def _percent(axes: Axes, values: Sequence[float]) -> None:
 
 
 def histogram_figure(residuals: Mapping[str, Residuals], system: str, axis: int) -> Figure:
-    """Histograms of the normalised residuals of one coordinate, with the unit normal."""
+    """Histograms of the normalised residuals of a coordinate, with the standard normal."""
     number = (3 if system == '1' else 7) + axis
     figure = new_figure(
         3.5 * len(residuals),
@@ -189,7 +190,7 @@ def histogram_figure(residuals: Mapping[str, Residuals], system: str, axis: int)
             np.exp(-x * x / 2) / np.sqrt(2 * np.pi),
             color=BLACK,
             linewidth=1.5,
-            label='unit normal',
+            label='standard normal',
         )
         axes.set(title=title_of(variant), xlim=(-LIMIT, LIMIT), xticks=(-8, -4, 0, 4, 8))
         axes.text(
@@ -241,9 +242,7 @@ def position_figure(residuals: Mapping[str, Residuals], system: str, axis: int) 
 
 
 def _scatter(axes: Axes, r: Residuals, axis: int, limit: float, colour: str) -> None:
-    """Dots of inliers, crosses of outliers (at the rim if beyond), and what the inliers do by
-    stripes.
-    """
+    """Dots of inliers, crosses of outliers (at the edge if beyond), and medians by stripes."""
     position = r.uv[:, axis]
     residual = r.residual[:, axis]
     axes.plot(
@@ -280,13 +279,11 @@ def _scatter(axes: Axes, r: Residuals, axis: int, limit: float, colour: str) -> 
 
 
 def map_figure(maps: Mapping[str, np.ndarray]) -> Figure:
-    """Size of the error of the correction over the image, one panel for each variant to one colour
-    scale.
-    """
+    """Error of the correction over the image, one panel per variant with a common scale."""
     figure = new_figure(
         4.3 * len(maps) + 1,
         4.9,
-        'What the correction leaves over the image, fluoroscopic system 1',
+        'Error of the corrected coordinates over the image, fluoroscopic system 1',
         'compressed',
     )
     panels = np.atleast_1d(figure.subplots(1, len(maps), sharey=True))
@@ -319,13 +316,11 @@ def map_figure(maps: Mapping[str, np.ndarray]) -> Figure:
 
 
 def curve_figure(plan: Plan, outcomes: Outcomes) -> Figure:
-    """Accuracy over the number of training exposures: object points, source, and the correction
-    itself.
-    """
+    """Accuracy of points, source and correction by the number of training exposures."""
     figure = new_figure(
         14,
         5.2,
-        f'Accuracy of {plan.exposures - plan.trained} exposures never used, by number of '
+        f'Accuracy of {plan.exposures - plan.trained} unused exposures by number of '
         'training exposures',
     )
     panels = figure.subplots(1, 3)
@@ -367,9 +362,7 @@ def curve_figure(plan: Plan, outcomes: Outcomes) -> Figure:
 
 
 def curves(plan: Plan, outcomes: Outcomes, variant: str) -> np.ndarray:
-    """Three arrays (counts,) of a variant: object points [mm], source [mm], correction [px]; rms
-    over the rigs.
-    """
+    """RMS over the rigs (3, counts) of object points [mm], source [mm], correction [px]."""
     cases = plan.curve_cases()
     out = np.full((3, len(plan.curve)), np.nan)
     for i, count in enumerate(plan.curve):

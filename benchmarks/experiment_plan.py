@@ -111,9 +111,10 @@ class Plan:
         }
 
     def cost_cases(self) -> dict[str, Case]:
-        """Cases of system 1 whose rounds are shown, by variant. The survey counts fully: where it
-        hardly does, C_r of a bead that is seen once or twice is nearly singular, and G is that of
-        these few beads.
+        """Cases of system 1 whose rounds are shown, by variant.
+
+        The survey has full weight: with a low weight, C_r of a bead seen once or twice is nearly
+        singular, and these few beads dominate G.
         """
         return {
             v: self.case(self.seeds[0], v, detail=True)
@@ -191,15 +192,15 @@ def full_plan() -> Plan:
             ),
         ),
         60,
-        # The paper fixed its datum by surveyed coordinates with a low weight. A survey that counts
-        # fully would hold the object points before any calibration, and hide most of what it
-        # improves.
+        # The paper defined its datum by surveyed coordinates with a low weight. A survey with full
+        # weight would fix the object points before any calibration, and hide most of the
+        # improvement.
         20.0,
     )
 
 
 def quick_plan() -> Plan:
-    """The same in small: every section is there, but the figures tell little."""
+    """A small plan with every section; its numbers mean little."""
     default = CalibrationOptions().model
     hard = Setting(
         '5 exposures, double distortion, 5 % false matches', strength=2.0, false_matches=0.05
@@ -246,17 +247,18 @@ def run(cases: Sequence[Case], processes: int = PROCESSES) -> Outcomes:
 
 
 def _run_group(group: Sequence[Case]) -> list[Outcome]:
-    """Outcomes of cases, each told on the standard error output."""
+    """Outcomes of cases, each reported on standard error."""
     outcomes = []
     for case in group:
         began = time.perf_counter()
         outcome = run_case(case)
         outcomes.append(outcome)
-        told = outcome.failed or f'{outcome.points_mm():.4f} mm out of sample'
+        result = outcome.failed or f'{outcome.points_mm():.4f} mm out of sample'
         print(
             f'rig {case.seed} {"+".join(case.fluoroscopes)}, '
             f'{case.training or case.exposures // case.every} exposures, '
-            f'{case.variant}{", joint" * case.joint}: {told}, {time.perf_counter() - began:.1f} s',
+            f'{case.variant}{", joint" * case.joint}: {result}, '
+            f'{time.perf_counter() - began:.1f} s',
             file=sys.stderr,
         )
     return outcomes

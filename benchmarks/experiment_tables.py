@@ -1,6 +1,4 @@
-"""Tables of the validation experiment: Tables 1-9 of Chow et al. with ours below theirs, and
-comparisons over rigs.
-"""
+"""Tables of the validation experiment: Tables 1-9 of Chow et al. with our rows, and more."""
 
 from __future__ import annotations
 
@@ -60,18 +58,18 @@ PAPER_OUTSIDE = {
 }
 NAMES = {
     BEFORE: 'ours: before',
-    HELD: 'ours: after (kNN, interior held)',
+    HELD: 'ours: after (kNN, interior fixed)',
     'knn': 'ours: after w/ IOP (kNN)',
 }
 
 
 def label_of(variant: str) -> str:
-    """First cell of a row of ours."""
+    """First cell of one of our rows."""
     return NAMES.get(variant, f'ours: {variant}')
 
 
 def gains(values: Iterable[float], first: Iterable[float]) -> list[str]:
-    """Improvements [%] over the row before, as text."""
+    """Improvements [%] over the row `before`, as text."""
     return [f'{100 * (1 - v / b):.1f}' for v, b in zip(values, first)]
 
 
@@ -167,8 +165,9 @@ def reprojection(outcome: Outcome) -> list[float]:
 
 
 def curve_table(plan: Plan, outcomes: Outcomes, which: int, digits: int) -> str:
-    """One figure for each variant and count of training exposures; which: 0 points, 1 source, 2
-    correction.
+    """A quantity by variant and number of training exposures.
+
+    which: 0 points, 1 source, 2 correction.
     """
     rows = []
     for variant in (*plan.models, KNOWN):
@@ -178,7 +177,7 @@ def curve_table(plan: Plan, outcomes: Outcomes, which: int, digits: int) -> str:
 
 
 class Comparison:
-    """Figures of a comparison over several rigs, by variant; failed cases are left out."""
+    """Results of a comparison over several rigs, by variant; failed cases are left out."""
 
     def __init__(self, plan: Plan, outcomes: Outcomes, setting: Setting) -> None:
         self._outcomes = {key: outcomes[case] for key, case in plan.setting_cases(setting).items()}
@@ -212,8 +211,9 @@ class Comparison:
         )
 
     def image_px(self, variant: str, within: str | None = None) -> float:
-        """RMSE [px] of the correction, rms over the rigs; within: over the area that this variant
-        covers too.
+        """RMSE [px] of the correction, RMS over the rigs.
+
+        within: variant to whose calibrated area it is restricted.
         """
         return float(
             np.sqrt(
@@ -311,7 +311,7 @@ def chosen(outcome: Outcome) -> str:
 
 
 def joint_table(plan: Plan, outcomes: Outcomes) -> str:
-    """Separate and joint calibration, tested alike; gains over the separate one in percent."""
+    """Separate and joint calibration with the same test; gains over separate in percent."""
     cases = plan.joint_cases()
     rows = []
     base = None

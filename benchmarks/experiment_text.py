@@ -1,6 +1,4 @@
-"""Text of docs/accuracy.md: description of the experiment, its figures, and the shortcomings that
-follow from them.
-"""
+"""Text of docs/accuracy.md: the experiment, its results, and the shortcomings they show."""
 
 from __future__ import annotations
 
@@ -47,8 +45,8 @@ Errors are root mean squares (RMSE) of the differences from the truth.
 
 | name | meaning |
 | --- | --- |
-| before | no correction, interior orientation held at its nominal value |
-| after (kNN, interior held) | the first variant of the paper: k nearest neighbours learn the interior orientation too |
+| before | no correction, interior orientation fixed at its nominal value |
+| after (kNN, interior fixed) | the first variant of the paper: k nearest neighbours learn the interior orientation too |
 | after w/ IOP (kNN), `knn` | the second variant of the paper: interior orientation (IOP) estimated in the adjustment |
 {models}| known distortion | observations corrected with the true distortion, interior orientation estimated: the lower bound |
 
@@ -157,7 +155,7 @@ def tables_of(plan: Plan, outcomes: Outcomes, system: str, first: int) -> list[s
 
 
 def convergence(plan: Plan, outcomes: Outcomes) -> str:
-    """How many rounds each calibration of system 1 took."""
+    """Number of rounds of each calibration of system 1."""
     of = {v: outcomes[c] for v, c in plan.cost_cases().items()}
     said = [
         f'{v}: {o.rounds} rounds, {o.seconds:.1f} s{"" if o.converged else " (not converged)"}'
@@ -246,7 +244,7 @@ def joint_section(plan: Plan, outcomes: Outcomes) -> str:
 
 
 def summary_section(plan: Plan, comparisons: Sequence[Comparison]) -> str:
-    """The most important figures."""
+    """The main results."""
     lines = ['## Summary\n']
     for c in comparisons:
         if not c.seeds(plan.default):
@@ -279,7 +277,7 @@ def summary_section(plan: Plan, comparisons: Sequence[Comparison]) -> str:
 
 
 def shortcomings(plan: Plan, outcomes: Outcomes, comparisons: Sequence[Comparison]) -> list[str]:
-    """Sentences on unmet aims and other shortcomings; each one follows from the figures."""
+    """Sentences on missed aims and other shortcomings, derived from the results."""
     return [
         *_of_settings(plan, comparisons),
         *_of_paper(plan, outcomes),
@@ -396,7 +394,7 @@ def _of_cases(outcomes: Outcomes) -> Iterator[str]:
     ]
     if held:
         yield (
-            f'kNN with the interior orientation held did not converge within {held[0].rounds} '
+            f'kNN with a fixed interior orientation did not converge within {held[0].rounds} '
             f'rounds ({len(held)} calibrations): it selects few neighbours, which follow the '
             'noise.'
         )

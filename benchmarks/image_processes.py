@@ -1,10 +1,10 @@
-"""Processes round the image node: a camera, and a node that does nothing but hand images on.
+"""Processes around the image node: a camera, and a relay that forwards images unchanged.
 
     python -m benchmarks.image_processes camera --ros-args -p rate:=120.0 -p frames:=600
     python -m benchmarks.image_processes relay
 
-The camera publishes bytes that are serialised already, as a driver that does not copy its images
-would: what the machine has is left to the node under test.
+The camera publishes serialised bytes, as a driver that does not copy its images would. This leaves
+the CPU to the node under test.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from fluoro_calib_ros.simulation.rig import virtual_rig
 
 from .relay import all_fatal
 
-DIFFERENT = 8  # images that come over and over
+DIFFERENT = 8  # images that are repeated
 
 
 @dataclass(frozen=True)

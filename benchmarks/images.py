@@ -5,10 +5,10 @@
     python -m benchmarks.images --picture docs/images/corrected_image.png
 
 Camera, node and the reader (this process, or one of its own for another transport) share the
-machine. An image is lost when it does not come out; latency is from the stamp of the camera, set
+machine. An image without an output is lost; latency is from the stamp of the camera, set
 just before it publishes, to the time stamp that DDS gives the output. A segment of shared memory
-of Fast DDS is smaller than an image by default: the cases `wide` are measured with one of 32 MB,
-as docs/images.md tells to make it.
+of Fast DDS is smaller than an image by default: the cases `wide` use one of 32 MB, as described in
+docs/images.md.
 """
 
 from __future__ import annotations
@@ -244,7 +244,7 @@ def measured(
 
 
 def _stream_figures(came: np.ndarray, frames: int) -> dict[str, Any]:
-    """Losses, rate [Hz] and latencies [ms] of the stamps and latencies (n, 2) [ns] that came."""
+    """Losses, rate [Hz] and latencies [ms] of received stamps and latencies (n, 2) [ns]."""
     latency = came[:, 1] * 1e-6
     span = (came[-1, 0] - came[0, 0]) * 1e-9
     return {
@@ -260,7 +260,7 @@ def _stream_figures(came: np.ndarray, frames: int) -> dict[str, Any]:
 def live(
     calibration: FluoroscopeCalibration, seconds: float, only: str = ''
 ) -> dict[str, dict[str, Any]]:
-    """Figures of the cases whose name contains `only`, by case, with the present transports."""
+    """Results by case, of those whose name contains `only`, with the current transports."""
     import rclpy
 
     from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
@@ -304,7 +304,7 @@ def live_wide(seconds: float, only: str = '') -> dict[str, dict[str, Any]]:
 def run(
     seconds: float = 10.0, only: str = ''
 ) -> tuple[list[dict[str, Any]], dict[str, dict[str, Any]]]:
-    """Figures of one core, and live figures by case."""
+    """Results on one core, and live results by case."""
     calibration, frames = calibration_of_the_rig()
     return on_one_core(calibration, frames), live(calibration, seconds, only) | live_wide(
         seconds, only

@@ -30,7 +30,7 @@ from .timing import section, timed
 MODELS = tuple(name for name in selectable_models() if name != 'none')
 POINTS = 2**20  # of a large array
 FRAME = 30  # points of a frame
-ROUNDS = 41  # in each, ours and theirs one after the other
+ROUNDS = 41  # of one measurement of each function
 HEADER = [
     'model',
     'cell [px]',
@@ -49,7 +49,7 @@ class Figures:
     """What was measured of one correction model.
 
     kind and k; cell_px; error_px: largest difference of a coordinate from the exact model at
-    20,000 random pixels of the calibrated area, stated_px: what the grid says of itself; build_s;
+    20,000 random pixels of the calibrated area, stated_px: that of the grid itself; build_s;
     points_per_s of a large array on one core; look_up_s, correct_s and predict_s of a frame, and
     ratio of predict_s to look_up_s.
     """
@@ -75,11 +75,12 @@ def mean_time(function: Callable[[], Any], calls: int) -> float:
     return (time.perf_counter() - began) / calls
 
 
-def beside_each_other(
+def side_by_side(
     ours: Callable[[], Any], correct: Callable[[], Any], theirs: Callable[[], Any]
 ) -> tuple[float, float, float, float]:
-    """Median times [s] of calls of three functions, and median ratio of the third to the first, in
-    rounds of all three: what else the machine does hits all of them.
+    """Median times [s] of three functions, and median ratio of the third to the first.
+
+    They are called in rounds, so that other load of the machine affects all of them.
     """
     rounds = np.array(
         [
@@ -91,8 +92,9 @@ def beside_each_other(
 
 
 def points_per_second(grid: CorrectionGrid, rng: np.random.Generator) -> float:
-    """Points of a large array that are looked up in a second of a core: du, dv, standard deviation
-    and status of pixels in random order, which is the worst for the cache. Median of 15.
+    """Points of a large array that one core looks up per second; median of 15 runs.
+
+    The pixels are in random order, which is the worst case for the cache.
     """
     u, v = rng.uniform(-0.5, np.array(grid.image_size)[:, None] - 0.5, (2, POINTS))
     values = np.empty((3, POINTS))
@@ -106,9 +108,7 @@ def points_per_second(grid: CorrectionGrid, rng: np.random.Generator) -> float:
 
 
 def measure(model: str) -> Figures:
-    """Figures of a correction model (of CalibrationOptions) for a calibration of the virtual rig
-    with 15 exposures.
-    """
+    """Measure a correction model, by name, on a calibration of 15 exposures of the virtual rig."""
     rig = virtual_rig(1)
     rng = np.random.default_rng(0)
     frames = {
@@ -124,11 +124,11 @@ def measure(model: str) -> Figures:
     calibration.prepare()
     frame = rng.uniform(80, 940, (FRAME, 2))
     u, v = np.ascontiguousarray(frame.T)
-    # A model without neighbours stands beside the paper's: the regressor with k = 3.
+    # A model without neighbours is compared with the regressor of the paper, k = 3.
     peer = KNeighborsRegressor(exact.k or 3, algorithm='kd_tree').fit(
         exact.train_uv, exact.train_duv
     )
-    times = beside_each_other(
+    times = side_by_side(
         lambda: grid.look_up(u, v),
         lambda: calibration.correct_arrays(u, v),
         lambda: peer.predict(frame),
@@ -146,7 +146,7 @@ def measure(model: str) -> Figures:
 
 
 def row(f: Figures) -> list[str]:
-    """The row of the table for Figures."""
+    """A row of the table."""
     return [
         f'{f.kind}, k = {f.k}' if f.k else f.kind,
         f'{f.cell_px:g}',

@@ -1,4 +1,4 @@
-"""Correction models beside regressors of scikit-learn, out of sample, on virtual rigs.
+"""Correction models and regressors of scikit-learn compared out of sample on virtual rigs.
 
 python -m benchmarks.models            the table of docs/models.md
 python -m benchmarks.models --rigs 3   on more rigs
@@ -180,7 +180,7 @@ def models_section(rigs: int = 2) -> str:
         rows.append(row(name, [measure(scene, error, options) for scene, error in pairs]))
         sys.stderr.write(f'{" | ".join(rows[-1])}\n')
     return section(
-        'Models beside each other, out of sample',
+        'Comparison of the models, out of sample',
         f'Means over {rigs} virtual rigs, one fluoroscope: {TRAIN_EXPOSURES} exposures to '
         f'calibrate, {TEST_EXPOSURES} others to test. Object points: 3-D RMSE of the test '
         'exposures, adjusted with the calibration held; with the distortion known exactly it is '

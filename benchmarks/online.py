@@ -1,14 +1,13 @@
-"""The online path at lab rates: nodes as processes, compared with relays that do nothing
-with the same messages.
+"""The online path at lab rates: nodes as processes, compared with plain relays.
 
     python -m benchmarks.online [--seconds 60] [--only NAME]
 
-The simulator, the nodes under test and the reader (this process) share the machine. A frame is
-lost when it does not come out. Latency is reported twice: within the node, from the arrival of the
-input (of the last view, for points) to the publication of the output, as the node's diagnostics
-have it (the median of its medians, and the largest of its 99 %, each of 2,000 frames); and from
+The simulator, the nodes under test and the reader (this process) share the machine. A frame
+without an output is lost. Latency is reported twice: within the node, from the arrival of the
+input (of the last view, for points) to the publication of the output, from the node's diagnostics
+(the median of its medians, and the largest of its 99 %, each of 2,000 frames); and from
 the stamp of the simulator, set just before it publishes, to the time stamp that DDS gives the
-output when it is published, with the way through DDS in it.
+output when it is published, which includes the transfer by DDS.
 """
 
 from __future__ import annotations
@@ -85,7 +84,7 @@ def logged(node: Node) -> FaultHandlers:
 
 
 class Reader(Node):
-    """Publishes the calibration, and counts what the nodes put out."""
+    """Publishes the calibration, and counts the outputs of the nodes."""
 
     def __init__(self, calibrations: Mapping[str, Calibration], orientation: Orientation) -> None:
         super().__init__('reader')
@@ -166,9 +165,7 @@ class Reader(Node):
 
 
 def _number_and_latency(data: bytes, info: dict[str, int]) -> tuple[int, int]:
-    """Frame number and latency [ns] of the CDR bytes of a message that begins with header and
-    frame_number.
-    """
+    """Frame number and latency [ns] of the CDR bytes of a message with header, frame_number."""
     seconds, nanoseconds, length = struct.unpack_from('<iII', data, 4)
     at = 4 + (12 + length + 3) // 4 * 4
     return struct.unpack_from('<I', data, at)[0], info[
@@ -250,9 +247,7 @@ def measured(
 
 
 def _nearly(came: Mapping[Any, Sequence[tuple[int, int]]], frames: int) -> bool:
-    """Whether the stream is over but for its last frames: the CPU of what is ending is not that of
-    the stream.
-    """
+    """Whether all but the last frames have come: CPU time is measured up to here."""
     return all(of_one[-1][0] >= frames - 10 for of_one in came.values())
 
 
@@ -288,7 +283,7 @@ def rig_of_the_simulator() -> tuple[dict[str, Calibration], Orientation]:
 
 
 def run(seconds: float, only: str = '') -> dict[str, list[dict[str, Any]]]:
-    """{case: figures of its nodes}."""
+    """Results of the nodes by case."""
     isolate_ros_graph()
     rclpy.init(args=[])
     reader = Reader(*rig_of_the_simulator())

@@ -1,10 +1,9 @@
-"""Honest precision: errors of many simulated calibrations over the standard deviations that are
-claimed for them.
+"""Errors of many simulated calibrations relative to their stated standard deviations.
 
-Every calibration is of a rig of its own. An error is taken against the truth in the gauge of the
-calibration: a shift, scale or turn of the whole image belongs to the orientation as well as to the
-distortion, so the true distortion is turned, shifted and scaled by the projective map that makes
-it as orthogonal to the gauge as the estimated one is.
+Every calibration has a rig of its own. Errors are computed against the truth in the gauge of the
+calibration: a shift, scale or rotation of the whole image can be part of the orientation or of the
+distortion, so the true distortion is transformed by the projective map that makes it orthogonal to
+the gauge, as the estimated one is.
 """
 
 from __future__ import annotations
@@ -34,11 +33,10 @@ MARGIN_PX = 8.0  # of the grid from the edge of the image
 def truth_in_gauge(
     fluoroscope: VirtualFluoroscope, uv: np.ndarray, interior: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
-    """Interior orientation (3,), turn (3, 3) of the sensor and correction of the truth in the
-    gauge of a calibration.
+    """True interior orientation, sensor rotation and correction in the gauge of a calibration.
 
-    uv (n, 2) image points over which its correction is orthogonal to the gauge about interior
-    (3,).
+    uv (n, 2) are the image points over which its correction is orthogonal to the gauge, interior
+    (3,) is its interior orientation [px].
     """
 
     def camera(k: np.ndarray) -> np.ndarray:
@@ -61,9 +59,7 @@ def truth_in_gauge(
 
 
 def normalised(seed: int, exposures: int = 15, model: str = 'auto') -> dict[str, float]:
-    """One calibration: mean normalised squared error by quantity, share of the correction within
-    its 95 % interval.
-    """
+    """Errors of one calibration; see errors_of."""
     rig = virtual_rig(seed)
     simulated = simulate_exposures(rig, exposures, seed, detection=Detection(beads=(125, 139)))
     return errors_of(
@@ -76,8 +72,10 @@ def normalised(seed: int, exposures: int = 15, model: str = 'auto') -> dict[str,
 def errors_of(
     job: CalibrationResult, rig: VirtualRig, simulated: SimulatedExposures
 ) -> dict[str, float]:
-    """Mean normalised squared errors of a calibration of fluoroscope a, and its correction against
-    the truth.
+    """Mean normalised squared errors of a calibration of fluoroscope a, by quantity.
+
+    Also 'interval', the fraction of the correction within its 95 % interval, and 'correction', its
+    RMSE [px].
     """
     run = job.runs['a']
     figures = job.fluoroscopes['a']

@@ -48,7 +48,7 @@ FROM_EXPOSURES = ', orientation from the calibration'
 
 @dataclass(frozen=True)
 class Outcome:
-    """Figures of one way on one rig.
+    """Results of one way on one rig.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Outcome:
     distance_mm : float
         RMSE of these distances.
     sd_orientation_mm : float
-        Of the points by the orientation of the rig, 3-D; NaN as `normalised`.
+        Of the points due to the orientation of the rig, 3-D; NaN like `normalised`.
     """
 
     rmse_mm: float

@@ -1,7 +1,7 @@
-"""The experiment of Chow et al. on the virtual rig, and what goes beyond it: `make validation`.
+"""The experiment of Chow et al. on the virtual rig, and further comparisons: `make validation`.
 
-Writes docs/accuracy.md and its pictures. What is done is in experiment_plan, what is written in
-experiment_text.
+Writes docs/accuracy.md and its pictures; experiment_plan lists the cases, experiment_text has the
+text.
 """
 
 from __future__ import annotations

@@ -70,14 +70,14 @@ def _plot_costs(axes: Axes, f: np.ndarray, g: np.ndarray, recorded: np.ndarray) 
         recorded,
         ':',
         color=RED,
-        label='G as recorded (its unit, the noise\nvariance, shrinks with F)',
+        label='G as recorded (in units of the noise\nvariance, which decreases with F)',
     )
     axes.plot(
         range(len(g)),
         g,
         '-',
         color=RED,
-        label='G: regression (weighted square sum of\nthe cross-validation, all in one unit)',
+        label='G: regression (weighted square sum of\nthe cross-validation, in one unit)',
         **MARKER,
     )
     axes.plot(
@@ -109,13 +109,11 @@ def _plot_change(axes: Axes, change: Sequence[float]) -> None:
         change,
         '-',
         color=BLACK,
-        label='change of the correction that the\nnext iteration would make',
+        label='change of the correction in the\nnext iteration',
         **MARKER,
     )
-    axes.axhline(
-        SETTLED_PX, color=GREY, linestyle='--', label=f'counts as settled: {SETTLED_PX:g} px'
-    )
-    axes.set(title='What is still moving', ylabel='RMS change of the correction [px]')
+    axes.axhline(SETTLED_PX, color=GREY, linestyle='--', label=f'tolerance: {SETTLED_PX:g} px')
+    axes.set(title='Convergence of the correction', ylabel='RMS change of the correction [px]')
 
 
 def _names_text(names: Sequence[str]) -> str:

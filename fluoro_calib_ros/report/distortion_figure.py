@@ -1,4 +1,4 @@
-"""The figure of the learned distortion of one fluoroscope."""
+"""The figure of the estimated distortion of one fluoroscope."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def distortion_figure(
     figure = new_figure(
         15,
         min(2 + 5.3 * height / width, 15),
-        f'Fluoroscope {name}: learned distortion ({model_text(model)})',
+        f'Fluoroscope {name}: estimated distortion ({model_text(model)})',
         'compressed',
     )
     left, right = figure.subplots(1, 2)
@@ -50,17 +50,17 @@ def distortion_figure(
         figure.colorbar(mesh, ax=axes, label=label)
     factor = _draw_arrows(left, model, image_size)
     left.set_title(
-        f'Displacement (du, dv) = observed - undistorted,\narrows {factor:g} times enlarged'
+        f'Displacement (du, dv) = observed - undistorted,\narrows magnified {factor:g} times'
     )
     right.plot(*model.train_uv.T, '.', color='white', markersize=2, alpha=0.5)
     right.set_title(
         f'Standard deviation of du and of dv,\ndots: the {len(model.train_uv)} training points'
     )
     gauge = (
-        'Shift, scale, rotation and tilt are in the interior and exterior orientation, not in '
+        'Shift, scale, rotation and tilt belong to the interior and exterior orientation, not to '
         'this field.'
         if interior_estimated
-        else 'The interior orientation was held: its errors (shift and scale) are part of this '
+        else 'The interior orientation was fixed: its errors (shift and scale) are part of this '
         'field.'
     )
     figure.supxlabel(f'{gauge} Hatched: outside the calibrated area.', fontsize=11)

@@ -50,7 +50,7 @@ def normalised_residuals(
 def histogram_figure(
     run: SelfCalibration, name: str, rows: np.ndarray, redundancy: np.ndarray
 ) -> Figure:
-    """Histograms of the normalised residuals of one fluoroscope, with the unit normal.
+    """Histograms of the normalised residuals of one fluoroscope, with the standard normal.
 
     rows (k,): its image points; redundancy (k,): their redundancy numbers.
     """
@@ -71,7 +71,7 @@ def histogram_figure(
             np.exp(-x * x / 2) / np.sqrt(2 * np.pi),
             color=BLACK,
             linewidth=2,
-            label='unit normal: 99.7 % within ±3',
+            label='standard normal: 99.7 % within ±3',
         )
         coordinate = COORDINATES[axis]
         axes.set(
@@ -150,8 +150,8 @@ def position_figure(
                 ylabel=f'{coordinate} residual [px]',
             )
     figure.supxlabel(
-        'Dots: inliers. Crosses: outliers, not in the RMSE, and those at the upper and lower rim '
-        'lie beyond the panel. Line: running median of the inliers.',
+        'Dots: inliers. Crosses: outliers, not in the RMSE; those at the upper and lower edge '
+        'are beyond the panel. Line: running median of the inliers.',
         fontsize=11,
     )
     return figure

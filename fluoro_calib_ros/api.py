@@ -16,7 +16,9 @@ from .calibration.options import CalibrationOptions
 from .calibration.request import CalibrationRequest
 from .calibration.result import CorrectedPoints, FluoroscopeCalibration
 from .errors import DataError
+from .exchange.content import FileSettings
 from .exposures.frame import Frame
+from .exposures.names import Names
 from .exposures.phantom import Phantom
 from .files.calibration_request import read_request
 from .files.phantom import read_phantom
@@ -24,11 +26,12 @@ from .files.reconstructed_points import write_reconstruction
 from .files.rig_orientation import load_orientation, save_orientation
 from .jobs.adjustment import adjust
 from .jobs.calibration import CalibrationOutcome, run_calibration
+from .jobs.conversion import ConversionRequest, convert
 from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
 from .jobs.result_folder import save_outcome, save_result
 from .jobs.simulation import SimulationOptions, simulate
-from .jobs.sources import Recording, read_calibrations, read_source
+from .jobs.sources import Recording, Survey, read_calibrations, read_source, read_survey
 from .photogrammetry.rig_orientation import RigOrientation
 from .validation.check import Validation
 from .validation.verdict import validate
@@ -38,10 +41,13 @@ __all__ = [
     'CalibrationOutcome',
     'CalibrationRequest',
     'CalibrationResult',
+    'ConversionRequest',
     'CorrectedPoints',
     'DataError',
+    'FileSettings',
     'FluoroscopeCalibration',
     'Frame',
+    'Names',
     'OrientationOutcome',
     'Phantom',
     'ReconstructionOptions',
@@ -49,9 +55,11 @@ __all__ = [
     'Recording',
     'RigOrientation',
     'SimulationOptions',
+    'Survey',
     'Validation',
     'adjust',
     'calibrate',
+    'convert',
     'correct',
     'load_orientation',
     'orient',
@@ -59,6 +67,7 @@ __all__ = [
     'read_phantom',
     'read_request',
     'read_source',
+    'read_survey',
     'reconstruct',
     'run_calibration',
     'save_orientation',

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from ..options import Option
 
 if TYPE_CHECKING:
-    from ..exchange.content import Settings
+    from ..exchange.content import FileSettings
 
 UNITS = ('mm', 'cm', 'm')
 
@@ -128,9 +128,9 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def file_settings(arguments: argparse.Namespace, **changes: Any) -> Settings:
+def file_settings(arguments: argparse.Namespace, **changes: Any) -> FileSettings:
     """Return the settings of `add_file_options`; changes replace some."""
-    from ..exchange.content import Settings
+    from ..exchange.content import FileSettings
 
     settings: dict[str, Any] = {
         'image_size': getattr(arguments, 'image_size', None),
@@ -140,7 +140,7 @@ def file_settings(arguments: argparse.Namespace, **changes: Any) -> Settings:
         'trial': arguments.trial,
     }
     settings.update(changes)
-    return Settings(**settings)
+    return FileSettings(**settings)
 
 
 def add_fluoroscopes(parser: argparse.ArgumentParser, use: str = 'use') -> None:

@@ -23,7 +23,7 @@ from .camera_files import check_matrix
 from .content import (
     Camera,
     Content,
-    Settings,
+    FileSettings,
     Written,
     from_units,
     in_units,
@@ -42,7 +42,7 @@ def recognise(sample: Sample) -> bool:
     return any(line.startswith('[') for line in sample.lines)
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read the cameras. Raises DataError."""
     try:
         document = tomllib.loads(read_text(path))
@@ -93,7 +93,7 @@ def numbers_of(
     return value
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write all cameras into one file."""
     mm, notes = settings.unit_or('mm', str(path))
     lines = []

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from .content import Content, Settings, Written
+from .content import Content, FileSettings, Written
 
-Reader = Callable[[Path, Settings], Content]
-Writer = Callable[[Path, Content, Settings], Written]
+Reader = Callable[[Path, FileSettings], Content]
+Writer = Callable[[Path, Content, FileSettings], Written]
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,7 @@ from ..files.access import make_folder
 from ..files.atomic import write_text
 from .base import Format, Sample
 from .camera_files import common_focal_length, refuse_distortion
-from .content import Camera, Content, Settings, Station, Written, from_units, in_units
+from .content import Camera, Content, FileSettings, Station, Written, from_units, in_units
 from .text import Row, joined, read_table, require_width
 from .xmalab_points import camera_order
 
@@ -56,7 +56,7 @@ class _Cameras:
         return self.names[self.of_station[station]]
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read the wanted parts from the file and those beside it. Raises DataError."""
     files = {ending: path.with_suffix(ending) for ending in WIDTHS}
     rows = {
@@ -86,7 +86,7 @@ def _rows(path: Path, width: int) -> list[Row]:
     return rows
 
 
-def _cameras(rows: Mapping[str, Sequence[Row]], settings: Settings) -> _Cameras:
+def _cameras(rows: Mapping[str, Sequence[Row]], settings: FileSettings) -> _Cameras:
     """Return the cameras: those of .eop, else those of .iop, else one."""
     of_station = {
         row.whole(0, 'the station'): row.whole(1, 'the camera') for row in rows.get('.eop', ())
@@ -118,7 +118,7 @@ def _exposures(of_station: Mapping[int, int]) -> dict[int, int]:
 
 
 def _observations(
-    rows: Mapping[str, Sequence[Row]], cameras: _Cameras, settings: Settings
+    rows: Mapping[str, Sequence[Row]], cameras: _Cameras, settings: FileSettings
 ) -> dict[str, list[Frame]]:
     """Return the frames by fluoroscope. Raises DataError."""
     sizes = {cameras.names[row.whole(0, 'the camera')]: _size(row) for row in rows.get('.iop', ())}
@@ -204,7 +204,7 @@ def _survey(path: Path, rows: Sequence[Row], mm: float) -> Phantom:
         raise DataError(f'{path}: {error}') from None
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write the parts that there are as bundle.pho, .iop, .eop and .xyz into the folder path."""
     mm, notes = settings.unit_or('mm', str(path))
     observations = content.observations or {}

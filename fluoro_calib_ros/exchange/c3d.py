@@ -19,7 +19,7 @@ from ..exposures.names import Names, number_names
 from ..files.access import read_bytes
 from ..files.atomic import write_bytes
 from .base import Format, Sample
-from .content import UNITS_MM, Content, Points, Settings, Written
+from .content import UNITS_MM, Content, FileSettings, Points, Written
 from .frames_of_points import at_constant_rate, labels
 from .labels import named_targets
 
@@ -44,7 +44,7 @@ def _ezc3d() -> Any:
     return ezc3d
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read points in space. Raises DataError."""
     if read_bytes(path)[1:2] != bytes([_MAGIC]):
         raise DataError(f'{path}: this is not a C3D file')
@@ -94,7 +94,7 @@ def _labels(parameters: Any) -> list[str]:
     return found
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write points in space. Raises DataError."""
     points = at_constant_rate(path, content, settings)
     first = int(points.frame[0])

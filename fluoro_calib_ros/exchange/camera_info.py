@@ -19,7 +19,7 @@ from ..files.access import read_text
 from .anipose import numbers_of
 from .base import Format, Sample
 from .camera_files import check_matrix, write_cameras
-from .content import Camera, Content, Settings, Written
+from .content import Camera, Content, FileSettings, Written
 
 ENDING = '_camera_info.yaml'
 _MODELS = ('plumb_bob', 'rational_polynomial')
@@ -33,7 +33,7 @@ def recognise(sample: Sample) -> bool:
     return {'camera_matrix', 'image_width'} <= keys
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read a camera. Raises DataError."""
     try:
         document = yaml.safe_load(read_text(path))
@@ -78,7 +78,7 @@ def _matrix(
     return data.reshape(rows, columns)
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write a file <fluoroscope>_camera_info.yaml for each camera into the folder path."""
     paths = write_cameras(path, content.cameras, ENDING, _text)
     note = f'{path}: camera_info has no position and attitude, only the interior orientation'

@@ -222,7 +222,7 @@ def has_content(part: Any) -> bool:
 
 
 @dataclass(frozen=True)
-class Settings:
+class FileSettings:
     """What a file does not say and a user does.
 
     Attributes

@@ -17,7 +17,7 @@ from ..errors import DataError
 from ..files.atomic import write_text
 from .base import Format, Sample
 from .camera_files import refuse_distortion
-from .content import Camera, Content, Settings, Written, camera_at
+from .content import Camera, Content, FileSettings, Written, camera_at
 from .text import joined, read_table, require_width
 
 ROWS = 11
@@ -34,7 +34,7 @@ def recognise(sample: Sample) -> bool:
     return len(widths) == 1
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read the cameras, which are called cam1, cam2, ... unless settings name them.
 
     Raises DataError, also without the image size.
@@ -86,7 +86,7 @@ def _camera(name: str, coefficients: np.ndarray, size: tuple[int, int], mm: floa
     return camera_at(name, matrix, size, rotation, position * mm)
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write the coefficients of all cameras, in their order."""
     mm, notes = settings.unit_or('mm', str(path))
     columns = []

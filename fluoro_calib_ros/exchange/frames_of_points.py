@@ -8,13 +8,13 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import DataError
-from .content import Content, Points, Settings
+from .content import Content, FileSettings, Points
 from .labels import default_name
 
 MAX_FRAMES = 10**6
 
 
-def at_constant_rate(path: Path, content: Content, settings: Settings) -> Points:
+def at_constant_rate(path: Path, content: Content, settings: FileSettings) -> Points:
     """Return the points of a content with all frames from the first to the last, and their rate.
 
     Frames that are missing have no points. Raises DataError without a rate.

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from ..errors import DataError
 from .base import Format, Sample
 from .camera_files import name_of_file
-from .content import Content, Settings, camera_at, from_units
+from .content import Content, FileSettings, camera_at, from_units
 from .text import Row, read_table, require_width
 
 ENDING = '_MayaCam.csv'
@@ -37,7 +37,7 @@ def recognise(sample: Sample) -> bool:
         return False
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read a camera, which is called like the file. Raises DataError that names the row."""
     rows = read_table(path)
     if len(rows) != _ROWS:

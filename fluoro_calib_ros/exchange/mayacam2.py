@@ -22,7 +22,7 @@ from .camera_files import check_matrix, check_rotation, name_of_file, write_came
 from .content import (
     Camera,
     Content,
-    Settings,
+    FileSettings,
     Written,
     from_units,
     in_units,
@@ -40,7 +40,7 @@ def recognise(sample: Sample) -> bool:
     return bool(sample.lines) and sample.lines[0] == 'image size'
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read a camera, which is called like the file. Raises DataError that names the line."""
     lines = read_text(path).splitlines()
     for number, title in _TITLES.items():
@@ -87,7 +87,7 @@ def _numbers(path: Path, lines: list[str], number: int, count: int) -> list[floa
     return row.numbers()
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write a file <fluoroscope>_MayaCam2.txt for each camera into the folder path."""
     mm, notes = settings.unit_or('mm', str(path))
     paths = write_cameras(path, content.cameras, ENDING, lambda camera: _text(camera, mm))

@@ -21,7 +21,7 @@ from ..files.phantom import read_named_phantom, write_phantom
 from ..files.reconstructed_points import COLUMNS as POINTS
 from ..files.reconstructed_points import NAME_COLUMN
 from .base import Format, Sample
-from .content import Content, Points, Settings, Written
+from .content import Content, FileSettings, Points, Written
 
 GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
 NS = 1e9
@@ -35,30 +35,30 @@ def _has_columns(sample: Sample, columns: tuple[str, ...]) -> bool:
     return set(columns) <= {cell.strip().strip('"') for cell in lines[0].split(separator)}
 
 
-def _read_observations(path: Path, settings: Settings) -> Content:
+def _read_observations(path: Path, settings: FileSettings) -> Content:
     frames, names = read_named_observations(path, settings.image_size, settings.names)
     return Content(observations=frames, names=names)
 
 
-def _write_observations(path: Path, content: Content, settings: Settings) -> Written:
+def _write_observations(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write the ids; names would not be read by programs that know this layout."""
     assert content.observations is not None
     write_observations_csv(path, content.observations, content.names)
     return Written((str(path),))
 
 
-def _read_phantom(path: Path, settings: Settings) -> Content:
+def _read_phantom(path: Path, settings: FileSettings) -> Content:
     survey, names = read_named_phantom(path, settings.names)
     return Content(survey=survey, names=names)
 
 
-def _write_phantom(path: Path, content: Content, settings: Settings) -> Written:
+def _write_phantom(path: Path, content: Content, settings: FileSettings) -> Written:
     assert content.survey is not None
     write_phantom(path, content.survey, content.names)
     return Written((str(path),))
 
 
-def _read_points(path: Path, settings: Settings) -> Content:
+def _read_points(path: Path, settings: FileSettings) -> Content:
     """Read reconstructed points. Raises DataError."""
     blocks = list(read_blocks(path, ('frame', 'target_id', 'x', 'y', 'z')))
     frame, target = (
@@ -117,7 +117,7 @@ def _rate(frame: np.ndarray, stamp_ns: np.ndarray) -> float | None:
     return float(whole) if whole and abs(rate - whole) < 1e-5 * whole else float(rate)
 
 
-def _write_points(path: Path, content: Content, settings: Settings) -> Written:
+def _write_points(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write the points that were seen, with what is known about them."""
     points = content.points
     assert points is not None
@@ -145,7 +145,7 @@ def _write_points(path: Path, content: Content, settings: Settings) -> Written:
     return Written((str(path),), (note,))
 
 
-def _read_grid(path: Path, settings: Settings) -> Content:
+def _read_grid(path: Path, settings: FileSettings) -> Content:
     blocks = list(read_blocks(path, GRID))
     names = np.array([name for block in blocks for name in block.strings('fluoroscope')])
     numbers = np.concatenate(
@@ -154,7 +154,7 @@ def _read_grid(path: Path, settings: Settings) -> Content:
     return Content(grids={str(n): numbers[names == n] for n in dict.fromkeys(names.tolist())})
 
 
-def _write_grid(path: Path, content: Content, settings: Settings) -> Written:
+def _write_grid(path: Path, content: Content, settings: FileSettings) -> Written:
     with atomic_file(path, 'w') as file:
         write_rows(file, [GRID])
         for name, rows in content.grids.items():

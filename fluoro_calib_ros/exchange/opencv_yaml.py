@@ -19,7 +19,7 @@ from .camera_files import check_matrix, check_rotation, name_of_file, write_came
 from .content import (
     Camera,
     Content,
-    Settings,
+    FileSettings,
     Written,
     from_units,
     in_units,
@@ -37,7 +37,7 @@ def recognise(sample: Sample) -> bool:
     return any(line.split(':')[0] in MATRIX_NAMES for line in sample.lines)
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read a camera, which is called like the file. Raises DataError."""
     text = read_text(path)
     try:
@@ -52,7 +52,7 @@ def read(path: Path, settings: Settings) -> Content:
         storage.release()
 
 
-def _camera(path: Path, storage: cv2.FileStorage, settings: Settings) -> Camera:
+def _camera(path: Path, storage: cv2.FileStorage, settings: FileSettings) -> Camera:
     matrix = _matrix(path, storage, MATRIX_NAMES)
     if matrix is None or matrix.shape != (3, 3):
         raise DataError(f'{path}: there is no camera_matrix of 3 x 3 numbers')
@@ -93,7 +93,7 @@ def _matrix(path: Path, storage: cv2.FileStorage, names: tuple[str, ...]) -> np.
     return None
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write a file <fluoroscope>_opencv.yaml for each camera into the folder path."""
     mm, notes = settings.unit_or('mm', str(path))
     paths = write_cameras(path, content.cameras, ENDING, lambda camera: _text(camera, mm))

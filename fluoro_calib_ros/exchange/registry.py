@@ -18,6 +18,7 @@ from . import (
     c3d,
     camera_info,
     dlt,
+    known_orientation,
     mayacam1,
     mayacam2,
     native,
@@ -31,7 +32,7 @@ from . import (
     xmalab_project,
 )
 from .base import Format, Sample
-from .content import PARTS, Content, Settings, Written, has_content
+from .content import PARTS, Content, FileSettings, Written, has_content
 
 HEAD = 65536  # bytes by which a format is recognised
 LINES = 20
@@ -42,6 +43,7 @@ FORMATS: dict[str, Format] = {
     format_.kind: format_
     for format_ in (
         *native.FORMATS,
+        known_orientation.FORMAT,
         xmalab_points.FORMAT,
         xmalab_project.FORMAT,
         xmalab_frame.FORMAT,
@@ -93,7 +95,7 @@ def recognised(path: PathLike) -> Format | None:
     return next((f for f in FORMATS.values() if f.recognise(sample)), None)
 
 
-def read(path: PathLike, settings: Settings, kind: str | None = None) -> Content:
+def read(path: PathLike, settings: FileSettings, kind: str | None = None) -> Content:
     """Read a file of any format, or a folder with a file of one format for each camera.
 
     kind is its format, by default the one it is recognised as. Raises DataError for a file that
@@ -123,7 +125,7 @@ def _beginning(path: Path) -> str:
     return f'it begins with {sample.lines[0][:MAX_SHOWN]!r}'
 
 
-def _read_folder(folder: Path, settings: Settings, kind: str | None) -> Content:
+def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Content:
     """Read a folder with a file for each camera. Raises DataError."""
     contents: dict[Path, tuple[str, Content]] = {}
     for path in sorted(p for p in folder.iterdir() if p.is_file() and p.name[0] != '.'):
@@ -149,7 +151,7 @@ def _read_folder(folder: Path, settings: Settings, kind: str | None) -> Content:
     return Content(cameras=tuple(cameras), lookups=lookups, notes=notes)
 
 
-def write(path: PathLike, kind: str, content: Content, settings: Settings) -> Written:
+def write(path: PathLike, kind: str, content: Content, settings: FileSettings) -> Written:
     """Write a content as a format.
 
     Raises DataError for a format that is only read, and for a content without what it holds.
@@ -167,6 +169,6 @@ def write(path: PathLike, kind: str, content: Content, settings: Settings) -> Wr
     return format_.write(Path(path), content, settings)
 
 
-def settings_for(kind: str, settings: Settings) -> Settings:
+def settings_for(kind: str, settings: FileSettings) -> FileSettings:
     """Return settings that read only what a format can hold."""
     return replace(settings, wanted=FORMATS[kind].parts)

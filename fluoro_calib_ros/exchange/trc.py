@@ -22,7 +22,7 @@ from .base import Format, Sample
 from .content import (
     UNITS_MM,
     Content,
-    Settings,
+    FileSettings,
     Written,
     from_units,
     in_units,
@@ -45,7 +45,7 @@ def recognise(sample: Sample) -> bool:
     return bool(sample.lines) and sample.lines[0].startswith('PathFileType')
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read points in space. Raises DataError that names the row."""
     lines = read_text(path).splitlines()
     if len(lines) < _HEADER_ROWS or not lines[0].startswith('PathFileType'):
@@ -98,7 +98,7 @@ def _coordinates(row: Row, count: int) -> np.ndarray:
     return xyz
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write points in space. Raises DataError."""
     points = at_constant_rate(path, content, settings)
     unit = settings.units or 'mm'

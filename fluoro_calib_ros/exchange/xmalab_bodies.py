@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import DataError
 from ..files.atomic import atomic_file
 from .base import Format, Sample
-from .content import Bodies, Content, Settings, Written, from_units, in_units
+from .content import Bodies, Content, FileSettings, Written, from_units, in_units
 from .text import Row, joined, read_table, require_width
 
 COLUMNS = (
@@ -34,7 +34,7 @@ def recognise(sample: Sample) -> bool:
     return bool(sample.lines) and '_R11' in sample.lines[0] and '_TX' in sample.lines[0]
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read the poses of rigid bodies. Raises DataError."""
     rows = read_table(path)
     header = rows[0].cells
@@ -90,7 +90,7 @@ def _check(row: Row, matrices: np.ndarray, names: list[str]) -> None:
             row.fail(f'the columns 01, 02, 03 and 1 of {name} are not 0, 0, 0 and 1')
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write the poses of rigid bodies, with header and column Frame."""
     bodies = content.bodies
     assert bodies is not None

@@ -19,7 +19,7 @@ from ..exposures.phantom import Phantom
 from ..files.access import read_text
 from ..files.atomic import write_text
 from .base import Format, Sample
-from .content import Content, Settings, Written, from_units, in_units
+from .content import Content, FileSettings, Written, from_units, in_units
 from .text import Row, joined, separator_of, table_of
 
 DEFAULT_SD_MM = 0.1  # the format has no standard deviation
@@ -33,12 +33,12 @@ def recognise(sample: Sample) -> bool:
     return 3 <= len(re.split(r'[,;\t]', sample.lines[1])) <= 4 and 'target' not in sample.lines[0]
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read the survey of a phantom; its standard deviation is 0.1 mm. Raises DataError."""
     return content_of(path, read_text(path), settings)
 
 
-def content_of(path: Path, text: str, settings: Settings) -> Content:
+def content_of(path: Path, text: str, settings: FileSettings) -> Content:
     """Return the survey in a text; path is for messages. Raises DataError."""
     # The header need not have the separator of the beads.
     rows = table_of(path, text, separator_of('\n'.join(text.splitlines()[1:])))
@@ -81,7 +81,7 @@ def _coordinates(row: Row) -> list[float]:
     return Row(row.path, row.line, row.cells[:3]).numbers()
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write the survey of a phantom."""
     survey = content.survey
     assert survey is not None

@@ -17,7 +17,7 @@ from ..files.access import check_safe_name, make_folder, read_text
 from ..files.atomic import atomic_file
 from .base import Format, Sample
 from .camera_files import name_of_file
-from .content import Content, Settings, Written
+from .content import Content, FileSettings, Written
 from .text import Row, separator_of
 
 ENDING = '_LUT.csv'
@@ -36,7 +36,7 @@ def recognise(sample: Sample) -> bool:
         return False
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read a table, of a fluoroscope that is called like the file. Raises DataError."""
     text = read_text(path)
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
@@ -76,7 +76,7 @@ def _numbers(path: Path, number: int, line: str, separator: str) -> list[float]:
         return Row(path, number, [cell.strip() for cell in cells]).numbers()
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write a file <fluoroscope>_LUT.csv for each fluoroscope into the folder path."""
     for name in content.lookups:
         check_safe_name(name, path)

@@ -21,7 +21,7 @@ from ..exposures.frame import Frame, points_on_image
 from ..exposures.names import Names, number_names
 from ..files.atomic import atomic_file
 from .base import Format, Sample
-from .content import Content, Settings, Written
+from .content import Content, FileSettings, Written
 from .labels import default_name, named_targets
 from .text import Row, joined, read_table, require_width
 
@@ -35,7 +35,7 @@ def recognise(sample: Sample) -> bool:
     return bool(sample.lines) and re.search(r'_cam\d+_[XY]\b', sample.lines[0], re.I) is not None
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read image points. Raises DataError."""
     rows = read_table(path)
     header, offsets, first = _header(rows[0])
@@ -103,7 +103,7 @@ def _header(row: Row) -> tuple[list[tuple[str, int]], int, int]:
     return pairs, offsets, first
 
 
-def _labels(cameras: Sequence[int], settings: Settings) -> dict[int, str]:
+def _labels(cameras: Sequence[int], settings: FileSettings) -> dict[int, str]:
     """Return the fluoroscopes of the numbered cameras."""
     given = settings.fluoroscopes
     plain = {camera: f'cam{camera}' for camera in cameras}
@@ -113,7 +113,7 @@ def _labels(cameras: Sequence[int], settings: Settings) -> dict[int, str]:
     return {camera: known.get(name, name) for camera, name in plain.items()}
 
 
-def _image_size(path: Path, settings: Settings) -> tuple[int, int]:
+def _image_size(path: Path, settings: FileSettings) -> tuple[int, int]:
     if settings.image_size is None:
         raise DataError(
             f'{path}: XMALab points do not contain the image size, --image-size WxH is needed'
@@ -127,7 +127,7 @@ def _check_offsets(row: Row, first: int, offsets: int) -> None:
         row.fail('the cameras are offset against each other in time: write them without offset')
 
 
-def _pixels(values: Sequence[float], settings: Settings, size: tuple[int, int]) -> np.ndarray:
+def _pixels(values: Sequence[float], settings: FileSettings, size: tuple[int, int]) -> np.ndarray:
     """Return pixels (n, 2) in our convention, NaN where either coordinate is missing."""
     uv = np.array(values).reshape(-1, 2)
     if settings.one_based:
@@ -152,7 +152,7 @@ def _check_point(
         )
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write image points, one column a target and camera, one row an exposure from 1 on."""
     observations = content.observations or {}
     cameras = camera_order(list(observations))
@@ -190,7 +190,7 @@ def write(path: Path, content: Content, settings: Settings) -> Written:
     return Written((str(path),), tuple(notes))
 
 
-def _file_pixels(frame: Frame, settings: Settings) -> np.ndarray:
+def _file_pixels(frame: Frame, settings: FileSettings) -> np.ndarray:
     """Return pixels (n, 2) in the convention of the file."""
     uv = np.array(frame.uv, dtype=float)
     if settings.y_up:

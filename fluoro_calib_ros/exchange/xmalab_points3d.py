@@ -18,7 +18,7 @@ from ..files.atomic import atomic_file
 from .base import Format, Sample
 from .content import (
     Content,
-    Settings,
+    FileSettings,
     Written,
     from_units,
     in_units,
@@ -41,7 +41,7 @@ def recognise(sample: Sample) -> bool:
     )
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read points in space. Raises DataError."""
     rows = read_table(path)
     first = int(rows[0].cells[0].lower() == 'frame')
@@ -82,7 +82,7 @@ def _targets(row: Row, first: int) -> list[str]:
     return targets
 
 
-def write(path: Path, content: Content, settings: Settings) -> Written:
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write points in space, with the column Frame."""
     points = content.points
     assert points is not None

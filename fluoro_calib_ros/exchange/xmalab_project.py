@@ -26,7 +26,7 @@ from ..files.access import os_error_reason
 from . import xmalab_frame
 from .base import Format, Sample
 from .camera_files import check_matrix, check_rotation
-from .content import Camera, Content, Settings, Station
+from .content import Camera, Content, FileSettings, Station
 from .labels import default_name, named_targets
 from .text import Row, table_of
 
@@ -42,7 +42,7 @@ def recognise(sample: Sample) -> bool:
     return sample.suffix == '.xma' and sample.head.startswith(b'PK')
 
 
-def read(path: Path, settings: Settings) -> Content:
+def read(path: Path, settings: FileSettings) -> Content:
     """Read the wanted parts of a project. Raises DataError."""
     with _Project(path, settings) as project:
         return project.content()
@@ -51,7 +51,7 @@ def read(path: Path, settings: Settings) -> Content:
 class _Project:
     """An open project; a context manager."""
 
-    def __init__(self, path: Path, settings: Settings) -> None:
+    def __init__(self, path: Path, settings: FileSettings) -> None:
         self._path = path
         self._settings = settings
         try:

@@ -21,7 +21,7 @@ from ..exchange.content import (
     Bodies,
     Camera,
     Content,
-    Settings,
+    FileSettings,
     Station,
     Written,
     camera_at,
@@ -69,7 +69,7 @@ class ConversionRequest:
         Whether image points are corrected by this calibration.
     fluoroscopes : sequence of str
         Those to convert, in this order; empty: all.
-    settings : Settings
+    settings : FileSettings
         What files do not say. Its unit holds for the source and what is written, pixels from 1 and
         rows upwards for the source if it is of another program, else for what is written.
     out_units : {'mm', 'cm', 'm'} or None
@@ -84,7 +84,7 @@ class ConversionRequest:
     calibration: str | os.PathLike[str] | None = None
     corrected: bool = False
     fluoroscopes: Sequence[str] = ()
-    settings: Settings = field(default_factory=Settings)
+    settings: FileSettings = field(default_factory=FileSettings)
     out_units: str | None = None
 
 
@@ -122,7 +122,7 @@ def convert(request: ConversionRequest) -> Written:
     return Written(written.paths, (*content.notes, *written.notes))
 
 
-def _read(request: ConversionRequest, settings: Settings) -> tuple[Content, bool]:
+def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, bool]:
     """Return the content of the source, and whether it is in the conventions of this package."""
     source = Path(request.source)
     if is_result_folder(source):
@@ -225,7 +225,7 @@ def _corrected(
 
 def result_content(
     directory: str | os.PathLike[str],
-    settings: Settings | None = None,
+    settings: FileSettings | None = None,
     exposure: int | None = None,
 ) -> Content:
     """Return the wanted parts of a result folder, of the fluoroscopes that settings name.
@@ -233,7 +233,7 @@ def result_content(
     exposure: that whose exterior orientations the cameras have. Raises DataError.
     """
     directory = Path(directory)
-    settings = settings or Settings()
+    settings = settings or FileSettings()
     wanted = set(settings.wanted)
     calibrations = load_calibrations(directory)
     found: dict[str, Any] = {'names': read_names(directory)}

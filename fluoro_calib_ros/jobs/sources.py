@@ -12,7 +12,7 @@ from ..bags.reader import read_frames
 from ..calibration.result import FluoroscopeCalibration
 from ..errors import DataError
 from ..exchange import registry
-from ..exchange.content import PARTS, Content, Settings
+from ..exchange.content import PARTS, Content, FileSettings
 from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
 from ..exposures.names import Names
@@ -68,7 +68,7 @@ def is_bag(path: str | os.PathLike[str]) -> bool:
 
 
 def read_content(
-    path: str | os.PathLike[str], settings: Settings, part: str, default: str
+    path: str | os.PathLike[str], settings: FileSettings, part: str, default: str
 ) -> Content:
     """Read a part of a file of any format.
 
@@ -86,9 +86,9 @@ def read_content(
     return registry.read(path, replace(settings, wanted=(part,)), kind)
 
 
-def read_survey(path: str | os.PathLike[str], settings: Settings | None = None) -> Survey:
+def read_survey(path: str | os.PathLike[str], settings: FileSettings | None = None) -> Survey:
     """Read a phantom from a file of any format. Raises DataError."""
-    content = read_content(path, settings or Settings(), 'survey', 'phantom')
+    content = read_content(path, settings or FileSettings(), 'survey', 'phantom')
     if content.survey is None:
         raise DataError(f'{path}: the file has no phantom')
     return Survey(content.survey, content.names, content.notes)
@@ -101,7 +101,7 @@ def read_source(
     fluoroscopes: Sequence[str] | None = None,
     collect: str | None = None,
     validate: bool = True,
-    settings: Settings | None = None,
+    settings: FileSettings | None = None,
 ) -> Recording:
     """Read the frames of a bag, or of a file with image points of any format.
 
@@ -120,7 +120,7 @@ def read_source(
         too. A CSV file already consists of exposures.
     validate : bool
         Whether every frame of a bag is validated; else only the lengths of its arrays.
-    settings : exchange.content.Settings, optional
+    settings : exchange.content.FileSettings, optional
         What the file does not say, and known names.
 
     Returns
@@ -132,7 +132,7 @@ def read_source(
     DataError
         For a source that cannot be read, and for a fluoroscope that it does not contain.
     """
-    settings = settings or Settings()
+    settings = settings or FileSettings()
     content = Content()
     bag = is_bag(path)
     if bag:
@@ -202,7 +202,7 @@ def read_calibrated_source(
     image_size: tuple[int, int] | None = None,
     fluoroscopes: Sequence[str] | None = None,
     validate: bool = True,
-    settings: Settings | None = None,
+    settings: FileSettings | None = None,
 ) -> tuple[Recording, dict[str, FluoroscopeCalibration]]:
     """Read all frames of a source whose fluoroscopes are calibrated, and all calibrations.
 
@@ -230,7 +230,7 @@ def read_calibrated_source(
     calibrations = read_calibrations(directory)
     if image_size is None:
         image_size = next(iter(calibrations.values())).image_size
-    settings = settings or Settings()
+    settings = settings or FileSettings()
     recording = read_source(
         path,
         image_size=image_size,
@@ -243,7 +243,7 @@ def read_calibrated_source(
 
 
 def read_point_table(
-    path: str | os.PathLike[str], directory: str | os.PathLike[str], settings: Settings
+    path: str | os.PathLike[str], directory: str | os.PathLike[str], settings: FileSettings
 ) -> tuple[PointsFile, tuple[str, ...]]:
     """Read image points to be corrected with the calibrations in a folder, and notes about them.
 

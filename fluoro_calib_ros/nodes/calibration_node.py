@@ -37,9 +37,9 @@ from ..exposures.collector import ExposureCollector, StillOptions
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.pairing import CompletePairer, PairingOptions
 from ..files.calibration import SUFFIX, load_calibrations, save_calibration
-from ..files.phantom import read_phantom
 from ..jobs.calibration import CalibrationOutcome, Rig
 from ..jobs.result_folder import save_outcome
+from ..jobs.sources import read_survey
 from ..jobs.worker_process import run_in_worker_process
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -181,9 +181,13 @@ class CalibrationNode(Node):
         if not self._settings.phantom:
             raise StartError('parameter phantom is not set: it names the file phantom.csv')
         try:
-            self._phantom = read_phantom(expand_path(self._settings.phantom))
+            survey = read_survey(expand_path(self._settings.phantom))
         except DataError as error:
             raise StartError(str(error)) from None
+        for note in survey.notes:
+            self.get_logger().warning(note)
+        self._phantom = survey.phantom
+        self._target_names = survey.names
         self._directory = expand_path(self._settings.calibration_directory)
 
     def _create_interfaces(self) -> None:
@@ -588,6 +592,7 @@ class CalibrationNode(Node):
             options_of_request(request, self._options, joint),
             joint,
             request.principal_distance or None,
+            self._target_names,
         )
         others = {n: c for n, c in self._calibrations().items() if n not in frames}
         all_frames = self._collector.frames()

@@ -10,12 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exchange import registry
-from fluoro_calib_ros.exchange.content import Camera, Content, Settings, camera_at
+from fluoro_calib_ros.exchange.content import Camera, Content, FileSettings, camera_at
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.simulation.rig import looking_at_origin
 
 SIZE = (1024, 768)
-MM = Settings(image_size=SIZE, units='mm')
+MM = FileSettings(image_size=SIZE, units='mm')
 
 
 def cameras():
@@ -69,11 +69,18 @@ def assert_same(found, expected, tolerance=1e-9):
 
 @pytest.mark.parametrize('units', ['mm', 'cm', 'm'])
 @pytest.mark.parametrize(
-    ('kind', 'tolerance'), [('mayacam2', 0), ('opencv', 0), ('anipose', 1e-15), ('dlt', 1e-10)]
+    ('kind', 'tolerance'),
+    [
+        ('mayacam2', 0),
+        ('opencv', 0),
+        ('anipose', 1e-15),
+        ('dlt', 1e-10),
+        ('known_orientation', 1e-12),
+    ],
 )
 def test_cameras_return_from_every_format(tmp_path, kind, tolerance, units):
     """In every unit; to the last digit where the format holds the numbers themselves."""
-    settings = Settings(image_size=SIZE, units=units, fluoroscopes=('a', 'b'))
+    settings = FileSettings(image_size=SIZE, units=units, fluoroscopes=('a', 'b'))
     registry.write(tmp_path / 'out', kind, Content(cameras=cameras()), settings)
     path = tmp_path / 'out'
     if kind == 'anipose':
@@ -260,12 +267,12 @@ def test_wrong_mayacam2_names_the_row(tmp_path, row, text, sentence):
 
 def test_unit_is_never_silent(tmp_path):
     """Asked for where a file does not say it; told where the usual one is written."""
-    written = registry.write(tmp_path, 'mayacam2', Content(cameras=cameras()), Settings())
+    written = registry.write(tmp_path, 'mayacam2', Content(cameras=cameras()), FileSettings())
     assert 'lengths in mm' in written.notes[0]
     with pytest.raises(
         DataError, match=r'does not say the unit of its lengths, --units mm\|cm\|m'
     ):
-        registry.read(tmp_path, Settings())
+        registry.read(tmp_path, FileSettings())
 
 
 def test_camera_without_pose_is_refused(tmp_path):

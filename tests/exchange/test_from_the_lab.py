@@ -9,7 +9,7 @@ import pytest
 from rigs import run
 
 from fluoro_calib_ros.exchange import registry
-from fluoro_calib_ros.exchange.content import Content, Settings
+from fluoro_calib_ros.exchange.content import Content, FileSettings
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.files.calibration import load_calibrations
@@ -34,10 +34,10 @@ def lab(tmp_path_factory):
     names = Names({f'bead {i:03d}': i for i in phantom.target_id.tolist()})
     write = registry.write
     content = Content(observations=frames, survey=phantom, names=names)
-    write(folder / 'points.csv', 'xmalab2d', content, Settings())
-    write(folder / 'cube.csv', 'framespec', content, Settings(units='cm'))
-    write(folder / 'own.csv', 'observations', Content(observations=frames), Settings())
-    write(folder / 'phantom.csv', 'phantom', Content(survey=phantom), Settings())
+    write(folder / 'points.csv', 'xmalab2d', content, FileSettings())
+    write(folder / 'cube.csv', 'framespec', content, FileSettings(units='cm'))
+    write(folder / 'own.csv', 'observations', Content(observations=frames), FileSettings())
+    write(folder / 'phantom.csv', 'phantom', Content(survey=phantom), FileSettings())
     return folder
 
 
@@ -84,7 +84,7 @@ def test_calibration_from_xmalab_is_the_same(lab, result, capsys):
 def test_source_of_a_calibration_is_recognised_by_its_names(lab, result):
     """What `validate --source` does: the observations have the digest of the calibration."""
     calibrations = load_calibrations(result)
-    known = Settings(names=read_names(result))
+    known = FileSettings(names=read_names(result))
     recording = read_source(
         lab / 'points.csv', image_size=(1024, 1024), fluoroscopes=['a', 'b'], settings=known
     )
@@ -101,7 +101,7 @@ def test_names_are_used_again_on_output(lab, reconstructed, capsys):
     pytest.importorskip('ezc3d')
     path = lab / 'space.c3d'
     assert run('convert', reconstructed, '--to', 'c3d', '--out', path, '--rate', 50) == 0
-    found = registry.read(path, Settings())
+    found = registry.read(path, FileSettings())
     assert found.points.rate_hz == 50
     assert set(found.names.targets) == {row['name'] for row in rows}
     capsys.readouterr()
@@ -181,7 +181,7 @@ def test_lookup_table_maps_corrected_points_onto_the_observed_ones(lab, result, 
 def test_result_folder_fills_the_files_of_chow_et_al(lab, result, capsys):
     """All four, from which the image points are computed again."""
     assert run('convert', result, '--to', 'bundle', '--out', lab / 'chow', '--units', 'mm') == 0
-    content = registry.read(lab / 'chow' / 'bundle.pho', Settings(units='mm'))
+    content = registry.read(lab / 'chow' / 'bundle.pho', FileSettings(units='mm'))
     frames = read_source(lab / 'own.csv', image_size=(1024, 1024)).frames
     assert [f.number for f in content.observations['cam2']] == [f.number for f in frames['b']]
     np.testing.assert_array_equal(content.observations['cam2'][1].uv, frames['b'][1].uv)
@@ -193,7 +193,7 @@ def test_poses_of_the_phantom_agree_with_its_points(lab, result, reconstructed, 
     """The rigid body takes the survey to the reconstructed beads of the exposure."""
     path = lab / 'bodies.csv'
     assert run('convert', result, '--to', 'rigidbody', '--out', path, '--units', 'mm') == 0
-    bodies = registry.read(path, Settings(units='mm')).bodies
+    bodies = registry.read(path, FileSettings(units='mm')).bodies
     phantom = read_phantom(lab / 'phantom.csv')
     rows = [row for row in rows_of(reconstructed) if row['frame'] == '3' and row['x']]
     found = np.array([[float(row[axis]) for axis in 'xyz'] for row in rows])
@@ -216,7 +216,7 @@ def test_correct_reads_points_of_xmalab(lab, result, capsys):
         lab / 'one.csv',
         'xmalab2d',
         Content(observations=frames, names=Names({'bead 003': 3})),
-        Settings(),
+        FileSettings(),
     )
     options = ('--calibration', result, '--fluoroscope', 'a', '--out', path)
     assert run('correct', lab / 'one.csv', *options) == 0

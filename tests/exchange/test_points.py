@@ -12,8 +12,8 @@ from fluoro_calib_ros.exchange.content import (
     Bodies,
     Camera,
     Content,
+    FileSettings,
     Points,
-    Settings,
     Station,
     points_without_precision,
 )
@@ -22,7 +22,7 @@ from fluoro_calib_ros.exposures.names import Names, number_names, safe_names
 from fluoro_calib_ros.exposures.phantom import Phantom
 
 SIZE = (1024, 768)
-SETTINGS = Settings(image_size=SIZE, units='mm')
+SETTINGS = FileSettings(image_size=SIZE, units='mm')
 
 
 def frames(sigma=False, numbers=(1, 3)):
@@ -102,7 +102,7 @@ def test_fluoroscopes_get_names_that_files_and_topics_may_have():
 def test_xmalab_points_return(tmp_path, one_based, y_up):
     """In all variants of XMALab's dialogue."""
     path = tmp_path / 'points.csv'
-    settings = Settings(image_size=SIZE, one_based=one_based, y_up=y_up)
+    settings = FileSettings(image_size=SIZE, one_based=one_based, y_up=y_up)
     registry.write(path, 'xmalab2d', Content(observations=frames()), settings)
     rows = list(csv.DictReader(path.open()))
     assert len(rows) == 3  # exposure 2 was not seen
@@ -123,7 +123,7 @@ def test_names_of_markers_return(tmp_path):
     content = Content(observations=frames(), names=names)
     registry.write(path, 'xmalab2d', content, SETTINGS)
     assert path.read_text().startswith('tib lat_cam1_X,tib lat_cam1_Y,tib lat_cam2_X')
-    again = registry.read(path, Settings(image_size=SIZE, names=names))
+    again = registry.read(path, FileSettings(image_size=SIZE, names=names))
     assert again.names == names
     assert_same_frames(again.observations, frames())
     assert registry.read(path, SETTINGS).names.targets == {
@@ -199,7 +199,7 @@ def test_columns_mixing_ids_and_names_are_refused(tmp_path):
 @pytest.mark.parametrize('units', ['cm', 'mm', 'm'])
 def test_frame_specification_returns(tmp_path, units):
     path = tmp_path / 'frame.csv'
-    settings = Settings(units=units)
+    settings = FileSettings(units=units)
     names = Names({f'bead {i}': i for i in range(7, 13)})
     registry.write(path, 'framespec', Content(survey=phantom(), names=names), settings)
     content = registry.read(path, settings)
@@ -214,7 +214,7 @@ def test_frame_specification_of_a_lab_is_read(tmp_path):
     beads = '0,0,1.5\n1,0,0\n0,1,0\n1,1,1\n'
     for header, factor in (('x y z', 10), ('white', 10), ('s2,s2,s2,x', 20), ('x,y,z', 10)):
         path.write_text(f'{header}\n{beads}')
-        content = registry.read(path, Settings())
+        content = registry.read(path, FileSettings())
         assert content.survey.target_id.tolist() == [1, 2, 3, 4]
         assert content.survey.xyz_mm[0].tolist() == [0, 0, 1.5 * factor]
         assert 'lengths in cm' in content.notes[0]
@@ -251,7 +251,7 @@ def test_files_of_chow_et_al_return(tmp_path):
     assert sorted(p.name for p in tmp_path.iterdir()) == [
         f'bundle.{s}' for s in ('eop', 'iop', 'pho', 'xyz')
     ]
-    again = registry.read(tmp_path / 'bundle.pho', Settings(units='mm'))
+    again = registry.read(tmp_path / 'bundle.pho', FileSettings(units='mm'))
     assert_same_frames(again.observations, content.observations)
     for one, other in zip(again.cameras, content.cameras):
         assert (one.name, one.image_size) == (other.name, SIZE)
@@ -320,7 +320,7 @@ def test_c3d_is_read_by_ezc3d(tmp_path):
     """Names, unit, rate, first frame, coordinates, residual; a gap is a residual of -1."""
     ezc3d = pytest.importorskip('ezc3d')
     path = tmp_path / 'points.c3d'
-    registry.write(path, 'c3d', Content(points=points(), names=NAMED), Settings())
+    registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
     file = ezc3d.c3d(str(path))
     parameters = file['parameters']['POINT']
     assert parameters['LABELS']['value'] == ['tib lat', 'tib med', 'fem']
@@ -341,7 +341,7 @@ def test_points_in_space_return(tmp_path, kind):
         pytest.importorskip('ezc3d')
     path = tmp_path / f'out.{kind if kind in ("c3d", "trc") else "csv"}'
     registry.write(path, kind, Content(points=points(), names=NAMED), SETTINGS)
-    content = registry.read(path, Settings(units='mm', names=NAMED))
+    content = registry.read(path, FileSettings(units='mm', names=NAMED))
     expected = points().xyz_mm.astype(np.float32) if kind == 'c3d' else points().xyz_mm
     found = content.points.xyz_mm
     if kind == 'points':  # it has no rows for frames without points
@@ -357,7 +357,7 @@ def test_trc_is_read_by_opensim(tmp_path):
     """Labels, unit, rate, times and coordinates; a gap is NaN there."""
     opensim = pytest.importorskip('opensim')
     path = tmp_path / 'points.trc'
-    registry.write(path, 'trc', Content(points=points(), names=NAMED), Settings())
+    registry.write(path, 'trc', Content(points=points(), names=NAMED), FileSettings())
     opensim.Logger.setLevelString('Off')
     table = opensim.TimeSeriesTableVec3(str(path))
     assert list(table.getColumnLabels()) == ['tib lat', 'tib med', 'fem']
@@ -376,9 +376,9 @@ def test_frames_left_out_are_gaps_at_a_constant_rate(tmp_path):
     )
     path = tmp_path / 'points.trc'
     with pytest.raises(DataError, match='does not contain the frame rate, --rate HZ is needed'):
-        registry.write(path, 'trc', Content(points=sparse), Settings())
-    registry.write(path, 'trc', Content(points=sparse), Settings(rate_hz=100.0))
-    found = registry.read(path, Settings()).points
+        registry.write(path, 'trc', Content(points=sparse), FileSettings())
+    registry.write(path, 'trc', Content(points=sparse), FileSettings(rate_hz=100.0))
+    found = registry.read(path, FileSettings()).points
     assert found.frame.tolist() == [1, 2, 3, 4]
     assert np.isnan(found.xyz_mm[1:3]).all() and found.xyz_mm[3, 0].tolist() == [4, 5, 6]
 
@@ -387,10 +387,10 @@ def test_xmalab_3d_points_of_a_lab_are_read(tmp_path):
     """Without the column Frame, NaN where a marker is not seen, and no unit."""
     path = tmp_path / 'points.csv'
     path.write_text('m1_X,m1_Y,m1_Z,m2_X,m2_Y,m2_Z\n1,2,3,NaN,NaN,NaN\n4,5,6,7,8,9\n')
-    found = registry.read(path, Settings(units='cm')).points
+    found = registry.read(path, FileSettings(units='cm')).points
     assert found.frame.tolist() == [1, 2]
     assert found.xyz_mm[1, 1].tolist() == [70, 80, 90] and np.isnan(found.xyz_mm[0, 1]).all()
-    assert 'does not say the unit' in refused(path, Settings())
+    assert 'does not say the unit' in refused(path, FileSettings())
 
 
 # ---- rigid bodies
@@ -403,8 +403,8 @@ def test_rigid_bodies_return(tmp_path):
     turn[1] = shift[1] = np.nan
     bodies = Bodies(('femur',), np.array([1, 2, 3]), turn, shift)
     path = tmp_path / 'bodies.csv'
-    registry.write(path, 'rigidbody', Content(bodies=bodies), Settings(units='cm'))
-    found = registry.read(path, Settings(units='cm')).bodies
+    registry.write(path, 'rigidbody', Content(bodies=bodies), FileSettings(units='cm'))
+    found = registry.read(path, FileSettings(units='cm')).bodies
     assert found.names == ('femur',)
     np.testing.assert_array_equal(found.rotation, turn)
     np.testing.assert_array_equal(found.translation_mm, shift)
@@ -429,10 +429,10 @@ def test_lookup_table_returns(tmp_path):
     """Every float32 to the last bit; -1 is a pixel without support."""
     maps = np.random.default_rng(1).uniform(-3, 70, (2, 48, 64)).astype(np.float32)
     maps[:, 3, 5] = np.nan
-    registry.write(tmp_path, 'lut', Content(lookups={'a': maps}), Settings())
+    registry.write(tmp_path, 'lut', Content(lookups={'a': maps}), FileSettings())
     path = tmp_path / 'a_LUT.csv'
     rows = path.read_text().splitlines()
     assert len(rows) == 96 and rows[3].split(', ')[5] == rows[51].split(', ')[5] == '-1'
-    np.testing.assert_array_equal(registry.read(path, Settings()).lookups['a'], maps)
+    np.testing.assert_array_equal(registry.read(path, FileSettings()).lookups['a'], maps)
     path.write_text('\n'.join(rows[:95]))
-    assert '95 rows, but a lookup table has as many for the rows' in refused(path, Settings())
+    assert '95 rows, but a lookup table has as many for the rows' in refused(path, FileSettings())

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exchange import registry
-from fluoro_calib_ros.exchange.content import Settings
+from fluoro_calib_ros.exchange.content import FileSettings
 
 SIZE = (320, 256)
 BEADS = np.array([[0, 0, 1.5], [1, 0, 0], [0, 1, 0], [1, 1, 1], [2, 1, 0]])
@@ -118,7 +118,7 @@ def write_project(path, separator='/', **changes):
 @pytest.mark.parametrize('separator', ['/', '\\'])
 def test_calibration_of_a_project_is_read(tmp_path, separator):
     """Points of the observed image that XMALab used; also of a project from Windows."""
-    content = registry.read(write_project(tmp_path / 'p.xma', separator), Settings(units='mm'))
+    content = registry.read(write_project(tmp_path / 'p.xma', separator), FileSettings(units='mm'))
     assert list(content.observations) == ['cam_1', 'cam_2']
     for camera in (1, 2):
         (frame,) = content.observations[f'cam_{camera}']
@@ -135,7 +135,7 @@ def test_calibration_of_a_project_is_read(tmp_path, separator):
 
 def test_cameras_of_a_project_are_those_of_the_reference_image(tmp_path):
     """In cm, the unit of frame specifications, with a note that says so."""
-    content = registry.read(write_project(tmp_path / 'p.xma'), Settings())
+    content = registry.read(write_project(tmp_path / 'p.xma'), FileSettings())
     for number, camera in enumerate(content.cameras, 1):
         assert camera.name == f'cam_{number}' and camera.image_size == SIZE
         np.testing.assert_allclose(camera.rotation, POSES[number], atol=1e-11)
@@ -147,14 +147,14 @@ def test_cameras_of_a_project_are_those_of_the_reference_image(tmp_path):
 def test_markers_of_a_trial_are_read(tmp_path):
     """A marker is seen where its status is above 0; one without description is marker001."""
     path = write_project(tmp_path / 'p.xma')
-    content = registry.read(path, Settings(trial='walk', wanted=('observations',)))
+    content = registry.read(path, FileSettings(trial='walk', wanted=('observations',)))
     frames = content.observations['cam_2']
     assert [f.number for f in frames] == [1, 2, 3]
     ids = content.names.targets
     assert frames[0].target_id.tolist() == [ids.get('marker001', 6), ids['tib']]
     np.testing.assert_allclose(frames[2].uv, marker_points(2, 1)[0][2:], atol=1e-9)
     with pytest.raises(DataError, match="there is no trial 'run', only walk"):
-        registry.read(path, Settings(trial='run'))
+        registry.read(path, FileSettings(trial='run'))
 
 
 @pytest.mark.parametrize(
@@ -173,7 +173,7 @@ def test_markers_of_a_trial_are_read(tmp_path):
 def test_damaged_project_is_refused(tmp_path, changes, sentence):
     path = write_project(tmp_path / 'p.xma', **changes)
     with pytest.raises(DataError) as caught:
-        registry.read(path, Settings(units='mm'))
+        registry.read(path, FileSettings(units='mm'))
     assert sentence in str(caught.value) and '\n' not in str(caught.value)
 
 
@@ -181,4 +181,4 @@ def test_truncated_project_is_refused(tmp_path):
     path = write_project(tmp_path / 'p.xma')
     path.write_bytes(path.read_bytes()[:2000])
     with pytest.raises(DataError, match='this is not an XMALab project, which is a ZIP file'):
-        registry.read(path, Settings())
+        registry.read(path, FileSettings())

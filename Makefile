@@ -2,7 +2,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint docs bench online endurance validation precision convergence bags clean
+.PHONY: help setup demo test lint docs bench online endurance validation precision convergence pathologies bags clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
@@ -21,6 +21,7 @@ help:
 	@echo 'make validation   repeat and extend the experiment of the paper: docs/accuracy.md (10 min)'
 	@echo 'make precision    compare errors of 200 simulations with their standard deviations: docs/precision.md (5 min)'
 	@echo 'make convergence  calibrate 200 random rigs with poor start values: docs/convergence.md (15 min)'
+	@echo 'make pathologies  calibrate rigs unlike the virtual rig: docs/pathologies.md (30 min)'
 	@echo 'make bags         regenerate the bags in bags/'
 	@echo 'make clean        delete .venv, .build and caches'
 	@echo
@@ -65,6 +66,9 @@ precision: setup
 
 convergence: setup
 	@$(RUN) -m benchmarks.convergence $(ARGS)
+
+pathologies: setup
+	@$(RUN) -m benchmarks.pathologies.run $(ARGS)
 
 bags: setup
 	@.venv/bin/fluoro-calib simulate --out bags $(ARGS)

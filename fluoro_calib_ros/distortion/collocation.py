@@ -16,7 +16,7 @@ from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
 from .estimation import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
 from .priors import Prior, gauge_precision, most_likely_prior, prior_precision, starting_prior
-from .series import MARGIN, Functions, Series, sd_over_image
+from .series import Functions, Series, sd_over_image
 from .series_model import SeriesModel
 
 if TYPE_CHECKING:
@@ -25,13 +25,16 @@ if TYPE_CHECKING:
     from ..photogrammetry.network import Network
 
 TREND_DEGREE = 3  # pincushion, S-shape and spiral are cubic to first order (Gronenschild 1997)
-START_MODES = 18  # half waves along the image, until the correlation length is known
+START_MODES = 18  # half waves along the image, until the signal is known
 MIN_MODES = 10
-MAX_MODES = 24  # the time grows with the sixth power, the accuracy hardly
-# Correlation length times frequency above which a Matern signal has less than 1e-4 of its spectral
-# density.
-CUT_OFF = 8.0
-SETTLED_PRIOR = 0.15  # change of the logarithms of the prior that changes no correction visibly
+MAX_MODES = 30  # the time grows with the sixth power
+# Prior variance times information of a sine below which the image points say nothing about it.
+NEGLIGIBLE = 0.1
+FEWER_MODES = 0.75  # part of the present modes from which fewer are worth a change
+MODE_CHANGES = 3  # at most
+SETTLED_PRIOR = (
+    0.3  # mean change of the logarithms of the variances that changes no correction visibly
+)
 MIN_START_SD_PX = 0.1
 
 
@@ -65,7 +68,7 @@ class CollocationTerms(AdjustedTerms):
         self.priors: list[Prior] = []
         self.gauges: list[np.ndarray] = []
         self.values: list[np.ndarray] = []
-        self._modes_fitted = False
+        self._mode_changes = 0
         for f, size in enumerate(self.sizes):
             rows = self.network.rows(f)
             core = before.residuals[rows][before.inliers[rows]]
@@ -103,18 +106,25 @@ class CollocationTerms(AdjustedTerms):
         coefficients (2m,), those of u first, and their covariance (2m, 2m).
         """
         functions = self.functions[f]
-        return Series(functions, coefficients.reshape(2, -1), sd_over_image(functions, covariance))
+        sd = np.hypot(sd_over_image(functions, covariance), self._sd_beyond(f))
+        return Series(functions, coefficients.reshape(2, -1), sd)
+
+    def _sd_beyond(self, f: int) -> float:
+        """Standard deviation [px] of the part of the signal that the series leaves out."""
+        functions = self.functions[f]
+        return self.priors[f].signal.sd_beyond(functions.highest) if functions.modes else 0.0
 
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
     ) -> tuple[bool, tuple[np.ndarray, ...]]:
-        """Renew priors and gauges at a solution, and the first time the number of modes.
+        """Renew priors, gauges and the numbers of modes at a solution.
 
         Returns whether the priors have settled, and the coefficients with which to continue.
         """
         settled = True
         coefficients = coefficients_of(adjustment)
         self.interior = adjustment.parameters.interior
+        modes = []
         for f, functions in enumerate(self.functions):
             last = self.priors[f]
             present = prior_of_additional(network, f)
@@ -123,22 +133,39 @@ class CollocationTerms(AdjustedTerms):
             now = most_likely_prior(functions, information, right, self.gauges[f], last)
             self.priors[f] = now
             self.gauges[f] = self._gauge(f)
-            change = abs(np.log(now.sd / last.sd)) + abs(np.log(now.reach / last.reach))
-            settled &= change < SETTLED_PRIOR
-        if self._modes_fitted:
+            if functions.modes:
+                change = now.signal.change(last.signal, functions.frequency)
+                settled &= change < SETTLED_PRIOR
+            modes.append(self._modes(f, information))
+        present_modes = [functions.modes for functions in self.functions]
+        if modes == present_modes or self._mode_changes == MODE_CHANGES:
             return settled, coefficients
-        self._modes_fitted = True
-        return False, self._fit_modes(coefficients)
+        self._mode_changes += 1
+        return False, self._with_modes(modes, coefficients)
 
-    def _fit_modes(self, coefficients: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
-        """Use as many modes as the correlation length of each signal needs.
+    def _modes(self, f: int, information: np.ndarray) -> int:
+        """Number of modes with which the image points of fluoroscope f can tell the signal.
 
-        Returns the coefficients for them.
+        information (2m, 2m) of its coefficients without prior.
         """
+        functions = self.functions[f]
+        if not functions.modes:
+            return 0
+        m = len(functions)
+        level = float(np.mean(np.diagonal(information)[len(functions.powers) : m]))
+        numbers = np.arange(MIN_MODES, MAX_MODES + 1)
+        variance = self.priors[f].signal.variance(numbers * functions.frequency_of_mode)
+        enough = numbers[variance * level < NEGLIGIBLE]
+        wanted = int(enough[0]) if len(enough) else MAX_MODES
+        kept = FEWER_MODES * functions.modes <= wanted <= functions.modes
+        return functions.modes if kept and self._mode_changes else wanted
+
+    def _with_modes(
+        self, modes: list[int], coefficients: tuple[np.ndarray, ...]
+    ) -> tuple[np.ndarray, ...]:
+        """Use these numbers of modes; return the coefficients for them."""
         out = []
-        for f, (functions, prior) in enumerate(zip(self.functions, self.priors)):
-            wanted = np.ceil(CUT_OFF / prior.reach * MARGIN * max(self.sizes[f]) / np.pi)
-            modes = int(np.clip(wanted, MIN_MODES, MAX_MODES))
-            self._set_functions(f, Functions(self.sizes[f], TREND_DEGREE, modes))
+        for f, functions in enumerate(self.functions):
+            self._set_functions(f, Functions(self.sizes[f], TREND_DEGREE, modes[f]))
             out.append(self.functions[f].converted(functions, coefficients[f]))
         return tuple(out)

@@ -1,9 +1,8 @@
 """Prior distributions of the coefficients of a distortion's trend and signal.
 
 Least-squares collocation (Moritz, "Advanced Physical Geodesy", 1980): the signal is a random field
-with a covariance function, here of Matern's family with nu = 5/2, the same for u and v. Its
-standard deviation and correlation length, and for each term of the trend whether it exists, are
-estimated from the observations themselves by their marginal likelihood (Rasmussen and Williams,
+with a covariance function (see `signal`). That, and for each term of the trend whether it exists,
+is estimated from the observations themselves by their marginal likelihood (Rasmussen and Williams,
 "Gaussian Processes for Machine Learning", 2006, 5.4; for the trend Tipping and Faul, "Fast
 marginal likelihood maximisation for sparse Bayesian models", 2003).
 """
@@ -13,23 +12,19 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve, lapack, solve_triangular
-from scipy.optimize import minimize
+from scipy.linalg import cho_factor, cho_solve
 
 from .gauge import gauge_basis
 from .series import Functions
+from .signal import Signal, most_likely_signal, starting_signal
 from .terms import trend_transformation
 
-MATERN = 2.5
 # Standard deviation to which the gauge is held; a much smaller one would damp the steps of the
 # adjustment.
 GAUGE_SD_PX = 3e-5
-MIN_VARIANCE = 1e-10  # of a coefficient of the signal: an amplitude of 1e-8 px
 # Prior variance of a trend term that does not exist, relative to that with which it is determined.
 MIN_RELATIVE_VARIANCE = 1e-3
 MAX_VARIANCE = 1e8  # of a trend term that exists
-REACH_RANGE = (0.02, 1.0)  # correlation length relative to the longer side of the image
-MIN_SD_PX = 1e-3  # of the signal
 SWEEPS = 3  # over the terms of the trend
 
 
@@ -37,28 +32,18 @@ SWEEPS = 3  # over the terms of the trend
 class Prior:
     """Prior of a distortion.
 
-    sd: standard deviation of the signal [px]; reach: its correlation length [px]; trend (t,):
-    variances of the trend terms [px^2].
+    signal: covariance function of the signal; trend (t,): variances of the trend terms [px^2].
     """
 
-    sd: float
-    reach: float
+    signal: Signal
     trend: np.ndarray
 
 
 def starting_prior(functions: Functions, sd: float) -> Prior:
     """Return a prior to start with; sd: RMS residual without correction [px]."""
     _, count = trend_transformation(functions.degree)
-    return Prior(0.3 * sd, 0.15 * max(functions.image_size), np.full(count, MAX_VARIANCE))
-
-
-def spectral_density(frequency: np.ndarray, sd: float, reach: float) -> np.ndarray:
-    """Variances (s,) of the coefficients of sines: Matern's covariance in two dimensions.
-
-    frequency (s,) [1/px]; sd, reach [px] (Rasmussen and Williams 2006, Eq. 4.15 for D = 2).
-    """
-    a = 2 * MATERN / reach**2
-    return sd**2 * 4 * np.pi * MATERN * a**MATERN * (a + frequency**2) ** -(MATERN + 1)
+    signal = starting_signal(0.3 * sd, max(functions.image_size))
+    return Prior(signal, np.full(count, MAX_VARIANCE))
 
 
 def prior_precision(functions: Functions, prior: Prior) -> np.ndarray:
@@ -67,18 +52,13 @@ def prior_precision(functions: Functions, prior: Prior) -> np.ndarray:
     t = len(functions.powers)
     out = np.zeros((2 * m, 2 * m))
     if functions.modes:
-        signal = 1 / _signal_variance(functions, prior.sd, prior.reach)
+        signal = 1 / prior.signal.variance(functions.frequency)
         for axis in (0, 1):
             at = axis * m + np.arange(t, m)
             out[at, at] = signal
     at = _trend_columns(functions)
     out[np.ix_(at, at)] = _trend_precision(functions, prior)
     return out
-
-
-def _signal_variance(functions: Functions, sd: float, reach: float) -> np.ndarray:
-    """Prior variances (s,) of the coefficients of the sines."""
-    return np.maximum(spectral_density(functions.frequency, sd, reach), MIN_VARIANCE)
 
 
 def _trend_columns(functions: Functions) -> np.ndarray:
@@ -152,44 +132,14 @@ def most_likely_prior(
 def _most_likely_signal(
     functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
 ) -> Prior:
-    """Return the prior with renewed standard deviation and correlation length of the signal."""
-    side = max(functions.image_size)
+    """Return the prior with a renewed signal."""
     at = _trend_columns(functions)
     base = information.copy(order='F')
     base[np.ix_(at, at)] += _trend_precision(functions, prior)
-    m = len(functions)
-    t = len(functions.powers)
-    signal = np.concatenate([np.arange(t, m), m + np.arange(t, m)])
-
-    def cost(log: np.ndarray) -> float:
-        sd, reach = np.exp(log)
-        if not (
-            REACH_RANGE[0] * side <= reach <= REACH_RANGE[1] * side and MIN_SD_PX <= sd <= side
-        ):
-            return np.inf
-        variance = np.tile(_signal_variance(functions, sd, reach), 2)
-        matrix = base.copy(order='F')
-        matrix[signal, signal] += 1 / variance
-        factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=1)
-        if failed:
-            return np.inf
-        z = solve_triangular(factor, right, lower=True, check_finite=False)
-        return np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(variance)) / 2 - z @ z / 2
-
-    start = np.log(
-        [
-            max(prior.sd, 2 * MIN_SD_PX),
-            np.clip(prior.reach, 1.1 * REACH_RANGE[0] * side, 0.9 * REACH_RANGE[1] * side),
-        ]
-    )
-    simplex = start + np.array([[0, 0], [0.4, 0], [0, 0.3]])
-    found = minimize(
-        cost,
-        start,
-        method='Nelder-Mead',
-        options={'initial_simplex': simplex, 'xatol': 0.05, 'fatol': 0.05, 'maxfev': 40},
-    )
-    return replace(prior, sd=float(np.exp(found.x[0])), reach=float(np.exp(found.x[1])))
+    columns = np.setdiff1d(np.arange(len(right)), at)
+    side = max(functions.image_size)
+    found = most_likely_signal(prior.signal, functions.frequency, base, right, columns, side)
+    return replace(prior, signal=found)
 
 
 def _most_likely_trend(
@@ -229,7 +179,7 @@ def _trend_alone(
         return information, right
     signal = information[np.ix_(rest, rest)].copy()
     signal[np.diag_indices(len(rest))] += 1 / np.tile(
-        _signal_variance(functions, prior.sd, prior.reach), 2
+        prior.signal.variance(functions.frequency), 2
     )
     mixed = information[np.ix_(rest, at)]
     solved = cho_solve(cho_factor(signal, lower=True), np.column_stack([mixed, right[rest]]))

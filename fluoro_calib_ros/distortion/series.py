@@ -64,6 +64,16 @@ class Functions:
         """Angular frequencies (s,) [1/px] of the sines."""
         return np.linalg.norm(np.pi * self._sines / (MARGIN * np.asarray(self.image_size)), axis=1)
 
+    @property
+    def frequency_of_mode(self) -> float:
+        """Angular frequency [1/px] of one half wave along the longer side."""
+        return np.pi / (MARGIN * max(self.image_size))
+
+    @property
+    def highest(self) -> float:
+        """Angular frequency [1/px] up to which there are sines."""
+        return (self.modes + 0.5) * self.frequency_of_mode
+
     def __len__(self) -> int:
         return len(self.powers) + len(self._sines)
 

@@ -24,7 +24,6 @@ from fluoro_calib_ros.distortion.priors import (
     Prior,
     gauge_precision,
     most_likely_prior,
-    spectral_density,
     starting_prior,
 )
 from fluoro_calib_ros.distortion.registry import MODELS, create_model
@@ -37,6 +36,7 @@ from fluoro_calib_ros.distortion.series import (
     sd_over_image,
     unpacked,
 )
+from fluoro_calib_ros.distortion.signal import Signal, _likelihood, spectral_density
 from fluoro_calib_ros.distortion.terms import (
     GAUGE,
     HIGHEST,
@@ -204,7 +204,7 @@ def drawn_field(functions, prior, seed, uv, noise):
             np.zeros((2, t)),
             rng.normal(
                 0,
-                np.sqrt(spectral_density(functions.frequency, prior.sd, prior.reach)),
+                np.sqrt(prior.signal.variance(functions.frequency)),
                 (2, m - t),
             ),
         ],
@@ -229,16 +229,57 @@ def test_prior_of_a_signal_is_estimated():
     found = []
     for seed in range(4):
         prior = starting_prior(functions, 1.0)
-        information, right = drawn_field(functions, Prior(0.5, 220.0, there), seed, uv, 0.25)
+        information, right = drawn_field(
+            functions, Prior(Signal(0.5, 220.0), there), seed, uv, 0.25
+        )
         gauge = gauge_precision(functions(uv), uv, np.array([511.5, 511.5, 4000.0]))
         for _ in range(4):
             prior = most_likely_prior(functions, information, right, gauge, prior)
         found.append(prior)
-    assert np.mean([p.sd for p in found]) == pytest.approx(0.5, rel=0.2)
-    assert np.mean([p.reach for p in found]) == pytest.approx(220, rel=0.2)
+    assert np.mean([p.signal.sd for p in found]) == pytest.approx(0.5, rel=0.2)
+    assert np.mean([p.signal.reach for p in found]) == pytest.approx(220, rel=0.2)
     trend = np.array([p.trend for p in found])
     assert (trend[:, [0, 4, 9]] > 0.01).all()
     assert np.mean(np.delete(trend, [0, 4, 9], axis=1) < 0.05) > 0.8
+
+
+def test_slopes_of_the_likelihood_of_a_signal():
+    """Against finite differences of its cost."""
+    functions = Functions((1024, 1024), 3, 12)
+    uv = pixels(600, 5, (1024, 1024))
+    prior = Prior(Signal(0.8, 400.0, 0.2, 60.0), np.ones(14))
+    information, right = drawn_field(functions, prior, 1, uv, 0.25)
+    information += 1e-3 * np.eye(len(right))
+    t = len(functions.powers)
+    m = len(functions)
+    columns = np.concatenate([np.arange(t, m), m + np.arange(t, m)])
+
+    def cost(at):
+        return _likelihood(at, functions.frequency, information, right, columns)
+
+    at = np.log([0.6, 300.0, 0.3, 80.0])
+    numeric = [(cost(at + h).cost - cost(at - h).cost) / 2e-4 for h in 1e-4 * np.eye(4)]
+    np.testing.assert_allclose(cost(at).slopes, numeric, rtol=1e-4, atol=1e-4)
+
+
+def test_a_signal_of_two_scales_is_found_from_the_observations():
+    """Ripples on a long wave: the standard deviation of the ripples within a quarter, and the
+    prior says how much a series without them leaves out.
+    """
+    functions = Functions((1024, 1024), -1, 22)
+    uv = pixels(2500, 3, (1024, 1024))
+    information, right = drawn_field(
+        functions, Prior(Signal(3.0, 800.0, 0.4, 80.0), np.zeros(0)), 2, uv, 0.25
+    )
+    prior = starting_prior(functions, 5.0)
+    gauge = np.zeros_like(information)
+    for _ in range(5):
+        prior = most_likely_prior(functions, information, right, gauge, prior)
+    assert prior.signal.fine_sd == pytest.approx(0.4, rel=0.25)
+    assert prior.signal.fine_reach == pytest.approx(80, rel=0.3)
+    assert prior.signal.sd_beyond(0.0) == pytest.approx(
+        np.hypot(prior.signal.sd, prior.signal.fine_sd)
+    )
 
 
 def test_expert_terms_and_gauge_are_independent():

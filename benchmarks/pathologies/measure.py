@@ -1,0 +1,162 @@
+"""Errors of a calibration out of sample, against its claims and against the oracle's."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from benchmarks.precision import truth_in_gauge
+
+from .scene import NAMES
+
+RESECTION_STEPS = 6
+INTERSECTION_STEPS = 4
+GRID = 31
+COVER = 1.96  # standard deviations of a 95 % interval
+
+
+@dataclass(frozen=True)
+class Truth:
+    """A camera as `truth_in_gauge` takes it: interior orientation and correction of pixels."""
+
+    interior: np.ndarray
+    distortion: object
+
+
+def resect(rays, points, rotation, source):
+    """Rotation and source that fit rays (n, 2) of points (n, 3) best, from approximate ones."""
+    for _ in range(RESECTION_STEPS):
+        x = (points - source) @ rotation.T
+        inverse = 1 / x[:, 2]
+        xy = x[:, :2] * inverse[:, None]
+        s = np.zeros((len(x), 2, 3))
+        s[:, 0, 0] = s[:, 1, 1] = inverse
+        s[:, :, 2] = -xy * inverse[:, None]
+        cross = np.zeros((len(x), 3, 3))
+        cross[:, 0, 1], cross[:, 0, 2], cross[:, 1, 2] = -x[:, 2], x[:, 1], -x[:, 0]
+        cross -= cross.transpose(0, 2, 1)
+        jacobian = np.concatenate([-s @ rotation, -s @ cross], axis=2).reshape(-1, 6)
+        scale = np.linalg.norm(jacobian, axis=0)
+        step = np.linalg.lstsq(jacobian / scale, (rays - xy).ravel(), rcond=None)[0] / scale
+        source = source + step[:3]
+        rotation = Rotation.from_rotvec(step[3:]).as_matrix() @ rotation
+    return rotation, source
+
+
+def intersect(rays, exteriors, points):
+    """Points (n, 3) from the rays (n, 2) of two fluoroscopes, from approximate ones."""
+    for _ in range(INTERSECTION_STEPS):
+        jacobian = []
+        misclosure = []
+        for ray, (rotation, source) in zip(rays, exteriors):
+            x = (points - source) @ rotation.T
+            xy = x[:, :2] / x[:, 2:]
+            s = (rotation[:2] - xy[:, :, None] * rotation[2]) / x[:, 2, None, None]
+            jacobian.append(s)
+            misclosure.append(ray - xy)
+        a = np.concatenate(jacobian, axis=1)
+        normal = a.transpose(0, 2, 1) @ a
+        right = a.transpose(0, 2, 1) @ np.concatenate(misclosure, axis=1)[..., None]
+        points = points + np.linalg.solve(normal, right)[..., 0]
+    return points
+
+
+def out_of_sample(scene, corrected, seed):
+    """RMS error [px] of noise-free test points and RMS error [mm] of stereo points with noise.
+
+    corrected(f, observed) returns rays (n, 2), c and bool (n,) of the points that are used.
+    """
+    rng = np.random.default_rng([seed, 5])
+    sd = scene.case.noise.sd
+    squares = []
+    errors = []
+    for pose in scene.test_poses:
+        rays = []
+        exteriors = []
+        used = np.ones(len(scene.true_mm), dtype=bool)
+        for f, camera in enumerate(scene.cameras):
+            observed = camera.distortion.observed(camera.ideal(scene.true_mm, pose))
+            on = ((observed > 0) & (observed < scene.case.side - 1)).all(axis=1)
+            ray, c, inside = corrected(f, observed)
+            on &= inside
+            used &= on
+            exterior = resect(ray[on], scene.true_mm[on], *camera.exterior(pose))
+            x = (scene.true_mm - exterior[1]) @ exterior[0].T
+            if f == 0:
+                squares.append(((ray - x[:, :2] / x[:, 2:])[on] * c) ** 2)
+            rays.append(ray + rng.normal(0, sd, ray.shape) / c)
+            exteriors.append(exterior)
+        found = intersect([r[used] for r in rays], exteriors, scene.true_mm[used])
+        errors.append(found - scene.true_mm[used])
+    return (
+        float(np.sqrt(np.mean(np.concatenate(squares)))),
+        float(np.sqrt(np.mean(np.concatenate(errors) ** 2))),
+    )
+
+
+def ratios(scene, result, oracle, seed):
+    """Ratio of image and stereo errors to those of the oracle with interiors (2, 3)."""
+    models = [result.calibrations[name] for name in NAMES]
+    inside_of = {}
+
+    def calibrated(f, observed):
+        found = models[f].model.evaluate(np.clip(observed, 0, scene.case.side - 1))
+        xp, yp, c = models[f].interior
+        inside_of.setdefault(f, []).append(~found.outside)
+        return (observed - found.duv - [xp, yp]) / c, c, ~found.outside
+
+    def known(f, observed):
+        xp, yp, c = oracle[f]
+        correction = scene.cameras[f].distortion.correction(observed)
+        return (observed - correction - [xp, yp]) / c, c, inside_of[f].pop(0)
+
+    image, stereo = out_of_sample(scene, calibrated, seed)
+    image_oracle, stereo_oracle = out_of_sample(scene, known, seed)
+    sd = scene.case.noise.sd
+    return {
+        'ratio': float(np.hypot(image, sd) / np.hypot(image_oracle, sd)),
+        'stereo': stereo / stereo_oracle,
+        'error_px': image,
+    }
+
+
+def claims(scene, result):
+    """NSE and cover95 of correction, points and sources of fluoroscope a."""
+    name = NAMES[0]
+    camera = scene.cameras[0]
+    run = result.runs[name]
+    uv = run.measured.network.uv
+    known = {id(uv): camera.distortion.correction(uv)}  # what the fit of the gauge asks again
+
+    def correction(pixels):
+        return known[id(pixels)] if id(pixels) in known else camera.distortion.correction(pixels)
+
+    truth = Truth(camera.interior, correction)
+    _, _, true = truth_in_gauge(truth, uv, run.after.parameters.interior[0])
+    side = scene.case.side
+    axis = np.linspace(0, side - 1, GRID)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    found = result.calibrations[name].model.evaluate(grid)
+    inside = ~found.outside
+    error = (found.duv - true(grid))[inside]
+    sd = found.sd[inside, None]
+    out = _statistics('correction', error, np.broadcast_to(sd, error.shape))
+    out['correction_px'] = float(np.sqrt(np.mean(error**2)))
+    out['correction_sd_px'] = float(np.sqrt(np.mean(found.sd[inside] ** 2)))
+    good = ~np.isin(result.targets.target_id - 1, scene.displaced)
+    offset = result.targets.xyz_mm - scene.true_mm[result.targets.target_id - 1]
+    sd = np.sqrt(np.diagonal(result.targets.covariance, axis1=1, axis2=2))
+    out |= _statistics('points', offset[good], sd[good])
+    exposures = result.fluoroscopes[name].exposures
+    true_sources = np.stack([camera.exterior(scene.poses[e.exposure - 1])[1] for e in exposures])
+    offset = np.stack([e.position_mm for e in exposures]) - true_sources
+    out |= _statistics('sources', offset, np.stack([e.sd_mm for e in exposures]))
+    return out
+
+
+def _statistics(name, error, sd):
+    normalised = np.abs(error) / np.maximum(sd, 1e-12)
+    return {
+        f'{name}_nse': float(np.mean(normalised**2)),
+        f'{name}_cover': float(np.mean(normalised <= COVER)),
+    }

@@ -1,0 +1,32 @@
+"""The oracle: a Gaussian adjustment that knows the distortion and has no false matches."""
+
+import numpy as np
+
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.exposures.frame import Frame
+
+from .scene import NAMES
+
+PAD = 1000  # px around the image, so that undistorted image points are on it
+
+
+def interior_of_oracle(scene):
+    """Interior orientations (2, 3) [px] that the oracle finds."""
+    side = scene.case.side + 2 * PAD
+    frames = {name: [] for name in NAMES}
+    for image in scene.images:
+        keep = ~image.false
+        frames[NAMES[image.camera]].append(
+            Frame(
+                NAMES[image.camera],
+                image.number,
+                image.rows[keep] + 1,
+                (image.clean - image.correction)[keep] + PAD,
+                (side, side),
+            )
+        )
+    options = CalibrationOptions(model='none', loss='gaussian')
+    found = calibrate(frames, scene.phantom, options)
+    interior = np.stack([found.fluoroscopes[name].interior for name in NAMES])
+    return interior - np.array([PAD, PAD, 0.0])

@@ -1,0 +1,183 @@
+"""Exposures of a case: two fluoroscopes, a phantom, its survey, poses and image points."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.phantom import Phantom
+
+from .fields import Distortion, Wander
+
+BETWEEN = np.deg2rad(80)  # angle between the axes of the fluoroscopes
+NAMES = ('a', 'b')
+EDGE = 0.5  # distance [px] of image points from the edge of the image
+MAX_TRIES = 40  # poses that are drawn until one shows the phantom
+NARROW = np.deg2rad(5)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A fluoroscope: interior (3,) [px], rotation (3, 3) and source (3,) [mm] in the rig."""
+
+    name: str
+    interior: np.ndarray
+    rotation: np.ndarray
+    source: np.ndarray
+    distortion: Distortion
+
+    def exterior(self, pose):
+        """Rotation phantom -> sensor and source in the phantom [mm] for a pose."""
+        turn, shift = pose
+        return self.rotation @ turn, turn.T @ (self.source - shift)
+
+    def ideal(self, points, pose):
+        """Ideal image points (n, 2) of points (n, 3) of the phantom."""
+        turn, source = self.exterior(pose)
+        x = (points - source) @ turn.T
+        return self.interior[:2] + self.interior[2] * x[:, :2] / x[:, 2:]
+
+
+@dataclass(frozen=True)
+class Image:
+    """Image points of one exposure, with what is true of them.
+
+    rows (n,) of the beads; observed (n, 2) with noise and false matches; clean (n, 2) without
+    false matches; correction (n, 2) of the clean ones; false (n,) bool.
+    """
+
+    camera: int
+    number: int
+    rows: np.ndarray
+    observed: np.ndarray
+    clean: np.ndarray
+    correction: np.ndarray
+    false: np.ndarray
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A case as drawn with a seed."""
+
+    case: object
+    cameras: tuple
+    true_mm: np.ndarray
+    phantom: Phantom
+    poses: list
+    images: list
+    test_poses: list
+    displaced: np.ndarray
+
+    def frames(self):
+        """Frames for the calibration, by fluoroscope."""
+        out = {name: [] for name in NAMES}
+        for image in self.images:
+            sigma = None
+            if self.case.sigma_known:
+                sigma = np.full(len(image.rows), self.case.noise.sd)
+            out[NAMES[image.camera]].append(
+                Frame(
+                    NAMES[image.camera],
+                    image.number,
+                    image.rows + 1,
+                    image.observed,
+                    (self.case.side, self.case.side),
+                    sigma,
+                )
+            )
+        return out
+
+
+def draw(case, seed):
+    """Draw the scene of a case."""
+    rng = np.random.default_rng([seed, *case.name.encode()])
+    true_mm = case.phantom(rng)
+    survey = true_mm + rng.normal(0, case.survey_sd * case.survey_factor, true_mm.shape)
+    displaced = rng.permutation(len(true_mm))[: case.displaced[0]]
+    direction = rng.normal(0, 1, (len(displaced), 3))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    survey[displaced] += case.displaced[1] * direction
+    if case.face_mm:
+        face = true_mm[:, 0] > np.quantile(true_mm[:, 0], 0.8)
+        survey[face] += case.face_mm * np.array([0.0, 0.6, 0.8])
+    phantom = Phantom(
+        np.arange(1, len(survey) + 1), np.round(survey, 4), np.full(len(survey), case.survey_sd)
+    )
+    cameras = tuple(_camera(case, rng, f) for f in range(2))
+    images = []
+    poses = []
+    for number in range(1, case.exposures + 1):
+        pose = _pose(case, rng, cameras, true_mm, number)
+        poses.append(pose)
+        images += [_image(case, rng, f, cameras[f], true_mm, pose, number) for f in range(2)]
+    tests = [_pose(case, rng, cameras, true_mm, n) for n in range(1, case.tests + 1)]
+    return Scene(case, cameras, true_mm, phantom, poses, images, tests, displaced)
+
+
+def _camera(case, rng, f):
+    side = case.side
+    angle = (f - 0.5) * BETWEEN + rng.normal(0, 0.02)
+    source = case.distance * np.array([np.cos(angle), np.sin(angle), rng.normal(0, 0.02)])
+    z = -source / np.linalg.norm(source)
+    x = np.cross(z, [0, 0, 1.0])
+    x /= np.linalg.norm(x)
+    looking = np.stack([x, np.cross(z, x), z])
+    tilt = Rotation.from_rotvec(rng.normal(0, [0.01, 0.01, 0.05])).as_matrix()
+    middle = (side - 1) / 2 + np.asarray(case.principal) * side / 1024 + rng.normal(0, 6, 2)
+    interior = np.append(middle, case.c * side * rng.uniform(0.97, 1.03))
+    if np.any(case.principal):
+        # The image shows the phantom all the same: the axis of the image goes past it.
+        offset = np.append(np.asarray(case.principal) * side / 1024 / interior[2], 0)
+        tilt = Rotation.from_rotvec([-offset[1], offset[0], 0]).as_matrix() @ tilt
+    distortion = Distortion.of(case.parts, rng, side)
+    return Camera(NAMES[f], interior, tilt @ looking, source, distortion)
+
+
+def _pose(case, rng, cameras, true_mm, number):
+    """Draw a pose in which both fluoroscopes see a fair part of the phantom."""
+    for _ in range(MAX_TRIES):
+        shift = rng.uniform(-case.spread, case.spread, 3)
+        if case.poses == 'narrow':
+            turn = Rotation.from_rotvec(rng.normal(0, NARROW, 3))
+            shift = shift / 2
+        elif case.poses == 'turntable':
+            angle = 2 * np.pi * (number + rng.uniform(0, 1)) / case.exposures
+            turn = Rotation.from_rotvec(rng.normal(0, 0.15, 3)) * Rotation.from_rotvec(
+                [0, 0, angle]
+            )
+        else:
+            turn = Rotation.random(random_state=int(rng.integers(2**31)))
+        pose = (turn.as_matrix(), shift)
+        seen = [_on_image(case, camera.ideal(true_mm, pose)).mean() for camera in cameras]
+        if min(seen) > case.min_seen:
+            break
+    return pose
+
+
+def _on_image(case, uv):
+    return ((uv > EDGE) & (uv < case.side - 1 - EDGE)).all(axis=1)
+
+
+def _image(case, rng, f, camera, true_mm, pose, number):
+    distortion = camera.distortion
+    if case.wander:
+        # The field of this exposure; the nominal one is the mean over all exposures.
+        change = Distortion.of((Wander(case.wander),), rng, case.side)
+        distortion = Distortion(
+            distortion.parts + change.parts, distortion.drawn + change.drawn, case.side
+        )
+    points = true_mm
+    if number <= case.moved[0]:
+        half = rng.random(len(points)) < 0.5
+        points = points + half[:, None] * rng.normal(0, case.moved[1], 3)
+    observed = distortion.observed(camera.ideal(points, pose))
+    observed = case.noise(rng, observed, case.side)
+    visible = _on_image(case, observed)
+    if case.blind is not None:
+        visible &= ~case.blind(observed / (case.side - 1))
+    rows = np.sort(rng.permutation(np.flatnonzero(visible))[: case.beads])
+    clean = observed[rows]
+    seen, false = case.false(rng, clean, case.side)
+    seen = np.clip(seen, EDGE, case.side - 1 - EDGE)
+    return Image(f, number, rows, seen, clean, distortion.correction(clean), false)

@@ -18,10 +18,12 @@ from .calibration.result import CorrectedPoints, FluoroscopeCalibration
 from .errors import DataError
 from .exchange.content import FileSettings
 from .exposures.frame import Frame
+from .exposures.moving_points import MovingPoints
 from .exposures.names import Names
 from .exposures.phantom import Phantom
 from .files.calibration_request import read_request
-from .files.phantom import read_phantom
+from .files.known_orientation import read_known_orientations
+from .files.phantom import read_moving_points, read_phantom
 from .files.reconstructed_points import write_reconstruction
 from .files.rig_orientation import load_orientation, save_orientation
 from .jobs.adjustment import adjust
@@ -32,6 +34,7 @@ from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, r
 from .jobs.result_folder import save_outcome, save_result
 from .jobs.simulation import SimulationOptions, simulate
 from .jobs.sources import Recording, Survey, read_calibrations, read_source, read_survey
+from .photogrammetry.known_orientation import KnownOrientation
 from .photogrammetry.rig_orientation import RigOrientation
 from .validation.check import Validation
 from .validation.verdict import validate
@@ -47,6 +50,8 @@ __all__ = [
     'FileSettings',
     'FluoroscopeCalibration',
     'Frame',
+    'KnownOrientation',
+    'MovingPoints',
     'Names',
     'OrientationOutcome',
     'Phantom',
@@ -64,6 +69,8 @@ __all__ = [
     'load_orientation',
     'orient',
     'read_calibrations',
+    'read_known_orientations',
+    'read_moving_points',
     'read_phantom',
     'read_request',
     'read_source',
@@ -86,6 +93,7 @@ def calibrate(
     *,
     joint: bool = False,
     principal_distance: float | None = None,
+    known_orientations: Mapping[str, KnownOrientation] | None = None,
     validated: bool = False,
     force: bool = False,
 ) -> CalibrationOutcome:
@@ -102,6 +110,10 @@ def calibrate(
         Whether all fluoroscopes are adjusted together; else one after the other.
     principal_distance : float, optional
         Start value, or with interior 'fixed' the held value [px].
+    known_orientations : mapping of str to KnownOrientation, optional
+        By fluoroscope, where K, R and t are known and only the distortion is to be estimated. The
+        phantom is then given in the frame of the lab; `MovingPoints.as_phantom` makes one of
+        points in motion.
     validated : bool
         Whether the calibration is validated with its own exposures, which takes some six times as
         long.
@@ -121,7 +133,12 @@ def calibrate(
         For options that contradict each other.
     """
     request = CalibrationRequest(
-        frames, phantom, options or CalibrationOptions(), joint, principal_distance
+        frames,
+        phantom,
+        options or CalibrationOptions(),
+        joint,
+        principal_distance,
+        known_orientations=known_orientations or {},
     )
     return run_calibration(request, validate=validated, force=force)
 

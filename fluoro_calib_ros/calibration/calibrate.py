@@ -13,6 +13,7 @@ from ..distortion.base import CorrectionModel
 from ..exposures.frame import validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.precision import Precision, geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
 from .constraints import RelativeOrientation, relative_orientations
@@ -25,6 +26,7 @@ from .held_calibration import (
 )
 from .initial_network import Frames, Measured, measured_network
 from .options import CalibrationOptions
+from .request import CalibrationRequest
 from .result import FluoroscopeCalibration, digest_of_sources
 from .robust_adjustment import adjusted_with_precision
 from .rounds import Round, SelfCalibration, rmse_of_inliers
@@ -175,27 +177,48 @@ def calibrate(
     ValueError
         If the relative orientation is to be constrained in separate adjustments.
     """
-    options = options or CalibrationOptions()
-    if options.relative_orientation != 'none' and not joint:
-        raise ValueError('a relative orientation constraint needs the joint adjustment')
+    request = CalibrationRequest(
+        frames, phantom, options or CalibrationOptions(), joint, principal_distance
+    )
+    return calibrate_request(request, progress, raise_if_cancelled)
+
+
+def calibrate_request(
+    request: CalibrationRequest,
+    progress: Callable[[str, Round], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> CalibrationResult:
+    """Self-calibrate the fluoroscopes of a request; see `calibrate` for the other arguments.
+
+    Raises DataError and ValueError as `calibrate`, ValueError also for options that exclude known
+    orientations.
+    """
+    _require_compatible(request)
+    options = request.options
     began = time.perf_counter()
     figures: dict[str, FluoroscopeResult] = {}
     calibrations: dict[str, FluoroscopeCalibration] = {}
     runs: dict[str, SelfCalibration] = {}
     # One thread: faster than two for these sizes, and sums are always made in the same order.
     with threadpool_limits(1):
-        for group in [tuple(frames)] if joint else [(name,) for name in frames]:
+        for group in request.groups:
             start = time.perf_counter()
             label = '+'.join(group)
-            of_group = {name: frames[name] for name in group}
-            measured = measured_network(of_group, phantom, principal_distance, raise_if_cancelled)
+            of_group = {name: request.frames[name] for name in group}
+            measured = measured_network(
+                of_group,
+                request.phantom,
+                request.principal_distance,
+                raise_if_cancelled,
+                request.known_orientations,
+            )
             run = self_calibrate(
                 measured, options, _progress_of(label, progress), raise_if_cancelled
             )
             seconds = time.perf_counter() - start
             runs[label] = run
             figures |= _figures_of_run(run)
-            calibrations |= _calibrations_of_run(run, of_group, phantom, options, seconds)
+            calibrations |= _calibrations_of_run(run, of_group, request.phantom, seconds)
         relative = [
             relative_orientations(run, options.relative_orientation) for run in runs.values()
         ]
@@ -203,7 +226,7 @@ def calibrate(
     return CalibrationResult(
         figures,
         calibrations,
-        combined_targets(targets, phantom, options.datum == 'survey'),
+        combined_targets(targets, request.phantom, options.datum == 'survey'),
         {label: run.history for label, run in runs.items()},
         runs,
         tuple(sentence for run in runs.values() for sentence in run.measured.left_out),
@@ -227,16 +250,26 @@ def _calibrations_of_run(
     run: SelfCalibration,
     frames: Frames,
     phantom: Phantom,
-    options: CalibrationOptions,
     seconds: float,
 ) -> dict[str, FluoroscopeCalibration]:
     """Calibrations of the fluoroscopes of a self-calibration that took some seconds."""
     return {
-        name: _calibration(
-            run, f, name, options, digest_of_sources(frames[name], phantom), seconds
-        )
+        name: _calibration(run, f, name, digest_of_sources(frames[name], phantom), seconds)
         for f, name in enumerate(run.measured.fluoroscopes)
     }
+
+
+def _require_compatible(request: CalibrationRequest) -> None:
+    """Raise ValueError for options that exclude each other."""
+    options = request.options
+    if options.relative_orientation != 'none' and not request.joint:
+        raise ValueError('a relative orientation constraint needs the joint adjustment')
+    if request.known_orientations and (
+        options.relative_orientation != 'none' or options.datum != 'survey'
+    ):
+        raise ValueError(
+            'known orientations exclude a relative orientation constraint and a free network'
+        )
 
 
 def _progress_of(
@@ -263,6 +296,7 @@ def adjust_with_calibrations(
     calibrations: Mapping[str, FluoroscopeCalibration],
     loss: str = 'student_t',
     raise_if_cancelled: Callable[[], None] | None = None,
+    known: Mapping[str, KnownOrientation] | None = None,
 ) -> CalibrationResult:
     """Adjust frames with calibrations held: interior orientations and corrections do not change.
 
@@ -291,7 +325,9 @@ def adjust_with_calibrations(
         for frame in of_fluoroscope:
             validate_frame(frame, phantom, calibrations[name].image_size)
     with threadpool_limits(1):
-        measured = network_of_calibrations(frames, phantom, calibrations, raise_if_cancelled)
+        measured = network_of_calibrations(
+            frames, phantom, calibrations, raise_if_cancelled, known
+        )
         correction, network = held_corrections(measured, calibrations)
         after, precise = adjusted_with_precision(
             network,
@@ -414,7 +450,6 @@ def _calibration(
     run: SelfCalibration,
     f: int,
     name: str,
-    options: CalibrationOptions,
     digest: str,
     seconds: float,
 ) -> FluoroscopeCalibration:
@@ -433,7 +468,7 @@ def _calibration(
         image_size=run.measured.image_size[f],
         interior=run.after.parameters.interior[f],
         interior_covariance=run.precision.interior[f],
-        interior_estimated=options.interior == 'estimated',
+        interior_estimated=bool(run.measured.network.interior_free[f]),
         model=model,
         train_exposure=train_exposure,
         image_sd=_image_sd(run, rows),

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..distortion.gauge import GaugeKind
 from ..errors import DataError
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.normal_equations import normal_equations
@@ -87,6 +88,58 @@ def paired_exposures(measured: Measured, b: int, a: int = 0) -> np.ndarray:
     return np.array(pairs, dtype=int).reshape(-1, 2)
 
 
+def interiors_to_estimate(measured: Measured, options: CalibrationOptions) -> np.ndarray:
+    """Whether (F,) the interior orientation of each fluoroscope is estimated.
+
+    It is held where it is known and has no standard deviation, and where flat targets parallel to
+    the image cannot show it.
+    """
+    estimated = options.interior == 'estimated'
+    out = np.full(len(measured.fluoroscopes), estimated)
+    for f, name in enumerate(measured.fluoroscopes):
+        if name in measured.known:
+            out[f] = measured.known[name].interior_sd is not None
+        elif _is_untilted(measured, f):
+            out[f] = estimated and options.interior_sd is not None
+    return out
+
+
+def gauges_of(measured: Measured, options: CalibrationOptions) -> tuple[GaugeKind, ...]:
+    """What the orientation of each fluoroscope can express.
+
+    Targets parallel to the image show no shift or scale that the exterior orientations could not
+    take up, though the interior orientation is held.
+    """
+    held = GaugeKind.TURNS if options.interior == 'fixed' else GaugeKind.FULL
+    return tuple(
+        GaugeKind.NONE
+        if name in measured.known
+        else GaugeKind.TREND
+        if _is_untilted(measured, f)
+        else held
+        for f, name in enumerate(measured.fluoroscopes)
+    )
+
+
+def _is_untilted(measured: Measured, f: int) -> bool:
+    return bool(measured.untilted) and measured.untilted[f]
+
+
+def _interior_sd(measured: Measured, options: CalibrationOptions) -> np.ndarray | None:
+    """Standard deviations (F, 3) [px] of the start values of the interior orientations.
+
+    None where nothing is known of any.
+    """
+    sd = np.full((len(measured.fluoroscopes), 3), np.inf)
+    if options.interior_sd is not None:
+        sd[:] = options.interior_sd
+    for f, name in enumerate(measured.fluoroscopes):
+        known = measured.known.get(name)
+        if known is not None:
+            sd[f] = np.inf if known.interior_sd is None else known.interior_sd
+    return sd if np.isfinite(sd).any() else None
+
+
 def with_constraints(measured: Measured, options: CalibrationOptions) -> Measured:
     """Return a network with the constraints and the datum of the options.
 
@@ -96,8 +149,8 @@ def with_constraints(measured: Measured, options: CalibrationOptions) -> Measure
         measured = _without_targets_of_few_rays(measured)
     network = replace(measured.network, datum=options.datum, relative=())
     start = replace(measured.start, relative=())
-    if options.interior_sd is not None:
-        sd = np.tile(options.interior_sd, (len(measured.fluoroscopes), 1))
+    sd = _interior_sd(measured, options)
+    if sd is not None:
         network = replace(network, interior_mean=start.interior, interior_sd=sd)
     if options.relative_orientation != 'none':
         constraints = _relative_constraints(measured, options)

@@ -3,20 +3,35 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
+from ..photogrammetry.exterior_prior import HELD_SD_MM, HELD_SD_RAD, ExteriorPrior
+from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.network import Network
-from ..photogrammetry.resection import Resection, principal_distance_of, resect, robust_dlt
+from ..photogrammetry.plane_resection import flatness, plane_of, tilt_of
+from ..photogrammetry.resection import MIN_FLATNESS, Resection, resection_at
 from ..photogrammetry.rotations import rotation_angle
-from ..photogrammetry.unknowns import Parameters
+from ..photogrammetry.unknowns import EXTERIOR_SIZE, Parameters
+from .start_orientation import (
+    UNTILTED,
+    View,
+    orient_view,
+    principal_distance_of_views,
+    settle_planes,
+    view_of,
+)
 
 MIN_EXPOSURES = 3
 MIN_TARGETS_OF_EXPOSURE = 12
+# Of an exposure whose orientation is known.
+MIN_TARGETS_OF_KNOWN = 1
+# Flat targets that are tilted less in all exposures do not show the principal distance.
+UNTILTED_RAD = np.deg2rad(5.0)
 # Smaller differences of rotation and distance make two exposures show one pose of the phantom.
 MIN_POSE_RAD = np.deg2rad(2.0)
 MIN_POSE_MM = 20.0
@@ -25,6 +40,7 @@ AXIAL_FACTOR = 10.0
 MAX_MISFIT = 8.0  # residuals of a resection relative to the median of the exposures
 
 Frames = Mapping[str, Sequence[Frame]]  # by fluoroscope
+Known = Mapping[str, KnownOrientation]  # by fluoroscope
 
 
 @dataclass(frozen=True)
@@ -46,6 +62,10 @@ class Measured:
         Of the object points.
     left_out : tuple of str
         One sentence for every frame that was not used.
+    untilted : tuple of bool
+        By fluoroscope, whether all exposures show flat targets parallel to the image.
+    known : mapping of str to KnownOrientation
+        Orientations that are known beforehand, by fluoroscope.
     """
 
     network: Network
@@ -55,6 +75,8 @@ class Measured:
     frames: tuple[Frame, ...]
     target_id: np.ndarray
     left_out: tuple[str, ...]
+    untilted: tuple[bool, ...] = ()
+    known: Known = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -75,12 +97,18 @@ class _Task:
     phantom: Phantom
     sensors: Mapping[str, KnownSensor] | None
     principal_distance: float | None
+    known: Known
     raise_if_cancelled: Callable[[], None] | None
 
-    @property
-    def min_exposures(self) -> int:
-        """Number of exposures that a fluoroscope needs."""
-        return MIN_EXPOSURES if self.sensors is None else 1
+    def min_exposures(self, name: str, untilted: bool = True) -> int:
+        """Number of exposures that a fluoroscope needs; untilted: of flat targets at rest."""
+        if self.sensors is not None or name in self.known:
+            return 1
+        return 1 if untilted and self.principal_distance is not None else MIN_EXPOSURES
+
+    def min_targets(self, name: str) -> int:
+        """Number of targets that an exposure needs."""
+        return MIN_TARGETS_OF_KNOWN if name in self.known else MIN_TARGETS_OF_EXPOSURE
 
 
 @dataclass(frozen=True)
@@ -91,6 +119,7 @@ class _Resected:
     resections: list[Resection]
     interior: np.ndarray
     left_out: list[str]
+    untilted: bool = False
 
 
 def nominal_interior(image_size: tuple[int, int], principal_distance: float) -> np.ndarray:
@@ -103,6 +132,7 @@ def measured_network(
     phantom: Phantom,
     principal_distance: float | None = None,
     raise_if_cancelled: Callable[[], None] | None = None,
+    known: Known | None = None,
 ) -> Measured:
     """Return network and start values of the frames of fluoroscopes that are to be calibrated.
 
@@ -114,6 +144,8 @@ def measured_network(
         Start value [px]; by default it is taken from the observations.
     raise_if_cancelled : callable, optional
         Called for every exposure; may raise to stop.
+    known : mapping of str to KnownOrientation, optional
+        Orientations that are known beforehand, by fluoroscope.
 
     Returns
     -------
@@ -125,7 +157,7 @@ def measured_network(
         If a frame is invalid, if exposures or targets are too few, or if all exposures show one
         pose.
     """
-    task = _Task(phantom, None, principal_distance, raise_if_cancelled)
+    task = _Task(phantom, None, principal_distance, known or {}, raise_if_cancelled)
     return _measured(
         task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
     )
@@ -136,13 +168,14 @@ def network_of_known_sensors(
     phantom: Phantom,
     sensors: Mapping[str, KnownSensor],
     raise_if_cancelled: Callable[[], None] | None = None,
+    known: Known | None = None,
 ) -> Measured:
     """Return network and start values with interior orientations and corrections held.
 
     One exposure of a fluoroscope is enough. The arguments and errors are those of
     `measured_network`; sensors {fluoroscope: KnownSensor}.
     """
-    task = _Task(phantom, sensors, None, raise_if_cancelled)
+    task = _Task(phantom, sensors, None, known or {}, raise_if_cancelled)
     return _measured(
         task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
     )
@@ -154,6 +187,8 @@ def _measured(task: _Task, found: Mapping[str, _Resected]) -> Measured:
     resections = [resection for one in found.values() for resection in one.resections]
     fluoroscope = np.repeat(np.arange(len(found)), [len(one.frames) for one in found.values()])
     network, target_id = _index(frames, fluoroscope, task, len(found))
+    if task.known:
+        network = replace(network, exterior=_exterior_prior(task, frames))
     start = Parameters(
         np.array([one.interior for one in found.values()]),
         np.array([resection.rotation for resection in resections]),
@@ -162,25 +197,96 @@ def _measured(task: _Task, found: Mapping[str, _Resected]) -> Measured:
     )
     sizes = tuple(one.frames[0].image_size for one in found.values())
     left_out = tuple(sentence for one in found.values() for sentence in one.left_out)
-    return Measured(network, start, tuple(found), sizes, tuple(frames), target_id, left_out)
+    untilted = tuple(one.untilted for one in found.values())
+    known = {name: task.known[name] for name in found if name in task.known}
+    return Measured(
+        network, start, tuple(found), sizes, tuple(frames), target_id, left_out, untilted, known
+    )
+
+
+def _exterior_prior(task: _Task, frames: Sequence[Frame]) -> ExteriorPrior:
+    """What is known of the exterior orientations of exposures."""
+    rotation = np.tile(np.eye(3), (len(frames), 1, 1))
+    position = np.zeros((len(frames), 3))
+    sd = np.full((len(frames), EXTERIOR_SIZE), np.inf)
+    for row, frame in enumerate(frames):
+        known = task.known.get(frame.fluoroscope)
+        if known is not None:
+            rotation[row] = known.rotation
+            position[row] = known.position_mm
+            sd[row] = np.repeat(known.exterior_sd or (HELD_SD_MM, HELD_SD_RAD), 3)
+    return ExteriorPrior(rotation, position, sd)
 
 
 def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
     """Resect the exposures of one fluoroscope. Raises DataError."""
     ordered, left_out = _usable_frames(task, name, frames)
-    found, interior, misfits = _resect_all(task, name, ordered)
-    if task.sensors is None:
-        _require_different_poses(name, found)
+    untilted = False
+    if name in task.known:
+        found, interior, misfits = _place_all(task, name, ordered)
+    else:
+        found, interior, misfits = _resect_all(task, name, ordered)
+        if task.sensors is None:
+            untilted = _are_untilted(task, ordered, found)
+    if task.sensors is None and name not in task.known:
+        _require_determined(task, name, found, untilted)
     left_out += misfits
     fitting = [(frame, one) for frame, one in zip(ordered, found) if one is not None]
-    if len(fitting) < task.min_exposures:
+    needed = task.min_exposures(name, untilted)
+    if len(fitting) < needed:
+        if not misfits:
+            raise DataError(f'fluoroscope {name}: {_too_few(len(fitting), needed, left_out)}')
         raise DataError(
             f'fluoroscope {name}: only {len(fitting)} of {len(found)} exposures fit the phantom, '
-            f'{task.min_exposures} are needed; the first that does not: {left_out[0]}'
+            f'{needed} are needed; the first that does not: {left_out[0]}'
         )
     return _Resected(
-        [frame for frame, _ in fitting], [one for _, one in fitting], interior, left_out
+        [frame for frame, _ in fitting],
+        [one for _, one in fitting],
+        interior,
+        left_out,
+        untilted,
     )
+
+
+def _place_all(
+    task: _Task, name: str, frames: Sequence[Frame]
+) -> tuple[list[Resection | None], np.ndarray, list[str]]:
+    """Known orientations of the frames of one fluoroscope; returns as _resect_all."""
+    known = task.known[name]
+    sensor = None if task.sensors is None else task.sensors[name]
+    predict = np.zeros_like if sensor is None else sensor.predict
+    interior = known.interior if sensor is None else np.asarray(sensor.interior)
+    found: list[Resection | None] = []
+    for frame in frames:
+        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        found.append(
+            resection_at(
+                known.rotation, known.position_mm, xyz, frame.uv - predict(frame.uv), interior
+            )
+        )
+    return found, interior, _reject_misfits(frames, found)
+
+
+def _are_untilted(task: _Task, frames: Sequence[Frame], found: Sequence[Resection | None]) -> bool:
+    """Whether all exposures show flat targets that are parallel to the image."""
+    for frame, one in zip(frames, found):
+        if one is None:
+            continue
+        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        if flatness(xyz) >= MIN_FLATNESS or tilt_of(one.rotation, plane_of(xyz)) > UNTILTED_RAD:
+            return False
+    return any(one is not None for one in found)
+
+
+def _require_determined(
+    task: _Task, name: str, found: Sequence[Resection | None], untilted: bool
+) -> None:
+    """Raise DataError where poses determine no principal distance."""
+    if not untilted:
+        _require_different_poses(name, found)
+    elif task.principal_distance is None:
+        raise DataError(f'fluoroscope {name}: {UNTILTED}')
 
 
 def _usable_frames(
@@ -193,20 +299,23 @@ def _usable_frames(
         validate_frame(frame, task.phantom, frames[0].image_size)
         if ordered and ordered[-1].number == frame.number:
             raise DataError(f'fluoroscope {name}: exposure {frame.number} appears twice')
-        if len(frame.target_id) < MIN_TARGETS_OF_EXPOSURE:
+        if len(frame.target_id) < task.min_targets(name):
             left_out.append(
                 f'fluoroscope {name}, exposure {frame.number}: {len(frame.target_id)} targets are '
-                f'too few, {MIN_TARGETS_OF_EXPOSURE} are needed'
+                f'too few, {task.min_targets(name)} are needed'
             )
         else:
             ordered.append(frame)
-    if len(ordered) < task.min_exposures:
-        few = f', {len(left_out)} more have too few targets' if left_out else ''
-        raise DataError(
-            f'fluoroscope {name}: {len(ordered)} exposures are too few, '
-            f'{task.min_exposures} are needed{few}'
-        )
+    needed = task.min_exposures(name)
+    if len(ordered) < needed:
+        raise DataError(f'fluoroscope {name}: {_too_few(len(ordered), needed, left_out)}')
     return ordered, left_out
+
+
+def _too_few(count: int, needed: int, left_out: Sequence[str]) -> str:
+    """Say that exposures are too few."""
+    few = f', {len(left_out)} more have too few targets' if left_out else ''
+    return f'{count} exposures are too few, {needed} are needed{few}'
 
 
 def _resect_all(
@@ -219,36 +328,41 @@ def _resect_all(
     """
     sensor = None if task.sensors is None else task.sensors[name]
     predict = np.zeros_like if sensor is None else sensor.predict
-    phantom = task.phantom
-    targets = [phantom.xyz_mm[phantom.index(frame.target_id)] for frame in frames]
-    pixels = [frame.uv - predict(frame.uv) for frame in frames]
-    projections: list[np.ndarray | None] = []
-    sentences = []
-    for frame, xyz, uv in zip(frames, targets, pixels):
+    views = []
+    for frame in frames:
         if task.raise_if_cancelled is not None:
             task.raise_if_cancelled()
-        try:
-            projections.append(robust_dlt(xyz, uv, seed=0))
-        except DataError as error:
-            projections.append(None)
-            sentences.append(f'{_exposure(frame)}: {error}')
+        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        views.append(view_of(frame, xyz, frame.uv - predict(frame.uv)))
+    sentences = [f'{_exposure(view.frame)}: {view.error}' for view in views if view.error]
+    if len(sentences) == len(views):
+        raise DataError(sentences[0])
     if sensor is None:
-        distances = [principal_distance_of(p) for p in projections if p is not None]
-        if not distances:
-            raise DataError(sentences[0])
-        distance = task.principal_distance or float(np.median(distances))
-        interior = nominal_interior(frames[0].image_size, distance)
+        interior = _start_interior(task, name, [view for view in views if not view.error])
     else:
         interior = np.asarray(sensor.interior)
     found: list[Resection | None] = []
-    for frame, projection, xyz, uv in zip(frames, projections, targets, pixels):
+    for view in views:
         try:
-            found.append(None if projection is None else resect(xyz, uv, interior, projection))
+            found.append(None if view.error else orient_view(view, interior))
         except DataError as error:
             found.append(None)
-            sentences.append(f'{_exposure(frame)}: {error}')
+            sentences.append(f'{_exposure(view.frame)}: {error}')
+    if sensor is None:
+        found = settle_planes(views, found, interior)
     sentences += _reject_misfits(frames, found)
     return found, interior, sentences
+
+
+def _start_interior(task: _Task, name: str, views: Sequence[View]) -> np.ndarray:
+    """Start values (3,) [px] of the interior orientation. Raises DataError."""
+    size = views[0].frame.image_size
+    middle = nominal_interior(size, 1.0)[:2]
+    try:
+        distance = task.principal_distance or principal_distance_of_views(views, middle, size)
+    except DataError as error:
+        raise DataError(f'fluoroscope {name}: {error}') from None
+    return nominal_interior(size, distance)
 
 
 def _reject_misfits(frames: Sequence[Frame], found: list[Resection | None]) -> list[str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from ..exposures.frame import Frame
 from ..exposures.names import Names
 from ..exposures.phantom import Phantom
+from ..photogrammetry.known_orientation import KnownOrientation
 from .options import CalibrationOptions
 
 
@@ -28,6 +29,9 @@ class CalibrationRequest:
         Start value, or with interior 'fixed' the held value [px]; None: from the observations.
     names : Names
         Names of targets, exposures and fluoroscopes in the files that they were read from.
+    known_orientations : mapping of str to KnownOrientation
+        Orientations that are known beforehand, by fluoroscope; the phantom is then surveyed in
+        their frame.
     """
 
     frames: Mapping[str, Sequence[Frame]]
@@ -36,6 +40,7 @@ class CalibrationRequest:
     joint: bool = False
     principal_distance: float | None = None
     names: Names = field(default_factory=Names)
+    known_orientations: Mapping[str, KnownOrientation] = field(default_factory=dict)
 
     @property
     def groups(self) -> list[tuple[str, ...]]:

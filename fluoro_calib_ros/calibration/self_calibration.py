@@ -23,7 +23,7 @@ from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment
 from .alternation import Regressions, calibrate_by_regression
 from .combined_adjustment import calibrate_by_adjustment
-from .constraints import with_constraints
+from .constraints import gauges_of, interiors_to_estimate, with_constraints
 from .diagnostics import raise_if_undetermined, undetermined_unknowns
 from .initial_network import Measured
 from .model_choice import START_MODEL, better_model
@@ -60,17 +60,13 @@ def self_calibrate(
         If the observations do not suffice.
     """
     options = options or CalibrationOptions()
-    network = replace(
-        measured.network,
-        interior_free=np.full(len(measured.fluoroscopes), options.interior == 'estimated'),
-    )
+    network = replace(measured.network, interior_free=interiors_to_estimate(measured, options))
     measured = with_constraints(replace(measured, network=network), options)
     before = _adjusted_without_correction(measured, options, raise_if_cancelled)
     automatic = options.model == AUTO
     source = model_source(START_MODEL if automatic else options.model)
-    problem = AdjustmentProblem(
-        measured.network, measured.image_size, before, options.interior == 'fixed'
-    )
+    gauges = gauges_of(measured, options)
+    problem = AdjustmentProblem(measured.network, measured.image_size, before, gauges)
     terms = source.adjusted_terms(problem)
     steps = _regression_steps(measured, options, source, terms)
     if steps is not None:
@@ -126,7 +122,7 @@ def _regression_steps(
             network.uv[rows],
             network.exposure[rows],
             measured.image_size[f],
-            options.interior == 'fixed',
+            gauges_of(measured, options)[f],
             None if terms is None else terms.values[f],
         )
         step = source.regression(points, options.k)

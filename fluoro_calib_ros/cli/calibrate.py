@@ -52,6 +52,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='start value, or with --interior fixed the held value '
         '(default: from the observations)',
     )
+    parser.add_argument(
+        '--known-orientation',
+        type=Path,
+        metavar='FILE',
+        help='YAML file with K, R and t of the fluoroscopes: only the distortion is estimated; '
+        'the phantom is then given in the frame of the lab, in motion with a column exposure',
+    )
     add_collect(parser)
     parser.add_argument(
         '--force',
@@ -108,6 +115,10 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
         error(f'--k is a number of neighbours, it needs --model {", ".join(models)}')
     if arguments.relative_orientation != 'none' and not arguments.joint:
         error('--relative-orientation needs --joint: the fluoroscopes in one adjustment')
+    if arguments.known_orientation and (
+        arguments.relative_orientation != 'none' or arguments.datum != 'survey'
+    ):
+        error('--known-orientation excludes --relative-orientation and --datum inner')
     if arguments.interior_sd and (
         arguments.interior == 'fixed' or arguments.principal_distance is None
     ):
@@ -118,21 +129,29 @@ def run(arguments: argparse.Namespace) -> None:
     """Self-calibrate and write the result folder. Raises DataError."""
     from ..calibration.options import CalibrationOptions
     from ..calibration.request import CalibrationRequest
+    from ..exposures.names import Names
+    from ..files.known_orientation import read_known_orientations
+    from ..files.phantom import has_exposures, read_moving_points
     from ..files.result_document import result_document
     from ..jobs.calibration import run_calibration
     from ..jobs.result_folder import save_outcome
     from ..jobs.sources import read_source, read_survey
     from ..report.tables import summary_table
 
-    survey = read_survey(arguments.phantom, file_settings(arguments))
+    known = {}
+    if arguments.known_orientation is not None:
+        known = read_known_orientations(arguments.known_orientation)
+    moving = bool(known) and has_exposures(arguments.phantom)
+    survey = None if moving else read_survey(arguments.phantom, file_settings(arguments))
+    names = Names() if survey is None else survey.names
     recording = read_source(
         arguments.source,
         image_size=arguments.image_size,
         fluoroscopes=arguments.fluoroscopes,
         collect=arguments.collect,
-        settings=file_settings(arguments, names=survey.names),
+        settings=file_settings(arguments, names=names),
     )
-    print_notes((*survey.notes, *recording.notes))
+    print_notes((*(() if survey is None else survey.notes), *recording.notes))
     print_unpaired(arguments.source, recording.unpaired)
     options = CalibrationOptions(
         **{
@@ -141,13 +160,21 @@ def run(arguments: argparse.Namespace) -> None:
             if name not in INTERNAL
         }
     )
+    if survey is None:
+        # Its targets have an id in every exposure.
+        frames, phantom = read_moving_points(arguments.phantom).as_phantom(recording.frames)
+    else:
+        frames = recording.frames
+        phantom = survey.phantom
+        names = recording.names
     request = CalibrationRequest(
-        recording.frames,
-        survey.phantom,
+        frames,
+        phantom,
         options,
         arguments.joint,
         arguments.principal_distance,
-        recording.names,
+        names,
+        known,
     )
     outcome = run_calibration(request, force=arguments.force, progress=print_round)
     save_outcome(arguments.out, outcome)

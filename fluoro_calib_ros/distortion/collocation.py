@@ -61,7 +61,7 @@ class CollocationTerms(AdjustedTerms):
     def __init__(self, problem: AdjustmentProblem, modes: int = START_MODES) -> None:
         before = problem.before
         self.network = problem.network
-        self.interior_held = problem.interior_held
+        self.gauge_kinds = problem.gauges
         self.sizes = problem.image_sizes
         self.interior = before.parameters.interior
         self.functions: list[Functions] = []
@@ -84,7 +84,7 @@ class CollocationTerms(AdjustedTerms):
 
     def _gauge(self, f: int) -> np.ndarray:
         uv = self.network.uv[self.network.rows(f)]
-        return gauge_precision(self.values[f], uv, self.interior[f], self.interior_held)
+        return gauge_precision(self.values[f], uv, self.interior[f], self.gauge_kinds[f])
 
     def with_additional(self, network: Network) -> Network:
         """Return the network with the terms under their present priors."""

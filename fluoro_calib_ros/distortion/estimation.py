@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 
 from ..photogrammetry.noise import INLIER_Q
+from .gauge import GaugeKind
 
 if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment
@@ -39,14 +40,14 @@ class AdjustmentProblem:
         Width and height [px] of the image of each fluoroscope.
     before : Adjustment
         Adjustment of the network without correction.
-    interior_held : bool
-        True where the interior orientation is not estimated.
+    gauges : sequence of GaugeKind
+        What the orientation of each fluoroscope can express.
     """
 
     network: Network
     image_sizes: Sequence[tuple[int, int]]
     before: Adjustment
-    interior_held: bool
+    gauges: Sequence[GaugeKind]
 
 
 @dataclass(frozen=True)
@@ -61,8 +62,8 @@ class TrainingPoints:
         Exposure of each image point.
     image_size : (int, int)
         Width and height of the image [px].
-    interior_held : bool
-        True where the interior orientation is not estimated, which makes the gauge smaller.
+    gauge : GaugeKind
+        What the orientation can express.
     trend : (N, m) ndarray or None
         Functions whose coefficients are estimated in the adjustment, the same for u and v; the
         correction is then kept orthogonal to all of them instead of the gauge.
@@ -71,7 +72,7 @@ class TrainingPoints:
     uv: np.ndarray
     exposure: np.ndarray
     image_size: tuple[int, int]
-    interior_held: bool
+    gauge: GaugeKind
     trend: np.ndarray | None = None
 
 
@@ -214,6 +215,11 @@ def prior_of_additional(network: Network, f: int) -> np.ndarray:
 
 
 def exposure_folds(exposure: np.ndarray, folds: int = FOLDS) -> np.ndarray:
-    """Fold (N,) of each image point: the exposures (N,) are dealt out in turn."""
+    """Fold (N,) of each image point: the exposures (N,) are dealt out in turn.
+
+    Of a single exposure the image points are dealt out.
+    """
     _, number = np.unique(exposure, return_inverse=True)
+    if not number.any():
+        return np.arange(len(exposure)) % folds
     return number % min(folds, number.max() + 1)

@@ -12,26 +12,55 @@ v - yp) by
 (derivatives of the collinearity condition; the last three are common to all exposures and leave
 sources and object points where they are). The fitted correction is kept orthogonal to them. Where
 the interior orientation is held, only the turns are left, with their shifts: (-y, x), (c + x x/c,
-x y/c), (x y/c, c + y y/c).
+x y/c), (x y/c, c + y y/c). Where the exterior orientations are known too, nothing competes.
+
+Flat targets parallel to the image show neither principal distance nor principal point, and any
+distance of the source takes up a scale. Where these are given, they are those of a distortion
+without shift, scale and tilt, such as that of Brown: the part in the gauge vanishes of the cubic
+polynomial that fits the correction best, not of the correction as a whole.
 """
 
 from __future__ import annotations
 
+from enum import Enum
+
 import numpy as np
 from numpy.typing import ArrayLike
+
+from .terms import CUBIC, cubic_terms, polynomial_coefficients, polynomial_powers
+
+
+class GaugeKind(Enum):
+    """What the orientation can express, and a correction must not.
+
+    FULL: interior orientation and turns. TREND: the same, where the interior orientation is given
+    as that of a cubic distortion, and the exposures do not show it. TURNS: the interior
+    orientation is held, and its errors are learned by the correction. NONE: the exterior
+    orientations are known too.
+    """
+
+    FULL = 'full'
+    TREND = 'trend'
+    TURNS = 'turns'
+    NONE = 'none'
+
 
 UNIT_PX = 512.0  # of the image coordinates in the basis; any fixed length would do
 
 
-def gauge_basis(uv: ArrayLike, interior: np.ndarray, interior_held: bool = False) -> np.ndarray:
+def gauge_basis(
+    uv: ArrayLike, interior: np.ndarray, kind: GaugeKind = GaugeKind.FULL
+) -> np.ndarray:
     """Basis (n, 2, g) of the gauge at pixels uv (n, 2), scaled to about one; interior (3,) [px].
 
-    g is 6, or 3 where the interior orientation is held.
+    g is 3 for the turns, 0 for none, else 6.
     """
     x, y = (np.asarray(uv) - interior[:2]).T / UNIT_PX
     one = np.ones_like(x)
     zero = np.zeros_like(x)
-    if interior_held:
+    if kind is GaugeKind.NONE:
+        return np.zeros((len(x), 2, 0))
+    if kind is GaugeKind.TURNS:
         square = (UNIT_PX / interior[2]) ** 2
         columns = [
             (-y, x),
@@ -44,7 +73,7 @@ def gauge_basis(uv: ArrayLike, interior: np.ndarray, interior_held: bool = False
 
 
 def gauge_coefficients(
-    uv: ArrayLike, fitted: np.ndarray, interior: np.ndarray, interior_held: bool = False
+    uv: ArrayLike, fitted: np.ndarray, interior: np.ndarray, kind: GaugeKind = GaugeKind.FULL
 ) -> np.ndarray:
     """Coefficients (g,) of the part of fitted corrections that is in the gauge.
 
@@ -56,12 +85,42 @@ def gauge_coefficients(
         Corrections there [px].
     interior : (3,) ndarray
         xp, yp, c [px].
-    interior_held : bool
-        True where the interior orientation is not estimated.
+    kind : GaugeKind
 
     Returns
     -------
     (g,) ndarray
     """
-    basis = gauge_basis(uv, interior, interior_held)
-    return np.linalg.lstsq(basis.reshape(-1, basis.shape[2]), fitted.reshape(-1), rcond=None)[0]
+    basis = gauge_basis(uv, interior, kind)
+    if kind is GaugeKind.TREND:
+        basis = np.concatenate([basis, _cubic_terms(uv, interior)], axis=2)
+    count = 6 if kind is GaugeKind.TREND else basis.shape[2]
+    flat = basis.reshape(-1, basis.shape[2])
+    return np.linalg.lstsq(flat, fitted.reshape(-1), rcond=None)[0][:count]
+
+
+def gauge_rows(
+    values: np.ndarray, uv: np.ndarray, interior: np.ndarray, kind: GaugeKind = GaugeKind.FULL
+) -> np.ndarray:
+    """Rows (g, 2m) whose products with the coefficients of a series vanish without a gauge part.
+
+    values (n, m): functions of the series at pixels uv (n, 2); interior (3,) [px]. The
+    coefficients are those of u, then those of v.
+    """
+    basis = gauge_basis(uv, interior, kind)
+    count = basis.shape[2]
+    if kind is GaugeKind.TREND:
+        basis = np.concatenate([basis, _cubic_terms(uv, interior)], axis=2)
+        flat = basis.reshape(-1, basis.shape[2])
+        solved = np.linalg.solve(flat.T @ flat, flat.T)[:count]
+        basis = solved.T.reshape(len(uv), 2, count) * len(uv)
+    rows = [basis[:, axis].T @ values for axis in (0, 1)]
+    return np.concatenate(rows, axis=1) / len(uv)
+
+
+def _cubic_terms(uv: ArrayLike, interior: np.ndarray) -> np.ndarray:
+    """Terms (n, 2, 14) that complete the gauge to all cubic polynomials about (xp, yp)."""
+    x, y = (np.asarray(uv) - interior[:2]).T / UNIT_PX
+    powers = np.stack([x**i * y**j for i, j in polynomial_powers(CUBIC)], axis=1)
+    terms = [polynomial_coefficients(CUBIC, parts) for parts in cubic_terms().values()]
+    return np.stack([powers @ term.T for term in terms], axis=2)

@@ -6,7 +6,7 @@ import numpy as np
 
 from .cross_validation import CrossValidation
 from .estimation import RegressionStep, TrainingPoints, exposure_folds, require_training
-from .gauge import gauge_basis
+from .gauge import gauge_basis, gauge_coefficients
 from .neighbours import Neighbourhoods, NeighbourTable
 from .series import Series
 from .smoother import NeighbourSmoother
@@ -120,14 +120,23 @@ class NeighbourRegression(RegressionStep[NeighbourSmoother]):
     def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> np.ndarray:
         """Change values (N, 2) so that their fitted correction is orthogonal to the gauge."""
         if self._trend is None:
-            basis = gauge_basis(self.points.uv, interior, self.points.interior_held)
+            basis = gauge_basis(self.points.uv, interior, self.points.gauge)
         else:
             basis = self._trend
-        flat = basis[self.inliers].reshape(-1, basis.shape[2])
+        if not basis.shape[2]:
+            return values
         for _ in range(self.model_type.gauge_passes):
             fitted = self.smooth(values)[self.inliers]
-            values = values - basis @ np.linalg.lstsq(flat, fitted.reshape(-1), rcond=None)[0]
+            values = values - basis @ self._part_in(basis, fitted, interior)
         return values
+
+    def _part_in(self, basis: np.ndarray, fitted: np.ndarray, interior: np.ndarray) -> np.ndarray:
+        """Coefficients of the part of corrections fitted at the inliers that is in the gauge."""
+        if self._trend is None:
+            uv = self.points.uv[self.inliers]
+            return gauge_coefficients(uv, fitted, interior, self.points.gauge)
+        flat = basis[self.inliers].reshape(-1, basis.shape[2])
+        return np.linalg.lstsq(flat, fitted.reshape(-1), rcond=None)[0]
 
     def model(self, values: np.ndarray, series: Series | None = None) -> NeighbourSmoother:
         """Return the correction model of values (N, 2) with its noise and bias.

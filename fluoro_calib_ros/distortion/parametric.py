@@ -19,7 +19,7 @@ from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.noise_estimation import LOOSE
 from ..photogrammetry.precision import information_of_additional
 from .estimation import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
-from .gauge import gauge_basis
+from .gauge import GaugeKind, gauge_basis
 from .series import Functions, Series, sd_over_image
 from .series_model import SeriesModel
 from .terms import HIGHEST, expert_terms
@@ -62,7 +62,8 @@ class StepwiseTerms(AdjustedTerms):
 
     def __init__(self, problem: AdjustmentProblem) -> None:
         self.network = problem.network
-        self.names, terms = expert_terms()
+        # What no orientation can take up is left to the terms.
+        self.names, terms = expert_terms(GaugeKind.NONE in problem.gauges)
         self.functions: list[Functions] = []
         self.values: list[np.ndarray] = []
         self._maps: list[np.ndarray] = []
@@ -72,8 +73,10 @@ class StepwiseTerms(AdjustedTerms):
             functions = Functions(size, HIGHEST)
             values = functions(uv)
             interior = problem.before.parameters.interior[f]
-            gauge = gauge_basis(uv, interior, problem.interior_held)
-            terms_f = _without_gauge(terms, values, gauge)
+            # The terms themselves have no shift, scale or tilt.
+            kind = problem.gauges[f]
+            kind = GaugeKind.NONE if kind is GaugeKind.TREND else kind
+            terms_f = _without_gauge(terms, values, gauge_basis(uv, interior, kind))
             self.functions.append(functions)
             self._maps.append(terms_f.reshape(len(terms), -1))
             self.values.append(np.einsum('nm,tam->nat', values, terms_f))
@@ -195,6 +198,8 @@ def _without_gauge(terms: np.ndarray, values: np.ndarray, gauge: np.ndarray) -> 
     -------
     (t, 2, m) ndarray
     """
+    if not gauge.shape[2]:
+        return terms
     flat = gauge.reshape(-1, gauge.shape[2])
     as_polynomials = np.linalg.lstsq(values, gauge.reshape(len(values), -1), rcond=None)[0]
     as_polynomials = as_polynomials.reshape(values.shape[1], 2, -1).transpose(2, 1, 0)

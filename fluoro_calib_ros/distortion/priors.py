@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.linalg import cho_factor, cho_solve
 
-from .gauge import gauge_basis
+from .gauge import GaugeKind, gauge_rows
 from .series import Functions
 from .signal import Signal, most_likely_signal, starting_signal
 from .terms import trend_transformation
@@ -75,7 +75,10 @@ def _trend_precision(functions: Functions, prior: Prior) -> np.ndarray:
 
 
 def gauge_precision(
-    values: np.ndarray, uv: np.ndarray, interior: np.ndarray, interior_held: bool = False
+    values: np.ndarray,
+    uv: np.ndarray,
+    interior: np.ndarray,
+    kind: GaugeKind = GaugeKind.FULL,
 ) -> np.ndarray:
     """Precision matrix that keeps a series orthogonal to the gauge at image points.
 
@@ -87,15 +90,13 @@ def gauge_precision(
         Image points [px].
     interior : (3,) ndarray
         xp, yp, c [px].
-    interior_held : bool
-        True where the interior orientation is not estimated.
+    kind : GaugeKind
 
     Returns
     -------
     (2m, 2m) ndarray
     """
-    gauge = gauge_basis(uv, interior, interior_held)
-    rows = np.concatenate([gauge[:, axis].T @ values for axis in (0, 1)], axis=1) / len(uv)
+    rows = gauge_rows(values, uv, interior, kind)
     return rows.T @ rows / GAUGE_SD_PX**2
 
 

@@ -16,18 +16,19 @@ from math import comb
 import numpy as np
 
 HIGHEST = 7  # degree of the highest term
+CUBIC = 3  # degree of the trend
 
 Part = tuple[int, int, int, float]  # (axis, i, j, factor): factor x^i y^j in u (axis 0) or v (1)
 
 
-def _powers(degree: int) -> list[tuple[int, int]]:
+def polynomial_powers(degree: int) -> list[tuple[int, int]]:
     """Exponents (i, j) of the polynomials x^i y^j."""
     return [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
 
 
 def polynomial_coefficients(degree: int, parts: Iterable[Part]) -> np.ndarray:
     """Coefficients (2, m) of a term as polynomials of a degree."""
-    number = {power: k for k, power in enumerate(_powers(degree))}
+    number = {power: k for k, power in enumerate(polynomial_powers(degree))}
     out = np.zeros((2, len(number)))
     for axis, i, j, factor in parts:
         out[axis, number[i, j]] += factor
@@ -102,11 +103,27 @@ EXPERT: dict[str, list[Part]] = {
 }
 
 
-def expert_terms() -> tuple[list[str], np.ndarray]:
-    """Names of the 31 terms, and their coefficients (31, 2, m) as polynomials of degree 7."""
-    return list(EXPERT), np.stack(
-        [polynomial_coefficients(HIGHEST, parts) for parts in EXPERT.values()]
+def expert_terms(with_gauge: bool = False) -> tuple[list[str], np.ndarray]:
+    """Names of the 31 terms, and their coefficients (31, 2, m) as polynomials of degree 7.
+
+    with_gauge: whether the six terms of the gauge follow, for orientations that are known.
+    """
+    terms = {**EXPERT, **GAUGE} if with_gauge else EXPERT
+    return list(terms), np.stack(
+        [polynomial_coefficients(HIGHEST, parts) for parts in terms.values()]
     )
+
+
+def cubic_terms() -> dict[str, list[Part]]:
+    """Return the 14 terms that complete the gauge to all polynomials of degree 3."""
+    return {
+        'radial 1': _radial(1),
+        'spiral 1': _spiral(1),
+        **DECENTRING,
+        **AFFINE,
+        **SQUARES,
+        **CUBES,
+    }
 
 
 @cache
@@ -118,14 +135,7 @@ def trend_transformation(degree: int) -> tuple[np.ndarray, int]:
     """
     if degree < 0:
         return np.zeros((0, 0)), 0
-    own = {
-        'radial 1': _radial(1),
-        'spiral 1': _spiral(1),
-        **DECENTRING,
-        **AFFINE,
-        **SQUARES,
-        **CUBES,
-    }
+    own = cubic_terms()
     columns = [
         polynomial_coefficients(degree, parts).ravel()
         for parts in [*own.values(), *GAUGE.values()]

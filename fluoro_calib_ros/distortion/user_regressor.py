@@ -23,7 +23,7 @@ from .estimation import (
     TrainingPoints,
     require_training,
 )
-from .gauge import gauge_basis
+from .gauge import gauge_basis, gauge_coefficients
 from .lookup import LookupModel, grid_nodes, hull_corners
 from .series import Series
 
@@ -159,13 +159,15 @@ class UserRegression(RegressionStep[LookupModel]):
         duv = np.asarray(regressor.predict(self._features(pixels)), dtype=float)
         fitted = LookupModel(0, pixels, duv).predict(uv)
         basis = self._gauge(uv)
-        flat = basis.reshape(-1, basis.shape[2])
-        coefficients = np.linalg.lstsq(flat, fitted.reshape(-1), rcond=None)[0]
+        if not basis.shape[2]:
+            return LookupModel(0, pixels, duv)
+        assert self._interior is not None, 'without_gauge comes before smooth'
+        coefficients = gauge_coefficients(uv, fitted, self._interior, self.points.gauge)
         return LookupModel(0, pixels, duv - self._gauge(pixels) @ coefficients)
 
     def _gauge(self, uv: np.ndarray) -> np.ndarray:
         assert self._interior is not None, 'without_gauge comes before smooth'
-        return gauge_basis(uv, self._interior, self.points.interior_held)
+        return gauge_basis(uv, self._interior, self.points.gauge)
 
     def _features(self, uv: np.ndarray) -> np.ndarray:
         """Image coordinates (n, 2) from -1 to 1 along the longer side."""

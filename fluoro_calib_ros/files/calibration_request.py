@@ -17,6 +17,7 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from .access import PathLike
 from .json_file import read_json, write_json
+from .known_orientation import read_known_orientations, write_known_orientations
 from .names import read_names, write_names
 from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
@@ -25,6 +26,7 @@ from .validation import delete_validation
 OBSERVATIONS = 'observations.csv'
 PHANTOM = 'phantom.csv'
 OPTIONS = 'options.json'
+KNOWN_ORIENTATION = 'known_orientation.yaml'  # only where there are any
 VERSION = 1  # of options.json
 
 
@@ -45,6 +47,10 @@ def write_request(directory: PathLike, request: CalibrationRequest) -> None:
     }
     write_json(directory / OPTIONS, document)
     write_names(directory, request.names)
+    if request.known_orientations:
+        write_known_orientations(directory / KNOWN_ORIENTATION, request.known_orientations)
+    else:
+        (directory / KNOWN_ORIENTATION).unlink(missing_ok=True)
 
 
 def read_request(
@@ -95,7 +101,9 @@ def read_request(
             )
     used = {name: frames[name] for name in calibrations}
     names = read_names(directory)
-    return CalibrationRequest(used, phantom, options, joint, distance, names)
+    path = directory / KNOWN_ORIENTATION
+    known = read_known_orientations(path) if path.exists() else {}
+    return CalibrationRequest(used, phantom, options, joint, distance, names, known)
 
 
 def _require_file(path: Path, option: str = '') -> Path:

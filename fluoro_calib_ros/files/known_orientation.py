@@ -50,12 +50,9 @@ def _orientation(entry: Any, where: str) -> KnownOrientation:
         if key not in entry:
             raise DataError(f'{where}: {key} is missing')
     try:
+        k, r, t = (np.array(entry[key], dtype=float) for key in KEYS[:3])
         return KnownOrientation.from_matrices(
-            np.array(entry['K'], dtype=float),
-            np.array(entry['R'], dtype=float),
-            np.array(entry['t_mm'], dtype=float),
-            entry.get('interior_sd_px'),
-            entry.get('exterior_sd'),
+            k, r, t, entry.get('interior_sd_px'), entry.get('exterior_sd')
         )
     except (TypeError, ValueError) as error:
         # DataError is a ValueError.

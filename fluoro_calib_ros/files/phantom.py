@@ -1,6 +1,7 @@
 """The file of the phantom: CSV `target_id,x,y,z,sd`, in millimetres.
 
-Files of a lab may have names of beads instead of ids.
+Files of a lab may have names of beads instead of ids. Points in motion have a further column
+`exposure`.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ import numpy as np
 
 from ..errors import DataError
 from ..exposures.columns import first_repeated
+from ..exposures.moving_points import MovingPoints
 from ..exposures.names import Names, without_trivial
 from ..exposures.phantom import Phantom
 from .atomic import atomic_file
@@ -18,6 +20,7 @@ from .csv_table import read_blocks, write_rows
 from .named_column import NamedColumn
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
+EXPOSURE = 'exposure'
 
 
 def read_phantom(path: str | os.PathLike[str]) -> Phantom:
@@ -59,6 +62,35 @@ def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
         return Phantom(ids, numbers[:, :3], numbers[:, 3])
     except DataError as error:
         raise DataError(f'{path}: {error}') from None
+
+
+def has_exposures(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file of a phantom holds coordinates by exposure. Raises DataError."""
+    return any(EXPOSURE in block for block in read_blocks(path, COLUMNS))
+
+
+def read_moving_points(path: str | os.PathLike[str]) -> MovingPoints:
+    """Read MovingPoints from a CSV file with the columns exposure, target_id and x, y, z, sd [mm].
+
+    Raises DataError that names row and cause.
+    """
+    parts = []
+    lines = []
+    for block in read_blocks(path, (EXPOSURE, *COLUMNS)):
+        numbers = np.column_stack([block.floats(name) for name in COLUMNS[1:]])
+        block.require('sd', numbers[:, 3] > 0, 'not above 0')
+        parts.append((block.ids(EXPOSURE), block.ids('target_id'), numbers))
+        lines.append(block.lines)
+    exposure, target_id, numbers = (np.concatenate(column) for column in zip(*parts))
+    points = MovingPoints(exposure, target_id, numbers[:, :3], numbers[:, 3])
+    repeated = first_repeated(points.ids(exposure, target_id))
+    if repeated is not None:
+        first, second = (np.concatenate(lines)[row] for row in repeated)
+        raise DataError(
+            f'{path}, row {second}: target {target_id[repeated[1]]} of exposure '
+            f'{exposure[repeated[1]]} is already given in row {first}'
+        )
+    return points
 
 
 def write_phantom(

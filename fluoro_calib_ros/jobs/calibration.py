@@ -11,8 +11,9 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..calibration.calibrate import CalibrationResult, calibrate
+from ..calibration.calibrate import CalibrationResult, calibrate_request
 from ..calibration.initial_network import MIN_EXPOSURES
+from ..calibration.known_rig import orientation_of_known
 from ..calibration.request import CalibrationRequest
 from ..calibration.result import FluoroscopeCalibration
 from ..calibration.rig_orientation import orientation_of_exposures
@@ -21,7 +22,12 @@ from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..validation.check import Validation
-from ..validation.inputs import copied_exposures, find_wrong_input, validate_magnitudes
+from ..validation.inputs import (
+    copied_exposures,
+    find_wrong_input,
+    find_wrong_orientation,
+    validate_magnitudes,
+)
 from ..validation.plausibility import implausible
 from ..validation.rigidity import contradiction
 from ..validation.verdict import validate_or_report
@@ -128,7 +134,7 @@ def run_calibration(
     """
     validate_magnitudes(request.frames, request.phantom)
     request, copies = _without_copies(request)
-    doubts = list(find_wrong_input(_valid(request), request.phantom).values())
+    doubts = _wrong_input(request)
     if doubts and not force:
         raise DataError('. '.join(doubts))
     result = _calibrated(request, progress, raise_if_cancelled)
@@ -146,6 +152,23 @@ def run_calibration(
     return CalibrationOutcome(request, result, rig, orientation, note, validation, tuple(doubts))
 
 
+def _wrong_input(request: CalibrationRequest) -> list[str]:
+    """Return a sentence for every fluoroscope whose exposures cannot be right."""
+    frames = _valid(request)
+    known = request.known_orientations
+    absent = [name for name in known if name not in request.frames]
+    if absent:
+        raise DataError(
+            f'fluoroscope {absent[0]}: its orientation is known, but it has no observations; '
+            f'there are only those of {", ".join(request.frames)}'
+        )
+    unknown = {name: exposures for name, exposures in frames.items() if name not in known}
+    return [
+        *find_wrong_input(unknown, request.phantom).values(),
+        *find_wrong_orientation(frames, request.phantom, known).values(),
+    ]
+
+
 def _calibrated(
     request: CalibrationRequest,
     progress: Progress | None,
@@ -153,15 +176,7 @@ def _calibrated(
 ) -> CalibrationResult:
     """Calibrate; a normal matrix that breaks down is a fault in the data. Raises DataError."""
     try:
-        return calibrate(
-            request.frames,
-            request.phantom,
-            request.options,
-            request.joint,
-            request.principal_distance,
-            progress,
-            raise_if_cancelled,
-        )
+        return calibrate_request(request, progress, raise_if_cancelled)
     except np.linalg.LinAlgError as error:
         raise DataError(
             f'the exposures do not determine the calibration: {str(error).lower()}; add exposures '
@@ -174,7 +189,8 @@ def _without_copies(request: CalibrationRequest) -> tuple[CalibrationRequest, li
     sentences = []
     frames = {}
     for name, exposures in request.frames.items():
-        copies = copied_exposures(exposures)
+        # Of a fixed fluoroscope the same points may be seen again.
+        copies = [] if name in request.known_orientations else copied_exposures(exposures)
         numbers = {copy.number for copy, _ in copies}
         frames[name] = [frame for frame in exposures if frame.number not in numbers]
         if copies and len(frames[name]) < MIN_EXPOSURES:
@@ -213,6 +229,9 @@ def _orientation(
     names = [name for name in rig.fluoroscopes or calibrations if name in calibrations]
     if len(names) < 2:
         return None, 'a single fluoroscope is calibrated'
+    if all(name in request.known_orientations for name in names):
+        known = request.known_orientations
+        return orientation_of_known(known, result.fluoroscopes, result.calibrations), ''
     calibrated = [name for name in names if name in result.fluoroscopes]
     for name in calibrated[1:]:
         first = calibrated[0]

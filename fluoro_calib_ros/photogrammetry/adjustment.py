@@ -114,6 +114,9 @@ def total_cost(network: Network, parameters: Parameters, q: np.ndarray, noise: N
     if network.interior_sd is not None:
         difference = parameters.interior - network.interior_mean
         square += np.sum(network.interior_weight * difference**2)
+    if network.exterior is not None:
+        off = network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
+        square += np.sum(network.exterior.weights * off**2)
     for constraint, pose in zip(network.relative, parameters.relative):
         square += np.sum(discrepancies(constraint, pose, parameters) ** 2 @ constraint.weights)
     value = noise.cost(q, network.sigma) + square / 2

@@ -159,7 +159,9 @@ def undetermined_interiors(
         sd = np.sqrt(np.diagonal(precision.interior[f])) * factor
         c = parameters.interior[f, 2]
         remark = _flatness_remark(network)
-        if sd[2] > MAX_RELATIVE_SD * c or correlations[f] > MAX_DISTANCE_CORRELATION:
+        weighted = network.interior_weight[f, 2] > 0
+        inseparable = not weighted and correlations[f] > MAX_DISTANCE_CORRELATION
+        if sd[2] > MAX_RELATIVE_SD * c or inseparable:
             out.append(
                 f'fluoroscope {name}: principal distance and distance to the phantom cannot be '
                 f'separated (standard deviation of c {100 * sd[2] / c:.0f} %, '

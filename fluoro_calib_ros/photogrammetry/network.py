@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from .additional_parameters import AdditionalParameters
+from .exterior_prior import ExteriorPrior
 from .relative_orientation import exposures_after_step
 from .relative_pose import POSE_SIZE, RelativeConstraint
 from .rotations import matrix_from_vector
@@ -46,6 +47,8 @@ class Network:
         the same in all of them.
     interior_mean, interior_sd : (F, 3) ndarray, optional
         Prior of the interior orientations [px]; an infinite standard deviation means no prior.
+    exterior : ExteriorPrior, optional
+        What is known of the exterior orientations.
     datum : {'survey', 'inner'}
         'survey': the surveyed coordinates are weighted observations. 'inner': they have no weight,
         and inner constraints over the object points define the datum.
@@ -63,6 +66,7 @@ class Network:
     relative: tuple[RelativeConstraint, ...] = ()
     interior_mean: np.ndarray | None = None
     interior_sd: np.ndarray | None = None
+    exterior: ExteriorPrior | None = None
     datum: str = 'survey'
 
     @property
@@ -87,10 +91,11 @@ class Network:
 
     @property
     def n_observations(self) -> int:
-        """Number of scalar observations, without priors."""
+        """Number of scalar observations, without priors of the global unknowns."""
         survey = self.survey_mm.size if self.datum == 'survey' else 0
         constraints = POSE_SIZE * sum(len(r.pairs) for r in self.relative)
-        return 2 * self.n_image_points + survey + constraints
+        exterior = 0 if self.exterior is None else self.exterior.sd.size
+        return 2 * self.n_image_points + survey + constraints + exterior
 
     @cached_property
     def layout(self) -> UnknownLayout:

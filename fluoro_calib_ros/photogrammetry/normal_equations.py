@@ -321,6 +321,10 @@ def normal_equations(
     blocks = _GlobalBlocks.zeros(network)
     blocks.add_interiors(parameters, sums)
     coupled_pairs, coupled = _add_relative(parameters, ee, e, blocks)
+    if network.exterior is not None:
+        weights = network.exterior.weights
+        ee[:, np.arange(EXTERIOR_SIZE), np.arange(EXTERIOR_SIZE)] += weights
+        e -= weights * network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
     if sums.linearised:
         _add_additional(parameters, sums.linearised, blocks)
     return NormalEquations(

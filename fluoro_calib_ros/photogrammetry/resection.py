@@ -8,8 +8,10 @@ weights.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 from scipy.linalg import rq
 
@@ -113,18 +115,18 @@ def decompose(projection: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return k / k[2, 2], rotation, -np.linalg.solve(m, projection[:, 3])
 
 
-def _squared_residuals(projection: np.ndarray, xyz: np.ndarray, uv: np.ndarray) -> np.ndarray:
-    """Squared residuals (..., n) of projection matrices (..., 3, 4).
+def squared_residuals(projection: np.ndarray, xyz: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Squared residuals (..., n) of projection matrices (..., 3, 4) or homographies (..., 3, 3).
 
     They are infinite for points in the plane of the source.
     """
-    x = xyz @ np.swapaxes(projection[..., :3], -1, -2) + projection[..., None, :, 3]
+    x = xyz @ np.swapaxes(projection[..., :-1], -1, -2) + projection[..., None, :, -1]
     with np.errstate(divide='ignore', invalid='ignore'):
         r = np.sum((x[..., :2] / x[..., 2:] - uv) ** 2, axis=-1)
     return np.where(np.isfinite(r), r, np.inf)
 
 
-def _robust_variance(squared: np.ndarray) -> float:
+def robust_variance(squared: np.ndarray) -> float:
     """Variance [px^2] of each coordinate by the median of squared residuals (n,)."""
     # The median of chi-square with two degrees of freedom is 2 ln 2.
     return max(np.median(squared) / (2 * np.log(2)), MIN_VARIANCE)
@@ -151,13 +153,59 @@ def robust_dlt(xyz: np.ndarray, uv: np.ndarray, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     samples = np.argsort(rng.random((SAMPLES, len(xyz))), axis=1)[:, :SAMPLE_SIZE]
     candidates = direct_linear_transformation(xyz[samples], uv[samples])
-    squared = _squared_residuals(candidates, xyz, uv)
+    squared = squared_residuals(candidates, xyz, uv)
     best = squared[np.argmin(np.median(squared, axis=1))]
     for _ in range(DLT_ITERATIONS):
-        weights = Noise(nu=NU).weight(best / _robust_variance(best))
+        weights = Noise(nu=NU).weight(best / robust_variance(best))
         projection = direct_linear_transformation(xyz, uv, weights)
-        best = _squared_residuals(projection, xyz, uv)
+        best = squared_residuals(projection, xyz, uv)
     return projection
+
+
+def robust_p3p(
+    xyz: np.ndarray, uv: np.ndarray, interior: np.ndarray, seed: int = 0
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and position (3,) [mm] of few targets of which up to half may be false.
+
+    The solution of three targets (Ke and Roumeliotis, "An efficient algebraic solution to the
+    perspective-three-point problem", CVPR 2017) with the least median of squared residuals, then
+    that of the half of the targets that fits it (SQPnP of Terzakis and Lourakis, ECCV 2020), if it
+    is better. xyz (n, 3), uv (n, 2), interior (3,) [px]. Raises DataError where there is none.
+    """
+    rng = np.random.default_rng(seed)
+    rays = (uv - interior[:2]) / interior[2]
+    best: tuple[float, np.ndarray, np.ndarray] | None = None
+
+    def keep_better(turns: Sequence[np.ndarray], shifts: Sequence[np.ndarray]) -> None:
+        nonlocal best
+        for turn, shift in zip(turns, shifts):
+            rotation = matrix_from_vector(np.ravel(turn))
+            x = xyz @ rotation.T + np.ravel(shift)
+            if not (x[:, 2] > 0).all():
+                continue
+            median = float(np.median(np.sum((x[:, :2] / x[:, 2:] - rays) ** 2, axis=1)))
+            if best is None or median < best[0]:
+                best = (median, rotation, np.ravel(shift))
+
+    for _ in range(SAMPLES):
+        three = rng.permutation(len(xyz))[:3]
+        _, turns, shifts = cv2.solveP3P(
+            xyz[three, None], rays[three, None], np.eye(3), None, cv2.SOLVEPNP_AP3P
+        )
+        keep_better(turns, shifts)
+    if best is None:
+        raise DataError(
+            'the image points do not fit the phantom: targets would lie behind the source'
+        )
+    x = xyz @ best[1].T + best[2]
+    near = np.argsort(np.sum((x[:, :2] / x[:, 2:] - rays) ** 2, axis=1))[: (len(xyz) + 1) // 2 + 1]
+    if len(near) >= 3:
+        _, turns, shifts, _ = cv2.solvePnPGeneric(
+            xyz[near, None], rays[near, None], np.eye(3), None, flags=cv2.SOLVEPNP_SQPNP
+        )
+        keep_better(turns, shifts)
+    _, rotation, shift = best
+    return rotation, -rotation.T @ shift
 
 
 def principal_distance_of(projection: np.ndarray) -> float:
@@ -197,7 +245,46 @@ def resect(
     """
     projection = robust_dlt(xyz, uv) if projection is None else projection
     problem = _Problem(xyz, uv, interior)
-    rotation, position = _start_orientation(projection, problem)
+    return _refined(problem, *_start_orientation(projection, problem), max_steps)
+
+
+def refine_resection(
+    xyz: np.ndarray,
+    uv: np.ndarray,
+    interior: np.ndarray,
+    rotation: np.ndarray,
+    position: np.ndarray,
+    max_steps: int = 100,
+) -> Resection:
+    """Exterior orientation of one exposure from start values (3, 3) and (3,) [mm].
+
+    The other arguments and the errors are those of `resect`.
+    """
+    return _refined(_Problem(xyz, uv, interior), rotation, position, max_steps)
+
+
+def resection_at(
+    rotation: np.ndarray,
+    position: np.ndarray,
+    xyz: np.ndarray,
+    uv: np.ndarray,
+    interior: np.ndarray,
+) -> Resection:
+    """Return a known exterior orientation with the scale and inliers of its residuals.
+
+    Targets that would lie behind the source are outliers. The other arguments are those of
+    `resect`.
+    """
+    squared = _Problem(xyz, uv, interior).squared_residuals(rotation, position)
+    squared = np.where(np.isfinite(squared), squared, np.inf)
+    scale = float(np.sqrt(robust_variance(squared)))
+    return Resection(rotation, position, scale, Noise(nu=NU).inliers(squared / scale**2))
+
+
+def _refined(
+    problem: _Problem, rotation: np.ndarray, position: np.ndarray, max_steps: int
+) -> Resection:
+    """Refine an exterior orientation. Raises DataError for a target behind the source."""
     mu = START_DAMPING
     for _ in range(max_steps):
         system = problem.linearise(rotation, position)
@@ -243,7 +330,7 @@ class _Problem:
                 'the image points do not fit the phantom: targets would lie behind the source'
             )
         squared = np.sum(r * r, axis=1)
-        noise = Noise(nu=NU, scale=float(np.sqrt(_robust_variance(squared))))
+        noise = Noise(nu=NU, scale=float(np.sqrt(robust_variance(squared))))
         w = noise.weight(squared / noise.scale**2)
         jacobian = jacobian.reshape(-1, 6)
         weighted = (np.repeat(w, 2)[:, None] * jacobian).T
@@ -251,9 +338,14 @@ class _Problem:
 
     def squared_residuals(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
         """Squared residuals (n,) [px^2]; NaN behind the source."""
-        return np.sum(
-            (self.uv - project(rotation, position, self.xyz, self.interior)) ** 2, axis=1
+        n = len(self.xyz)
+        predicted = project(
+            np.broadcast_to(rotation, (n, 3, 3)),
+            np.broadcast_to(position, (n, 3)),
+            self.xyz,
+            self.interior,
         )
+        return np.sum((self.uv - predicted) ** 2, axis=1)
 
 
 def _damped_step(

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations, calibrate
+from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations, calibrate_request
 from ..calibration.request import CalibrationRequest
 from ..calibration.result import FluoroscopeCalibration
 from ..exposures.frame import Frame
@@ -115,14 +115,8 @@ class Evidence:
         if options.interior == 'fixed':  # as in the calibration that is validated
             distance = float(np.mean([self.calibrations[name].interior[2] for name in frames]))
         options = replace(options, max_iterations=min(options.max_iterations, MAX_ROUNDS))
-        return calibrate(
-            frames,
-            self.phantom,
-            options,
-            self.request.joint,
-            distance,
-            raise_if_cancelled=self.raise_if_cancelled,
-        ).calibrations
+        part = replace(self.request, frames=frames, options=options, principal_distance=distance)
+        return calibrate_request(part, raise_if_cancelled=self.raise_if_cancelled).calibrations
 
     def adjust(
         self,
@@ -135,7 +129,8 @@ class Evidence:
             self.phantom,
             calibrations,
             self.request.options.loss,
-            raise_if_cancelled=self.raise_if_cancelled,
+            self.raise_if_cancelled,
+            self.request.known_orientations,
         )
 
 

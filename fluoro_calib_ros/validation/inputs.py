@@ -19,7 +19,10 @@ import numpy as np
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
-from ..photogrammetry.resection import decompose, robust_dlt
+from ..photogrammetry.collinearity import project
+from ..photogrammetry.known_orientation import KnownOrientation
+from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
+from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
 
 MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
 FIT = 0.004  # median residual over the longer side of the image of ids that are certainly right
@@ -33,6 +36,8 @@ SD_MM = (1e-6, 1e3)  # of surveyed coordinates
 SIGMA_PX = (1e-4, 1e3)  # of image points
 MIN_REACH = 0.6  # of the image points over the image, to the right and down
 MIN_SHARE = 0.5  # of the targets that other ids must have on the phantom
+# Median residual of a known orientation over the longer side of the image from which it is wrong.
+WRONG_ORIENTATION = 0.1
 SAME_PX = 1e-6  # image points of two exposures that agree so closely are copies
 MIN_COMMON = 8  # targets in two exposures that are compared
 COPIED = 0.9  # share of common image points that are the same in a copied exposure
@@ -60,12 +65,13 @@ class Fit:
 
     misfit_px is the median residual of the robust direct linear transformation, depth the sign of
     the depth of the targets: -1 where they lie behind the source; distance_mm is that of the
-    source from their middle.
+    source from their middle. A plane that is mirrored is one seen from behind, and its distance is
+    unknown.
     """
 
     misfit_px: float
     depth: int
-    distance_mm: float
+    distance_mm: float | None
 
 
 def validate_magnitudes(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> None:
@@ -106,7 +112,7 @@ def _validate_sigma(frame: Frame) -> None:
 def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: np.ndarray) -> Fit | None:
     """Fit an exposure, with target_id (n,) for its ids, to the phantom.
 
-    Returns None where too few targets are on the phantom, or where they lie in one plane.
+    Returns None where too few targets are on the phantom, or where they lie on a line.
     """
     rows = phantom.index(target_id)
     on_phantom = rows >= 0
@@ -114,6 +120,8 @@ def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: np.ndarray) -> Fit
         return None
     xyz = phantom.xyz_mm[rows[on_phantom]]
     uv = np.asarray(frame.uv, dtype=float)[on_phantom]
+    if flatness(xyz) < MIN_FLATNESS:
+        return _fit_of_plane(xyz, uv)
     try:
         with np.errstate(all='ignore'):
             projection = robust_dlt(xyz, uv)
@@ -129,6 +137,17 @@ def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: np.ndarray) -> Fit
     return Fit(float(np.median(residual)), -1 if np.median(depth) < 0 else 1, distance)
 
 
+def _fit_of_plane(xyz: np.ndarray, uv: np.ndarray) -> Fit | None:
+    """Fit image points (n, 2) to targets (n, 3) in one plane."""
+    try:
+        with np.errstate(all='ignore'):
+            xy = plane_of(xyz).coordinates(xyz)
+            squared = squared_residuals(robust_homography(xy, uv), xy, uv)
+    except (DataError, np.linalg.LinAlgError):
+        return None
+    return Fit(float(np.sqrt(np.median(squared))), 1, None)
+
+
 def find_wrong_input(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> dict[str, str]:
     """Return a sentence for every fluoroscope whose exposures cannot be of the phantom as given.
 
@@ -142,6 +161,47 @@ def find_wrong_input(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) ->
         if sentence:
             out[name] = f'fluoroscope {name}: {sentence}'
     return out
+
+
+def find_wrong_orientation(
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    known: Mapping[str, KnownOrientation],
+) -> dict[str, str]:
+    """Return a sentence for every fluoroscope whose known orientation its exposures contradict."""
+    out = {}
+    for name, orientation in known.items():
+        residuals = [
+            _residuals(frame, phantom, orientation)
+            for frame in frames[name]
+            if (phantom.index(frame.target_id) >= 0).all()
+        ]
+        if not residuals:
+            continue
+        median = float(np.median(np.concatenate(residuals)))
+        if median > WRONG_ORIENTATION * max(frames[name][0].image_size):
+            behind = 'most targets would lie behind the source'
+            far = f'image points are {median:.0f} px off in the median'
+            out[name] = (
+                f'fluoroscope {name}: the known orientation does not fit, '
+                f'{far if np.isfinite(median) else behind}: check the unit and the frame of the '
+                'lab, that R and t lead from the lab to the sensor, and that v runs down'
+            )
+    return out
+
+
+def _residuals(frame: Frame, phantom: Phantom, known: KnownOrientation) -> np.ndarray:
+    """Distances (n,) [px] of image points from their targets, infinite behind the source."""
+    xyz = phantom.xyz_mm[phantom.index(frame.target_id)]
+    n = len(xyz)
+    predicted = project(
+        np.broadcast_to(known.rotation, (n, 3, 3)),
+        np.broadcast_to(known.position_mm, (n, 3)),
+        xyz,
+        known.interior,
+    )
+    distance = np.linalg.norm(frame.uv - predicted, axis=1)
+    return np.where(np.isfinite(distance), distance, np.inf)
 
 
 def _wrong_exposures(exposures: Sequence[Frame], phantom: Phantom) -> str:
@@ -215,6 +275,8 @@ def _cause(frame: Frame, phantom: Phantom) -> str:
 
 def _unit_cause(phantom: Phantom, fit: Fit) -> str:
     """Return the sentence on the unit, the same for all exposures: that of a rounded distance."""
+    if fit.distance_mm is None:
+        return ''
     digits = -int(np.floor(np.log10(max(fit.distance_mm, 1e-300))))
     return wrong_unit(round(fit.distance_mm, digits), phantom)
 

@@ -63,7 +63,8 @@ def validate(
         request.phantom,
         calibrations,
         request.options.loss,
-        raise_if_cancelled=raise_if_cancelled,
+        raise_if_cancelled,
+        request.known_orientations,
     )
     request = replace(request, frames=_used_frames(request.frames, result))
     steps = _StepCounter(progress, 1 + _count_steps(len(request.groups)))

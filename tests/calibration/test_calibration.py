@@ -540,10 +540,6 @@ def shuffled_ids(frame, seed=4):
             'fluoroscope a: [45]. inliers are too few for the correction',
         ),
         (
-            lambda f: [cut(frame, 30) for frame in f[:3]],
-            'fluoroscope a, exposure 1: all targets lie in one plane',
-        ),
-        (
             lambda f: f[:2] + [shuffled_ids(f[2])],
             'fluoroscope a: only 2 of 3 exposures fit the phantom, 3 are needed; '
             'the first .* fluoroscope a, exposure 3: ',

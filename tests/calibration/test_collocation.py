@@ -20,6 +20,7 @@ from fluoro_calib_ros.calibration.model_choice import better_model
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.robust_adjustment import adjusted_with_precision, start_noise
 from fluoro_calib_ros.distortion.estimation import AdjustmentProblem
+from fluoro_calib_ros.distortion.gauge import GaugeKind
 from fluoro_calib_ros.distortion.priors import (
     Prior,
     gauge_precision,
@@ -462,7 +463,7 @@ def whole(rig, model, count=10, seed=1):
         np.zeros_like(measured.network.uv),
         start_noise('student_t'),
     )
-    problem = AdjustmentProblem(measured.network, measured.image_size, before, False)
+    problem = AdjustmentProblem(measured.network, measured.image_size, before, (GaugeKind.FULL,))
     terms = MODELS[model].adjusted_terms(problem)
     return calibrate_by_adjustment(measured, before, MODELS[model], terms, 60), terms
 

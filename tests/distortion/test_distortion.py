@@ -11,7 +11,7 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from fluoro_calib_ros.distortion.cross_validation import CrossValidation
 from fluoro_calib_ros.distortion.estimation import TrainingPoints, exposure_folds
-from fluoro_calib_ros.distortion.gauge import gauge_basis, gauge_coefficients
+from fluoro_calib_ros.distortion.gauge import GaugeKind, gauge_basis, gauge_coefficients
 from fluoro_calib_ros.distortion.knn import KnnModel
 from fluoro_calib_ros.distortion.local_linear import LocalLinearModel
 from fluoro_calib_ros.distortion.neighbour_regression import NeighbourRegression
@@ -377,20 +377,20 @@ def test_gauge_is_the_effect_of_a_change_of_orientation():
 # ---- the regression step
 
 
-def regression_of(kind, uv, exposure, interior_held=False, k=None):
+def regression_of(kind, uv, exposure, gauge=GaugeKind.FULL, k=None):
     """The regression step of a neighbour model."""
-    return NeighbourRegression(MODELS[kind], TrainingPoints(uv, exposure, SIZE, interior_held), k)
+    return NeighbourRegression(MODELS[kind], TrainingPoints(uv, exposure, SIZE, gauge), k)
 
 
-def regressor_and_values(kind='local_linear', interior_held=False, k=None, n=600):
+def regressor_and_values(kind='local_linear', gauge=GaugeKind.FULL, k=None, n=600):
     uv, duv = training(n)
     exposure = np.repeat(np.arange(15), n // 15)
-    return regression_of(kind, uv, exposure, interior_held, k), duv
+    return regression_of(kind, uv, exposure, gauge, k), duv
 
 
-def chosen(kind='local_linear', interior_held=False, k=None):
+def chosen(kind='local_linear', gauge=GaugeKind.FULL, k=None):
     """A regression step after its first choice, with 20 outliers, and its values."""
-    regressor, values = regressor_and_values(kind, interior_held, k)
+    regressor, values = regressor_and_values(kind, gauge, k)
     q = np.ones(len(values))
     q[::30] = 2 * INLIER_Q
     values[::30] += 500
@@ -454,19 +454,19 @@ def test_changes_are_reported_and_inliers_have_hysteresis():
         regressor.choose(values, np.where(np.arange(600) < 11, q, 2 * INLIER_Q), information)
 
 
-@pytest.mark.parametrize('interior_held', [False, True])
+@pytest.mark.parametrize('gauge', [GaugeKind.FULL, GaugeKind.TURNS])
 @pytest.mark.parametrize('kind', ['knn', 'local_linear'])
-def test_fitted_correction_is_made_orthogonal_to_the_gauge(kind, interior_held):
+def test_fitted_correction_is_made_orthogonal_to_the_gauge(kind, gauge):
     """To shift, scale and rotations of the sensor; only to the rotations while the interior
     orientation is held.
     """
     interior = np.array([320.0, 240.0, 2000.0])
-    regressor, values = chosen(kind, interior_held)
+    regressor, values = chosen(kind, gauge)
     inside = regressor.inliers
     size = [
         np.abs(
             gauge_coefficients(
-                regressor.points.uv[inside], regressor.smooth(v)[inside], interior, interior_held
+                regressor.points.uv[inside], regressor.smooth(v)[inside], interior, gauge
             )
         ).max()
         for v in (values, regressor.without_gauge(values, interior))
@@ -479,8 +479,8 @@ def test_scale_is_part_of_the_correction_while_the_interior_orientation_is_held(
     it.
     """
     interior = np.array([320.0, 240.0, 2000.0])
-    for held, part in ((True, 1.0), (False, 0.0)):
-        regressor, _ = chosen(interior_held=held)
+    for gauge, part in ((GaugeKind.TURNS, 1.0), (GaugeKind.FULL, 0.0)):
+        regressor, _ = chosen(gauge=gauge)
         scale = 0.01 * (regressor.points.uv - interior[:2])
         kept = regressor.smooth(regressor.without_gauge(scale, interior))
         np.testing.assert_allclose(

@@ -122,12 +122,11 @@ def test_fixed_interior_orientation_needs_no_tilt():
     )
 
 
-def test_beads_in_a_plane_are_reported():
+def test_beads_in_a_plane_are_calibrated_where_it_is_tilted():
     frames, phantom = frames_of_poses(tilted(), beads(0.01))
-    with pytest.raises(DataError, match='one plane'):
-        calibrate(
-            {'a': frames}, phantom, CalibrationOptions(model='none'), principal_distance=4000.0
-        )
+    found = calibrate({'a': frames}, phantom, CalibrationOptions(model='none'))
+    figures = found.fluoroscopes['a']
+    assert figures.interior[2] == pytest.approx(4000, abs=5 * figures.interior_sd[2])
 
 
 def test_exposure_with_two_targets_is_reported():

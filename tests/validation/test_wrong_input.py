@@ -204,7 +204,7 @@ HOSTILE = {
     'phantom on a line': (
         frames,
         lambda: survey(PHANTOM.xyz_mm * [1, 0, 0]),
-        'all targets lie in one plane',
+        'all targets lie on one line or in one place',
     ),
     'all exposures on a line': (
         lambda: flattened(6),

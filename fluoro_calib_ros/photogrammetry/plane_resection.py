@@ -1,0 +1,202 @@
+"""Resection from targets in one plane: grids, boards, and the visible face of a phantom.
+
+The image of a plane is a homography (Hartley and Zisserman, "Multiple View Geometry", 2nd ed.,
+2004, 4.1 and 8.1). It gives the exterior orientation where the interior orientation is known, and
+where the plane is tilted one condition each for principal distance and principal point (Zhang,
+"A flexible new technique for camera calibration", IEEE Trans. Pattern Anal. Mach. Intell. 22,
+2000). A narrow beam images a plane nearly as parallel projection would, which does not tell a tilt
+from the opposite one: each pose has a second one, mirrored at the line of sight (Schweighofer and
+Pinz, "Robust pose estimation from a planar target", IEEE Trans. Pattern Anal. Mach. Intell. 28,
+2006).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import DataError
+from .noise import Noise
+from .resection import (
+    DLT_ITERATIONS,
+    MIN_FLATNESS,
+    MIN_TARGETS,
+    NU,
+    SAMPLES,
+    robust_variance,
+    squared_residuals,
+)
+
+SAMPLE_SIZE = 4  # a homography has 8 unknowns, and a target gives two equations
+# Smallest singular value of the conditions on the principal distance over the largest possible one
+# below which no plane is tilted enough to find it: some 3 degrees in a beam of 15 degrees.
+MIN_TILT = 1e-3
+
+
+@dataclass(frozen=True)
+class Plane:
+    """The plane of targets.
+
+    Attributes
+    ----------
+    centre_mm : (3,) ndarray
+    axes : (3, 3) ndarray
+        Right-handed axes as rows: two in the plane, and its normal.
+    """
+
+    centre_mm: np.ndarray
+    axes: np.ndarray
+
+    def coordinates(self, xyz: np.ndarray) -> np.ndarray:
+        """Coordinates (n, 2) [mm] in the plane of targets (n, 3)."""
+        return (xyz - self.centre_mm) @ self.axes[:2].T
+
+
+def flatness(xyz: np.ndarray) -> float:
+    """Smallest over largest extent of targets (n, 3): 0 for a plane, about 1 for a cube."""
+    extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+    return float(extent[-1] / extent[0]) if extent[0] > 0 else 0.0
+
+
+def plane_of(xyz: np.ndarray) -> Plane:
+    """Return the plane that fits targets (n, 3) best. Raises DataError for targets on a line."""
+    centre = xyz.mean(axis=0)
+    _, extent, axes = np.linalg.svd(xyz - centre, full_matrices=False)
+    if extent[1] <= MIN_FLATNESS * extent[0]:
+        raise DataError('all targets lie on one line or in one place')
+    axes = axes * np.array([1, 1, np.linalg.det(axes)])[:, None]
+    return Plane(centre, axes)
+
+
+def homography(xy: np.ndarray, uv: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+    """Homographies (..., 3, 3) with uv ~ H (xy, 1) by the direct linear transformation.
+
+    xy (..., n, 2), uv (..., n, 2) and weights (..., n) of n >= 4 points. Coordinates are
+    normalised (Hartley and Zisserman, algorithm 4.2).
+    """
+    x, from_x = _normalised(xy)
+    u, from_u = _normalised(uv)
+    x1 = np.concatenate([x, np.ones_like(x[..., :1])], axis=-1)
+    zero = np.zeros_like(x1)
+    rows = np.concatenate(
+        [
+            np.concatenate([x1, zero, -u[..., :1] * x1], axis=-1),
+            np.concatenate([zero, x1, -u[..., 1:] * x1], axis=-1),
+        ],
+        axis=-2,
+    )
+    if weights is not None:
+        rows = rows * np.sqrt(np.concatenate([weights, weights], axis=-1))[..., None]
+    _, vectors = np.linalg.eigh(np.swapaxes(rows, -1, -2) @ rows)
+    normalised = vectors[..., 0].reshape(vectors.shape[:-2] + (3, 3))
+    return from_u @ normalised @ np.linalg.inv(from_x)
+
+
+def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points (..., n, 2) about zero at a mean distance of about one; the matrix back from them."""
+    mean = points.mean(axis=-2, keepdims=True)
+    square = np.mean(np.sum((points - mean) ** 2, axis=-1), axis=-1)[..., None, None]
+    size = np.sqrt(np.maximum(square, 1e-300) / 2)
+    back = np.zeros(points.shape[:-2] + (3, 3))
+    back[..., [0, 1], [0, 1]] = size[..., 0]
+    back[..., :2, 2] = mean[..., 0, :]
+    back[..., 2, 2] = 1
+    return (points - mean) / size, back
+
+
+def robust_homography(xy: np.ndarray, uv: np.ndarray, seed: int = 0) -> np.ndarray:
+    """Homography (3, 3) of targets of which up to half may be falsely matched.
+
+    The sample with the least median of squared residuals (Rousseeuw 1984) is refined on all points
+    with robust weights. xy (n, 2) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError
+    where they are too few or their image points lie on a line.
+    """
+    if len(xy) < MIN_TARGETS:
+        raise DataError(f'{len(xy)} targets are too few for a resection, {MIN_TARGETS} are needed')
+    spread = np.linalg.svd(uv - uv.mean(axis=0), compute_uv=False)
+    if spread[1] <= MIN_FLATNESS * spread[0]:
+        raise DataError('all image points lie on one line or in one place')
+    rng = np.random.default_rng(seed)
+    samples = np.argsort(rng.random((SAMPLES, len(xy))), axis=1)[:, :SAMPLE_SIZE]
+    candidates = homography(xy[samples], uv[samples])
+    squared = squared_residuals(candidates, xy, uv)
+    best = squared[np.argmin(np.median(squared, axis=1))]
+    for _ in range(DLT_ITERATIONS):
+        weights = Noise(nu=NU).weight(best / robust_variance(best))
+        found = homography(xy, uv, weights)
+        best = squared_residuals(found, xy, uv)
+    return found
+
+
+def principal_distance_of_planes(
+    homographies: Sequence[np.ndarray], principal_point: np.ndarray
+) -> float | None:
+    """Principal distance [px] from homographies (3, 3) of planes in mm, None: no plane is tilted.
+
+    Zhang's conditions h1' B h2 = 0 and h1' B h1 = h2' B h2 with B = K^-T K^-1; with the principal
+    point (2,) [px] known they are linear in 1/c^2. They are weighted with what they tell of it: a
+    plane that is not tilted tells nothing.
+    """
+    product = 0.0
+    size = 0.0
+    for h in homographies:
+        shifted = h.copy()
+        shifted[:2] -= np.outer(principal_point, h[2])
+        a, b = shifted[:2, :2].T
+        l_a, l_b = shifted[2, :2]
+        # With x = 1/c^2: x a'b + l_a l_b = 0 and x (a'a - b'b) + l_a^2 - l_b^2 = 0.
+        factors = np.array([a @ b, (a @ a - b @ b) / 2])
+        constants = np.array([l_a * l_b, (l_a**2 - l_b**2) / 2])
+        weight = 1 / (a @ a + b @ b) ** 2
+        product -= weight * (factors @ constants)
+        size += weight * (factors @ factors)
+    if size < MIN_TILT**2 * len(homographies) or product <= 0:
+        return None
+    # Least squares with the errors in the constants, which are small and uncertain.
+    return float(np.sqrt(size / product))
+
+
+def poses_of_homography(
+    found: np.ndarray, plane: Plane, interior: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rotation (3, 3) and position (3,) [mm] of a homography, and those mirrored.
+
+    interior (3,) [px]. The second pose is that of the plane mirrored at the line of sight to the
+    middle of the targets.
+    """
+    xp, yp, c = interior
+    m = np.linalg.solve(np.array([[c, 0, xp], [0, c, yp], [0, 0, 1.0]]), found)
+    m = m / np.sqrt(np.linalg.norm(m[:, 0]) * np.linalg.norm(m[:, 1]))
+    if m[2, 2] < 0:  # the middle of the targets is before the source
+        m = -m
+    u, _, vt = np.linalg.svd(m[:, :2], full_matrices=False)
+    first = u @ vt
+    return [_pose(first, m[:, 2], plane), _pose(_mirrored(first, m[:, 2]), m[:, 2], plane)]
+
+
+def mirrored_pose(
+    rotation: np.ndarray, position: np.ndarray, plane: Plane
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) and position (3,) of the pose mirrored at the line of sight."""
+    middle = rotation @ (plane.centre_mm - position)
+    return _pose(_mirrored(rotation @ plane.axes[:2].T, middle), middle, plane)
+
+
+def _mirrored(axes: np.ndarray, middle: np.ndarray) -> np.ndarray:
+    """Axes (3, 2) of a plane in the sensor frame, mirrored at the line of sight to its middle."""
+    sight = middle / np.linalg.norm(middle)
+    return axes - 2 * np.outer(sight, sight @ axes)
+
+
+def _pose(axes: np.ndarray, middle: np.ndarray, plane: Plane) -> tuple[np.ndarray, np.ndarray]:
+    """Pose with these axes (3, 2) and middle (3,) of the plane in the sensor frame."""
+    turned = np.column_stack([axes, np.cross(axes[:, 0], axes[:, 1])])
+    rotation = turned @ plane.axes
+    return rotation, plane.centre_mm - rotation.T @ middle
+
+
+def tilt_of(rotation: np.ndarray, plane: Plane) -> float:
+    """Angle [rad] between the normal of a plane and the axis of the sensor."""
+    return float(np.arccos(min(abs(rotation[2] @ plane.axes[2]), 1.0)))

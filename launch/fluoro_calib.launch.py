@@ -1,66 +1,140 @@
 """Calibration, correction and reconstruction of the fluoroscopes of one rig.
 
-ros2 launch fluoro_calib_ros fluoro_calib.launch.py phantom:=/path/to/phantom.csv [namespace:=rig1]
-[params_file:=my.yaml] [bag:=recording] [simulate:=true] [images:=true]
+ros2 launch fluoro_calib_ros fluoro_calib.launch.py phantom:=/path/to/phantom.csv
+ros2 launch fluoro_calib_ros fluoro_calib.launch.py --show-args
 """
 
 import os
+from dataclasses import dataclass
 
+import yaml
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
-from launch.actions import DeclareLaunchArgument
-from launch.conditions import IfCondition
-from launch.substitutions import LaunchConfiguration, PythonExpression
-from launch_ros.actions import Node
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
+from launch_ros.actions import Node, SetParameter
+
+PACKAGE = 'fluoro_calib_ros'
+SWITCH = ['true', 'false']
+
+
+@dataclass(frozen=True)
+class Argument:
+    """A launch argument."""
+
+    name: str
+    default: str
+    description: str
+    choices: tuple = ()
+
+    def declare(self):
+        """Return the action that declares it."""
+        return DeclareLaunchArgument(
+            self.name,
+            default_value=self.default,
+            description=self.description,
+            choices=list(self.choices) or None,
+        )
+
+
+# Passed on to the nodes that have the parameter, where they are not empty.
+PARAMETERS = (
+    Argument('phantom', '', 'phantom.csv with the surveyed coordinates of the beads [mm]'),
+    Argument('fluoroscopes', '', 'names of the fluoroscopes, e.g. [a, b]'),
+    Argument(
+        'calibration_directory',
+        '',
+        'folder of the saved calibrations, from which all nodes start (default: '
+        'fluoro_calib/<namespace> in $ROS_HOME or ~/.ros, for the calibration node)',
+    ),
+    Argument('rig_frame', '', 'name of the rig frame on /tf_static'),
+    Argument('autostart', '', 'false: a lifecycle manager configures and activates the nodes'),
+)
+SWITCHES = (
+    Argument('calibration', 'true', 'false: without the calibration node', SWITCH),
+    Argument('images', 'false', 'true: correct images, too', SWITCH),
+    Argument('simulate', 'false', 'true: with the virtual rig', SWITCH),
+    Argument('use_sim_time', 'false', 'true: take the time from /clock', SWITCH),
+    Argument('respawn', 'false', 'true: restart a node that has failed', SWITCH),
+)
+OTHERS = (
+    Argument('namespace', '', 'namespace of the rig'),
+    Argument('params_file', '', 'parameters of the nodes (default: config/fluoro_calib.yaml)'),
+    Argument('log_level', 'info', 'debug, info, warn, error or fatal'),
+    Argument('bag', '', 'bag to play (default: none)'),
+    Argument('bag_topics', '', 'topics of the bag to play, e.g. [/a/target_observations]'),
+    Argument('bag_rate', '', 'speed relative to the recording'),
+    Argument('scene', '', 'scene of the simulator: phantom or markers'),
+    Argument('rate', '', 'frame rate of the simulator [Hz]'),
+)
+# Parameters of the nodes that launch arguments set.
+RIG = ('fluoroscopes', 'calibration_directory', 'autostart')
+OF_NODE = {
+    'calibration_node': ('phantom', 'fluoroscopes', 'calibration_directory', 'rig_frame'),
+    'correction_node': RIG,
+    'reconstruction_node': (*RIG, 'rig_frame'),
+    'image_node': RIG,
+}
+
+
+def shut_down_if_not_started(event, context):
+    """Shut down where a node could not start, such as with a wrong phantom: exit status 1.
+
+    A node that crashes later leaves the others running.
+    """
+    if event.returncode == 1:
+        return [Shutdown(reason=f'{event.process_name} could not start')]
+    return None
+
+
+def nodes_of_rig(context):
+    """Return the nodes with their parameters."""
+    values = {
+        argument.name: context.launch_configurations[argument.name]
+        for argument in (*PARAMETERS, *SWITCHES, *OTHERS)
+    }
+    share = get_package_share_directory(PACKAGE)
+    params_file = values['params_file'] or os.path.join(share, 'config', 'fluoro_calib.yaml')
+
+    def node(executable, parameters, needed=False):
+        given = {name: yaml.safe_load(text) for name, text in parameters.items() if text}
+        for name in ('phantom', 'calibration_directory', 'rig_frame', 'bag'):
+            if name in given:
+                given[name] = parameters[name]  # also where it reads like a number
+        if 'rate' in given:
+            given['rate'] = float(given['rate'])
+        return Node(
+            package=PACKAGE,
+            executable=executable,
+            # With its name, launch's parameters take precedence over any pattern in the file.
+            name=executable,
+            namespace=values['namespace'],
+            output='screen',
+            parameters=[params_file, *([given] if given else [])],
+            arguments=['--ros-args', '--log-level', values['log_level']],
+            respawn=values['respawn'] == 'true',
+            respawn_delay=1.0,
+            on_exit=shut_down_if_not_started if needed else None,
+        )
+
+    def configured(executable, needed=False):
+        return node(executable, {name: values[name] for name in OF_NODE[executable]}, needed)
+
+    actions = [SetParameter('use_sim_time', values['use_sim_time'] == 'true')]
+    if values['calibration'] == 'true':
+        actions.append(configured('calibration_node', needed=values['respawn'] == 'false'))
+    actions += [configured('correction_node'), configured('reconstruction_node')]
+    if values['images'] == 'true':
+        actions.append(configured('image_node'))
+    if values['bag']:
+        bag = {'bag': values['bag'], 'topics': values['bag_topics'], 'rate': values['bag_rate']}
+        actions.append(node('player_node', {**bag, 'wait_for_readers': '2'}))
+    if values['simulate'] == 'true':
+        simulated = ('fluoroscopes', 'scene', 'rate')
+        actions.append(node('simulator_node', {name: values[name] for name in simulated}))
+    return actions
 
 
 def generate_launch_description():
     """Nodes of one rig, in one namespace."""
-    parameters = os.path.join(
-        get_package_share_directory('fluoro_calib_ros'), 'config', 'fluoro_calib.yaml'
-    )
-    arguments = [
-        DeclareLaunchArgument(
-            'phantom', description='phantom.csv with the surveyed coordinates of the beads [mm]'
-        ),
-        DeclareLaunchArgument('namespace', default_value='', description='namespace of the rig'),
-        DeclareLaunchArgument(
-            'params_file', default_value=parameters, description='parameters of the nodes'
-        ),
-        DeclareLaunchArgument('bag', default_value='', description='bag to play (default: none)'),
-        DeclareLaunchArgument(
-            'images', default_value='false', description='true: correct images too'
-        ),
-        DeclareLaunchArgument(
-            'simulate', default_value='false', description='true: with the virtual rig'
-        ),
-    ]
-    namespace = LaunchConfiguration('namespace')
-    params_file = LaunchConfiguration('params_file')
-
-    def node(executable, *parameters, condition=None):
-        return Node(
-            package='fluoro_calib_ros',
-            executable=executable,
-            namespace=namespace,
-            output='screen',
-            parameters=[params_file, *parameters],
-            condition=condition,
-        )
-
-    has_bag = PythonExpression(["'", LaunchConfiguration('bag'), "' != ''"])
-    return LaunchDescription(
-        arguments
-        + [
-            node('calibration_node', {'phantom': LaunchConfiguration('phantom')}),
-            node('correction_node'),
-            node('reconstruction_node'),
-            node('image_node', condition=IfCondition(LaunchConfiguration('images'))),
-            node(
-                'player_node',
-                {'bag': LaunchConfiguration('bag'), 'wait_for_readers': 2},
-                condition=IfCondition(has_bag),
-            ),
-            node('simulator_node', condition=IfCondition(LaunchConfiguration('simulate'))),
-        ]
-    )
+    arguments = [argument.declare() for argument in (*PARAMETERS, *SWITCHES, *OTHERS)]
+    return LaunchDescription([*arguments, OpaqueFunction(function=nodes_of_rig)])

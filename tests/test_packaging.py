@@ -7,6 +7,7 @@ import importlib.util
 import pathlib
 import re
 import subprocess
+import sys
 import xml.etree.ElementTree as ElementTree
 
 import pytest
@@ -159,3 +160,30 @@ def test_no_machine_paths():
                 continue
             found = foreign.search(content)
             assert not found, f'{path}: {content[found.start() : found.start() + 60]!r}'
+
+
+@pytest.mark.parametrize(
+    'node, blocked, said',
+    [
+        ('image_node', 'rclpy', 'source /opt/ros/<distribution>/setup.bash'),
+        (
+            'calibration_node',
+            'fluoro_calib_msgs',
+            'ln -s fluoro_calib_ros/msg_defs src/fluoro_calib_msgs',
+        ),
+        ('player_node', 'mcap', 'pip install mcap'),
+    ],
+)
+def test_node_without_a_module_says_what_to_install(node, blocked, said):
+    """One sentence and exit status 1, no traceback."""
+    code = (
+        f'import sys; sys.modules[{blocked!r}] = None; '
+        f'from fluoro_calib_ros.entry_points import {node}; {node}()'
+    )
+    done = subprocess.run(
+        [sys.executable, '-c', code], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    (line,) = done.stderr.strip().splitlines()
+    assert line.startswith(f'{node}: the Python module {blocked} is missing: ')
+    assert said in line

@@ -368,13 +368,20 @@ def install_package() -> None:
         '--editable',
         str(ROOT),
     )
-    # an editable install leaves out data_files: what ROS looks up in share/ is linked
+    # an editable install leaves out data_files: what ROS looks up in share/ and lib/ is linked,
+    # each file on its own, for `ros2 launch` follows no links to folders
     share = VENV / 'share' / PACKAGE
-    share.mkdir(parents=True, exist_ok=True)
     index = VENV / 'share' / 'ament_index' / 'resource_index' / 'packages'
-    for link, target in [
-        (share / name, ROOT / name) for name in ('package.xml', 'launch', 'config')
-    ] + [(index / PACKAGE, ROOT / 'resource' / PACKAGE)]:
+    files = [ROOT / 'package.xml', *(ROOT / 'launch').iterdir(), *(ROOT / 'config').iterdir()]
+    links = {share / path.relative_to(ROOT): path for path in files}
+    links[index / PACKAGE] = ROOT / 'resource' / PACKAGE
+    for script in (VENV / 'bin').iterdir():
+        if script.name.endswith('_node') or script.name.startswith('fluoro'):
+            links[VENV / 'lib' / PACKAGE / script.name] = script
+    for folder in (share, VENV / 'lib' / PACKAGE):
+        shutil.rmtree(folder, ignore_errors=True)
+    for link, target in links.items():
+        link.parent.mkdir(parents=True, exist_ok=True)
         link.unlink(missing_ok=True)
         link.symlink_to(target)
 
@@ -399,7 +406,17 @@ def steps() -> list[Step]:
             'fluoro_calib_ros, editable',
             install_package,
             venv.wanted,
-            *(ROOT / name for name in ('setup.py', 'setup.cfg', 'package.xml', 'resource')),
+            *(
+                ROOT / name
+                for name in (
+                    'setup.py',
+                    'setup.cfg',
+                    'package.xml',
+                    'resource',
+                    'launch',
+                    'config',
+                )
+            ),
         ),
     ]
 

@@ -89,15 +89,19 @@ class ExposureCollector:
         self.coverage: dict[str, Coverage] = {}
         self._recent: deque[Pair] = deque(maxlen=MAX_RECENT)
         self._streaming = False
+        self._single: Pair | None = None  # collected as a single shot, may begin a stream
 
     def offer(self, pair: Pair) -> str:
         """Collect a pair if the phantom stands still in a new pose.
 
-        Returns '' if the pair was collected, else the reason why not.
+        Returns '' if the pair was collected, else the reason why not. The first frame of a stream
+        is collected like a single shot, and discarded once the next ones show that the phantom
+        moves.
         """
         first = self.fluoroscopes[0]
         now = pair[first].stamp_ns
         still_ns = self.still.still_time_s * 1e9
+        self._confirm_single(pair, still_ns)
         window = [p for p in self._recent if 0 <= now - p[first].stamp_ns <= still_ns]
         moved = max((self._displacement(pair, p) for p in window), default=0.0)
         span = max((now - p[first].stamp_ns for p in window), default=0)
@@ -110,7 +114,28 @@ class ExposureCollector:
         for known in self.exposures:
             if self._displacement(pair, known) < self.still.new_px:
                 return 'this pose of the phantom is already collected'
-        return self.add(pair)
+        refusal = self.add(pair)
+        self._single = pair if not refusal and not window else None
+        return refusal
+
+    def _confirm_single(self, pair: Pair, still_ns: float) -> None:
+        """Discard the single shot where the next frames show that the phantom moved."""
+        single = self._single
+        if single is None:
+            return
+        first = self.fluoroscopes[0]
+        if not 0 <= pair[first].stamp_ns - single[first].stamp_ns <= still_ns:
+            self._single = None
+        elif self._displacement(pair, single) > self.still.still_px:
+            self._single = None
+            self._discard(single)
+
+    def _discard(self, pair: Pair) -> None:
+        """Remove an exposure."""
+        self.exposures = [known for known in self.exposures if known is not pair]
+        self.coverage = {}
+        for known in self.exposures:
+            self._cover(known)
 
     def _displacement(self, one: Pair, other: Pair) -> float:
         """Return the largest displacement [px] that a fluoroscope sees between two pairs."""
@@ -137,10 +162,14 @@ class ExposureCollector:
             if any(known[name].number == pair[name].number for name in self.fluoroscopes):
                 return f'frame {min(numbers)} is collected already'
         self.exposures.append(pair)
+        self._cover(pair)
+        return ''
+
+    def _cover(self, pair: Pair) -> None:
+        """Add a pair to the coverage."""
         for name in self.fluoroscopes:
             frame = pair[name]
             self.coverage.setdefault(name, Coverage(frame.image_size)).add(frame.uv)
-        return ''
 
     def reset(self) -> None:
         """Discard all exposures."""
@@ -148,6 +177,7 @@ class ExposureCollector:
         self.coverage = {}
         self._recent.clear()
         self._streaming = False
+        self._single = None
 
     def frames(self, fluoroscopes: Iterable[str] | None = None) -> dict[str, list[Frame]]:
         """Return the collected frames by fluoroscope.

@@ -45,6 +45,14 @@ class Phantom:
             ordered.setflags(write=False)
             object.__setattr__(self, name, ordered)
 
+    def equals(self, other: Phantom) -> bool:
+        """Return whether another phantom has the same targets, coordinates and sds."""
+        return (
+            np.array_equal(self.target_id, other.target_id)
+            and np.array_equal(self.xyz_mm, other.xyz_mm)
+            and np.array_equal(self.sd_mm, other.sd_mm)
+        )
+
     def index(self, target_id: ArrayLike) -> NDArray[np.intp]:
         """Return the rows (n,) of target ids (n,), -1 for an id that the phantom does not have."""
         target_id = np.asarray(target_id, dtype=np.int64)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
+import time
 from multiprocessing.connection import Connection
 
 from ..calibration.request import CalibrationRequest
@@ -12,6 +14,7 @@ from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run_ca
 
 POLL_S = 0.05  # interval at which the caller may cancel [s]
 NICE = 10  # lower priority than the live nodes
+PARENT_POLL_S = 0.5  # interval at which the worker looks whether its caller is alive [s]
 
 
 def run_in_worker_process(
@@ -30,7 +33,9 @@ def run_in_worker_process(
     """
     context = multiprocessing.get_context('spawn')  # a fork would copy locks of other threads
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_work, daemon=True, args=(sender, request, validate, rig))
+    process = context.Process(
+        target=_work, daemon=True, args=(sender, request, validate, rig, os.getpid())
+    )
     # The process inherits the mask: an interrupt from the keyboard only reaches the caller, which
     # terminates the process.
     masked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
@@ -69,14 +74,19 @@ def _outcome(
 
 
 def _work(
-    sender: Connection, request: CalibrationRequest, validate: bool, rig: Rig | None
+    sender: Connection,
+    request: CalibrationRequest,
+    validate: bool,
+    rig: Rig | None,
+    parent: int,
 ) -> None:
-    """Run the job in the worker process.
+    """Run the job in the worker process, which ends with its parent process.
 
     Sends ('round', arguments of progress) after every round, and ('outcome', CalibrationOutcome)
     or ('error', exception) at the end.
     """
     os.nice(NICE)
+    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
     try:
         outcome = run_calibration(
             request,
@@ -89,3 +99,10 @@ def _work(
         sender.send(('error', error))
     except Exception as error:
         sender.send(('error', RuntimeError(repr(error))))
+
+
+def _end_with(parent: int) -> None:
+    """End this process once its parent has died, which cannot terminate it any more."""
+    while os.getppid() == parent:
+        time.sleep(PARENT_POLL_S)
+    os._exit(1)

@@ -11,16 +11,23 @@ from rclpy.node import Node
 
 from ..calibration import result as calibration_result
 from ..errors import DataError
-from .messages.fluoroscope_calibration import calibration_from_message
+from .messages.fluoroscope_calibration import calibration_from_message, message_from_calibration
+from .runtime.discovery import publisher_conflict
 from .runtime.errors import one_line
 from .runtime.qos import latched_qos
+
+# Calls of release() after which an undisputed calibration is used, in case a second node that is
+# seen has died.
+HOLD_TICKS = 3
 
 
 class CalibrationInput:
     """Subscribes to the calibrations of fluoroscopes and prepares them for use.
 
     The calibration in use stays until the next one is prepared: a frame sees one or the other. Of
-    calibrations that come while one is being prepared, the newest one is next.
+    calibrations that come while one is being prepared, the newest one is next. While two
+    calibration nodes serve the same fluoroscope, their calibrations are held back until release()
+    finds one node only.
 
     Parameters
     ----------
@@ -51,6 +58,8 @@ class CalibrationInput:
         self._current: dict[str, Any] = dict.fromkeys(names)
         self._next: dict[str, FluoroscopeCalibration] = {}
         self._threads: dict[str, threading.Thread] = {}
+        self._held: dict[str, dict[str, FluoroscopeCalibration]] = {name: {} for name in names}
+        self._patience = dict.fromkeys(names, 0)
         self._lock = threading.Lock()  # of _next and _threads
         self._subscriptions = [
             node.create_subscription(
@@ -77,7 +86,43 @@ class CalibrationInput:
         for thread in running:
             thread.join()
 
+    def begin_with(
+        self, name: str, calibration: calibration_result.FluoroscopeCalibration
+    ) -> None:
+        """Use a calibration of a file until another one arrives."""
+        self._start(name, message_from_calibration(calibration))
+
+    def conflict(self, name: str) -> str:
+        """Return a message where several calibration nodes serve a fluoroscope, else ''."""
+        return publisher_conflict(self._node, f'{name}/calibration_status')
+
+    def release(self) -> None:
+        """Use the newest calibration held back where only one calibration node is left.
+
+        To be called once a second. A single calibration that nothing contradicts is also used
+        while a second node is there, which may be one that has died, if there is none yet.
+        """
+        for name, held in self._held.items():
+            if not held:
+                continue
+            self._patience[name] -= 1
+            alone = not self.conflict(name)
+            undisputed = self._current[name] is None and len(held) == 1
+            if alone or (undisputed and self._patience[name] <= 0):
+                self._start(name, list(held.values())[-1])
+                held.clear()
+
     def _on_calibration(self, name: str, message: FluoroscopeCalibration) -> None:
+        if self.conflict(name):
+            self._held[name].pop(message.calibration_id, None)
+            self._held[name][message.calibration_id] = message
+            self._patience[name] = HOLD_TICKS
+            return
+        self._held[name].clear()
+        self._start(name, message)
+
+    def _start(self, name: str, message: FluoroscopeCalibration) -> None:
+        """Prepare a calibration in a thread."""
         with self._lock:
             self._next[name] = message
             thread = self._threads.get(name)

@@ -35,8 +35,12 @@ from ..calibration.rounds import Round
 from ..errors import DataError
 from ..exposures.collector import ExposureCollector, StillOptions
 from ..exposures.frame import Frame, validate_frame
+from ..exposures.names import Names
 from ..exposures.pairing import CompletePairer, PairingOptions
+from ..exposures.phantom import Phantom
 from ..files.calibration import SUFFIX, load_calibrations, save_calibration
+from ..files.calibration_request import PHANTOM as PHANTOM_FILE
+from ..files.phantom import read_phantom
 from ..jobs.calibration import CalibrationOutcome, Rig
 from ..jobs.result_folder import save_outcome
 from ..jobs.sources import read_survey
@@ -57,10 +61,17 @@ from .messages.self_calibration import (
 from .messages.target_observations import frame_from_message
 from .orientation_service import CaptureSettings, OrientationService
 from .runtime.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, Status
+from .runtime.discovery import publisher_conflict
 from .runtime.errors import StartError
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
-from .runtime.parameters import ParameterGroup, RigParameters, check_timeout, expand_path
+from .runtime.parameters import (
+    ParameterGroup,
+    RigParameters,
+    check_timeout,
+    default_calibration_directory,
+    expand_path,
+)
 from .runtime.qos import (
     incompatible_qos_message,
     latched_qos,
@@ -77,11 +88,15 @@ class CalibrationParameters(RigParameters):
     """Parameters of the calibration node."""
 
     phantom: str = option(
-        '', 'file phantom.csv with the surveyed coordinates of the beads; required', unit='mm'
+        '',
+        'file phantom.csv with the surveyed coordinates of the beads; without it the node only '
+        'serves saved calibrations',
+        unit='mm',
     )
     calibration_directory: str = option(
-        '~/.ros/fluoro_calib',
-        'folder in which calibrations are saved, and from which they are loaded at the start',
+        '',
+        'folder in which calibrations are saved, and from which they are loaded at the start; '
+        'empty: fluoro_calib/<namespace> in $ROS_HOME or ~/.ros',
     )
     collect: str = option(
         'still',
@@ -177,18 +192,33 @@ class CalibrationNode(Node):
         self._load_at_start()
 
     def _read_files(self) -> None:
-        """Read the phantom. Raises StartError."""
-        if not self._settings.phantom:
-            raise StartError('parameter phantom is not set: it names the file phantom.csv')
+        """Read the phantom, if one is named. Raises StartError."""
+        directory = self._settings.calibration_directory
+        self._phantom: Phantom | None = None
+        self._target_names = Names()
         try:
-            survey = read_survey(expand_path(self._settings.phantom))
+            self._directory = (
+                expand_path(directory)
+                if directory
+                else default_calibration_directory(self.get_namespace())
+            )
+            if self._settings.phantom:
+                self._read_phantom(expand_path(self._settings.phantom))
         except DataError as error:
             raise StartError(str(error)) from None
+        if self._phantom is None and not any(self._directory.glob('*' + SUFFIX)):
+            raise StartError(
+                'parameter phantom is not set: it names the file phantom.csv, without which the '
+                f'node only serves saved calibrations, and there are none in {self._directory}'
+            )
+
+    def _read_phantom(self, path: Path) -> None:
+        """Read the phantom. Raises DataError."""
+        survey = read_survey(path)
         for note in survey.notes:
             self.get_logger().warning(note)
         self._phantom = survey.phantom
         self._target_names = survey.names
-        self._directory = expand_path(self._settings.calibration_directory)
 
     def _create_interfaces(self) -> None:
         # Services that await must not keep others from being answered.
@@ -196,11 +226,13 @@ class CalibrationNode(Node):
         self._calibration_outputs = {}
         self._status_outputs = {}
         for name in self._names:
-            self._calibration_outputs[name] = self.create_publisher(
-                FluoroscopeCalibration, f'{name}/calibration', latched_qos()
-            )
+            # The status first: by its publishers, receivers of calibrations recognise that two
+            # nodes serve the same fluoroscope.
             self._status_outputs[name] = self.create_publisher(
                 CalibrationStatus, f'{name}/calibration_status', 10
+            )
+            self._calibration_outputs[name] = self.create_publisher(
+                FluoroscopeCalibration, f'{name}/calibration', latched_qos()
             )
             self._subscribe(self._fluoroscopes[name])
         self._orientation = OrientationService(
@@ -264,6 +296,14 @@ class CalibrationNode(Node):
         self._pairer = CompletePairer(self._names, self._pairing)
         self._collector = ExposureCollector(self._names, self._still)
 
+    def _required_phantom(self) -> Phantom:
+        """Return the phantom. Raises DataError where the node has none."""
+        if self._phantom is None:
+            raise DataError(
+                'parameter phantom is not set: the node only serves saved calibrations'
+            )
+        return self._phantom
+
     def _calibrations(self) -> dict[str, calibration_result.FluoroscopeCalibration]:
         """Return the present calibrations by fluoroscope."""
         return {
@@ -277,6 +317,8 @@ class CalibrationNode(Node):
     def _on_frame(self, fluoroscope: _Fluoroscope, message: TargetObservations) -> None:
         """Validate a frame, pair it, and collect the pair where it is wanted."""
         fluoroscope.received += 1
+        if self._phantom is None:
+            return
         try:
             frame = self._validated(fluoroscope, message)
         except DataError as error:
@@ -292,6 +334,7 @@ class CalibrationNode(Node):
         Raises DataError for an invalid frame.
         """
         name = fluoroscope.name
+        assert self._phantom is not None
         frame = frame_from_message(message, name)
         if len(frame.target_id) and (self._phantom.index(frame.target_id) < 0).all():
             if not fluoroscope.is_other_object_logged:
@@ -320,7 +363,13 @@ class CalibrationNode(Node):
             if not refusal:
                 self._captures.popleft().set_result(pair)
         elif self._collect == 'still':
+            before = len(self._collector.exposures)
             refusal = self._collector.offer(pair)
+            if len(self._collector.exposures) < before:
+                self.get_logger().info(
+                    f'exposure {before} discarded: it is the first frame of a stream in which the '
+                    'phantom moves'
+                )
         else:
             return
         if not refusal:
@@ -340,8 +389,9 @@ class CalibrationNode(Node):
     ) -> Capture.Response:
         timeout = request.timeout_sec or self._settings.capture_timeout
         try:
+            self._required_phantom()
             check_timeout(timeout)
-        except ValueError as error:
+        except ValueError as error:  # DataError among them
             response.message = str(error)
             return response
         captured = Future()
@@ -439,11 +489,24 @@ class CalibrationNode(Node):
         loaded = {n: c for n, c in load_calibrations(directory).items() if n in self._names}
         return loaded, self._orientation.load(directory, loaded) if loaded else None
 
+    def _check_phantom_of_directory(self) -> None:
+        """Raise DataError where the saved calibrations were made with another phantom."""
+        path = self._directory / PHANTOM_FILE
+        if self._phantom is None or not path.exists():
+            return
+        if not self._phantom.equals(read_phantom(path)):
+            raise DataError(
+                f'{self._directory}: its calibrations were made with another phantom than '
+                f'{self._settings.phantom}; use another calibration_directory, or load them by '
+                'the service load_calibration'
+            )
+
     def _load_at_start(self) -> None:
         if not any(self._directory.glob('*' + SUFFIX)):
             return
         try:
             loaded, orientation = self._load(self._directory)
+            self._check_phantom_of_directory()
         except (DataError, OSError) as error:
             self._load_fault = str(error)
             self.get_logger().error(f'no calibration loaded: {error}')
@@ -588,7 +651,7 @@ class CalibrationNode(Node):
         joint = self._settings.joint and len(frames) > 1
         job = CalibrationRequest(
             frames,
-            self._phantom,
+            self._required_phantom(),
             options_of_request(request, self._options, joint),
             joint,
             request.principal_distance or None,
@@ -673,6 +736,9 @@ class CalibrationNode(Node):
             return failure
         if fluoroscope.incompatible:
             return WARN, fluoroscope.incompatible
+        conflict = publisher_conflict(self, f'{fluoroscope.name}/calibration_status')
+        if conflict:
+            return ERROR, conflict
         if self._load_fault:
             return ERROR, f'no calibration loaded: {self._load_fault}'
         if fluoroscope.refused_calibration:
@@ -682,7 +748,7 @@ class CalibrationNode(Node):
                 f'the last calibration was refused: {fluoroscope.refused_calibration}; '
                 f'{in_use} is in use',
             )
-        topic = f'{fluoroscope.name}/target_observations'
+        topic = self.resolve_topic_name(f'{fluoroscope.name}/target_observations')
         if not fluoroscope.received and not self.count_publishers(topic):
             return WARN, 'no publisher of target observations'
         if progress.frames_unpaired:

@@ -7,11 +7,14 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from ..calibration.result import FluoroscopeCalibration
+from ..errors import DataError
+from ..files.calibration import load_calibrations
 from .calibration_input import CalibrationInput
-from .runtime.diagnostics import OK, WARN, LatencyWindow, Status
+from .runtime.diagnostics import ERROR, OK, WARN, LatencyWindow, Status
+from .runtime.errors import one_line
 from .runtime.lifecycle import StreamNode
 from .runtime.logging import RateLimitedLogger
-from .runtime.parameters import ManagedParameters
+from .runtime.parameters import ManagedParameters, expand_path
 from .runtime.refusals import RefusalLog
 from .runtime.stream_reader import FaultHandlers
 
@@ -69,11 +72,13 @@ class CorrectingNode(StreamNode):
     def __init__(self, name: str) -> None:
         super().__init__(name)
         self.names: tuple[str, ...] = ()
+        self._directory = ''
         self.streams: dict[str, Any] = {}
 
     def use_parameters(self, parameters: ManagedParameters) -> None:
         """Take the parameters that all these nodes have; subclasses call it in __init__."""
         self.autostart = parameters.autostart
+        self._directory = parameters.calibration_directory
         self.names = parameters.fluoroscopes
         self.reset()
 
@@ -106,6 +111,24 @@ class CorrectingNode(StreamNode):
             self, self.names, self.prepare, self.on_calibration_ready, self._on_refused_calibration
         )
         self.own(self._calibrations, self._calibrations.close)
+        if self._directory:
+            self._load_calibrations(self._directory)
+
+    def _load_calibrations(self, text: str) -> None:
+        """Begin with the calibrations of a folder."""
+        try:
+            directory = expand_path(text)
+            loaded = load_calibrations(directory)
+            missing = [name for name in self.names if name not in loaded]
+            if missing:
+                raise DataError(f'{directory}: there is no calibration of {", ".join(missing)}')
+        except (DataError, OSError) as error:
+            self.get_logger().error(f'no calibration loaded: {one_line(error)}')
+            for name in self.names:
+                self._on_refused_calibration(name, one_line(error))
+            return
+        for name in self.names:
+            self._calibrations.begin_with(name, loaded[name])
 
     @property
     def fault_handlers(self) -> FaultHandlers:
@@ -122,6 +145,7 @@ class CorrectingNode(StreamNode):
 
     def diagnose(self) -> list[Status]:
         """Return the status of every fluoroscope."""
+        self._calibrations.release()
         incompatible = self.incompatible_publishers()
         return [
             Status(name, *self._verdict(stream, incompatible), self._values(stream))
@@ -152,6 +176,9 @@ class CorrectingNode(StreamNode):
         failure = stream.refusals.failure_status()
         if failure:
             return failure
+        conflict = self._calibrations.conflict(stream.name)
+        if conflict:
+            return ERROR, conflict
         topics = [f'{stream.name}/{topic}' for topic in self.topics]
         for topic in topics:
             if topic in incompatible:
@@ -160,6 +187,6 @@ class CorrectingNode(StreamNode):
             return WARN, f'no calibration yet: {stream.waiting} {self.item}s were not corrected'
         if not self.readers:
             return WARN, 'the node is not active'
-        if not any(map(self.count_publishers, topics)):
+        if not any(map(self.has_publisher, topics)):
             return WARN, f'no publisher of {self.subject}'
         return stream.refusals.refusal_status() or (OK, 'correcting')

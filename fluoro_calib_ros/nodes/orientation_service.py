@@ -36,7 +36,8 @@ class CaptureSettings:
     ----------
     names : sequence of str
         Fluoroscopes of the rig.
-    phantom : Phantom
+    phantom : Phantom or None
+        Without one nothing can be captured.
     rig_frame : str
         Name of the rig frame.
     timeout_s : float
@@ -46,7 +47,7 @@ class CaptureSettings:
     """
 
     names: Sequence[str]
-    phantom: Phantom
+    phantom: Phantom | None
     rig_frame: str
     timeout_s: float
     directory: Path
@@ -159,6 +160,11 @@ class OrientationService:
     async def _orient(self, request: Orient.Request) -> rig_orientation.RigOrientation:
         """Capture frames and orient the rig. Raises DataError and ValueError."""
         names = self._settings.names
+        phantom = self._settings.phantom
+        if phantom is None:
+            raise DataError(
+                'parameter phantom is not set: the node only serves saved calibrations'
+            )
         check_timeout(request.timeout_sec or self._settings.timeout_s)
         missing = [name for name in names if name not in self._calibrations()]
         if missing:
@@ -166,7 +172,7 @@ class OrientationService:
         frames = await self._captured(request)
         calibrations = dict(self._calibrations())
         outcome = await self._in_thread(
-            lambda: orient(frames, self._settings.phantom, calibrations, self._settings.rig_frame)
+            lambda: orient(frames, phantom, calibrations, self._settings.rig_frame)
         )
         if not belongs_to(outcome.orientation, self._calibrations()):
             raise DataError('the calibrations have changed meanwhile, capture the phantom again')

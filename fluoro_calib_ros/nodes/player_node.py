@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from importlib import import_module
 
 import rclpy
+from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
@@ -24,6 +25,9 @@ from .runtime.main import run
 from .runtime.parameters import ParameterGroup
 from .runtime.qos import observations_qos, qos_overrides, recorded_latched_qos
 
+# Message types of the streams that the nodes process.
+STREAM_TYPES = ('TargetObservations', 'CorrectedObservations', 'Image', 'CompressedImage')
+
 
 @dataclass(frozen=True)
 class PlayerParameters:
@@ -33,7 +37,10 @@ class PlayerParameters:
     rate: float = option(1.0, 'speed relative to the recording', minimum=0.001, maximum=1e6)
     loop: bool = option(False, 'whether the bag is played over and over')
     wait_for_readers: int = option(
-        1, 'subscriptions of every topic to wait for', minimum=0, maximum=100
+        1,
+        'subscriptions to wait for, of every topic with observations or images, or else of all',
+        minimum=0,
+        maximum=100,
     )
     strip_prefix: str = option('', 'prefix removed from recorded topics')
     topics: tuple[str, ...] = option(('',), 'topics to play; empty: all')
@@ -85,9 +92,11 @@ class PlayerNode(Node):
         """
         package, _, name = info.type.partition('/msg/')
         try:
-            message_type = getattr(import_module(f'{package or "no"}.msg'), name)
+            # Only packages in the ament index: a bag must not name any module to be imported.
+            get_package_prefix(package)
+            message_type = getattr(import_module(f'{package}.msg'), name)
             check_for_type_support(message_type)
-        except (ImportError, AttributeError):
+        except (PackageNotFoundError, ValueError, ImportError, AttributeError):
             self.get_logger().warning(
                 f'{topic} is not played: the type {info.type or "(none)"} is not installed'
             )
@@ -105,10 +114,17 @@ class PlayerNode(Node):
                 f'{topic} cannot be played as {relative!r}: {one_line(error)}'
             ) from None
 
+    def _awaited_outputs(self) -> list[Publisher]:
+        """Return the publishers whose readers are waited for: /rosout of a bag has none."""
+        streams = [o for o in self._outputs.values() if o.msg_type.__name__ in STREAM_TYPES]
+        return streams or list(self._outputs.values())
+
     def _play(self) -> None:
         try:
             outputs = self._outputs.values()
-            wait_for_readers(self, outputs, self._settings.wait_for_readers, self._stopping)
+            wait_for_readers(
+                self, self._awaited_outputs(), self._settings.wait_for_readers, self._stopping
+            )
             while not self._stopping.is_set():
                 self._play_once()
                 if not self._settings.loop:

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from ..drift.options import DriftOptions
 from ..drift.rig_watch import RigDriftWatch
 from ..errors import DataError
 from ..exposures.pairing import PairingOptions, exposure_pairer
-from ..files.rig_orientation import load_orientation
+from ..files.rig_orientation import load_orientation, orientation_path
 from ..options import option
 from ..photogrammetry import rig_orientation
 from ..reconstruction.correspondence import CorrectedView
@@ -59,7 +60,7 @@ from .messages.transforms import transforms_of_orientation
 from .runtime.diagnostics import OK, WARN, LatencyWindow, Status
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run
-from .runtime.parameters import ManagedParameters, ParameterGroup
+from .runtime.parameters import ManagedParameters, ParameterGroup, expand_path
 from .runtime.qos import latched_qos, observations_qos
 from .runtime.refusals import RefusalLog, Refused
 from .runtime.stream_reader import FaultHandlers
@@ -86,8 +87,9 @@ class ReconstructionParameters(ManagedParameters):
     )
     orientation_file: str = option(
         '',
-        'rig_orientation.npz to begin with; empty: the orientation comes from a topic',
+        'rig_orientation.npz to begin with; empty: the one of calibration_directory, if any',
     )
+    rig_frame: str = option('rig', 'parent of the optical frames on /tf_static')
     ellipsoid_sigmas: float = option(
         10.0,
         'half axes of the ellipsoids for RViz',
@@ -192,8 +194,7 @@ class ReconstructionNode(StreamNode):
         self._transforms = self.create_publisher(TFMessage, '/tf_static', latched_qos())
         self.own(self._transforms, self.destroy_publisher, self._transforms)
         self._create_inputs()
-        if self._settings.orientation_file:
-            self._load_orientation(self._settings.orientation_file)
+        self._load_at_start()
 
     def _create_inputs(self) -> None:
         self.create_input(
@@ -232,9 +233,15 @@ class ReconstructionNode(StreamNode):
 
     # -- orientation
 
-    def _load_orientation(self, path: str) -> None:
+    def _load_at_start(self) -> None:
+        """Begin with the orientation of a file, if there is one."""
         try:
-            self._on_orientation(message_from_orientation(load_orientation(path)))
+            path = self._settings.orientation_file
+            if not path and self._settings.calibration_directory:
+                saved = orientation_path(expand_path(self._settings.calibration_directory))
+                path = saved if Path(saved).exists() else ''
+            if path:
+                self._on_orientation(message_from_orientation(load_orientation(path)))
         except DataError as error:
             self.get_logger().error(str(error))
             self._refusals.last_fault = str(error)
@@ -256,7 +263,7 @@ class ReconstructionNode(StreamNode):
         ids = orientation.calibration_ids
         newest = list(self._rigs.items())[-(MAX_ORIENTATIONS - 1) :]
         self._rigs = {**{i: old for i, old in newest if i != ids}, ids: rig}
-        self._transforms.publish(transforms_of_orientation(message))
+        self._transforms.publish(transforms_of_orientation(message, self._settings.rig_frame))
         self.get_logger().info(f'{description_of(message)}, in use')
 
     def _on_camera_info(self, name: str, message: CameraInfo) -> None:
@@ -411,9 +418,7 @@ class ReconstructionNode(StreamNode):
 
     def _stream_fault(self, unpaired: int) -> tuple[bytes, str] | None:
         """Return level and message where something is wrong with the streams."""
-        missing = [
-            n for n in self._names if not self.count_publishers(f'{n}/corrected_observations')
-        ]
+        missing = [n for n in self._names if not self.has_publisher(f'{n}/corrected_observations')]
         if missing:
             return WARN, f'no publisher of corrected observations of {", ".join(missing)}'
         if self._pairer.silent:

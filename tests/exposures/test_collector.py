@@ -156,7 +156,25 @@ def test_movement_seen_by_one_fluoroscope_counts():
     assert collector.offer(pair(1, 0)) == ''
     assert collector.offer(pair(2, 20, 0, 50)) == 'the phantom moves'
     assert collector.offer(pair(3, 2000, 0, 50)) == ''
-    assert len(collector.exposures) == 2
+    assert [p['a'].number for p in collector.exposures] == [3], 'the first one was in motion'
+
+
+def test_first_frame_of_a_stream_in_motion_is_not_kept():
+    """It looks like a single shot until the next frames come."""
+    collector = ExposureCollector('ab')
+    for number in range(10):
+        collector.offer(pair(number + 1, 20 * number, 3.0 * number))
+    assert collector.exposures == [] and collector.coverage == {}
+    for number in range(10, 20):
+        collector.offer(pair(number + 1, 20 * number, 27.0))
+    assert len(collector.exposures) == 1 and set(collector.coverage) == {'a', 'b'}
+
+
+def test_single_shot_is_kept_where_the_phantom_moves_later():
+    collector = ExposureCollector('ab')
+    for number, (stamp, shift) in enumerate([(0, 0), (20, 0), (150, 50), (170, 60)]):
+        collector.offer(pair(number + 1, stamp, shift))
+    assert [p['a'].number for p in collector.exposures] == [1]
 
 
 def test_every_single_shot_in_a_new_pose_is_collected():

@@ -113,7 +113,10 @@ class Inbox:
             create_subscription=self._subscribe,
             destroy_subscription=lambda _: None,
             get_logger=lambda: SimpleNamespace(error=lambda text: None),
+            resolve_topic_name=lambda topic: topic,
+            get_publishers_info_by_topic=lambda topic: self.publishers,
         )
+        self.publishers = []
         self.calibrations = CalibrationInput(
             node,
             ['a'],
@@ -188,7 +191,7 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
         create_timer=lambda *_, **__: None,
         destroy_timer=lambda _: None,
     )
-    settings = CaptureSettings(('a', 'b'), None, 'rig', 5.0, Path())
+    settings = CaptureSettings(('a', 'b'), rigs.rig().phantom, 'rig', 5.0, Path())
     service = OrientationService(node, settings, lambda: present, None)
 
     async def recalibrated(function):

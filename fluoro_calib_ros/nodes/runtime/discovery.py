@@ -34,6 +34,25 @@ def wait_for_readers(
         stop.wait(SETTLING_S)
 
 
+def publisher_conflict(node: Node, topic: str) -> str:
+    """Return a message where several nodes publish a topic that belongs to one, else ''.
+
+    A node that was killed counts until DDS notices, within half a minute.
+    """
+    publishers = node.get_publishers_info_by_topic(node.resolve_topic_name(topic))
+    if len(publishers) < 2:
+        return ''
+    names = sorted(
+        f'{p.node_namespace.rstrip("/")}/{p.node_name}'
+        for p in publishers
+        if 'UNKNOWN' not in p.node_name  # DDS announces the names of nodes later
+    )
+    return (
+        f'{len(publishers)} nodes publish {topic} ({", ".join(names)}): no new calibration is '
+        'used until only one is left'
+    )
+
+
 def wait_until_acknowledged(
     publishers: Iterable[Publisher], stop: threading.Event, timeout_s: float = 10.0
 ) -> bool:

@@ -189,6 +189,10 @@ class StreamNode(ManagedNode):
         self.readers.append(StreamReader(self, faults))
         return self.readers[-1]
 
+    def has_publisher(self, topic: str) -> bool:
+        """Return whether a topic, as this node calls it, has a publisher; remaps are applied."""
+        return bool(self.count_publishers(self.resolve_topic_name(topic)))
+
     def incompatible_publishers(self) -> dict[str, str]:
         """Return a message for every topic with an incompatible publisher, and log them."""
         found: dict[str, str] = {}

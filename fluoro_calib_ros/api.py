@@ -22,7 +22,6 @@ from .exposures.moving_points import MovingPoints
 from .exposures.names import Names
 from .exposures.phantom import Phantom
 from .files.calibration_request import read_request
-from .files.known_orientation import read_known_orientations
 from .files.phantom import read_moving_points, read_phantom
 from .files.reconstructed_points import write_reconstruction
 from .files.rig_orientation import load_orientation, save_orientation
@@ -33,7 +32,14 @@ from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
 from .jobs.result_folder import save_outcome, save_result
 from .jobs.simulation import SimulationOptions, simulate
-from .jobs.sources import Recording, Survey, read_calibrations, read_source, read_survey
+from .jobs.sources import (
+    Recording,
+    Survey,
+    read_calibrations,
+    read_orientations,
+    read_source,
+    read_survey,
+)
 from .photogrammetry.known_orientation import KnownOrientation
 from .photogrammetry.rig_orientation import RigOrientation
 from .validation.check import Validation
@@ -69,8 +75,8 @@ __all__ = [
     'load_orientation',
     'orient',
     'read_calibrations',
-    'read_known_orientations',
     'read_moving_points',
+    'read_orientations',
     'read_phantom',
     'read_request',
     'read_source',

@@ -55,9 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--known-orientation',
         type=Path,
+        action='append',
+        default=[],
         metavar='FILE',
-        help='YAML file with K, R and t of the fluoroscopes: only the distortion is estimated; '
-        'the phantom is then given in the frame of the lab, in motion with a column exposure',
+        help='K, R and t of the fluoroscopes, a YAML file or a camera of another program, such as '
+        'MayaCam 2; repeatable: only the distortion is estimated; the phantom is then given in '
+        'the frame of the lab, in motion with a column exposure',
     )
     add_collect(parser)
     parser.add_argument(
@@ -130,17 +133,14 @@ def run(arguments: argparse.Namespace) -> None:
     from ..calibration.options import CalibrationOptions
     from ..calibration.request import CalibrationRequest
     from ..exposures.names import Names
-    from ..files.known_orientation import read_known_orientations
     from ..files.phantom import has_exposures, read_moving_points
     from ..files.result_document import result_document
     from ..jobs.calibration import run_calibration
     from ..jobs.result_folder import save_outcome
-    from ..jobs.sources import read_source, read_survey
+    from ..jobs.sources import read_orientations, read_source, read_survey
     from ..report.tables import summary_table
 
-    known = {}
-    if arguments.known_orientation is not None:
-        known = read_known_orientations(arguments.known_orientation)
+    known = read_orientations(arguments.known_orientation, file_settings(arguments))
     moving = bool(known) and has_exposures(arguments.phantom)
     survey = None if moving else read_survey(arguments.phantom, file_settings(arguments))
     names = Names() if survey is None else survey.names

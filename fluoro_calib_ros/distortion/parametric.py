@@ -127,6 +127,9 @@ class StepwiseTerms(AdjustedTerms):
         selected = self.selected[f]
         rows = network.rows(f)
         dof = 2 * len(rows) - network.n_unknowns + len(self.names) * len(self.selected)
+        if network.exterior is not None:
+            # Most unknowns are known beforehand.
+            dof += network.n_observations - 2 * network.n_image_points
         limit = stdtrit(max(dof, 1), 1 - SIGNIFICANCE / (2 * len(self.names)))  # quantile of t
         if self._remove_insignificant(f, information, coefficients, limit):
             return True

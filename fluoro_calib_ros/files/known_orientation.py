@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,13 @@ from .atomic import write_text
 
 VERSION = 1
 KEYS = ('K', 'R', 't_mm', 'interior_sd_px', 'exterior_sd')
+
+
+def holds_known_orientations(path: PathLike) -> bool:
+    """Return whether a file is a YAML file with an entry of fluoroscopes. Raises DataError."""
+    if Path(path).suffix.lower() not in ('.yaml', '.yml'):
+        return False
+    return any(line.startswith('fluoroscopes:') for line in read_text(path).splitlines())
 
 
 def read_known_orientations(path: PathLike) -> dict[str, KnownOrientation]:

@@ -65,8 +65,11 @@ def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
 
 
 def has_exposures(path: str | os.PathLike[str]) -> bool:
-    """Return whether a file of a phantom holds coordinates by exposure. Raises DataError."""
-    return any(EXPOSURE in block for block in read_blocks(path, COLUMNS))
+    """Return whether a file holds coordinates by exposure; False for files of other programs."""
+    try:
+        return any(EXPOSURE in block for block in read_blocks(path, COLUMNS))
+    except DataError:
+        return False
 
 
 def read_moving_points(path: str | os.PathLike[str]) -> MovingPoints:

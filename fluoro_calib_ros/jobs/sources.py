@@ -19,7 +19,9 @@ from ..exposures.names import Names
 from ..exposures.phantom import Phantom
 from ..files.calibration import load_calibrations
 from ..files.image_points import PointsFile, points_of_frames, read_points
+from ..files.known_orientation import holds_known_orientations, read_known_orientations
 from ..files.names import read_names
+from ..photogrammetry.known_orientation import KnownOrientation
 
 MAGIC = b'\x89MCAP'  # of a bag
 
@@ -92,6 +94,41 @@ def read_survey(path: str | os.PathLike[str], settings: FileSettings | None = No
     if content.survey is None:
         raise DataError(f'{path}: the file has no phantom')
     return Survey(content.survey, content.names, content.notes)
+
+
+def read_orientations(
+    paths: Iterable[str | os.PathLike[str]], settings: FileSettings | None = None
+) -> dict[str, KnownOrientation]:
+    """Read known orientations of fluoroscopes by name.
+
+    paths: YAML files of docs/known_orientation.md, or files of cameras of any format, such as
+    MayaCam 2. Raises DataError, also for a fluoroscope that occurs in two files.
+    """
+    out: dict[str, KnownOrientation] = {}
+    for path in paths:
+        if holds_known_orientations(path):
+            found = read_known_orientations(path)
+        else:
+            found = _orientations_of_cameras(path, settings or FileSettings())
+        for name in found:
+            if name in out:
+                raise DataError(f'{path}: the orientation of fluoroscope {name} is already given')
+        out |= found
+    return out
+
+
+def _orientations_of_cameras(
+    path: str | os.PathLike[str], settings: FileSettings
+) -> dict[str, KnownOrientation]:
+    """Read the cameras of a file. Raises DataError for one without position and attitude."""
+    content = read_content(path, settings, 'cameras', 'camera')
+    out = {}
+    for camera in content.cameras:
+        try:
+            out[camera.name] = KnownOrientation.from_matrices(camera.matrix, *camera.pose)
+        except DataError as error:
+            raise DataError(f'{path}, camera {camera.name}: {error}') from None
+    return out
 
 
 def read_source(

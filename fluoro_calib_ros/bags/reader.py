@@ -11,6 +11,7 @@ from mcap.records import Schema
 
 from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
+from ..exposures.strays import without_strays
 from ..files.access import check_safe_name
 from .definitions import TARGET_OBSERVATIONS, fields_of, from_cdr, type_hash, typestore
 from .frames import fluoroscope_of_topic, frame_from_message
@@ -29,10 +30,14 @@ class TopicInfo(NamedTuple):
 
 @dataclass(frozen=True)
 class BagContents:
-    """Frames of a bag in the order of time, and the topics they were read from, by fluoroscope."""
+    """Frames of a bag in the order of time, and the topics they were read from, by fluoroscope.
+
+    notes are sentences about image points that were left out.
+    """
 
     frames: dict[str, list[Frame]]
     topics: dict[str, str]
+    notes: tuple[str, ...] = ()
 
 
 def read_frames(source: PathLike, validate: bool = True) -> BagContents:
@@ -61,6 +66,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     fluoroscopes = _observation_topics(source)
     _check_definitions(source, fluoroscopes)
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(fluoroscopes.values())}
+    notes: list[str] = []
     first: dict[tuple[str, int], int] = {}  # message in which a frame occurred first
     for message in iterate_messages(source, fluoroscopes):
         name = fluoroscopes[message.topic]
@@ -69,6 +75,8 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
         try:
             frame = frame_from_message(from_cdr(message.data, TARGET_OBSERVATIONS), name)
             if validate:
+                frame, stray = without_strays(frame)
+                notes += [f'not used: {stray}'] * bool(stray)
                 validate_frame(frame)
         except DataError as error:
             raise DataError(f'{where}: {error}') from None
@@ -85,6 +93,7 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     return BagContents(
         {name: of_fluoroscope for name, of_fluoroscope in frames.items() if of_fluoroscope},
         dict(sorted(topics.items())),
+        tuple(notes),
     )
 
 

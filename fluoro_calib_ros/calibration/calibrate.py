@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -17,14 +17,14 @@ from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.precision import Precision, geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
 from .constraints import RelativeOrientation, relative_orientations
-from .diagnostics import correlations_of, outliers_of
+from .diagnostics import correlations_of, misfitting_exposures, outliers_of
 from .held_calibration import (
     held_corrections,
     network_of_calibrations,
     noise_of_calibrations,
     too_few_rays_for_noise,
 )
-from .initial_network import Frames, Measured, measured_network
+from .initial_network import MIN_EXPOSURES, Frames, Measured, measured_network
 from .options import CalibrationOptions
 from .request import CalibrationRequest
 from .result import FluoroscopeCalibration, digest_of_sources
@@ -32,6 +32,7 @@ from .robust_adjustment import adjusted_with_precision
 from .rounds import Round, SelfCalibration, rmse_of_inliers
 from .self_calibration import self_calibrate
 
+MAX_REPEATS = 3  # of a calibration, to leave out exposures that do not fit
 TOLERANCE_WITHOUT_CORRECTION = 1e-4  # its residuals are only reported
 
 
@@ -205,15 +206,8 @@ def calibrate_request(
             start = time.perf_counter()
             label = '+'.join(group)
             of_group = {name: request.frames[name] for name in group}
-            measured = measured_network(
-                of_group,
-                request.phantom,
-                request.principal_distance,
-                raise_if_cancelled,
-                request.known_orientations,
-            )
-            run = self_calibrate(
-                measured, options, _progress_of(label, progress), raise_if_cancelled
+            run = _calibrated_group(
+                request, of_group, _progress_of(label, progress), raise_if_cancelled
             )
             seconds = time.perf_counter() - start
             runs[label] = run
@@ -257,6 +251,37 @@ def _calibrations_of_run(
         name: _calibration(run, f, name, digest_of_sources(frames[name], phantom), seconds)
         for f, name in enumerate(run.measured.fluoroscopes)
     }
+
+
+def _calibrated_group(
+    request: CalibrationRequest,
+    frames: Frames,
+    progress: Callable[[Round], None] | None,
+    raise_if_cancelled: Callable[[], None] | None,
+) -> SelfCalibration:
+    """Calibrate fluoroscopes in one adjustment, without exposures of which too little fits."""
+    left_out: tuple[str, ...] = ()
+    for _ in range(MAX_REPEATS):
+        measured = measured_network(
+            frames,
+            request.phantom,
+            request.principal_distance,
+            raise_if_cancelled,
+            request.known_orientations,
+        )
+        run = self_calibrate(measured, request.options, progress, raise_if_cancelled)
+        misfits = misfitting_exposures(run)
+        kept = {
+            name: [f for f in exposures if (name, f.number) not in misfits]
+            for name, exposures in frames.items()
+        }
+        if not misfits or any(len(exposures) < MIN_EXPOSURES for exposures in kept.values()):
+            break
+        left_out += tuple(misfits.values())
+        frames = kept
+    return replace(
+        run, measured=replace(run.measured, left_out=(*left_out, *run.measured.left_out))
+    )
 
 
 def _require_compatible(request: CalibrationRequest) -> None:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.diagnosis import (
@@ -16,6 +18,8 @@ from ..photogrammetry.outliers import find_outliers
 from ..photogrammetry.precision import Precision
 from .initial_network import Measured
 from .rounds import SelfCalibration
+
+MIN_FITTING = 0.5  # share of the image points of an exposure that is used
 
 
 def undetermined_unknowns(measured: Measured) -> str:
@@ -80,6 +84,27 @@ def outliers_of(run: SelfCalibration) -> tuple[list[dict[str, Any]], list[dict[s
         for row, offset, value in zip(found.target, found.offset_mm, found.target_value)
     ]
     return points, targets
+
+
+def misfitting_exposures(run: SelfCalibration) -> dict[tuple[str, int], str]:
+    """Return a sentence for every exposure of which less than half fits, by name and number.
+
+    Where most exposures of a fluoroscope are like that, none of them stands out, and the whole
+    calibration is to be judged instead.
+    """
+    network = run.measured.network
+    count = np.bincount(network.exposure, minlength=network.n_exposures)
+    fitting = np.bincount(network.exposure, run.after.inliers, network.n_exposures)
+    share = fitting / count
+    out = {}
+    for row, frame in enumerate(run.measured.frames):
+        own = network.fluoroscope == network.fluoroscope[row]
+        if share[row] < MIN_FITTING and np.median(share[own]) >= MIN_FITTING:
+            out[frame.fluoroscope, frame.number] = (
+                f'fluoroscope {frame.fluoroscope}, exposure {frame.number}: only '
+                f'{100 * share[row]:.0f} % of the image points fit, the others are false matches'
+            )
+    return out
 
 
 def _exposure_numbers(measured: Measured) -> list[int]:

@@ -36,8 +36,8 @@ def _has_columns(sample: Sample, columns: tuple[str, ...]) -> bool:
 
 
 def _read_observations(path: Path, settings: FileSettings) -> Content:
-    frames, names = read_named_observations(path, settings.image_size, settings.names)
-    return Content(observations=frames, names=names)
+    frames, names, stray = read_named_observations(path, settings.image_size, settings.names)
+    return Content(observations=frames, names=names, notes=(stray,) if stray else ())
 
 
 def _write_observations(path: Path, content: Content, settings: FileSettings) -> Written:

@@ -16,6 +16,7 @@ from ..errors import DataError
 from ..exposures.columns import first_repeated, is_positive
 from ..exposures.frame import Frame, points_on_image
 from ..exposures.names import Names, safe_names, without_trivial
+from ..exposures.strays import few
 from .access import check_safe_name
 from .atomic import atomic_file
 from .csv_table import Block, format_float, read_blocks, write_rows
@@ -79,20 +80,21 @@ def read_observations_csv(
         For text that is not a number, a point off the image, and a target that occurs twice in a
         frame. The message names the row.
     """
-    return _read(path, image_size, _Columns(None))
+    return _read(path, image_size, _Columns(None))[0]
 
 
 def read_named_observations(
     path: PathLike, image_size: tuple[int, int] | None, known: Names
-) -> tuple[dict[str, list[Frame]], Names]:
+) -> tuple[dict[str, list[Frame]], Names, str]:
     """Read the frames of a CSV file in which fluoroscopes, exposures and targets may have names.
 
-    known are names whose ids are given. Returns the frames by id of the fluoroscope, and the
-    names of the file. Raises DataError as `read_observations_csv` does.
+    known are names whose ids are given. Returns the frames by id of the fluoroscope, the names of
+    the file, and a sentence about the few points that are off the image and left out, or ''.
+    Raises DataError as `read_observations_csv` does.
     """
     columns = _Columns(known)
-    frames = _read(path, image_size, columns)
-    return frames, columns.names()
+    frames, stray = _read(path, image_size, columns)
+    return frames, columns.names(), stray
 
 
 class _Columns:
@@ -123,13 +125,14 @@ class _Columns:
 
 def _read(
     path: PathLike, image_size: tuple[int, int] | None, columns: _Columns
-) -> dict[str, list[Frame]]:
+) -> tuple[dict[str, list[Frame]], str]:
     if image_size is None:
         raise DataError(
             f'{path}: a CSV file does not contain the image size, --image-size WxH is needed'
         )
     blocks = read_blocks(path, COLUMNS)
-    rows = _concatenate([_parse(block, columns, image_size) for block in blocks])
+    rows = _concatenate([_parse(block, columns) for block in blocks])
+    rows, stray = _on_image(path, rows, image_size, columns.known is not None)
     rows = replace(
         rows,
         exposure=columns.exposure.numbers(rows.exposure),
@@ -140,7 +143,29 @@ def _read(
     for of_frame in _by_frame(rows, names):
         name = names[of_frame.code[0]]
         frames[name].append(_frame(path, name, of_frame, image_size))
-    return frames
+    return {name: of_one for name, of_one in frames.items() if of_one}, stray
+
+
+def _on_image(
+    path: PathLike, rows: _Rows, image_size: tuple[int, int], leave_out: bool
+) -> tuple[_Rows, str]:
+    """Return the rows without a few that are off the image, and a sentence about these.
+
+    Raises DataError where they are many, or are not to be left out.
+    """
+    off = ~points_on_image(rows.uv, image_size)
+    if not off.any():
+        return rows, ''
+    first = int(np.argmax(off))
+    u, v = rows.uv[first]
+    sentence = (
+        f'{path}, row {rows.line[first]}: the point ({u:g}, {v:g}) is off the image of '
+        f'{image_size[0]} x {image_size[1]} px'
+    )
+    if not leave_out or not few(int(off.sum()), len(off)):
+        raise DataError(sentence)
+    more = f', and {off.sum() - 1} more' if off.sum() > 1 else ''
+    return rows[~off], f'not used: {sentence}{more}'
 
 
 def write_observations_csv(
@@ -185,7 +210,7 @@ def _labels(frames: Sequence[Frame], names: Names) -> _Labels:
     return _Labels(names.fluoroscope_names(), exposures, targets)
 
 
-def _parse(block: Block, columns: _Columns, image_size: tuple[int, int]) -> _Rows:
+def _parse(block: Block, columns: _Columns) -> _Rows:
     """Return a block of the file as arrays; new names are added to columns."""
     names = block.strings('fluoroscope')
     codes = columns.codes
@@ -195,14 +220,6 @@ def _parse(block: Block, columns: _Columns, image_size: tuple[int, int]) -> _Row
                 check_safe_name(name, f'{block.path}, row {block.lines[names.index(name)]}')
             codes[name] = len(codes)
     uv = np.column_stack([block.floats('u'), block.floats('v')])
-    on_image = points_on_image(uv, image_size)
-    if not on_image.all():
-        index = int(np.argmin(on_image))
-        block.fail(
-            index,
-            f'the point ({uv[index, 0]:g}, {uv[index, 1]:g}) is off the image of '
-            f'{image_size[0]} x {image_size[1]} px',
-        )
     sigma = np.full(len(uv), np.nan)
     if 'sigma' in block:
         sigma = block.floats_or_nan('sigma')

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations
 from ..calibration.result import FluoroscopeCalibration
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
+from ..exposures.strays import frames_without_strays
 from .sources import select_calibrations
 
 
@@ -18,6 +20,8 @@ def adjust(
     loss: str = 'student_t',
 ) -> CalibrationResult:
     """Adjust exposures of the phantom with interior orientations and corrections held.
+
+    A few image points that are off the image, or not of the phantom, are left out.
 
     Parameters
     ----------
@@ -37,6 +41,7 @@ def adjust(
     DataError
         For a missing calibration, and for frames that do not suffice or do not fit.
     """
-    return adjust_with_calibrations(
-        frames, phantom, select_calibrations(calibrations, frames), loss
-    )
+    used = select_calibrations(calibrations, frames)
+    cleaned, strays = frames_without_strays(frames, phantom)
+    result = adjust_with_calibrations(cleaned, phantom, used, loss)
+    return replace(result, left_out=(*strays, *result.left_out))

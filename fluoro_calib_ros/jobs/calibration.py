@@ -20,6 +20,7 @@ from ..calibration.rig_orientation import orientation_of_exposures
 from ..calibration.rounds import Round
 from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
+from ..exposures.strays import frames_without_strays
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..validation.check import Validation
 from ..validation.inputs import (
@@ -29,7 +30,7 @@ from ..validation.inputs import (
     validate_magnitudes,
 )
 from ..validation.plausibility import implausible
-from ..validation.rigidity import contradiction
+from ..validation.rigidity import contradiction, interchanged
 from ..validation.verdict import validate_or_report
 
 Progress = Callable[[str, Round], None]
@@ -103,7 +104,8 @@ def run_calibration(
 ) -> CalibrationOutcome:
     """Self-calibrate the fluoroscopes of a request, and orient the rig.
 
-    Exposures that repeat an earlier one are left out.
+    Exposures that repeat an earlier one are left out, and so are a few image points off the image
+    or of targets that the phantom does not have.
 
     Parameters
     ----------
@@ -133,13 +135,16 @@ def run_calibration(
         For options that contradict each other.
     """
     validate_magnitudes(request.frames, request.phantom)
+    request, left_out = _without_strays(request)
     request, copies = _without_copies(request)
+    left_out += copies
     doubts = _wrong_input(request)
     if doubts and not force:
         raise DataError('. '.join(doubts))
     result = _calibrated(request, progress, raise_if_cancelled)
-    result = replace(result, left_out=(*copies, *result.left_out))
+    result = replace(result, left_out=(*left_out, *result.left_out))
     doubts += implausible(request, result)
+    doubts += _interchanged(result)
     if doubts and not force:
         raise DataError('. '.join(doubts))
     rig = rig or Rig()
@@ -184,6 +189,12 @@ def _calibrated(
         ) from None
 
 
+def _without_strays(request: CalibrationRequest) -> tuple[CalibrationRequest, list[str]]:
+    """Return the request without a few unusable image points, and sentences about these."""
+    cleaned, sentences = frames_without_strays(request.frames, request.phantom)
+    return (replace(request, frames=cleaned) if sentences else request), sentences
+
+
 def _without_copies(request: CalibrationRequest) -> tuple[CalibrationRequest, list[str]]:
     """Return the request without repeated exposures, and a sentence for each of these."""
     sentences = []
@@ -218,6 +229,14 @@ def _valid(request: CalibrationRequest) -> dict[str, list[Frame]]:
                 continue
             out[name].append(frame)
     return out
+
+
+def _interchanged(result: CalibrationResult) -> list[str]:
+    """Return a sentence for every two fluoroscopes whose frames are interchanged somewhere."""
+    first, *others = result.fluoroscopes
+    figures = result.fluoroscopes
+    found = [interchanged((first, name), figures[first], figures[name]) for name in others]
+    return [sentence for sentence in found if sentence]
 
 
 def _orientation(

@@ -173,7 +173,9 @@ def read_source(
     content = Content()
     bag = is_bag(path)
     if bag:
-        found = read_frames(path, validate).frames
+        contents = read_frames(path, validate)
+        found = contents.frames
+        content = Content(notes=contents.notes)
     else:
         settings = replace(settings, image_size=image_size, fluoroscopes=tuple(fluoroscopes or ()))
         content = read_content(path, settings, 'observations', 'observations')
@@ -188,7 +190,7 @@ def read_source(
     frames = {name: found[name] for name in wanted}
     if collect is None or not bag:
         return Recording(frames, {}, names, content.notes)
-    return Recording(*collect_recorded(frames, collect), names)
+    return Recording(*collect_recorded(frames, collect), names, content.notes)
 
 
 def select_calibrations(

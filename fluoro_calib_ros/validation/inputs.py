@@ -171,15 +171,19 @@ def find_wrong_orientation(
     """Return a sentence for every fluoroscope whose known orientation its exposures contradict."""
     out = {}
     for name, orientation in known.items():
-        residuals = [
-            _residuals(frame, phantom, orientation)
-            for frame in frames[name]
-            if (phantom.index(frame.target_id) >= 0).all()
+        median = _median_residual(frames[name], phantom, orientation)
+        limit = WRONG_ORIENTATION * max(frames[name][0].image_size) if frames[name] else np.inf
+        fits = [
+            other
+            for other, theirs in known.items()
+            if other != name and _median_residual(frames[name], phantom, theirs) <= limit
         ]
-        if not residuals:
-            continue
-        median = float(np.median(np.concatenate(residuals)))
-        if median > WRONG_ORIENTATION * max(frames[name][0].image_size):
+        if median > limit and fits:
+            out[name] = (
+                f'fluoroscope {name}: its image points fit the known orientation of fluoroscope '
+                f'{fits[0]}, the fluoroscopes are interchanged'
+            )
+        elif median > limit:
             behind = 'most targets would lie behind the source'
             far = f'image points are {median:.0f} px off in the median'
             out[name] = (
@@ -188,6 +192,16 @@ def find_wrong_orientation(
                 'lab, that R and t lead from the lab to the sensor, and that v runs down'
             )
     return out
+
+
+def _median_residual(frames: Sequence[Frame], phantom: Phantom, known: KnownOrientation) -> float:
+    """Median distance [px] of image points from their targets, 0 where there are none."""
+    distances = [
+        _residuals(frame, phantom, known)
+        for frame in frames
+        if (phantom.index(frame.target_id) >= 0).all()
+    ]
+    return float(np.median(np.concatenate(distances))) if distances else 0.0
 
 
 def _residuals(frame: Frame, phantom: Phantom, known: KnownOrientation) -> np.ndarray:

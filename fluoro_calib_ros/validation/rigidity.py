@@ -7,16 +7,75 @@ other, however well each fluoroscope is calibrated.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from ..calibration.calibrate import FluoroscopeResult
+from ..calibration.calibrate import ExposureResult, FluoroscopeResult
 from ..photogrammetry.rotations import matrix_from_quaternion, rotation_angle
 
 MIN_PAIRS = 3
+# Distance, in radians and relative shift, from which a pair is not one of the rig.
+INTERCHANGED = 0.4
 # Median deviation of the pairs from their median, far above that of a rig whose mounting gives.
 MAX_SHIFT_MM = 10.0
 MAX_SHIFT = 0.01  # the same over the distance of the sources; the larger of both holds
 MAX_TURN_RAD = np.deg2rad(1.0)
+
+
+def interchanged(names: tuple[str, str], one: FluoroscopeResult, other: FluoroscopeResult) -> str:
+    """Return a sentence where frames of two fluoroscopes are interchanged in some exposures.
+
+    The relative orientation of such a pair is far from the others, and its inverse is near them.
+    """
+    pairs = _pairs(one, other)
+    if len(pairs) < MIN_PAIRS:
+        return ''
+    turn, shift = _relative(pairs)
+    numbers = [a.exposure for a, _ in pairs]
+    middle = int(np.argmin(np.median(_distances(turn, shift, turn, shift), axis=1)))
+    there = turn[middle : middle + 1]
+    base = shift[middle : middle + 1]
+    far = _distances(turn, shift, there, base)[:, 0] > INTERCHANGED
+    inverse_turn = turn.transpose(0, 2, 1)
+    inverse_shift = -(turn @ shift[..., None])[..., 0]
+    near = _distances(inverse_turn, inverse_shift, there, base)[:, 0] < INTERCHANGED / 2
+    wrong = [str(number) for number, is_wrong in zip(numbers, far & near) if is_wrong]
+    if not wrong:
+        return ''
+    a, b = names
+    return (
+        f'the frames of fluoroscopes {a} and {b} are interchanged in exposure'
+        f'{"s" * (len(wrong) > 1)} {", ".join(wrong)}'
+    )
+
+
+def _pairs(
+    one: FluoroscopeResult, other: FluoroscopeResult
+) -> list[tuple[ExposureResult, ExposureResult]]:
+    """Return the exposures of the same number."""
+    by_number = {e.exposure: e for e in other.exposures}
+    return [(e, by_number[e.exposure]) for e in one.exposures if e.exposure in by_number]
+
+
+def _relative(
+    pairs: Sequence[tuple[ExposureResult, ExposureResult]],
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return rotations (k, 3, 3) from sensor to sensor, and shifts (k, 3) [mm] in the first."""
+    r_a = matrix_from_quaternion([a.quaternion_wxyz for a, _ in pairs])
+    r_b = matrix_from_quaternion([b.quaternion_wxyz for _, b in pairs])
+    base = np.array([b.position_mm - a.position_mm for a, b in pairs])
+    return r_b @ r_a.transpose(0, 2, 1), (r_a @ base[..., None])[..., 0]
+
+
+def _distances(
+    turn: np.ndarray, shift: np.ndarray, other_turn: np.ndarray, other_shift: np.ndarray
+) -> np.ndarray:
+    """Return how far (k, l) relative orientations are apart: angle [rad] and relative shift."""
+    angle = rotation_angle(turn[:, None] @ other_turn[None].transpose(0, 1, 3, 2))
+    length = np.linalg.norm(other_shift, axis=-1)[None]
+    apart = np.linalg.norm(shift[:, None] - other_shift[None], axis=-1)
+    return angle + apart / np.maximum(length, 1e-9)
 
 
 def contradiction(names: tuple[str, str], one: FluoroscopeResult, other: FluoroscopeResult) -> str:
@@ -24,15 +83,10 @@ def contradiction(names: tuple[str, str], one: FluoroscopeResult, other: Fluoros
 
     Exposures of the same number belong together. Fewer than three pairs cannot contradict.
     """
-    by_number = {e.exposure: e for e in other.exposures}
-    pairs = [(e, by_number[e.exposure]) for e in one.exposures if e.exposure in by_number]
+    pairs = _pairs(one, other)
     if len(pairs) < MIN_PAIRS:
         return ''
-    r_a = matrix_from_quaternion([a.quaternion_wxyz for a, _ in pairs])
-    r_b = matrix_from_quaternion([b.quaternion_wxyz for _, b in pairs])
-    base = np.array([b.position_mm - a.position_mm for a, b in pairs])
-    shift = (r_a @ base[..., None])[..., 0]
-    turn = r_b @ r_a.transpose(0, 2, 1)
+    turn, shift = _relative(pairs)
     deviation = np.linalg.norm(shift - np.median(shift, axis=0), axis=1)
     middle = int(np.argmin(deviation))
     off_mm = float(np.median(deviation))

@@ -167,6 +167,14 @@ WRONG = {
 }
 
 
+def test_interchanged_fluoroscopes_are_named():
+    one, other = rigs.rig().fluoroscopes
+    known = {'a': truth_of(other), 'b': truth_of(one)}
+    request = CalibrationRequest(one_pose(), rigs.rig().phantom, PLAIN, known_orientations=known)
+    with pytest.raises(DataError, match='fit the known orientation of fluoroscope b, the fluoros'):
+        run_calibration(request)
+
+
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('kind', WRONG)
 def test_a_wrong_orientation_is_refused_in_a_sentence(kind):

@@ -10,17 +10,21 @@ import numpy as np
 import pytest
 from rigs import exposures, rig, run
 
+from fluoro_calib_ros.calibration.initial_network import measured_network
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.phantom import write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, rotation_angle
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.validation.inputs import copied_exposures, find_wrong_input
 from fluoro_calib_ros.validation.plausibility import implausible
+from fluoro_calib_ros.validation.verdict import validate_or_report
 
 FAST = CalibrationOptions(model='none')
 PHANTOM = rig().phantom
@@ -281,6 +285,100 @@ def test_few_wrong_exposures_are_left_out_and_named():
     assert [e.exposure for e in outcome.result.fluoroscopes['a'].exposures] == list(range(1, 9))
     assert len(outcome.result.left_out) == 3
     assert 'exposure 200: the image points are those of exposure 1' in outcome.result.left_out[0]
+
+
+def test_exposures_of_which_less_than_half_fits_are_left_out_and_named():
+    """Beads labelled as ones nearby: the exposure starts well, but most of it does not fit."""
+    strong = virtual_rig(1, 2.0)
+    good = simulate_exposures(strong, 5, 1).frames['a']
+    wrong = simulate_exposures(strong, 6, 1, Detection(false_matches=0.52)).frames['a'][5]
+    outcome = run_calibration(CalibrationRequest({'a': [*good, wrong]}, strong.phantom, FAST))
+    assert [e.exposure for e in outcome.result.fluoroscopes['a'].exposures] == [1, 2, 3, 4, 5]
+    assert 'exposure 6: only' in outcome.result.left_out[0]
+    assert '% of the image points fit' in outcome.result.left_out[0]
+
+
+def test_single_points_that_cannot_be_used_are_left_out_and_counted(tmp_path, capsys):
+    """A point off the image and an unknown id, in Python and by the command."""
+    seen = frames()
+    uv = seen[0].uv.copy()
+    uv[3, 0] = 1024.2
+    ids = seen[1].target_id.copy()
+    ids[7] = 9999
+    seen[:2] = [replace(seen[0], uv=uv), replace(seen[1], target_id=ids)]
+    outcome = run_calibration(CalibrationRequest({'a': seen}, PHANTOM, FAST))
+    assert len(outcome.result.left_out) == 2
+    off, unknown = outcome.result.left_out
+    assert off == (
+        f'fluoroscope a, exposure 1: 1 image point, target {seen[0].target_id[3]} off the image'
+    )
+    assert unknown == 'fluoroscope a, exposure 2: 1 image point, target 9999 not on the phantom'
+    write_observations_csv(tmp_path / 'observations.csv', {'a': seen})
+    write_phantom(tmp_path / 'phantom.csv', PHANTOM)
+    arguments = ('--image-size', '1024x1024', '--phantom', tmp_path / 'phantom.csv')
+    arguments += ('--model', 'none', '--out', tmp_path / 'result')
+    assert run('calibrate', tmp_path / 'observations.csv', *arguments) == 0
+    said = capsys.readouterr().err
+    assert 'the point (1024.2, ' in said
+    assert 'target 9999 not on the phantom' in said
+
+
+def test_many_points_that_cannot_be_used_are_refused():
+    seen = frames()
+    ids = seen[1].target_id.copy()
+    ids[:20] += 9000
+    seen[1] = replace(seen[1], target_id=ids)
+    with pytest.raises(DataError, match=r'a, frame 2: target .* is not on the phantom'):
+        run_calibration(CalibrationRequest({'a': seen}, PHANTOM, FAST))
+
+
+def test_interchanged_fluoroscopes_are_found():
+    seen = {n: list(f[:5]) for n, f in exposures().items()}
+    a = seen['a'][2]
+    b = seen['b'][2]
+    seen['a'][2] = replace(b, fluoroscope='a')
+    seen['b'][2] = replace(a, fluoroscope='b')
+    sentence = 'the frames of fluoroscopes a and b are interchanged in exposure 3$'
+    with pytest.raises(DataError, match=sentence):
+        run_calibration(CalibrationRequest(seen, PHANTOM, FAST))
+
+
+@pytest.mark.parametrize('depth_mm', [0.0, 4.0, 12.0])
+def test_few_targets_of_a_facade_start_near_the_truth(depth_mm):
+    """13 targets nearly in a plane, one exposure among full ones: a DLT may be far off."""
+    fluoroscope = rig().fluoroscopes[0]
+    rng = np.random.default_rng(3)
+    facade = rng.uniform(-1, 1, (13, 3)) * [100, 80, depth_mm / 2]
+    ids = 1000 + np.arange(13)
+    both = Phantom(
+        np.append(PHANTOM.target_id, ids),
+        np.concatenate([PHANTOM.xyz_mm, facade]),
+        np.append(PHANTOM.sd_mm, np.full(13, 0.1)),
+    )
+    rotation = matrix_from_vector([0.5, 0.1, 0.9])
+    points = facade @ rotation.T
+    uv = fluoroscope.distortion.distort(fluoroscope.ideal(points)) + rng.normal(0, 0.25, (13, 2))
+    uv[4] += 60
+    seen = [*frames(3), Frame('a', 50, ids, uv, (1024, 1024))]
+    start = measured_network({'a': seen}, both).start
+    true_rotation, source = fluoroscope.exterior((rotation, np.zeros(3)))
+    assert np.rad2deg(rotation_angle(start.rotation[3] @ true_rotation.T)) < 5
+    assert np.linalg.norm(start.position_mm[3] - source) < 0.1 * np.linalg.norm(source)
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('kind', ['phantom in m', 'all ids shuffled'])
+def test_forced_input_is_validated_without_a_traceback(kind):
+    make_frames, make_phantom, _ = WRONG[kind]
+    phantom = PHANTOM if make_phantom is None else make_phantom()
+    request = CalibrationRequest({'a': make_frames()[:4]}, phantom, FAST)
+    try:
+        outcome = run_calibration(request, force=True)
+    except DataError as error:
+        assert '\n' not in str(error)
+        return
+    verdict = validate_or_report(outcome.request, outcome.calibrations)
+    assert verdict.verdict != 'pass'
 
 
 def test_impossible_result_is_refused_unless_forced():

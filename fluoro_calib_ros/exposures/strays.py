@@ -1,0 +1,73 @@
+"""Single image points that cannot be used: off the image, or of a target that is unknown.
+
+A few of them are left out and reported. Many are a fault of the whole input, such as a wrong image
+size or another phantom, and are left to `validate_frame`, which refuses the frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from .frame import Frame, points_on_image
+from .phantom import Phantom
+
+MAX_SHARE = 0.05  # of the image points of a frame that are left out; one always is
+
+
+def few(count: int, of: int) -> bool:
+    """Return whether so many image points of a frame or file can be left out."""
+    return 0 < count <= max(1, MAX_SHARE * of) and count < of
+
+
+def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame, str]:
+    """Return the frame without its few stray points, and a sentence about them, '' without any.
+
+    phantom: its targets are known, by default all. A frame with many of them, or whose arrays do
+    not belong together, is returned as it is.
+    """
+    ids = np.asarray(frame.target_id)
+    uv = np.asarray(frame.uv)
+    if uv.shape != (len(ids), 2) or (frame.sigma is not None and len(frame.sigma) != len(ids)):
+        return frame, ''
+    finite = np.isfinite(uv).all(axis=1)
+    off = finite & ~points_on_image(uv, frame.image_size)
+    unknown = np.zeros(len(ids), dtype=bool) if phantom is None else phantom.index(ids) < 0
+    stray = off | unknown
+    if not few(int(stray.sum()), len(ids)):
+        return frame, ''
+    kept = ~stray
+    cleaned = replace(
+        frame,
+        target_id=ids[kept],
+        uv=uv[kept],
+        sigma=None if frame.sigma is None else np.asarray(frame.sigma)[kept],
+    )
+    causes = [
+        f'target {_listed(ids[chosen])} {cause}'
+        for chosen, cause in ((off, 'off the image'), (unknown & ~off, 'not on the phantom'))
+        if chosen.any()
+    ]
+    return cleaned, (
+        f'fluoroscope {frame.fluoroscope}, exposure {frame.number}: {stray.sum()} image '
+        f'point{"s" * bool(stray.sum() > 1)}, {" and ".join(causes)}'
+    )
+
+
+def frames_without_strays(
+    frames: Mapping[str, Sequence[Frame]], phantom: Phantom
+) -> tuple[dict[str, list[Frame]], list[str]]:
+    """Return the frames by fluoroscope without their few stray points, and sentences on these."""
+    sentences = []
+    out: dict[str, list[Frame]] = {}
+    for name, exposures in frames.items():
+        cleaned = [without_strays(frame, phantom) for frame in exposures]
+        out[name] = [frame for frame, _ in cleaned]
+        sentences += [sentence for _, sentence in cleaned if sentence]
+    return out, sentences
+
+
+def _listed(ids: Iterable[int]) -> str:
+    return ', '.join(str(i) for i in ids)

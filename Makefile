@@ -2,16 +2,18 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint docs bench online endurance validation precision convergence pathologies bags clean
+.PHONY: help setup demo test oldest lint docs bench online endurance validation precision convergence pathologies bags clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
 # processes that run tests
 WORKERS ?= 2
+OLDEST_PYTHON ?= python3.12
 
 help:
 	@echo 'make demo         calibrate, correct and reconstruct the recorded rig in bags/ over real ROS 2 nodes'
 	@echo 'make test         run all tests'
+	@echo 'make oldest       run the tests that need no ROS with the oldest supported versions of all packages'
 	@echo 'make lint         run ruff, mypy and the import contracts (also part of the tests)'
 	@echo 'make docs         build the documentation and the API reference in docs/_build/html'
 	@echo 'make setup        create or update .venv: packages, ROS 2 and messages; demo, test, ... run it first'
@@ -36,6 +38,13 @@ demo: setup
 
 test: setup
 	@$(RUN) -m pytest tests -n $(WORKERS) --dist loadfile $(ARGS)
+
+oldest:
+	@$(OLDEST_PYTHON) -m venv .oldest
+	@.oldest/bin/python -m pip install --quiet --requirement requirements-oldest.txt
+	@.oldest/bin/python -m pytest tests -n $(WORKERS) --dist loadfile \
+	    --ignore tests/ros --ignore tests/nodes --ignore tests/test_lint.py \
+	    --ignore tests/test_packaging.py -m "not long" $(ARGS)
 
 lint: setup
 	@.venv/bin/ruff check .
@@ -74,5 +83,5 @@ bags: setup
 	@.venv/bin/fluoro-calib simulate --out bags $(ARGS)
 
 clean:
-	rm -rf .venv .build demo_result .pytest_cache .mypy_cache .ruff_cache docs/_build *.egg-info
+	rm -rf .venv .oldest .build demo_result .pytest_cache .mypy_cache .ruff_cache docs/_build *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -6,6 +6,8 @@ A self-calibration does not go through them: it looks up neighbours once for all
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.sparse import issparse
@@ -13,10 +15,13 @@ from scipy.spatial import cKDTree
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.neighbors import KNeighborsRegressor
 from sklearn.preprocessing import PolynomialFeatures
-from sklearn.utils import Tags
-from sklearn.utils.validation import _check_sample_weight, check_is_fitted, validate_data
+from sklearn.utils.validation import _check_sample_weight, check_is_fitted
 
 from .neighbours import RIDGE
+from .sklearn_versions import validated
+
+if TYPE_CHECKING:
+    from sklearn.utils import Tags
 
 MIN_BANDWIDTH = 1e-6  # of coincident neighbours
 
@@ -35,7 +40,7 @@ class KnnRegressor(KNeighborsRegressor):
         """Fit to samples X (N, d) with targets y (N,) or (N, outputs)."""
         self.sample_weight_ = None
         if sample_weight is not None:
-            samples, targets = validate_data(self, X, y, multi_output=True, accept_sparse='csr')
+            samples, targets = validated(self, X, y, multi_output=True, accept_sparse='csr')
             weight = _check_sample_weight(sample_weight, samples)
             positive = weight > 0
             X = samples[positive]
@@ -50,7 +55,7 @@ class KnnRegressor(KNeighborsRegressor):
         """Predict the targets of samples X (n, d)."""
         if getattr(self, '_scipy_tree', None) is None or self.n_neighbors > self.n_samples_fit_:
             return super().predict(X)
-        samples = validate_data(self, X, reset=False, dtype=float)
+        samples = validated(self, X, reset=False, dtype=float)
         assert self._scipy_tree is not None
         _, index = self._scipy_tree.query(samples, k=np.arange(1, self.n_neighbors + 1))
         values = self._y[:, None] if self._y.ndim == 1 else self._y
@@ -82,6 +87,9 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
         tags.target_tags.multi_output = True
         return tags
 
+    def _more_tags(self) -> dict[str, Any]:  # before scikit-learn 1.6
+        return {'multioutput': True}
+
     def fit(
         self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None
     ) -> LocalLinearRegressor:
@@ -89,7 +97,7 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
 
         Sample weights weight the fits of trend and planes; a sample of weight 0 is left out.
         """
-        samples, targets = validate_data(
+        samples, targets = validated(
             self, X, y, multi_output=True, y_numeric=True, dtype=np.float64
         )
         if self.n_neighbors < 1:
@@ -115,7 +123,7 @@ class LocalLinearRegressor(RegressorMixin, BaseEstimator):
     def predict(self, X: ArrayLike) -> np.ndarray:
         """Predict the targets of samples X (n, d)."""
         check_is_fitted(self)
-        samples = validate_data(self, X, reset=False, dtype=np.float64)
+        samples = validated(self, X, reset=False, dtype=np.float64)
         distance, index = self._tree.query(samples, k=np.arange(1, self.n_neighbors_ + 1))
         bandwidth = np.maximum(distance[:, -1:], MIN_BANDWIDTH)
         kernel = (1 - (distance / bandwidth) ** 3) ** 3

@@ -179,12 +179,13 @@ def _repeatable_multi_output(regressor: Any) -> Any:
     """Return a regressor of two outputs that gives the same numbers for the same observations."""
     from sklearn.base import clone
     from sklearn.multioutput import MultiOutputRegressor
-    from sklearn.utils import get_tags
+
+    from .sklearn_versions import supports_multi_output
 
     regressor = clone(regressor)
     for name, value in regressor.get_params(deep=True).items():
         if name.rpartition('__')[2] == 'random_state' and value is None:
             regressor.set_params(**{name: 0})
-    if get_tags(regressor).target_tags.multi_output:
+    if supports_multi_output(regressor):
         return regressor
     return MultiOutputRegressor(regressor)

@@ -6,9 +6,12 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
+import cv2
+
 STACK_SUFFIXES = ('.tif', '.tiff')
 IMAGE_SUFFIXES = ('.png', *STACK_SUFFIXES, '.jpg', '.jpeg', '.bmp', '.pgm')
 LOSSLESS_CODEC = 'FFV1'
+SUPPORTS_16_BIT_VIDEOS = tuple(map(int, cv2.__version__.split('.')[:2])) >= (4, 7)
 # Codec by which videos are written. Players know MP4 with lossy codecs only.
 VIDEO_CODECS = {'.avi': LOSSLESS_CODEC, '.mkv': LOSSLESS_CODEC, '.mp4': 'mp4v'}
 

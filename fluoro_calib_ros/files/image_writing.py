@@ -24,6 +24,7 @@ from .image_formats import (
     IMAGE_SUFFIXES,
     LOSSLESS_CODEC,
     STACK_SUFFIXES,
+    SUPPORTS_16_BIT_VIDEOS,
     VIDEO_CODECS,
     listed,
     suffix_of,
@@ -125,15 +126,21 @@ def _open_video(
             'use avi or mkv'
         )
     check_name(out.absolute())
-    depth = cv2.CV_16U if is_16_bit else cv2.CV_8U
+    # OpenCV 4.6 knows no depth: it writes 8 bits.
+    depth = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U] if is_16_bit else []
     video = cv2.VideoWriter(
         str(temporary),
         cv2.CAP_FFMPEG,
         cv2.VideoWriter_fourcc(*codec),
         frame_rate,
         (width, height),
-        [cv2.VIDEOWRITER_PROP_IS_COLOR, 0, cv2.VIDEOWRITER_PROP_DEPTH, depth],
+        [cv2.VIDEOWRITER_PROP_IS_COLOR, 0, *depth],
     )
+    if not video.isOpened() and is_16_bit and not SUPPORTS_16_BIT_VIDEOS:
+        raise DataError(
+            f'{out}: this version of OpenCV ({cv2.__version__}) cannot write videos of 16 bits, '
+            'write a TIFF stack'
+        )
     if not video.isOpened():
         raise DataError(f'{out}: cannot be written')
     return video

@@ -15,6 +15,9 @@ PNG_COMPRESSION = 1
 EIGHT_BIT_SUFFIXES = ('.jpg', '.jpeg', '.bmp')
 
 LOG_LEVEL_SILENT = 0
+JPEG_START = b'\xff\xd8'
+JPEG_END = b'\xff\xd9'
+MAX_JPEG_TRAILER = 4096  # what some cameras append to an image [bytes]
 
 
 def silence_opencv() -> None:
@@ -40,6 +43,8 @@ def decode(content: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
         raise DataError('the image is empty, it has no data')
     if data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE:
         _check_png(data.data)
+    if data[:2].tobytes() == JPEG_START and JPEG_END not in data[-MAX_JPEG_TRAILER:].tobytes():
+        raise DataError('the image is cut off, the end of its JPEG data is missing')
     try:
         image = cv2.imdecode(data, cv2.IMREAD_UNCHANGED)
     except cv2.error:

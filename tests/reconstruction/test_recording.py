@@ -443,7 +443,7 @@ def test_reconstruct_reports_where_no_drift_can_be_detected(folder, capsys):
         (
             'short.csv',
             ['--cluster', 'tibia: 1 2'],
-            'a CSV file, does not contain the times of its exposures',
+            'which is no bag, does not contain the times of its exposures',
         ),
     ],
 )

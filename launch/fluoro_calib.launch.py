@@ -53,6 +53,7 @@ SWITCHES = (
     Argument('calibration', 'true', 'false: without the calibration node', SWITCH),
     Argument('images', 'false', 'true: correct images, too', SWITCH),
     Argument('simulate', 'false', 'true: with the virtual rig', SWITCH),
+    Argument('rviz', 'false', 'true: show points and optical frames in RViz', SWITCH),
     Argument('use_sim_time', 'false', 'true: take the time from /clock', SWITCH),
     Argument('respawn', 'false', 'true: restart a node that has failed', SWITCH),
 )
@@ -125,6 +126,16 @@ def nodes_of_rig(context):
     actions += [configured('correction_node'), configured('reconstruction_node')]
     if values['images'] == 'true':
         actions.append(configured('image_node'))
+    if values['rviz'] == 'true':
+        display = os.path.join(share, 'config', 'rig.rviz')
+        actions.append(
+            Node(
+                package='rviz2',
+                executable='rviz2',
+                namespace=values['namespace'],
+                arguments=['-d', display, '-f', values['rig_frame'] or 'rig'],
+            )
+        )
     if values['bag']:
         bag = {'bag': values['bag'], 'topics': values['bag_topics'], 'rate': values['bag_rate']}
         actions.append(node('player_node', {**bag, 'wait_for_readers': '2'}))

@@ -2,6 +2,7 @@
 
 import importlib.util
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -126,3 +127,19 @@ def test_a_group_becomes_an_options_object(make_node):
 def test_invalid_values_name_the_parameter(make_node, values, sentence):
     with pytest.raises(StartError, match=f'^{sentence}'):
         GROUP.declare(make_node(**values))
+
+
+def test_shipped_rviz_and_aggregator_configurations_name_our_topics_and_nodes():
+    config = ROOT / 'config'
+    displays = yaml.safe_load((config / 'rig.rviz').read_text())['Visualization Manager']
+    topics = {d['Topic']['Value'] for d in displays['Displays'] if 'Topic' in d}
+    assert topics == {'reconstruction/points', 'reconstruction/markers'}
+    assert (
+        displays['Global Options']['Fixed Frame']
+        == parameters_of(import_module('fluoro_calib_ros.nodes.reconstruction_node').PARAMETERS)[
+            'rig_frame'
+        ].default
+    )
+    groups = yaml.safe_load((config / 'diagnostics.yaml').read_text())['/**']['ros__parameters']
+    nodes = {name for g in groups.values() if isinstance(g, dict) for name in g['contains']}
+    assert nodes == {f'{n}_node' for n in ('calibration', 'correction', 'reconstruction', 'image')}

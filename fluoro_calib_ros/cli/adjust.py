@@ -35,10 +35,13 @@ def run(arguments: argparse.Namespace) -> None:
     from ..files.names import read_names
     from ..files.result_document import result_document
     from ..jobs.adjustment import adjust
-    from ..jobs.result_folder import save_result
+    from ..jobs.result_folder import check_result_folder, save_result
     from ..jobs.sources import read_calibrations, read_source, read_survey, select_calibrations
     from ..report.tables import summary_table
 
+    check_result_folder(
+        arguments.out, (arguments.source, arguments.phantom, arguments.calibration)
+    )
     calibrations = read_calibrations(arguments.calibration)
     known = read_names(arguments.calibration)
     survey = read_survey(arguments.phantom, file_settings(arguments, names=known))

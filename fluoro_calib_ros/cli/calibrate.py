@@ -136,10 +136,12 @@ def run(arguments: argparse.Namespace) -> None:
     from ..files.phantom import has_exposures, read_moving_points
     from ..files.result_document import result_document
     from ..jobs.calibration import run_calibration
-    from ..jobs.result_folder import save_outcome
+    from ..jobs.result_folder import check_result_folder, save_outcome
     from ..jobs.sources import read_orientations, read_source, read_survey
     from ..report.tables import summary_table
 
+    inputs = (arguments.source, arguments.phantom, *arguments.known_orientation)
+    check_result_folder(arguments.out, inputs)
     known = read_orientations(arguments.known_orientation, file_settings(arguments))
     moving = bool(known) and has_exposures(arguments.phantom)
     survey = None if moving else read_survey(arguments.phantom, file_settings(arguments))
@@ -177,11 +179,14 @@ def run(arguments: argparse.Namespace) -> None:
         known,
     )
     outcome = run_calibration(request, force=arguments.force, progress=print_round)
-    save_outcome(arguments.out, outcome)
-    if arguments.figures:
-        from ..report.figures import write_figures
 
-        write_figures(outcome.result, arguments.out / 'figures')
+    def write_more(folder: Path) -> None:
+        if arguments.figures:
+            from ..report.figures import write_figures
+
+            write_figures(outcome.result, folder / 'figures')
+
+    save_outcome(arguments.out, outcome, write_more=write_more)
     if outcome.orientation is None and len(recording.frames) > 1:
         print_note(f'no orientation of the rig: {outcome.orientation_note}')
     for sentence in outcome.result.left_out:

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Callable
 from pathlib import Path
 
+from ..errors import DataError
 from .arguments import UNITS, add_file_options, add_fluoroscopes, file_settings, image_size
 from .output import print_notes, print_result
 
@@ -94,8 +95,14 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Convert. Raises DataError."""
+    from ..files.folder import check_output_file
     from ..jobs.conversion import ConversionRequest, convert
 
+    inputs = [path for path in (arguments.source, arguments.calibration) if path is not None]
+    if arguments.out.resolve() in [path.resolve() for path in inputs]:
+        raise DataError(f'{arguments.out}: the input would be overwritten, choose another output')
+    if not arguments.out.is_dir():  # bags and formats of several files make or fill a folder
+        check_output_file(arguments.out, inputs)
     written = convert(
         ConversionRequest(
             arguments.source,

@@ -56,6 +56,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Correct image points or images. Raises DataError."""
+    from ..files.folder import check_output_file
     from ..files.image_formats import (
         IMAGE_SUFFIXES,
         VIDEO_CODECS,
@@ -65,6 +66,8 @@ def run(arguments: argparse.Namespace) -> None:
     )
     from ..jobs.sources import read_calibrations
 
+    if arguments.source.is_file() or not arguments.out.is_dir():  # images can fill a folder
+        check_output_file(arguments.out, (arguments.source, arguments.calibration))
     names = None if arguments.fluoroscope is None else [arguments.fluoroscope]
     calibrations = read_calibrations(arguments.calibration, names)
     if is_image_source(arguments.source):

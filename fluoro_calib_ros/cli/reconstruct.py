@@ -71,12 +71,14 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the points of a recording. Raises DataError."""
+    from ..files.folder import check_output_file
     from ..files.reconstructed_points import write_reconstruction
     from ..files.rig_orientation import load_orientation, orientation_path
     from ..jobs.reconstruction import ReconstructionOptions, check_orientation, reconstruct
     from ..jobs.sources import is_bag, read_calibrated_source
 
     path = arguments.orientation or orientation_path(arguments.calibration)
+    check_output_file(arguments.out, (arguments.source, arguments.calibration, path))
     recording, calibrations = read_calibrated_source(
         arguments.source,
         arguments.calibration,

@@ -29,6 +29,9 @@ def atomic_file(path: PathLike, mode: str = 'wb') -> Iterator[IO[Any]]:
     """
     target = os.path.realpath(path)  # a symbolic link remains one
     folder, name = os.path.split(target)
+    if os.path.lexists(target) and not os.path.isfile(target):
+        what = 'a directory' if os.path.isdir(target) else 'a device or pipe'
+        raise DataError(f'{path}: cannot be written (this is {what}, not a file)')
     temporary = os.path.join(folder, f'.{name[:100]}.{secrets.token_hex(8)}.tmp')
     text: dict[str, Any] = {} if 'b' in mode else {'encoding': 'utf-8', 'newline': ''}
     try:

@@ -21,6 +21,7 @@ from ..simulation.exposures import SimulatedExposures
 from ..simulation.rig import VirtualFluoroscope, VirtualRig
 from ..simulation.tracking import SimulatedTracking
 
+TRUTH = 'truth'  # folder of what a data set was made with
 TRUE_SD_MM = 1e-6  # the file of the true coordinates has to contain a standard deviation
 
 
@@ -50,14 +51,14 @@ def write_exposures(
         ]
         for fluoroscope, frames in simulated.frames.items()
     }
-    write_observations_csv(directory / 'truth' / f'{name}_undistorted.csv', perfect)
+    write_observations_csv(directory / TRUTH / f'{name}_undistorted.csv', perfect)
     lines = ['fluoroscope,exposure,x_mm,y_mm,z_mm,qw,qx,qy,qz']
     for fluoroscope in rig.fluoroscopes:
         for frame, pose in zip(simulated.frames[fluoroscope.name], simulated.poses):
             rotation, position = fluoroscope.exterior(pose)
             numbers = [f'{x:.9f}' for x in (*position, *quaternion_from_matrix(rotation))]
             lines.append(','.join([fluoroscope.name, str(frame.number), *numbers]))
-    write_text(directory / 'truth' / f'{name}_exposures.csv', '\n'.join(lines) + '\n')
+    write_text(directory / TRUTH / f'{name}_exposures.csv', '\n'.join(lines) + '\n')
 
 
 def write_tracking(directory: PathLike, tracking: SimulatedTracking) -> None:
@@ -71,7 +72,7 @@ def write_tracking(directory: PathLike, tracking: SimulatedTracking) -> None:
             f'{number},{marker},{x:.6f},{y:.6f},{z:.6f}'
             for marker, (x, y, z) in zip(tracking.marker_id, points)
         ]
-    write_text(directory / 'truth' / 'markers.csv', '\n'.join(lines) + '\n')
+    write_text(directory / TRUTH / 'markers.csv', '\n'.join(lines) + '\n')
 
 
 def write_rig(directory: PathLike, rig: VirtualRig, options: Mapping[str, Any]) -> None:
@@ -80,14 +81,14 @@ def write_rig(directory: PathLike, rig: VirtualRig, options: Mapping[str, Any]) 
     options are those of the simulation. Raises DataError.
     """
     directory = Path(directory)
-    make_folder(directory / 'truth')
+    make_folder(directory / TRUTH)
     write_phantom(directory / 'phantom.csv', rig.phantom)
     write_phantom(
-        directory / 'truth' / 'phantom.csv',
+        directory / TRUTH / 'phantom.csv',
         Phantom(rig.phantom.target_id, rig.true_mm, np.full(len(rig.true_mm), TRUE_SD_MM)),
     )
     write_json(
-        directory / 'truth' / 'rig.json',
+        directory / TRUTH / 'rig.json',
         {
             'made_with': dict(options),
             'fluoroscopes': {f.name: _fluoroscope(f) for f in rig.fluoroscopes},

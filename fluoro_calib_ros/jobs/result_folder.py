@@ -3,33 +3,72 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 from ..calibration.calibrate import CalibrationResult
 from ..calibration.result import FluoroscopeCalibration
 from ..errors import DataError
-from ..files.calibration import save_calibration
-from ..files.calibration_request import write_request
+from ..files import names, validation
+from ..files.calibration import SUFFIX, load_calibrations, save_calibration
+from ..files.calibration_request import (
+    KNOWN_ORIENTATION,
+    OBSERVATIONS,
+    OPTIONS,
+    PHANTOM,
+    write_request,
+)
+from ..files.folder import FolderKind, check_output_folder, replaced_folder
 from ..files.json_file import write_json
 from ..files.result_document import result_document
+from ..files.rig_orientation import NAME as ORIENTATION
 from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
 from ..files.validation import write_validation
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 
 RESULT = 'result.json'
+# All that belongs to one calibration; calibrations of other fluoroscopes stay in the folder.
+_OWN = (
+    RESULT,
+    OBSERVATIONS,
+    PHANTOM,
+    OPTIONS,
+    KNOWN_ORIENTATION,
+    ORIENTATION,
+    names.NAME,
+    validation.NAME,
+    'residuals.csv',
+    'exposures.csv',
+    'targets.csv',
+    'figures',
+    'report.html',
+)
+
+
+def _is_own(name: str) -> bool:
+    """Return whether an entry belongs to a result, or is what a killed run left of a file."""
+    return name in _OWN or (name.startswith('.') and name.endswith('.tmp'))
+
+
+def _marks(name: str) -> bool:
+    return name in (RESULT, ORIENTATION) or name.endswith(SUFFIX)
+
+
+RESULT_FOLDER = FolderKind('a result folder', _is_own, _marks)
 
 
 def save_outcome(
     directory: str | os.PathLike[str],
     outcome: CalibrationOutcome,
     present: RigOrientation | None = None,
+    write_more: Callable[[Path], object] | None = None,
 ) -> RigOrientation | None:
-    """Write the outcome of a calibration job into a folder, which is made where it is missing.
+    """Write the outcome of a calibration job as a result folder, which replaces an earlier one.
 
     Writes the calibrations, result.json, the sources (observations, phantom, options), the
-    orientation of the rig and, where there is one, the validation.
+    orientation of the rig and, where there is one, the validation. The folder is exchanged as a
+    whole, and the earlier one is kept as DIRECTORY.previous.
 
     Parameters
     ----------
@@ -37,6 +76,8 @@ def save_outcome(
     outcome : CalibrationOutcome
     present : RigOrientation, optional
         Orientation in use; by default that in the folder.
+    write_more : callable, optional
+        Called with the new folder to write files of other names, such as figures.
 
     Returns
     -------
@@ -46,31 +87,79 @@ def save_outcome(
     Raises
     ------
     DataError
-        Where a file cannot be written.
+        Where the folder cannot be written, or is not a result folder; it is then unchanged.
     """
-    directory = Path(directory)
-    save_result(directory, outcome.result, outcome.doubts)
-    write_request(directory, outcome.request)
-    saved = saved_orientation(directory)
-    orientation = kept_orientation(present or saved, outcome.orientation, outcome.calibrations)
-    if orientation is not None and orientation is not saved:
-        save_orientation(directory, orientation)
-    if outcome.validation is not None:
-        write_validation(directory, outcome.validation)
+    orientation = kept_orientation(
+        present or saved_orientation(directory), outcome.orientation, outcome.calibrations
+    )
+    with replaced_folder(directory, RESULT_FOLDER) as folder:
+        _write_result(folder, outcome.result, outcome.doubts)
+        write_request(folder, outcome.request)
+        if orientation is not None:
+            save_orientation(folder, orientation)
+        if outcome.validation is not None:
+            write_validation(folder, outcome.validation)
+        if write_more is not None:
+            write_more(folder)
     return orientation
 
 
 def save_result(
     directory: str | os.PathLike[str], result: CalibrationResult, doubts: Sequence[str] = ()
 ) -> None:
-    """Write calibrations and result.json of a calibration or adjustment.
+    """Write calibrations and result.json of a calibration or adjustment as a result folder.
 
-    doubts are the reasons why a forced calibration cannot be right. Raises DataError.
+    doubts are the reasons why a forced calibration cannot be right. An earlier folder is replaced
+    as a whole and kept as DIRECTORY.previous. Raises DataError.
     """
-    directory = Path(directory)
+    with replaced_folder(directory, RESULT_FOLDER) as folder:
+        _write_result(folder, result, doubts)
+
+
+def save_calibrations(
+    directory: str | os.PathLike[str],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation | None,
+) -> None:
+    """Write calibrations and the orientation of the rig as a result folder.
+
+    Where these are the calibrations in the folder, only the orientation is written. Else the
+    folder is replaced as a whole and kept as DIRECTORY.previous. Raises DataError.
+    """
+    check_output_folder(directory, RESULT_FOLDER)
+    if _saved_ids(directory, calibrations) == [c.calibration_id for c in calibrations.values()]:
+        if orientation is not None:
+            save_orientation(directory, orientation)
+        return
+    with replaced_folder(directory, RESULT_FOLDER) as folder:
+        for calibration in calibrations.values():
+            save_calibration(folder, calibration)
+        if orientation is not None:
+            save_orientation(folder, orientation)
+
+
+def check_result_folder(
+    directory: str | os.PathLike[str], inputs: Iterable[str | os.PathLike[str]] = ()
+) -> None:
+    """Raise DataError unless a result folder can be written there without harm to the inputs."""
+    check_output_folder(directory, RESULT_FOLDER, inputs)
+
+
+def _write_result(folder: Path, result: CalibrationResult, doubts: Sequence[str]) -> None:
     for calibration in result.calibrations.values():
-        save_calibration(directory, calibration)
-    write_json(directory / RESULT, {**result_document(result), 'doubts': list(doubts)})
+        save_calibration(folder, calibration)
+    write_json(folder / RESULT, {**result_document(result), 'doubts': list(doubts)})
+
+
+def _saved_ids(
+    directory: str | os.PathLike[str], calibrations: Mapping[str, FluoroscopeCalibration]
+) -> list[str]:
+    """Return the ids of the calibrations of these fluoroscopes in a folder, none for a fault."""
+    try:
+        saved = load_calibrations(directory)
+    except DataError:
+        return []
+    return [saved[name].calibration_id for name in calibrations if name in saved]
 
 
 def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | None:

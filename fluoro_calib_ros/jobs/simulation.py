@@ -6,14 +6,24 @@ import dataclasses
 import os
 from pathlib import Path
 
+from ..files.folder import FolderKind, replaced_folder
 from ..options import option, validate_options
 from ..simulation.exposures import Detection, simulate_exposures
 from ..simulation.rig import virtual_rig
 from ..simulation.streams import START_NS, StreamStart
 from ..simulation.tracking import simulate_tracking
-from .dataset import write_exposures, write_rig, write_tracking
+from .dataset import TRUTH, write_exposures, write_rig, write_tracking
 
 HOUR_NS = 3600 * 10**9
+_PARTS = ('calibration', 'calibration.csv', 'test', 'test.csv', 'tracking', 'phantom.csv', TRUTH)
+
+
+def _is_own(name: str) -> bool:
+    """Return whether an entry belongs to a data set, or is what a killed run left of a part."""
+    return name in _PARTS or (name.startswith('.') and name.endswith('.tmp'))
+
+
+DATA_SET = FolderKind('a data set of the virtual rig', _is_own, lambda name: name == TRUTH)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,10 +61,16 @@ class SimulationOptions:
 def simulate(directory: str | os.PathLike[str], options: SimulationOptions | None = None) -> None:
     """Write bags, CSV files, phantom and truth of a virtual rig into a folder.
 
-    Raises DataError where a file cannot be written.
+    An earlier data set is replaced as a whole and kept as DIRECTORY.previous. Raises DataError
+    where the folder cannot be written, or is no data set.
     """
     options = options or SimulationOptions()
-    directory = Path(directory)
+    with replaced_folder(directory, DATA_SET) as folder:
+        _write(folder, options)
+
+
+def _write(directory: Path, options: SimulationOptions) -> None:
+    """Write the parts of a data set."""
     rig = virtual_rig(options.seed, options.strength)
     write_rig(directory, rig, dataclasses.asdict(options))
     detection = Detection(options.noise, options.false_matches)

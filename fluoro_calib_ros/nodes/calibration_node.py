@@ -38,11 +38,16 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.names import Names
 from ..exposures.pairing import CompletePairer, PairingOptions
 from ..exposures.phantom import Phantom
-from ..files.calibration import SUFFIX, load_calibrations, save_calibration
+from ..files.calibration import SUFFIX, load_calibrations
 from ..files.calibration_request import PHANTOM as PHANTOM_FILE
 from ..files.phantom import read_phantom
 from ..jobs.calibration import CalibrationOutcome, Rig
-from ..jobs.result_folder import save_outcome
+from ..jobs.result_folder import (
+    check_result_folder,
+    kept_orientation,
+    save_calibrations,
+    save_outcome,
+)
 from ..jobs.sources import read_survey
 from ..jobs.worker_process import run_in_worker_process
 from ..options import option
@@ -185,6 +190,7 @@ class CalibrationNode(Node):
         self._capture_refusal = ''  # why the last pair was not captured
         self._start_collection()
         self._load_fault = ''
+        self._save_fault = ''
         self._stopping = threading.Event()
         self._running: tuple[str, ...] = ()  # fluoroscopes of the running job
         self._job: threading.Thread | None = None  # waits for the worker process
@@ -445,13 +451,13 @@ class CalibrationNode(Node):
             directory = self._directory_of(request)
             if not calibrations:
                 raise DataError('there is no calibration to save')
-            for calibration in calibrations.values():
-                save_calibration(directory, calibration)
-            self._orientation.save(directory)
+            save_calibrations(directory, calibrations, self._orientation.present)
         except (DataError, OSError) as error:
             response.message = f'not saved: {error}'
             self.get_logger().error(response.message)
             return response
+        if directory == self._directory:
+            self._save_fault = ''
         response.success = True
         response.message = f'{", ".join(calibrations)} saved to {directory}'
         return response
@@ -585,19 +591,39 @@ class CalibrationNode(Node):
             name: replace(calibration, seconds=outcome.result.seconds)
             for name, calibration in outcome.result.calibrations.items()
         }
-        orientation = save_outcome(self._directory, outcome, self._orientation.present)
+        orientation, fault = self._save_outcome(outcome)
         if outcome.orientation is None:
             self.get_logger().warning(f'no new orientation of the rig: {outcome.orientation_note}')
         if orientation is None:
             self._orientation.clear()
         self._publish(calibrations, orientation)
         fill_result(result, outcome.result, calibrations)
+        self._save_fault = fault
+        if fault:
+            result.message = f'{result.message}; {fault}'
+            self.get_logger().error(fault)
         for sentence in outcome.result.left_out:
             self.get_logger().warning(f'not used: {sentence}')
         self.get_logger().info(result.message)
         if outcome.validation is not None:
             fill_verdict(result, outcome.validation)
             self._log_verdict(outcome.validation)
+
+    def _save_outcome(self, outcome: CalibrationOutcome) -> tuple[RigOrientation | None, str]:
+        """Save the outcome of a job; returns the orientation to use, and why it is not saved.
+
+        What a calibration has cost is not lost where its folder cannot be written any more: the
+        outcome is used and published all the same.
+        """
+        present = self._orientation.present
+        try:
+            return save_outcome(self._directory, outcome, present), ''
+        except DataError as error:
+            orientation = kept_orientation(present, outcome.orientation, outcome.calibrations)
+            return orientation, (
+                f'the calibration is in use but not saved: {error}; save it by the service '
+                'save_calibration'
+            )
 
     def _start_job(
         self,
@@ -607,8 +633,9 @@ class CalibrationNode(Node):
     ) -> Future:
         """Start a calibration in a worker process; returns the Future of its CalibrationOutcome.
 
-        Raises DataError and ValueError.
+        Raises DataError and ValueError, also where the outcome could not be saved.
         """
+        check_result_folder(self._directory)
         job, rig = self._job_of(request)
         done = Future()
 
@@ -741,6 +768,8 @@ class CalibrationNode(Node):
             return ERROR, conflict
         if self._load_fault:
             return ERROR, f'no calibration loaded: {self._load_fault}'
+        if self._save_fault:
+            return ERROR, self._save_fault
         if fluoroscope.refused_calibration:
             in_use = progress.calibration_id or 'no calibration'
             return (

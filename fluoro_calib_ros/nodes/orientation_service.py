@@ -112,11 +112,6 @@ class OrientationService:
         """Forget the orientation in use: it no longer belongs to the calibrations."""
         self._present = None
 
-    def save(self, directory: Path) -> None:
-        """Save the orientation in use, if any. Raises DataError."""
-        if self._present is not None:
-            save_orientation(directory, self._present)
-
     def load(
         self, directory: Path, calibrations: Mapping[str, FluoroscopeCalibration]
     ) -> rig_orientation.RigOrientation | None:

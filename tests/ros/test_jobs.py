@@ -214,3 +214,12 @@ def test_exposures_of_one_pose_are_refused(rig, exposures):
     )
     assert rig.state() == before
     assert client.status().calibration_id
+
+
+def test_unwritable_folder_is_noticed_before_the_job(graph):
+    """And before anything that is missing for the job itself."""
+    graph.calibration_node('/proc/calibrations')
+    graph.client.expect(Calibrate, 'calibrate')
+    answer = graph.client.call(Calibrate, 'calibrate')
+    assert not answer.success
+    assert answer.message.startswith('/proc/calibrations: ') and 'written' in answer.message

@@ -1,0 +1,394 @@
+"""Folders that are replaced as a whole, and outputs that must not destroy anything.
+
+A new folder is written beside the old one and both are exchanged in one step of the file system.
+The old one is kept as NAME.previous. What a killed run leaves behind is hidden, and is cleaned up
+by the next one. Its names are .NAME.<random>.tmp while a folder is being written,
+.NAME.<inode>.swap when it is complete, and .NAME.<random>.old for a folder on its way to
+NAME.previous or to deletion.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import errno
+import fcntl
+import os
+import secrets
+import shutil
+import stat
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import DataError
+from .access import PathLike, make_folder, os_error_reason
+from .atomic import sync_folder
+
+PREVIOUS = '.previous'
+# Ends of the names of files that are read from a folder: of a bag, or a result.
+_INPUT_NAMES = (
+    *('.mcap', '.db3', '.zstd', '.npz', '.yaml', '.json'),
+    *('observations.csv', 'phantom.csv', 'names.csv'),
+)
+_AT_FDCWD = -100
+_RENAME_EXCHANGE = 2
+# What a file system or an old kernel without exchange answers.
+_NO_EXCHANGE = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EXDEV)
+
+
+@dataclass(frozen=True)
+class FolderKind:
+    """What a folder of one kind consists of.
+
+    Attributes
+    ----------
+    title : str
+        What it is called in messages, such as 'a result folder'.
+    is_own : callable
+        Whether an entry of this name is part of such a folder, and is replaced with it. All other
+        entries belong to the user and are carried over.
+    marks : callable
+        Whether an entry of this name shows that a folder is of this kind.
+    """
+
+    title: str
+    is_own: Callable[[str], bool]
+    marks: Callable[[str], bool]
+
+
+def check_output_folder(path: PathLike, kind: FolderKind, inputs: Iterable[PathLike] = ()) -> None:
+    """Raise DataError unless a folder of this kind may be written at a path.
+
+    There must be nothing, an empty folder or one of this kind, which can be written. None of the
+    inputs may be replaced: neither that folder, nor a file or folder in it or above it.
+    """
+    target = os.path.realpath(path)
+    if os.path.lexists(target) and not os.path.isdir(target):
+        raise DataError(f'{path}: this is {_what(target)}, not a folder; choose another output')
+    for each in inputs:
+        source = os.path.realpath(each)
+        if target == source or source.startswith(os.path.join(target, '')):
+            raise DataError(
+                f'{path}: the input {each} would be overwritten, choose another output folder'
+            )
+        if target.startswith(os.path.join(source, '')):
+            raise DataError(
+                f'{path}: the output lies in the input {each}, choose another output folder'
+            )
+    for folder in (target, target + PREVIOUS):
+        _check_kind(folder, kind)
+    _check_writable(path, target)
+
+
+def check_output_file(path: PathLike, inputs: Iterable[PathLike] = ()) -> None:
+    """Raise DataError unless a file may be written at a path.
+
+    There must be nothing or a regular file, which is neither an input nor part of one.
+    """
+    target = os.path.realpath(path)
+    if os.path.lexists(target) and not os.path.isfile(target):
+        raise DataError(f'{path}: this is {_what(target)}, not a file; choose another output')
+    for each in inputs:
+        source = os.path.realpath(each)
+        name = os.path.basename(target)
+        is_part = os.path.dirname(target) == source and name.endswith(_INPUT_NAMES)
+        if os.path.exists(target) and (is_part or _is_same(target, source)):
+            raise DataError(
+                f'{path}: the input {each} would be overwritten, choose another output file'
+            )
+
+
+@contextmanager
+def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
+    """Yield a new folder to write into, which gets its name when the block ends without an error.
+
+    Parameters
+    ----------
+    path : path-like
+    kind : FolderKind
+        Entries of an earlier folder that are not of this kind are carried over. A part of the
+        earlier folder that is to be kept is to be written again.
+
+    Raises
+    ------
+    DataError
+        Where the folder cannot be written. After any exception the earlier folder is unchanged.
+    """
+    check_output_folder(path, kind)
+    target = os.path.realpath(path)
+    parent = os.path.dirname(target)
+    make_folder(parent)
+    clean_up(target)
+    in_place = _is_fixed(target, kind)
+    staging = ''
+    try:
+        staging, lock = _locked_folder(target if in_place else parent, os.path.basename(target))
+        try:
+            if not in_place and os.path.isdir(target):
+                shutil.copymode(target, staging)
+                _carry_over(target, staging, kind)
+            yield Path(staging)
+            sync_folder(staging)
+            if in_place:
+                _move_entries(staging, target, kind)
+            else:
+                _put_in_place(staging, target)
+        finally:
+            os.close(lock)
+    except OSError as error:
+        _delete(staging)
+        raise DataError(f'{path}: cannot be written ({os_error_reason(error)})') from None
+    except DataError as error:
+        _delete(staging)
+        raise DataError(str(error).replace(staging, str(path))) from None
+    except BaseException:
+        _delete(staging)
+        raise
+
+
+def clean_up(path: PathLike) -> None:
+    """Finish or delete what killed runs left beside a folder; running ones are left alone.
+
+    Raises DataError where that is not possible.
+    """
+    target = os.path.realpath(path)
+    parent = os.path.dirname(target)
+    try:
+        for folder in (parent, target):
+            for leftover in _leftovers(folder, os.path.basename(target)):
+                if not _is_locked(leftover):
+                    _settle(leftover, target)
+    except OSError as error:
+        raise DataError(
+            f'{path}: what an earlier run left behind cannot be cleaned up '
+            f'({os_error_reason(error)})'
+        ) from None
+
+
+def _settle(leftover: str, target: str) -> None:
+    """Keep a leftover that is an old folder, delete it otherwise."""
+    mark, suffix = leftover.rsplit('.', 2)[1:]
+    is_old = suffix == 'old' or (suffix == 'swap' and mark != str(os.stat(leftover).st_ino))
+    if is_old and not os.path.lexists(target):
+        os.rename(leftover, target)
+    elif is_old and not os.path.lexists(target + PREVIOUS):
+        os.rename(leftover, target + PREVIOUS)
+    elif suffix == 'swap' and is_old:
+        _keep_as_previous(leftover, target)
+    else:
+        shutil.rmtree(leftover)
+
+
+def _put_in_place(staging: str, target: str) -> None:
+    """Give a complete folder its name, and the old one the name of the previous."""
+    parent, name = os.path.split(target)
+    complete = os.path.join(parent, f'.{name[:100]}.{os.stat(staging).st_ino}.swap')
+    os.rename(staging, complete)
+    try:
+        if not os.path.lexists(target):
+            os.rename(complete, target)
+            sync_folder(parent)
+            return
+        try:
+            _exchange(complete, target)
+        except OSError as error:
+            if error.errno not in _NO_EXCHANGE:
+                raise
+            old = _hidden(target, 'old')
+            os.rename(target, old)
+            os.rename(complete, target)
+            complete = old
+    except OSError:
+        _delete(complete)
+        raise
+    sync_folder(parent)
+    _keep_as_previous(complete, target)
+    sync_folder(parent)
+
+
+def _keep_as_previous(folder: str, target: str) -> None:
+    """Keep a folder as NAME.previous; the one of that name is deleted."""
+    previous = target + PREVIOUS
+    if os.path.lexists(previous):
+        outdated = _hidden(target, 'old')
+        os.rename(previous, outdated)
+        os.rename(folder, previous)
+        shutil.rmtree(outdated, ignore_errors=True)
+    else:
+        os.rename(folder, previous)
+
+
+def _exchange(first: str, second: str) -> None:
+    """Exchange the names of two folders in one step (renameat2 of Linux). Raises OSError."""
+    function = getattr(ctypes.CDLL(None, use_errno=True), 'renameat2', None)
+    if function is None:
+        raise OSError(errno.ENOSYS, os.strerror(errno.ENOSYS))
+    paths = (os.fsencode(first), os.fsencode(second))
+    if function(_AT_FDCWD, paths[0], _AT_FDCWD, paths[1], _RENAME_EXCHANGE):
+        number = ctypes.get_errno()
+        raise OSError(number, os.strerror(number))
+
+
+def _move_entries(staging: str, target: str, kind: FolderKind) -> None:
+    """Move new entries into a folder that must stay where it is, one after the other."""
+    new = set(os.listdir(staging))
+    for name in os.listdir(target):
+        path = os.path.join(target, name)
+        if kind.is_own(name) and (name not in new or os.path.isdir(path)):
+            _delete(path)
+    for name in sorted(new):
+        os.replace(os.path.join(staging, name), os.path.join(target, name))
+    os.rmdir(staging)
+    sync_folder(target)
+
+
+def _carry_over(old: str, new: str, kind: FolderKind) -> None:
+    """Link what a user has put into a folder into the new one, or copy it."""
+
+    def link(source: str, copy: str) -> None:
+        try:
+            os.link(source, copy, follow_symlinks=False)
+        except OSError:
+            shutil.copy2(source, copy, follow_symlinks=False)
+
+    for name in sorted(os.listdir(old)):
+        source = os.path.join(old, name)
+        if kind.is_own(name):
+            continue
+        if os.path.isdir(source) and not os.path.islink(source):
+            shutil.copytree(source, os.path.join(new, name), symlinks=True, copy_function=link)
+        else:
+            link(source, os.path.join(new, name))
+
+
+def _locked_folder(parent: str, name: str) -> tuple[str, int]:
+    """Make a hidden folder that is locked as long as this process lives; returns path and lock."""
+    while True:
+        path = os.path.join(parent, f'.{name[:100]}.{secrets.token_hex(8)}.tmp')
+        os.mkdir(path)
+        lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+        with suppress(OSError):  # a file system without locks; or another run cleans up just now
+            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if os.path.isdir(path):
+            return path, lock
+        os.close(lock)
+
+
+def _is_locked(path: str) -> bool:
+    """Return whether a run is still writing a folder."""
+    lock = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    finally:
+        os.close(lock)
+    return False
+
+
+def _leftovers(folder: str, name: str) -> list[str]:
+    """Return the paths of hidden folders that replacing the folder `name` made in a folder."""
+    if not os.path.isdir(folder):
+        return []
+    start = f'.{name[:100]}.'
+    found = []
+    for entry in sorted(os.listdir(folder)):
+        mark, _, suffix = entry.removeprefix(start).partition('.')
+        if entry.startswith(start) and mark.isalnum() and suffix in ('tmp', 'swap', 'old'):
+            path = os.path.join(folder, entry)
+            if os.path.isdir(path) and not os.path.islink(path):
+                found.append(path)
+    return found
+
+
+def _hidden(target: str, suffix: str) -> str:
+    parent, name = os.path.split(target)
+    return os.path.join(parent, f'.{name[:100]}.{secrets.token_hex(8)}.{suffix}')
+
+
+def _is_fixed(target: str, kind: FolderKind) -> bool:
+    """Return whether a folder must stay where it is.
+
+    That is a mount point, the working folder (a shell in it would stay with the old one), and one
+    with folders of the same kind, into which others may be writing.
+    """
+    if not os.path.isdir(target):
+        return False
+    return (
+        os.path.ismount(target)
+        or not os.access(os.path.dirname(target), os.W_OK | os.X_OK)
+        or _is_same(target, os.curdir)
+        or any(_is_of_kind(os.path.join(target, name), kind) for name in os.listdir(target))
+    )
+
+
+def _is_of_kind(path: str, kind: FolderKind) -> bool:
+    return os.path.isdir(path) and any(kind.marks(name) for name in os.listdir(path))
+
+
+def _check_kind(folder: str, kind: FolderKind) -> None:
+    """Raise DataError for a folder that holds something, but is not of this kind."""
+    if not os.path.lexists(folder):
+        return
+    try:
+        names = [
+            name
+            for name in os.listdir(folder)
+            if name[0] != '.' and not _is_of_kind(os.path.join(folder, name), kind)
+        ]
+    except OSError as error:
+        raise DataError(f'{folder}: cannot be read ({os_error_reason(error)})') from None
+    if names and not any(kind.marks(name) for name in names):
+        raise DataError(
+            f'{folder}: this is not {kind.title}, it holds {min(names)}; it is not overwritten'
+        )
+
+
+def _check_writable(path: PathLike, target: str) -> None:
+    """Raise DataError unless files can be made in a folder, or in the one that it will be in."""
+    folder = target
+    while not os.path.lexists(folder):
+        folder = os.path.dirname(folder)
+    if not os.path.isdir(folder):
+        raise DataError(f'{path}: {folder} is {_what(folder)}, not a folder')
+    probe = os.path.join(folder, f'.{secrets.token_hex(8)}.tmp')
+    try:
+        with open(probe, 'xb') as file:
+            file.write(b'0')
+    except OSError as error:
+        raise DataError(f'{path}: cannot be written ({os_error_reason(error)})') from None
+    finally:
+        with suppress(OSError):
+            os.unlink(probe)
+
+
+def _what(path: str) -> str:
+    """Return what a path that is no folder, or no file, is."""
+    mode = os.stat(path).st_mode if os.path.exists(path) else 0
+    for test, name in (
+        (stat.S_ISREG, 'a file'),
+        (stat.S_ISDIR, 'a folder'),
+        (stat.S_ISFIFO, 'a pipe'),
+        (stat.S_ISCHR, 'a device'),
+        (stat.S_ISBLK, 'a device'),
+        (stat.S_ISSOCK, 'a socket'),
+    ):
+        if test(mode):
+            return name
+    return 'a broken link'
+
+
+def _is_same(first: str, second: str) -> bool:
+    try:
+        return os.path.samefile(first, second)
+    except OSError:
+        return False
+
+
+def _delete(path: str) -> None:
+    if os.path.isdir(path) and not os.path.islink(path):
+        shutil.rmtree(path, ignore_errors=True)
+    elif path:
+        with suppress(OSError):
+            os.unlink(path)

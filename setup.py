@@ -10,7 +10,10 @@ setup(
     name=package_name,
     version='0.1.0',
     packages=find_packages(include=[package_name, package_name + '.*']),
-    package_data={package_name + '.bags': ['msg/*.msg']},
+    package_data={
+        package_name + '.bags': ['msg/*.msg'],
+        package_name + '.report': ['templates/*.html'],
+    },
     data_files=[
         ('share/ament_index/resource_index/packages', ['resource/' + package_name]),
         ('share/' + package_name, ['package.xml']),
@@ -32,6 +35,7 @@ setup(
         'PyYAML',
         'opencv-python-headless>=4.6',
         'tqdm',
+        'jinja2',
         'tomli; python_version < "3.11"',
     ],
     extras_require={'c3d': ['ezc3d'], 'test': ['pytest', 'pytest-timeout', 'pytest-xdist']},

@@ -7,11 +7,21 @@ import sys
 from collections.abc import Sequence
 
 from ..errors import DataError
-from . import adjust, calibrate, convert, correct, orient, reconstruct, simulate, validate
+from . import (
+    adjust,
+    calibrate,
+    convert,
+    correct,
+    orient,
+    reconstruct,
+    report,
+    simulate,
+    validate,
+)
 
 # A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, where
 # arguments depend on each other, check(arguments, error).
-COMMANDS = (simulate, calibrate, adjust, correct, validate, orient, reconstruct, convert)
+COMMANDS = (simulate, calibrate, adjust, correct, validate, report, orient, reconstruct, convert)
 
 
 def make_parser(command: str | None = None) -> argparse.ArgumentParser:

@@ -27,6 +27,11 @@ class Coverage:
         self._occupied[cell[:, 1], cell[:, 0]] = True
 
     @property
+    def covered(self) -> np.ndarray:
+        """Whether cells (rows, columns) are covered."""
+        return binary_dilation(self._occupied, np.ones((3, 3), dtype=bool))
+
+    @property
     def fraction(self) -> float:
         """Covered fraction of the image, 0 to 1."""
-        return float(np.mean(binary_dilation(self._occupied, np.ones((3, 3), dtype=bool))))
+        return float(np.mean(self.covered))

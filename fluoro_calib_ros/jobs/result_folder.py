@@ -28,6 +28,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 
 RESULT = 'result.json'
+REPORT = 'report.html'
 # All that belongs to one calibration; calibrations of other fluoroscopes stay in the folder.
 _OWN = (
     RESULT,
@@ -42,7 +43,7 @@ _OWN = (
     'exposures.csv',
     'targets.csv',
     'figures',
-    'report.html',
+    REPORT,
 )
 
 

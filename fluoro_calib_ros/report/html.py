@@ -1,0 +1,309 @@
+"""The report of a calibration as one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import base64
+import platform
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jinja2 import Environment, FileSystemLoader, StrictUndefined
+from matplotlib import style
+from matplotlib.figure import Figure
+
+from ..calibration.result import FluoroscopeCalibration
+from ..exposures.frame import Frame
+from ..exposures.names import Names
+from ..exposures.phantom import Phantom
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.rotations import matrix_from_quaternion
+from .distortion_figure import distortion_figure
+from .report_figures import (
+    bead_shifts,
+    covered_cells,
+    distribution,
+    exposure_bars,
+    missing_sides,
+    residual_map,
+)
+from .residuals import Residuals, residuals_of
+from .style import STYLE, png_bytes
+from .text import model_text
+
+TEMPLATES = Path(__file__).parent / 'templates'
+VERDICTS = {
+    'pass': 'This calibration can be used.',
+    'fail': 'Do not use this calibration.',
+    'cannot tell': 'It cannot be told whether this calibration can be used.',
+    None: 'This calibration has not been validated.',
+}
+MAX_ROWS = 40  # of the lists of outliers and correlations
+PACKAGES = ('fluoro_calib_ros', 'numpy', 'scipy')
+
+
+@dataclass(frozen=True)
+class ReportInput:
+    """What a result folder contains.
+
+    Attributes
+    ----------
+    title : str
+    result : mapping
+        Content of result.json.
+    calibrations : mapping of str to FluoroscopeCalibration
+    frames : mapping of str to sequence of Frame
+        Exposures of the calibration.
+    phantom : Phantom
+    settings : mapping
+        Content of options.json.
+    validation : mapping or None
+        Content of validation.json.
+    orientation : RigOrientation or None
+    names : Names
+    written : str
+        Date of result.json, as text.
+    """
+
+    title: str
+    result: Mapping[str, Any]
+    calibrations: Mapping[str, FluoroscopeCalibration]
+    frames: Mapping[str, Sequence[Frame]]
+    phantom: Phantom
+    settings: Mapping[str, Any]
+    validation: Mapping[str, Any] | None = None
+    orientation: RigOrientation | None = None
+    names: Names = field(default_factory=Names)
+    written: str = ''
+
+
+def report_html(given: ReportInput) -> str:
+    """Return the report as HTML: pictures inside, no reference to anything outside."""
+    environment = Environment(
+        loader=FileSystemLoader(TEMPLATES),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    residuals = {name: _residuals(given, name) for name in given.calibrations}
+    with style.context(['default', STYLE]):
+        pictures = {name: _pictures(given, name, residuals[name]) for name in residuals}
+        beads = _bead_picture(given)
+    return environment.get_template('report.html').render(
+        given=given,
+        verdict=_verdict(given),
+        fluoroscopes={name: _fluoroscope(given, name, residuals[name]) for name in residuals},
+        pictures=pictures,
+        beads=beads,
+        rig=_rig(given),
+        outliers=_outliers(given),
+        correlations=given.result.get('correlations', [])[:MAX_ROWS],
+        versions=_versions(),
+        text=_text,
+    )
+
+
+def _verdict(given: ReportInput) -> dict[str, Any]:
+    """Return verdict, its sentence, and what to do."""
+    verdict = None if given.validation is None else given.validation.get('verdict')
+    findings = list(given.validation.get('findings', [])) if given.validation else []
+    findings += [f'This cannot be right: {doubt}' for doubt in given.result.get('doubts', [])]
+    if verdict is None:
+        findings.insert(
+            0, 'Run fluoro-calib validate on this folder, then write the report again.'
+        )
+    if verdict == 'pass' and not findings:
+        findings.append('Correct and reconstruct with it; keep this report with your data.')
+    return {
+        'name': verdict or 'not validated',
+        'class': (verdict or 'none').replace(' ', '-'),
+        'sentence': VERDICTS.get(verdict, VERDICTS['cannot tell']),
+        'findings': findings,
+        'checks': given.validation.get('checks', []) if given.validation else [],
+    }
+
+
+def _residuals(given: ReportInput, name: str) -> Residuals:
+    exposures = given.result['fluoroscopes'][name]['exposures']
+    poses = {
+        int(entry['exposure']): (
+            matrix_from_quaternion(np.array(entry['quaternion_wxyz'], dtype=float)),
+            np.array(entry['position_mm'], dtype=float),
+        )
+        for entry in exposures
+    }
+    points = {int(t['target_id']): np.array(t['xyz_mm'], float) for t in given.result['targets']}
+    outliers = {
+        (int(o['exposure']), int(o['target_id']))
+        for o in _outlying_points(given)
+        if o['fluoroscope'] == name
+    }
+    return residuals_of(given.calibrations[name], given.frames[name], poses, points, outliers)
+
+
+def _outlying_points(given: ReportInput) -> list[Mapping[str, Any]]:
+    return list((given.result.get('outliers') or {}).get('image_points', []))
+
+
+def _outliers(given: ReportInput) -> dict[str, Any]:
+    """Return the largest outliers, with names, and their number."""
+    points = sorted(_outlying_points(given), key=lambda o: -float(o['value']))
+    targets = given.names.target_names()
+    exposures = given.names.exposure_names()
+    rows = [
+        {
+            **o,
+            'target': targets.get(int(o['target_id']), o['target_id']),
+            'exposure_name': exposures.get(int(o['exposure']), o['exposure']),
+        }
+        for o in points[:MAX_ROWS]
+    ]
+    return {'count': len(points), 'rows': rows}
+
+
+def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[str, Any]:
+    """Return the numbers of a fluoroscope."""
+    calibration = given.calibrations[name]
+    covered = covered_cells(residuals.uv, calibration.image_size)
+    exposures = given.names.exposure_names()
+    missing = missing_sides(residuals.uv, calibration.image_size)
+    sd = calibration.model.evaluate(residuals.uv).sd if len(residuals.uv) else np.array([np.nan])
+    return {
+        'label': given.names.fluoroscope_names().get(name, name),
+        'entry': given.result['fluoroscopes'][name],
+        'calibration': calibration,
+        'model': model_text(calibration.model),
+        'covered': float(covered.mean()),
+        'missing': missing,
+        'correction_sd': float(np.median(sd)),
+        'largest': _largest(residuals),
+        'correlation': _correlation(calibration.interior_covariance),
+        'exposures': [
+            (exposures.get(number, number), *rest) for number, *rest in residuals.of_exposures()
+        ],
+    }
+
+
+def _largest(residuals: Residuals) -> float:
+    """Return the largest correction at an image point [px]."""
+    correction = residuals.before - residuals.after
+    return float(np.nanmax(np.hypot(*correction.T))) if len(correction) else float('nan')
+
+
+def _correlation(covariance: np.ndarray) -> list[list[float]]:
+    sd = np.sqrt(np.diag(covariance))
+    scale = np.outer(np.where(sd > 0, sd, np.nan), np.where(sd > 0, sd, np.nan))
+    return (covariance / scale).tolist()
+
+
+def _pictures(given: ReportInput, name: str, residuals: Residuals) -> list[tuple[str, str]]:
+    """Return title and PNG (base64) of the pictures of a fluoroscope."""
+    calibration = given.calibrations[name]
+    size = calibration.image_size
+    figures: list[tuple[str, Figure]] = []
+    if calibration.model.kind != 'none':
+        field_figure = distortion_figure(
+            calibration.model, name, size, calibration.interior_estimated
+        )
+        figures.append(('Distortion and its standard deviation', field_figure))
+    if residuals.inlier.any():
+        figures += [
+            ('Residuals and coverage', residual_map(residuals, name, size)),
+            ('RMS and number of beads by exposure', exposure_bars(residuals, name)),
+            ('Distribution of the residuals', distribution(residuals, name)),
+        ]
+    return [(title, _base64(figure)) for title, figure in figures]
+
+
+def _base64(figure: Figure) -> str:
+    return base64.b64encode(png_bytes(figure)).decode()
+
+
+def _bead_picture(given: ReportInput) -> dict[str, Any] | None:
+    """Return the shifts of the beads against the survey, None without beads."""
+    targets = given.result['targets']
+    ids = np.array([t['target_id'] for t in targets], dtype=np.int64)
+    row = given.phantom.index(ids) if len(ids) else np.zeros(0, dtype=int)
+    known = row >= 0
+    if known.sum() < 2:
+        return None
+    xyz = np.array([t['xyz_mm'] for t in targets], dtype=float)[known]
+    shift = xyz - given.phantom.xyz_mm[row[known]]
+    sd = given.phantom.sd_mm[row[known]]
+    order = np.argsort(-np.hypot(np.hypot(*shift.T[:2]), shift.T[2]) / sd)[:10]
+    names = given.names.target_names()
+    return {
+        'png': _base64(bead_shifts(shift, sd)),
+        'rms': np.sqrt(np.mean(shift**2, axis=0)).tolist(),
+        'largest': [
+            (names.get(int(i), int(i)), shift[k].tolist(), float(sd[k]))
+            for i, k in zip(ids[known][order], order)
+        ],
+    }
+
+
+def _rig(given: ReportInput) -> dict[str, Any]:
+    """Return what the drawing of the rig shows, in mm: in the frame of the rig, else per exposure.
+
+    Sources, corners of the images on a plane behind the phantom, and the places of the phantom.
+    """
+    entries = given.result['fluoroscopes']
+    fluoroscopes = []
+    places: list[list[float]] = []
+    names = [
+        n for n in (given.orientation.fluoroscopes if given.orientation else ()) if n in entries
+    ]
+    for name in names or list(entries)[:1]:
+        calibration = given.calibrations[name]
+        turn = np.eye(3)
+        origin = np.zeros(3)
+        if given.orientation is not None:
+            index = given.orientation.fluoroscopes.index(name)
+            turn = given.orientation.rotation[index]
+            origin = given.orientation.position_mm[index]
+        distances = [_in_sensor(e)[2] for e in entries[name]['exposures']] or [1000.0]
+        depth = 1.3 * float(np.median(distances))
+        xp, yp, c = calibration.interior
+        width, height = calibration.image_size
+        corners = [(0, 0), (width, 0), (width, height), (0, height)]
+        rays = np.array([((u - xp) / c, (v - yp) / c, 1.0) for u, v in corners]) * depth
+        fluoroscopes.append(
+            {
+                'name': name,
+                'source': origin.tolist(),
+                'corners': (rays @ turn + origin).tolist(),
+            }
+        )
+        if not places:
+            places = [
+                (turn.T @ _in_sensor(entry) + origin).tolist()
+                for entry in entries[name]['exposures']
+            ]
+    return {'fluoroscopes': fluoroscopes, 'places': places}
+
+
+def _in_sensor(entry: Mapping[str, Any]) -> np.ndarray:
+    """Return the origin of the phantom in the sensor frame of an exposure [mm]."""
+    rotation = matrix_from_quaternion(np.array(entry['quaternion_wxyz'], dtype=float))
+    return -rotation @ np.array(entry['position_mm'], dtype=float)
+
+
+def _versions() -> dict[str, str]:
+    out = {'Python': platform.python_version()}
+    for package in PACKAGES:
+        try:
+            out[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            out[package] = 'from source'
+    return out
+
+
+def _text(value: Any, digits: int = 3) -> str:
+    """Return a number for people, a dash for none."""
+    if value is None or (isinstance(value, float) and not np.isfinite(value)):
+        return '–'
+    return f'{float(value):.{digits}f}'

@@ -1,0 +1,116 @@
+"""The figures of the report: residuals and coverage over the image, by exposure, and in px."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.figure import Figure
+from scipy.stats import norm
+
+from ..exposures.coverage import CELLS, Coverage
+from .residuals import Residuals
+from .style import AFTER, BEFORE, BLACK, GREY, new_figure
+
+ARROW_SHARE = 0.03  # of the image, of the largest of most residuals
+BINS = 41
+
+
+def residual_map(residuals: Residuals, name: str, image_size: tuple[int, int]) -> Figure:
+    """Residuals after the calibration as arrows over the image; grey: not covered."""
+    width, height = image_size
+    figure = new_figure(7.5, 7.5 * height / width + 0.6, f'{name}: residuals and coverage')
+    axes = figure.subplots()
+    covered = covered_cells(residuals.uv, image_size)
+    axes.imshow(
+        np.where(covered, np.nan, 1.0),
+        extent=(-0.5, width - 0.5, height - 0.5, -0.5),
+        cmap='Greys',
+        vmin=0,
+        vmax=3,
+        interpolation='nearest',
+    )
+    after = residuals.after[residuals.inlier]
+    length = np.hypot(*after.T)
+    typical = float(np.quantile(length, 0.99)) if len(length) else 1.0
+    factor = ARROW_SHARE * max(image_size) / max(typical, 1e-9)
+    factor = float(f'{factor:.1g}')
+    u, v = residuals.uv[residuals.inlier].T
+    du, dv = after.T * factor
+    axes.quiver(u, v, du, dv, angles='xy', scale_units='xy', scale=1, color=AFTER, width=0.0015)
+    outside = residuals.uv[~residuals.inlier]
+    axes.plot(*outside.T, 'x', color=BEFORE, markersize=4, label=f'{len(outside)} outliers')
+    axes.set(xlabel='column u [px]', ylabel='row v [px]')
+    axes.set_xlim(-0.5, width - 0.5)
+    axes.set_ylim(height - 0.5, -0.5)
+    axes.grid(False)
+    axes.set_title(f'arrows magnified {factor:g} times; grey: no bead was seen here')
+    if len(outside):
+        axes.legend(loc='upper right')
+    return figure
+
+
+def covered_cells(uv: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
+    """Return (CELLS, CELLS) whether a part of the image is near an image point."""
+    coverage = Coverage(image_size)
+    coverage.add(uv)
+    return coverage.covered
+
+
+def missing_sides(uv: np.ndarray, image_size: tuple[int, int]) -> list[str]:
+    """Return the parts of the image, in words, of which less than half is covered."""
+    covered = covered_cells(uv, image_size)
+    third = CELLS // 3
+    rows = {'upper': slice(0, third), 'middle': slice(third, -third), 'lower': slice(-third, None)}
+    columns = {'left': rows['upper'], 'centre': rows['middle'], 'right': rows['lower']}
+    return [
+        f'{row} {column}'
+        for row, v in rows.items()
+        for column, u in columns.items()
+        if covered[v, u].mean() < 0.5
+    ]
+
+
+def exposure_bars(residuals: Residuals, name: str) -> Figure:
+    """RMS and number of beads by exposure."""
+    numbers, counts, _, after = zip(*residuals.of_exposures())
+    figure = new_figure(7.5, 4.6, f'{name}: by exposure')
+    upper, lower = figure.subplots(2, 1, sharex=True)
+    place = np.arange(len(numbers))
+    upper.bar(place, after, color=AFTER)
+    upper.axhline(np.median(after), color=BLACK, linewidth=1)
+    upper.set(ylabel='RMS [px]', title='line: median')
+    lower.bar(place, counts, color=GREY)
+    lower.set(ylabel='beads', xlabel='exposure')
+    step = max(1, len(numbers) // 15)
+    lower.set_xticks(place[::step], [str(number) for number in numbers[::step]])
+    return figure
+
+
+def distribution(residuals: Residuals, name: str) -> Figure:
+    """Histogram of the residuals of the inliers in px, and their quantiles against a normal."""
+    values = residuals.after[residuals.inlier].ravel()
+    figure = new_figure(7.5, 3.8, f'{name}: residuals in px')
+    left, right = figure.subplots(1, 2)
+    sd = 1.4826 * float(np.median(np.abs(values)))
+    limit = 5 * max(sd, 1e-9)
+    left.hist(np.clip(values, -limit, limit), BINS, color=AFTER, alpha=0.6, density=True)
+    x = np.linspace(-limit, limit, 200)
+    left.plot(x, norm.pdf(x, scale=max(sd, 1e-9)), color=BLACK, linewidth=1)
+    left.set(xlabel='residual [px]', title=f'robust sd {sd:.3f} px')
+    quantile = norm.ppf((np.arange(len(values)) + 0.5) / len(values))
+    right.plot(quantile, np.sort(values), '.', color=AFTER, markersize=3)
+    right.plot(quantile[[0, -1]], sd * quantile[[0, -1]], color=BLACK, linewidth=1)
+    right.set(xlabel='standard normal', ylabel='residual [px]', title='quantiles')
+    return figure
+
+
+def bead_shifts(shift_mm: np.ndarray, sd_mm: np.ndarray) -> Figure:
+    """Shifts of the beads against their survey (n, 3), and relative to its standard deviation."""
+    figure = new_figure(7.5, 3.6, 'Beads: adjusted minus survey')
+    left, right = figure.subplots(1, 2)
+    left.hist(shift_mm, 30, histtype='step', label=['x', 'y', 'z'], linewidth=1.5)
+    left.set(xlabel='shift [mm]')
+    left.legend()
+    ratio = np.sqrt(np.mean(shift_mm**2, axis=1)) / sd_mm
+    right.hist(ratio, 30, color=GREY)
+    right.set(xlabel='RMS of x, y, z over sd of the survey')
+    return figure

@@ -1,0 +1,109 @@
+"""Residuals of a calibration, computed again from what its result folder contains."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..calibration.result import FluoroscopeCalibration
+from ..exposures.frame import Frame
+from ..photogrammetry.collinearity import project
+
+Pose = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Image residuals of one fluoroscope.
+
+    Attributes
+    ----------
+    exposure, target_id : (n,) ndarray of int
+    uv : (n, 2) ndarray
+        Observed pixels.
+    before, after : (n, 2) ndarray
+        Observed and corrected minus computed [px].
+    inlier : (n,) ndarray of bool
+        False for image points that fail their test.
+    """
+
+    exposure: np.ndarray
+    target_id: np.ndarray
+    uv: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+    inlier: np.ndarray
+
+    def of_exposures(self) -> list[tuple[int, int, float, float]]:
+        """Return number, inliers, and RMS before and after [px] of every exposure."""
+        out = []
+        for number in np.unique(self.exposure):
+            rows = (self.exposure == number) & self.inlier
+            out.append(
+                (int(number), int(rows.sum()), _rms(self.before[rows]), _rms(self.after[rows]))
+            )
+        return out
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else float('nan')
+
+
+def residuals_of(
+    calibration: FluoroscopeCalibration,
+    frames: Sequence[Frame],
+    poses: Mapping[int, Pose],
+    points_mm: Mapping[int, np.ndarray],
+    outliers: set[tuple[int, int]],
+) -> Residuals:
+    """Return the residuals of the frames of a fluoroscope.
+
+    Parameters
+    ----------
+    calibration : FluoroscopeCalibration
+    frames : sequence of Frame
+    poses : mapping of int to (rotation, position_mm)
+        Exterior orientation by exposure; frames of other exposures were not used.
+    points_mm : mapping of int to (3,) ndarray
+        Adjusted object points by target.
+    outliers : set of (exposure, target)
+
+    Returns
+    -------
+    Residuals
+    """
+    exposure = []
+    target_id = []
+    uv = []
+    computed = []
+    for frame in frames:
+        if frame.number not in poses:
+            continue
+        known = [i for i, target in enumerate(frame.target_id.tolist()) if target in points_mm]
+        ids = frame.target_id[known]
+        rotation, position = poses[frame.number]
+        points = np.array([points_mm[i] for i in ids.tolist()]).reshape(-1, 3)
+        count = len(ids)
+        exposure.append(np.full(count, frame.number))
+        target_id.append(ids)
+        uv.append(frame.uv[known])
+        computed.append(
+            project(
+                np.broadcast_to(rotation, (count, 3, 3)),
+                np.broadcast_to(position, (count, 3)),
+                points,
+                calibration.interior,
+            )
+        )
+    if not exposure:
+        empty = np.zeros((0, 2))
+        none = np.zeros(0, dtype=int)
+        return Residuals(none, none, empty, empty, empty, none.astype(bool))
+    numbers, ids, observed, expected = map(np.concatenate, (exposure, target_id, uv, computed))
+    corrected = calibration.correct(observed, exact=True).uv
+    inlier = np.array([pair not in outliers for pair in zip(numbers.tolist(), ids.tolist())])
+    return Residuals(
+        numbers, ids, observed, observed - expected, corrected - expected, inlier.astype(bool)
+    )

@@ -1,0 +1,146 @@
+"""The report of a calibration as one HTML file."""
+
+import html.parser
+import json
+import re
+import shutil
+
+import numpy as np
+import pytest
+from rigs import calibrated, exposures, rig, run
+
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.exposures.names import Names
+from fluoro_calib_ros.files.calibration_request import write_request
+from fluoro_calib_ros.jobs.report import read_report_input
+from fluoro_calib_ros.jobs.result_folder import save_result
+from fluoro_calib_ros.report import html as html_report
+
+OPTIONS = {'model': 'parametric', 'max_iterations': 3}
+MAX_BYTES = 5_000_000
+
+
+@pytest.fixture(scope='module')
+def folder(tmp_path_factory):
+    """Result folder of fluoroscope a, whose targets have names."""
+    path = tmp_path_factory.mktemp('report') / 'result'
+    names = Names({f'<bead> {i}': i for i in rig().phantom.target_id.tolist()})
+    result = calibrated('a', 6, **OPTIONS)
+    save_result(path, result)
+    frames = {'a': exposures()['a'][:6]}
+    options = CalibrationOptions(**OPTIONS)
+    write_request(path, CalibrationRequest(frames, rig().phantom, options, names=names))
+    return path
+
+
+@pytest.fixture
+def without_pictures(monkeypatch):
+    """Pictures are drawn, but not rendered."""
+    monkeypatch.setattr(html_report, '_base64', lambda figure: '')
+
+
+class Page(html.parser.HTMLParser):
+    """Elements that are open, attributes that load something, and the text."""
+
+    def __init__(self):
+        super().__init__()
+        self.open = []
+        self.loads = []
+        self.text = []
+
+    def handle_starttag(self, tag, attributes):
+        if tag not in ('meta', 'br', 'img'):
+            self.open.append(tag)
+        self.loads += [v for name, v in attributes if name in ('src', 'href') and v]
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.text.append(data)
+
+
+def page_of(path):
+    page = Page()
+    text = path.read_text()
+    page.feed(text)
+    assert page.open == []
+    return page, text
+
+
+def write_verdict(folder, verdict, sentence, **changes):
+    given = read_report_input(folder)
+    document = {
+        'verdict': verdict,
+        'findings': [sentence],
+        'checks': [
+            {'name': 'halves', 'fluoroscope': 'a', 'value': 2.0, 'limit': 1.0, 'unit': 'px'}
+            | {'passed': verdict == 'pass', 'sentence': sentence, 'place': None}
+        ],
+        'calibration_id': {n: c.calibration_id for n, c in given.calibrations.items()},
+        'seconds': 1.0,
+    }
+    (folder / 'validation.json').write_text(json.dumps({**document, **changes}))
+
+
+def test_report_needs_nothing_else(folder, capsys):
+    """One file below 5 MB; pictures inside, no address; names are text, never markup."""
+    assert run('report', folder) == 0
+    path = folder / 'report.html'
+    page, text = page_of(path)
+    assert path.stat().st_size < MAX_BYTES
+    assert page.loads and all(load.startswith('data:image/png;base64,') for load in page.loads)
+    without_pictures = re.sub(r'base64,[^"]+', '', text)
+    assert not re.search(r'https?:|//[a-z]|@import|url\(', without_pictures)
+    assert '<bead>' not in without_pictures and '&lt;bead&gt;' in without_pictures
+    assert str(path) in capsys.readouterr().out
+
+
+def test_report_shows_the_residuals_of_the_adjustment(folder):
+    """They are computed again from the files; their RMS is that of the calibration."""
+    given = read_report_input(folder)
+    residuals = html_report._residuals(given, 'a')
+    entry = given.result['fluoroscopes']['a']
+    assert len(residuals.uv) == entry['observations']
+    rms = np.sqrt(np.mean(residuals.after[residuals.inlier] ** 2, axis=0))
+    np.testing.assert_allclose(rms, entry['rmse_px']['after'], rtol=0.1)
+
+
+@pytest.mark.parametrize(
+    ('verdict', 'sentence'),
+    [
+        ('pass', 'This calibration can be used.'),
+        ('fail', 'Do not use this calibration.'),
+        ('cannot tell', 'It cannot be told whether'),
+    ],
+)
+def test_verdict_and_what_to_do_come_first(folder, tmp_path, without_pictures, verdict, sentence):
+    copy = shutil.copytree(folder, tmp_path / 'copy')
+    write_verdict(copy, verdict, 'Record <5> more exposures.')
+    assert run('report', copy) == 0
+    page, _ = page_of(copy / 'report.html')
+    text = ' '.join(page.text)
+    place = text.index(f'Verdict: {verdict}')
+    assert place < text.index(sentence) < text.index('Record <5> more') < text.index('In short')
+
+
+def test_verdict_on_another_calibration_is_not_shown(folder, tmp_path, without_pictures):
+    copy = shutil.copytree(folder, tmp_path / 'copy')
+    write_verdict(copy, 'pass', 'good', calibration_id={'a': 'another'})
+    assert run('report', copy) == 0
+    page, _ = page_of(copy / 'report.html')
+    assert 'This calibration has not been validated.' in ' '.join(page.text)
+
+
+def test_folder_without_calibration_is_refused(folder, tmp_path, without_pictures, capsys):
+    assert run('report', tmp_path) == 1
+    assert 'there is no calibration in this folder' in capsys.readouterr().err
+    copy = shutil.copytree(folder, tmp_path / 'copy')
+    result = json.loads((copy / 'result.json').read_text())
+    del result['fluoroscopes']['a']['interior']
+    (copy / 'result.json').write_text(json.dumps(result))
+    (copy / 'report.html').write_text('earlier')
+    assert run('report', copy) == 1
+    assert 'this is not the result of a calibration' in capsys.readouterr().err
+    assert (copy / 'report.html').read_text() == 'earlier'

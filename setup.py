@@ -1,10 +1,21 @@
 """Package fluoro_calib_ros: for colcon, and for pip without ROS."""
 
+import os
 from glob import glob
 
 from setuptools import find_packages, setup
 
 package_name = 'fluoro_calib_ros'
+
+
+def files_below(folder):
+    """Return the data files of a folder, each with the folder in share/ into which it goes."""
+    return [
+        (os.path.join('share', package_name, path), [os.path.join(path, name) for name in names])
+        for path, _, names in os.walk(folder)
+        if names
+    ]
+
 
 setup(
     name=package_name,
@@ -19,6 +30,7 @@ setup(
         ('share/' + package_name, ['package.xml']),
         ('share/' + package_name + '/launch', sorted(glob('launch/*.launch.py'))),
         ('share/' + package_name + '/config', sorted(glob('config/*'))),
+        *files_below('bags'),
     ],
     python_requires='>=3.10',
     install_requires=[

@@ -5,6 +5,7 @@ reconstruct live, and report.
 from __future__ import annotations
 
 import argparse
+import os
 import subprocess
 import sys
 import time
@@ -213,11 +214,22 @@ def _raise_if_failed(nodes: NodeProcesses, out: Path) -> None:
         raise DemoError(f'a node ended with a fault, see the logs in {out}')
 
 
+def default_bags() -> Path:
+    """Return the folder bags of the working directory, or the one installed in a workspace."""
+    here = Path('bags')
+    prefixes = filter(None, os.environ.get('AMENT_PREFIX_PATH', '').split(os.pathsep))
+    installed = [Path(prefix) / 'share' / 'fluoro_calib_ros' / 'bags' for prefix in prefixes]
+    return next((folder for folder in (here, *installed) if folder.is_dir()), here)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the demonstration; exit status 0 when all of it worked."""
     parser = argparse.ArgumentParser(prog='fluoro_calib_demo', description=__doc__)
     parser.add_argument(
-        '--bags', type=Path, default=Path('bags'), help='folder of the bags (default: bags)'
+        '--bags',
+        type=Path,
+        default=default_bags(),
+        help='folder of the bags (default: bags, or where there is none the installed one)',
     )
     parser.add_argument(
         '--out',

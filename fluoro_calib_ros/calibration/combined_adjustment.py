@@ -15,6 +15,7 @@ import numpy as np
 
 from ..distortion.base import CorrectionModel
 from ..distortion.estimation import AdjustedTerms, require_training
+from ..distortion.misfit import FittedPoints, misfit_over_image
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
 from ..photogrammetry.elimination import factorize
@@ -112,9 +113,10 @@ def _models(
     for f, name in enumerate(measured.fluoroscopes):
         rows = network.rows(f)
         rows = rows[after.inliers[rows]]
-        models[name] = model_type(
-            0, network.uv[rows], values[rows], series=terms.fitted_series(f, after, precise)
-        )
+        series = terms.fitted_series(f, after, precise)
+        points = FittedPoints(network.uv[rows], after.residuals[rows], network.exposure[rows])
+        sd = np.hypot(series.sd, misfit_over_image(points, series))
+        models[name] = model_type(0, network.uv[rows], values[rows], series=replace(series, sd=sd))
     return models
 
 

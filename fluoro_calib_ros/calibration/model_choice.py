@@ -36,6 +36,8 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
     run: self-calibration by collocation; terms: its terms.
     """
     assert isinstance(terms, CollocationTerms)
+    if any(own is not None for own in terms.exposure_terms):
+        return None  # no other model knows what differs between exposures
     network = run.measured.network
     after = run.after
     scores = dict.fromkeys((START_MODEL, *ALTERNATIVES), 0.0)

@@ -11,10 +11,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
 from .estimation import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
+from .exposure_terms import (
+    ExposureTerms,
+    exposure_functions,
+    variation,
+    without_exposure_terms,
+)
 from .priors import Prior, gauge_precision, most_likely_prior, prior_precision, starting_prior
 from .series import Functions, Series, sd_over_image
 from .series_model import SeriesModel
@@ -35,6 +42,11 @@ MODE_CHANGES = 3  # at most
 SETTLED_PRIOR = (
     0.3  # mean change of the logarithms of the variances that changes no correction visibly
 )
+SETTLED_VARIATION = 0.05  # relative change of the size of what differs between exposures
+MAX_VARYING_EXPOSURES = 60  # of a fluoroscope that can have terms of their own, to limit the time
+# Renewals without visible change after which the priors are held. Noise and signal would otherwise
+# swing about their solution for long where the signal is as short as the distance of the points.
+HELD_AFTER = 2
 MIN_START_SD_PX = 0.1
 
 
@@ -68,7 +80,10 @@ class CollocationTerms(AdjustedTerms):
         self.priors: list[Prior] = []
         self.gauges: list[np.ndarray] = []
         self.values: list[np.ndarray] = []
+        self.exposure_terms: list[ExposureTerms | None] = [None] * len(self.sizes)
+        self._variation_tested = modes == 0
         self._mode_changes = 0
+        self._settled = 0
         for f, size in enumerate(self.sizes):
             rows = self.network.rows(f)
             core = before.residuals[rows][before.inliers[rows]]
@@ -88,26 +103,36 @@ class CollocationTerms(AdjustedTerms):
 
     def with_additional(self, network: Network) -> Network:
         """Return the network with the terms under their present priors."""
-        additional = tuple(
-            AdditionalParameters(values, prior_precision(functions, prior) + gauge)
-            for values, functions, prior, gauge in zip(
-                self.values, self.functions, self.priors, self.gauges
-            )
-        )
+        additional = tuple(self._additional(f) for f in range(len(self.functions)))
         return replace(network, additional=additional)
+
+    def _additional(self, f: int) -> AdditionalParameters:
+        """Additional parameters of fluoroscope f: the series, then the terms of its exposures."""
+        prior = prior_precision(self.functions[f], self.priors[f]) + self.gauges[f]
+        own = self.exposure_terms[f]
+        if own is None:
+            return AdditionalParameters(self.values[f], prior)
+        series = np.einsum('nm,ab->nabm', self.values[f], np.eye(2))
+        series = series.reshape(len(series), 2, -1)
+        values = np.concatenate([series, own.values], axis=2)
+        return AdditionalParameters(values, block_diag(prior, np.diag(own.precision)))
 
     def zeros(self) -> tuple[np.ndarray, ...]:
         """Coefficients of no correction, by fluoroscope."""
-        return tuple(np.zeros(2 * len(functions)) for functions in self.functions)
+        return tuple(
+            np.zeros(2 * len(functions) + (0 if own is None else own.count))
+            for functions, own in zip(self.functions, self.exposure_terms)
+        )
 
     def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
-        """Return the series of fluoroscope f.
+        """Return the series of fluoroscope f, without the terms of its exposures.
 
-        coefficients (2m,), those of u first, and their covariance (2m, 2m).
+        coefficients (p,), those of u first, and their covariance (p, p).
         """
         functions = self.functions[f]
-        sd = np.hypot(sd_over_image(functions, covariance), self._sd_beyond(f))
-        return Series(functions, coefficients.reshape(2, -1), sd)
+        own = slice(2 * len(functions))
+        sd = np.hypot(sd_over_image(functions, covariance[own, own]), self._sd_beyond(f))
+        return Series(functions, coefficients[own].reshape(2, -1), sd)
 
     def _sd_beyond(self, f: int) -> float:
         """Standard deviation [px] of the part of the signal that the series leaves out."""
@@ -121,27 +146,74 @@ class CollocationTerms(AdjustedTerms):
 
         Returns whether the priors have settled, and the coefficients with which to continue.
         """
-        settled = True
         coefficients = coefficients_of(adjustment)
+        if self._settled == HELD_AFTER:
+            return True, coefficients
         self.interior = adjustment.parameters.interior
-        modes = []
-        for f, functions in enumerate(self.functions):
-            last = self.priors[f]
-            present = prior_of_additional(network, f)
-            information = information_of_additional(matrix, f) - present
-            right = (information + present) @ coefficients[f]
-            now = most_likely_prior(functions, information, right, self.gauges[f], last)
-            self.priors[f] = now
-            self.gauges[f] = self._gauge(f)
-            if functions.modes:
-                change = now.signal.change(last.signal, functions.frequency)
-                settled &= change < SETTLED_PRIOR
-            modes.append(self._modes(f, information))
+        found = [
+            self._renew_prior(f, network, matrix, coefficients[f])
+            for f in range(len(self.functions))
+        ]
+        modes = [modes for modes, _ in found]
         present_modes = [functions.modes for functions in self.functions]
-        if modes == present_modes or self._mode_changes == MODE_CHANGES:
-            return settled, coefficients
-        self._mode_changes += 1
-        return False, self._with_modes(modes, coefficients)
+        if modes != present_modes and self._mode_changes < MODE_CHANGES:
+            self._mode_changes += 1
+            self._settled = 0
+            return False, self._with_modes(modes, coefficients)
+        settled = all(steady for _, steady in found)
+        if settled and not self._variation_tested:
+            self._variation_tested = True
+            if self._add_exposure_terms(adjustment):
+                self._mode_changes = 0  # what varied may have passed for ripples
+                fewer = [min(number, START_MODES) for number in present_modes]
+                coefficients = self._with_modes(fewer, coefficients)
+                zeros = self.zeros()
+                return False, tuple(
+                    np.concatenate([old, new[len(old) :]]) for old, new in zip(coefficients, zeros)
+                )
+        self._settled = self._settled + 1 if settled else 0
+        return settled, coefficients
+
+    def _renew_prior(
+        self, f: int, network: Network, matrix: FactorizedNormalMatrix, coefficients: np.ndarray
+    ) -> tuple[int, bool]:
+        """Renew the prior of fluoroscope f; return the modes it needs and whether it is steady."""
+        functions = self.functions[f]
+        last = self.priors[f]
+        present = prior_of_additional(network, f)
+        information = information_of_additional(matrix, f) - present
+        right = (information + present) @ coefficients
+        own = self.exposure_terms[f]
+        if own is not None:
+            posterior = np.linalg.inv(information + present)
+            end = slice(2 * len(functions), None)
+            before = own.size_px
+            own.renew(coefficients[end], np.diagonal(posterior)[end])
+            information, right = without_exposure_terms(
+                information, right, own.precision, 2 * len(functions)
+            )
+            if abs(own.size_px - before) > SETTLED_VARIATION * before:
+                self._settled = 0
+        self.priors[f] = most_likely_prior(functions, information, right, self.gauges[f], last)
+        self.gauges[f] = self._gauge(f)
+        if not functions.modes:
+            return 0, True
+        change = self.priors[f].signal.change(last.signal, functions.frequency)
+        return self._modes(f, information), change < SETTLED_PRIOR
+
+    def _add_exposure_terms(self, adjustment: Adjustment) -> bool:
+        """Add terms of the exposures where the residuals show that they differ; True if any."""
+        for f, size in enumerate(self.sizes):
+            rows = self.network.rows(f)
+            functions = exposure_functions(
+                self.network.uv[rows], size, self.interior[f], self.interior_held
+            )
+            exposure = self.network.exposure[rows]
+            core = adjustment.inliers[rows]
+            found = variation(adjustment.residuals[rows][core], exposure[core], functions[core])
+            if found.is_varying and len(np.unique(exposure)) <= MAX_VARYING_EXPOSURES:
+                self.exposure_terms[f] = ExposureTerms(functions, exposure)
+        return any(own is not None for own in self.exposure_terms)
 
     def _modes(self, f: int, information: np.ndarray) -> int:
         """Number of modes with which the image points of fluoroscope f can tell the signal.
@@ -167,5 +239,7 @@ class CollocationTerms(AdjustedTerms):
         out = []
         for f, functions in enumerate(self.functions):
             self._set_functions(f, Functions(self.sizes[f], TREND_DEGREE, modes[f]))
-            out.append(self.functions[f].converted(functions, coefficients[f]))
+            end = 2 * len(functions)
+            series = self.functions[f].converted(functions, coefficients[f][:end])
+            out.append(np.concatenate([series, coefficients[f][end:]]))
         return tuple(out)

@@ -120,7 +120,69 @@ def intersect(
     """
     rays = _rays(job, frames)
     target_id, bead = np.unique(rays.target_id, return_inverse=True)
-    points = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target_id)].copy()
+    start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target_id)]
+    return _beads(rays, target_id, bead, start, phantom)
+
+
+def least_chi2_without_a_ray(
+    job: CalibrationResult,
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    target_id: np.ndarray,
+) -> np.ndarray:
+    """Smallest squared misclosures (n,) of beads with any one of their rays left out.
+
+    A false match that agrees with the other rays by chance displaces a bead; without it the bead
+    is in place. Zero where too few rays are left.
+
+    Parameters
+    ----------
+    job, frames, phantom
+        As in `intersect`.
+    target_id : (n,) ndarray of int
+        Beads.
+
+    Returns
+    -------
+    (n,) ndarray
+    """
+    rays = _rays(job, frames)
+    out = np.zeros(len(target_id))
+    for number, target in enumerate(target_id):
+        own = np.flatnonzero(rays.target_id == target)
+        count = len(own)
+        # One copy of the bead for each ray that it lacks.
+        copy, used = np.nonzero(~np.eye(count, dtype=bool))
+        part = Rays(*(getattr(rays, name)[own[used]] for name in rays.__dataclass_fields__))
+        start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target)]
+        ids = np.full(count, target)
+        found = _beads(part, ids, copy, np.tile(start, (count, 1)), phantom)
+        if len(found.target_id) == count:
+            out[number] = found.chi2.min()
+    return out
+
+
+def _beads(
+    rays: Rays, target_id: np.ndarray, bead: np.ndarray, start: np.ndarray, phantom: Phantom
+) -> Beads:
+    """Intersect beads from rays.
+
+    Parameters
+    ----------
+    rays : Rays
+    target_id : (n,) ndarray of int
+    bead : (N,) ndarray of int
+        Row of the bead of each ray.
+    start : (n, 3) ndarray
+        Start values [mm].
+    phantom : Phantom
+
+    Returns
+    -------
+    Beads
+        Those that are well determined.
+    """
+    points = start.copy()
     for step in range(STEPS_L1 + STEPS_L2):
         ideal, _, d_point, _ = project_with_jacobian(
             rays.rotation, rays.position_mm, points[bead], rays.interior

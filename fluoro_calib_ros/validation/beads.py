@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from scipy.stats import chi2
 
-from .bead_intersection import Beads, distances, intersect
+from .bead_intersection import Beads, distances, intersect, least_chi2_without_a_ray
 from .check import Check, Finding, judge, not_made
 from .evidence import Evidence, Subject
 
@@ -23,13 +23,34 @@ def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     """Compare the beads that all fluoroscopes see with their survey."""
     found = intersect(evidence.result, evidence.frames, evidence.phantom)
     has_trend = any(common.is_significant for common in evidence.trends.values())
-    return compare_with_survey(found, has_trend)
+
+    def least_chi2(target_id: np.ndarray) -> np.ndarray:
+        return least_chi2_without_a_ray(
+            evidence.result, evidence.frames, evidence.phantom, target_id
+        )
+
+    return compare_with_survey(found, has_trend, least_chi2)
 
 
-def compare_with_survey(beads: Beads, has_trend: bool = False) -> list[Check]:
+def compare_with_survey(
+    beads: Beads,
+    has_trend: bool = False,
+    least_chi2: Callable[[np.ndarray], np.ndarray] | None = None,
+) -> list[Check]:
     """Return the checks 'beads' and 'distances'.
 
-    has_trend says whether the residuals of a fluoroscope have a trend.
+    Parameters
+    ----------
+    beads : Beads
+    has_trend : bool
+        Whether the residuals of a fluoroscope have a trend.
+    least_chi2 : callable, optional
+        Called with target ids; returns their smallest squared misclosures with any ray left out.
+        A bead is out of place only if it is so by these, too.
+
+    Returns
+    -------
+    list of Check
     """
     count = len(beads.target_id)
     if count < MIN_BEADS:
@@ -42,8 +63,12 @@ def compare_with_survey(beads: Beads, has_trend: bool = False) -> list[Check]:
             for name in ('beads', 'distances')
         ]
     limit = SD_FACTOR**2 * chi2.ppf(1 - FALSE_ALARM / count, 3)
-    order = np.argsort(-beads.chi2)
-    wrong = order[beads.chi2[order] > limit]
+    square = beads.chi2
+    suspects = np.flatnonzero(square > limit)
+    if least_chi2 is not None and len(suspects):
+        square[suspects] = np.minimum(square[suspects], least_chi2(beads.target_id[suspects]))
+    order = np.argsort(-square)
+    wrong = order[square[order] > limit]
     size = np.linalg.norm(beads.misclosure, axis=1)
     worst = order[0]
     sentence = (
@@ -54,7 +79,7 @@ def compare_with_survey(beads: Beads, has_trend: bool = False) -> list[Check]:
         sentence = _wrong_beads(beads.target_id[wrong], size[wrong])
     finding = Finding(
         size[worst],
-        size[worst] * np.sqrt(limit / beads.chi2[worst]),
+        size[worst] * np.sqrt(limit / max(square[worst], 1e-9)),
         'mm',
         sentence,
         'survey again, or give a larger sd, and calibrate again',

@@ -19,6 +19,7 @@ from ..exposures.frame import Frame
 from .beads import BEADS
 from .check import Check, Validation, not_made, verdict_of
 from .evidence import Evidence
+from .exposure_variation import VARIATION
 from .halves import HALVES
 from .held_out import HELD_OUT
 from .residual_trends import TRENDS
@@ -26,7 +27,7 @@ from .residual_trends import TRENDS
 Progress = Callable[[str, int, int], None]
 
 # A new check is a module with a Subject, and its entry here; docs/verdict.md describes it.
-SUBJECTS = (BEADS, HALVES, TRENDS, HELD_OUT)
+SUBJECTS = (BEADS, HALVES, TRENDS, VARIATION, HELD_OUT)
 
 
 def validate(

@@ -19,7 +19,12 @@ from fluoro_calib_ros.files.calibration_request import read_request, write_reque
 from fluoro_calib_ros.files.validation import validation_document
 from fluoro_calib_ros.report.verdict import verdict_text
 from fluoro_calib_ros.validation import verdict as verdict_module
-from fluoro_calib_ros.validation.bead_intersection import Beads, distances, intersect
+from fluoro_calib_ros.validation.bead_intersection import (
+    Beads,
+    distances,
+    intersect,
+    least_chi2_without_a_ray,
+)
 from fluoro_calib_ros.validation.beads import FALSE_ALARM as BEADS_FALSE_ALARM
 from fluoro_calib_ros.validation.beads import compare_with_survey
 from fluoro_calib_ros.validation.check import Check, Finding, Validation, judge, verdict_of
@@ -41,6 +46,7 @@ CHECKS = [
     'whiteness',
     'worst_area',
     'drift',
+    'variation',
     'held_out',
     'exposures',
     'beads',
@@ -320,12 +326,26 @@ def test_bead_with_a_wrong_survey_is_reported_with_its_error():
     phantom, wrong = phantom_with_a_wrong_bead()
     frames = {'a': exposures()['a']}
     job = calibrate(frames, phantom, CalibrationOptions(max_iterations=6, **LOCAL))
-    beads, dist = compare_with_survey(
-        intersect(adjust_with_calibrations(frames, phantom, job.calibrations), frames, phantom)
-    )
+    held = adjust_with_calibrations(frames, phantom, job.calibrations)
+    beads, dist = compare_with_survey(intersect(held, frames, phantom))
+    # It is out of place whichever ray is left out.
+    assert least_chi2_without_a_ray(held, frames, phantom, np.array([wrong]))[0] > 100
     assert beads.passed is False and f'the survey of bead {wrong} is wrong by ' in beads.sentence
     assert abs(beads.value - 3.0) < 0.4 and beads.limit < 1.5
     assert dist.passed  # without the bead that is named
+
+
+def test_a_bead_that_one_ray_puts_out_of_place_is_not_accused():
+    n = 40
+    rng = np.random.default_rng(4)
+    survey = rng.uniform(-100, 100, (n, 3))
+    found = survey + rng.normal(0, 0.1, (n, 3))
+    found[7] += 3.0
+    covariance = np.tile(0.01 * np.eye(3), (n, 1, 1))
+    beads = Beads(np.arange(n), found, covariance, np.full(n, 4), survey, np.full(n, 0.01))
+    assert compare_with_survey(beads)[0].passed is False
+    check = compare_with_survey(beads, least_chi2=lambda ids: np.full(len(ids), 2.0))[0]
+    assert check.passed and 'wrong' not in check.sentence
 
 
 def test_errors_of_intersected_beads_agree_with_their_covariance():

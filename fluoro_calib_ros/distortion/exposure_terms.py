@@ -1,0 +1,163 @@
+"""Distortion that differs between exposures: low-order terms of each exposure.
+
+The magnetic field about an image intensifier, and so its distortion, changes with the angle of a
+C-arm. The change is smooth: the 14 terms of the cubic trend, less what the orientation of an
+exposure absorbs, describe it (Gronenschild, Medical Physics 26, 1999). Their coefficients are
+random effects with mean zero (Robinson, "That BLUP is a good thing", Statistical Science 6, 1991);
+the variance of each term over the exposures has the largest marginal likelihood (MacKay, Neural
+Computation 4, 1992) and vanishes where nothing changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from .gauge import gauge_basis
+from .series import Functions
+from .terms import trend_transformation
+
+TREND_DEGREE = 3
+# Square sum of the terms over its expectation for independent residuals from which distortion is
+# taken to vary. Object points and the common distortion absorb a part of the residuals: constant
+# distortions have 0.4 to 0.8 (docs/pathologies.md).
+VARYING = 0.85
+START_VARIANCE = 0.04  # px^2
+MIN_VARIANCE = 1e-8  # px^2
+ORIENTATION = 6  # unknowns of an exposure
+MIN_POINTS = 30  # of an exposure whose terms are tested
+
+
+@dataclass(frozen=True)
+class Variation:
+    """Change of a distortion between exposures.
+
+    Attributes
+    ----------
+    chi2_per_dof : float
+        Square sum of the terms of all exposures over its expectation for independent residuals.
+    size_px : float
+        RMS of a coordinate of the change [px], without what the noise contributes.
+    """
+
+    chi2_per_dof: float
+    size_px: float
+
+    @property
+    def is_varying(self) -> bool:
+        """Whether the residuals show a change."""
+        return self.chi2_per_dof > VARYING
+
+
+def exposure_functions(
+    uv: np.ndarray,
+    image_size: tuple[int, int],
+    interior: np.ndarray,
+    interior_held: bool = False,
+) -> np.ndarray:
+    """Values (N, 2, 14) of the terms at pixels uv (N, 2), orthogonal and with an RMS of one.
+
+    They are orthogonal to the gauge about interior (3,), which orientations absorb.
+    """
+    to_terms, count = trend_transformation(TREND_DEGREE)
+    as_polynomials = np.linalg.inv(to_terms)[:, :count].reshape(2, -1, count)
+    values = np.einsum('nm,amt->nat', Functions(image_size, TREND_DEGREE)(uv), as_polynomials)
+    gauge = gauge_basis(uv, interior, interior_held)
+    both = np.concatenate([gauge, values], axis=2).reshape(2 * len(uv), -1)
+    q, _ = np.linalg.qr(both)
+    return q[:, gauge.shape[2] :].reshape(len(uv), 2, count) * np.sqrt(2 * len(uv))
+
+
+def is_determined(exposure: np.ndarray, fewest: int) -> bool:
+    """Whether at least `fewest` exposures have enough of the image points of exposure (n,)."""
+    return int(np.sum(np.unique(exposure, return_counts=True)[1] >= MIN_POINTS)) >= fewest
+
+
+def variation(residuals: np.ndarray, exposure: np.ndarray, functions: np.ndarray) -> Variation:
+    """Return the change of the distortion that residuals show.
+
+    residuals (n, 2) [px] of inliers, their exposures (n,), and the values (n, 2, 14) of
+    `exposure_functions`. The variance of the noise is that which the terms leave.
+    """
+    explained = 0.0
+    left = 0.0
+    dof = 0
+    dof_left = 0
+    points = 0
+    for number in np.unique(exposure):
+        own = exposure == number
+        if own.sum() < MIN_POINTS:
+            continue
+        a = functions[own].reshape(-1, functions.shape[2])
+        q, _ = np.linalg.qr(a)
+        square = float(np.sum((q.T @ residuals[own].ravel()) ** 2))
+        explained += square
+        left += float(np.sum(residuals[own] ** 2)) - square
+        dof += a.shape[1]
+        dof_left += len(a) - a.shape[1] - ORIENTATION
+        points += len(a)
+    if not dof or left <= 0:
+        return Variation(0.0, 0.0)
+    noise = left / dof_left
+    excess = max(explained - VARYING * dof * noise, 0.0)
+    return Variation(explained / (dof * noise), float(np.sqrt(excess / points)))
+
+
+class ExposureTerms:
+    """Terms of every exposure of a fluoroscope as additional parameters.
+
+    The coefficients of one exposure stand after those of the one before.
+
+    Attributes
+    ----------
+    values : (N, 2, 14 e) ndarray
+        Functions at the image points; zero but for those of the own exposure.
+    variance : (14,) ndarray
+        Variance of the coefficients of each term over the exposures [px^2].
+    """
+
+    def __init__(self, functions: np.ndarray, exposure: np.ndarray) -> None:
+        numbers, place = np.unique(exposure, return_inverse=True)
+        n, _, count = functions.shape
+        self.exposures = len(numbers)
+        values = np.zeros((n, 2, self.exposures, count))
+        values[np.arange(n), :, place] = functions
+        self.values = values.reshape(n, 2, -1)
+        self.variance = np.full(count, START_VARIANCE)
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return self.values.shape[2]
+
+    @property
+    def precision(self) -> np.ndarray:
+        """Prior precisions (14 e,) of the coefficients."""
+        return np.tile(1 / self.variance, self.exposures)
+
+    @property
+    def size_px(self) -> float:
+        """RMS of a coordinate of the change [px]."""
+        return float(np.sqrt(np.sum(self.variance)))
+
+    def renew(self, mean: np.ndarray, posterior: np.ndarray) -> None:
+        """Renew the variances from coefficients (14 e,) and their posterior variances (14 e,)."""
+        mean = mean.reshape(self.exposures, -1)
+        posterior = posterior.reshape(self.exposures, -1)
+        determined = np.clip(1 - posterior / self.variance, 1e-6, 1).sum(axis=0)
+        self.variance = np.maximum(np.sum(mean**2, axis=0) / determined, MIN_VARIANCE)
+
+
+def without_exposure_terms(
+    information: np.ndarray, right: np.ndarray, precision: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information (c, c) and right side (c,) of the first coefficients, the others eliminated.
+
+    precision (p - c,): prior of the coefficients that are eliminated.
+    """
+    rest = information[count:, count:] + np.diag(precision)
+    mixed = information[count:, :count]
+    solved = np.linalg.solve(rest, np.column_stack([mixed, right[count:]]))
+    reduced = information[:count, :count] - mixed.T @ solved[:, :-1]
+    return reduced, right[:count] - mixed.T @ solved[:, -1]

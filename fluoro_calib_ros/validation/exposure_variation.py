@@ -1,0 +1,71 @@
+"""Check 'variation': the distortion is the same in all exposures."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from ..distortion.exposure_terms import (
+    VARYING,
+    Variation,
+    exposure_functions,
+    is_determined,
+    variation,
+)
+from .check import Check, Finding, judge, more_exposures, not_made
+from .evidence import Evidence, Subject
+
+NAME = 'variation'
+MIN_EXPOSURES = 4
+# A change below it leaves corrections and verdict as they are: with 15 exposures it adds less than
+# 2 % to the errors (docs/pathologies.md).
+HARMLESS_PX = 0.1
+
+
+def check_variation(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Fit low-order terms to the residuals of each exposure; a check for each fluoroscope."""
+    return [_check(evidence, name) for name in names]
+
+
+def variation_of(evidence: Evidence, name: str) -> Variation | None:
+    """Change of the distortion of a fluoroscope between exposures; None with too few points."""
+    calibration = evidence.calibrations[name]
+    residuals = evidence.trends[name].inliers
+    if not is_determined(residuals.exposure, MIN_EXPOSURES):
+        return None
+    functions = exposure_functions(
+        residuals.uv,
+        calibration.image_size,
+        calibration.interior,
+        not calibration.interior_estimated,
+    )
+    return variation(residuals.r, residuals.exposure, functions)
+
+
+def _check(evidence: Evidence, name: str) -> Check:
+    count = len(evidence.frames[name])
+    found = variation_of(evidence, name)
+    if found is None:
+        return not_made(
+            NAME,
+            name,
+            f'fluoroscope {name}: check {NAME} could not be made, too few exposures have enough '
+            f'image points; {more_exposures(count)}',
+        )
+    return judge(
+        NAME,
+        name,
+        Finding(
+            found.size_px,
+            HARMLESS_PX,
+            'px',
+            f'fluoroscope {name}: the distortion differs between exposures by '
+            f'{found.size_px:.2f} px (chi2/dof {found.chi2_per_dof:.2f}, constant up to '
+            f'{VARYING:.2f})',
+            'a magnetic field that turns with the C-arm, a phantom that moved or was bent; '
+            f'{more_exposures(count)} at the angle that is used, or calibrate each angle',
+        ),
+        evidence.trends[name].is_significant,
+    )
+
+
+VARIATION = Subject(check_variation)

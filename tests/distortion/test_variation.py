@@ -1,0 +1,88 @@
+"""Distortion that differs between exposures, and what a model cannot follow."""
+
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.distortion.exposure_terms import (
+    VARYING,
+    ExposureTerms,
+    exposure_functions,
+    variation,
+    without_exposure_terms,
+)
+from fluoro_calib_ros.distortion.gauge import gauge_basis
+from fluoro_calib_ros.distortion.misfit import FittedPoints, misfit_over_image
+from fluoro_calib_ros.distortion.series import SD_GRID, Functions, Series
+
+SIZE = (800, 600)
+INTERIOR = np.array([410.0, 290.0, 2900.0])
+EXPOSURES = 12
+NOISE = 0.25
+
+
+def image_points(seed=0, count=100):
+    """Pixels (n, 2) of some exposures, and their exposures (n,)."""
+    rng = np.random.default_rng(seed)
+    uv = rng.uniform(0, 1, (EXPOSURES * count, 2)) * SIZE
+    return uv, np.repeat(np.arange(EXPOSURES), count), rng
+
+
+def test_terms_are_orthogonal_to_each_other_and_to_the_gauge():
+    uv, _, _ = image_points()
+    functions = exposure_functions(uv, SIZE, INTERIOR).reshape(-1, 14)
+    np.testing.assert_allclose(functions.T @ functions / len(functions), np.eye(14), atol=1e-9)
+    gauge = gauge_basis(uv, INTERIOR).reshape(len(functions), -1)
+    np.testing.assert_allclose(gauge.T @ functions / len(functions), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize('size_px', [0.0, 0.15, 0.5])
+def test_variation_is_found_with_its_size(size_px):
+    uv, exposure, rng = image_points(1)
+    functions = exposure_functions(uv, SIZE, INTERIOR)
+    coefficients = rng.normal(0, size_px / np.sqrt(14), (EXPOSURES, 14))
+    r = np.einsum('nak,nk->na', functions, coefficients[exposure])
+    found = variation(r + rng.normal(0, 0.8 * NOISE, r.shape), exposure, functions)
+    # Independent residuals have 1; those of an adjustment less, which the limit is for.
+    assert found.chi2_per_dof > 1.5 * VARYING if size_px else found.chi2_per_dof < 1.25
+    assert found.size_px == pytest.approx(np.sqrt(np.mean(r**2)), rel=0.25, abs=0.03)
+
+
+def test_variances_of_the_terms_are_found_and_vanish_where_nothing_differs():
+    uv, exposure, rng = image_points(2)
+    functions = exposure_functions(uv, SIZE, INTERIOR)
+    true = np.zeros(14)
+    true[[0, 5, 9]] = 0.3
+    coefficients = rng.normal(0, 1, (EXPOSURES, 14)) * true
+    values = np.einsum('nak,nk->na', functions, coefficients[exposure])
+    values += rng.normal(0, NOISE, values.shape)
+    terms = ExposureTerms(functions, exposure)
+    a = terms.values.reshape(2 * len(uv), -1)
+    information = a.T @ a / NOISE**2
+    right = a.T @ values.ravel() / NOISE**2
+    for _ in range(40):
+        posterior = np.linalg.inv(information + np.diag(terms.precision))
+        terms.renew(posterior @ right, np.diagonal(posterior))
+    sd = np.sqrt(terms.variance)
+    np.testing.assert_allclose(sd[true > 0], coefficients[:, true > 0].std(axis=0), rtol=0.2)
+    assert (sd[true == 0] < 0.03).all()
+    assert terms.size_px == pytest.approx(np.sqrt(np.sum(terms.variance)))
+    reduced, rest = without_exposure_terms(information, right, terms.precision[14:], 14)
+    prior = np.append(np.zeros(14), terms.precision[14:])
+    everything = np.linalg.solve(information + np.diag(prior), right)
+    np.testing.assert_allclose(np.linalg.solve(reduced, rest), everything[:14], rtol=1e-8)
+
+
+def test_what_a_series_cannot_follow_is_part_of_its_standard_deviation():
+    """A dent in one place, and nothing where residuals are noise."""
+    uv, exposure, rng = image_points(3, 200)
+    functions = Functions(SIZE, 1)
+    series = Series(functions, np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
+    noise = rng.normal(0, NOISE, uv.shape)
+    flat = misfit_over_image(FittedPoints(uv, noise, exposure), series)
+    assert (flat == 0).mean() > 0.98
+    dent = 1.5 * np.exp(-np.sum((uv - [600, 150]) ** 2, axis=1) / (2 * 50**2))
+    found = misfit_over_image(FittedPoints(uv, noise + dent[:, None], exposure), series)
+    row = round(150 / SIZE[1] * (SD_GRID - 1))
+    column = round(600 / SIZE[0] * (SD_GRID - 1))
+    assert 0.7 < found[row, column] < 1.6
+    assert np.median(found) < 0.1

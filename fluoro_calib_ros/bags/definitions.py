@@ -22,6 +22,20 @@ MAX_PADDING = 10 * PADDING  # of a message with ten of them
 _SEPARATOR = '=' * 80  # between the definitions of a schema
 
 
+@dataclasses.dataclass(frozen=True)
+class Definition:
+    """Definition of a message type in a bag: text, its encoding, and hash, '' where unknown."""
+
+    text: str
+    encoding: str = 'ros2msg'
+    type_hash: str = ''
+
+
+def known_definition(msg_type: str) -> Definition:
+    """Return the definition of a type in the typestore. Raises DataError for an unknown one."""
+    return Definition(full_text(msg_type), 'ros2msg', type_hash(msg_type))
+
+
 @cache
 def typestore() -> Typestore:
     """Return the rosbags typestore of Jazzy with the messages of fluoro_calib_msgs."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from .definitions import type_hash
+from .definitions import Definition
 
 VERSION = 9
 NO_MESSAGE_NS = 2**63 - 1  # starting time of a bag without messages [ns]
@@ -48,6 +48,7 @@ class BagTopic:
     msg_type : str
     qos : list of dict
         Offered QoS profiles.
+    definition : Definition
     count : int
         Number of messages.
     channel : int
@@ -57,6 +58,7 @@ class BagTopic:
     name: str
     msg_type: str
     qos: list[dict[str, Any]]
+    definition: Definition
     count: int = 0
     channel: int = field(default=0, compare=False)
 
@@ -96,7 +98,7 @@ def _topic_metadata(topic: BagTopic) -> dict[str, Any]:
             'type': topic.msg_type,
             'serialization_format': 'cdr',
             'offered_qos_profiles': topic.qos,
-            'type_description_hash': type_hash(topic.msg_type),
+            'type_description_hash': topic.definition.type_hash,
         },
         'message_count': topic.count,
     }

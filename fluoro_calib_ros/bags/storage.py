@@ -26,6 +26,21 @@ def storage_files(source: PathLike) -> list[str]:
     metadata = os.path.join(source, 'metadata.yaml')
     if os.path.lexists(metadata):
         return _listed_files(source, metadata)
+    return _files_in(source)
+
+
+def candidate_files(source: PathLike) -> list[str]:
+    """Return the paths of the .mcap files of a damaged bag, whatever its metadata.yaml says.
+
+    Raises DataError for a source that is not a bag.
+    """
+    if not os.path.lexists(source):
+        raise DataError(f'{source}: there is no such bag')
+    return _files_in(source) if os.path.isdir(source) else [os.fspath(source)]
+
+
+def _files_in(source: PathLike) -> list[str]:
+    """Return the paths of the .mcap files in a folder, in the order of their numbers."""
     try:
         names = [name for name in os.listdir(source) if name.endswith('.mcap') and name[0] != '.']
     except OSError as error:

@@ -21,7 +21,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame
 from ..files.access import os_error_reason
 from ..files.atomic import sync_folder, write_text
-from .definitions import TARGET_OBSERVATIONS, full_text, message_class, to_cdr, type_hash
+from .definitions import TARGET_OBSERVATIONS, Definition, known_definition, to_cdr
 from .frames import message_from_frame, observations_topic
 from .metadata import NO_MESSAGE_NS, BagTopic, FileSpan, bag_metadata
 from .qos import PROFILES, to_yaml
@@ -191,16 +191,23 @@ class BagWriter:
         time = frame.stamp_ns if log_time_ns is None else log_time_ns
         self.write(topic, TARGET_OBSERVATIONS, message_from_frame(frame), time)
 
-    def add_topic(self, topic: str, msg_type: str, qos: Qos = 'observations') -> BagTopic:
+    def add_topic(
+        self,
+        topic: str,
+        msg_type: str,
+        qos: Qos = 'observations',
+        definition: Definition | None = None,
+    ) -> BagTopic:
         """Add a topic, which may remain without messages.
 
-        Raises DataError for an invalid name and an unknown type.
+        Without definition the type is one that this program knows. Raises DataError for an
+        invalid name and an unknown type.
         """
         if not _TOPIC_NAME.fullmatch(topic):
             raise DataError(f'{self.path}: {topic!r} cannot be the name of a ROS topic')
-        message_class(msg_type)
+        definition = definition or known_definition(msg_type)
         profiles = [PROFILES[qos]] if isinstance(qos, str) else list(qos)
-        self._topics[topic] = BagTopic(topic, msg_type, profiles)
+        self._topics[topic] = BagTopic(topic, msg_type, profiles, definition)
         self._register(self._topics[topic])
         return self._topics[topic]
 
@@ -236,7 +243,7 @@ class BagWriter:
         """Write schema and channel of a topic into the file."""
         if topic.msg_type not in self._schemas:
             self._schemas[topic.msg_type] = self._mcap.register_schema(
-                topic.msg_type, 'ros2msg', full_text(topic.msg_type).encode()
+                topic.msg_type, topic.definition.encoding, topic.definition.text.encode()
             )
         topic.channel = self._mcap.register_channel(
             topic.name,
@@ -244,7 +251,7 @@ class BagWriter:
             self._schemas[topic.msg_type],
             {
                 'offered_qos_profiles': to_yaml(topic.qos),
-                'topic_type_hash': type_hash(topic.msg_type),
+                'topic_type_hash': topic.definition.type_hash,
             },
         )
 

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from ..errors import DataError
 from . import (
     adjust,
+    bag,
     calibrate,
     convert,
     correct,
@@ -21,7 +22,18 @@ from . import (
 
 # A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, where
 # arguments depend on each other, check(arguments, error).
-COMMANDS = (simulate, calibrate, adjust, correct, validate, report, orient, reconstruct, convert)
+COMMANDS = (
+    simulate,
+    calibrate,
+    adjust,
+    correct,
+    validate,
+    report,
+    orient,
+    reconstruct,
+    convert,
+    bag,
+)
 
 
 def make_parser(command: str | None = None) -> argparse.ArgumentParser:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import stat
 
 from ..errors import DataError
 
@@ -17,11 +18,25 @@ def os_error_reason(error: OSError) -> str:
     return (error.strerror or type(error).__name__).lower()
 
 
+def check_regular_file(path: PathLike) -> None:
+    """Raise DataError for a pipe, device or socket: reading one may never end.
+
+    What does not exist, or cannot be looked at, is left to the reader.
+    """
+    try:
+        mode = os.stat(path).st_mode
+    except (OSError, ValueError):
+        return
+    if not stat.S_ISREG(mode) and not stat.S_ISDIR(mode):
+        raise DataError(f'{path}: this is a pipe, device or socket, not a file')
+
+
 def read_bytes(path: PathLike) -> bytes:
     """Return the content of a file.
 
     Raises DataError for a file that does not exist, cannot be read or is empty, and for a folder.
     """
+    check_regular_file(path)
     try:
         with open(path, 'rb') as file:
             content = file.read()

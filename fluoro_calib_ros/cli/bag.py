@@ -1,0 +1,159 @@
+"""fluoro-calib bag: record, look into and recover bags."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from .output import print_result
+
+if TYPE_CHECKING:
+    from ..bags.inspection import BagReport, TopicReport
+    from ..bags.salvage import Damage
+
+NAME = 'bag'
+HELP = 'Look into a bag, or recover a damaged one.'
+EXAMPLE = 'fluoro-calib bag recover cut.mcap --out recovered'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
+    recover = _add_action(
+        actions, 'recover', 'Write all intact messages of a damaged or cut-off bag to a new one.'
+    )
+    recover.add_argument('source', type=Path, metavar='IN', help='bag (file or folder)')
+    recover.add_argument(
+        '--out', required=True, type=Path, metavar='FOLDER', help='new bag, which must not exist'
+    )
+    info = _add_action(actions, 'info', 'Say what is in a bag and what is wrong with it.')
+    info.add_argument('source', type=Path, metavar='BAG', help='bag (file or folder)')
+
+
+def _add_action(actions: Any, name: str, text: str) -> argparse.ArgumentParser:
+    action: argparse.ArgumentParser = actions.add_parser(name, help=text, description=text)
+    action.add_argument(
+        '--json',
+        action='store_true',
+        default=argparse.SUPPRESS,
+        help='print the result as JSON on standard output',
+    )
+    return action
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Run the action. Raises DataError."""
+    actions: Mapping[str, Callable[[argparse.Namespace], None]] = {
+        'recover': _recover,
+        'info': _info,
+    }
+    actions[arguments.action](arguments)
+
+
+def _recover(arguments: argparse.Namespace) -> None:
+    from ..bags.recovery import recover_bag
+
+    recovery = recover_bag(arguments.source, arguments.out)
+    total = sum(recovery.counts.values())
+    lost = recovery.lost
+    document = {
+        'out': str(arguments.out),
+        'messages': recovery.counts,
+        'lost': lost,
+        'damages': [_damage_document(damage) for damage in recovery.damages],
+        'left_out': recovery.skipped,
+    }
+    lines = [f'{total} messages recovered, written to {arguments.out}']
+    lines += [f'  {topic}: {count}' for topic, count in recovery.counts.items()]
+    lines += [_damage_text(damage) for damage in recovery.damages]
+    if lost:
+        counts = ', '.join(f'{topic} {count}' for topic, count in lost.items())
+        lines.append(f'lost in all, as the bag says how many it had: {counts}')
+    elif not recovery.damages:
+        lines.append('nothing is lost')
+    lines += [f'left out: {topic}: {reason}' for topic, reason in recovery.skipped.items()]
+    print_result(arguments, document, '\n'.join(lines))
+
+
+def _info(arguments: argparse.Namespace) -> None:
+    from ..bags.inspection import inspect_bag
+
+    report = inspect_bag(arguments.source)
+    faults = report.faults
+    document = {
+        'files': report.files,
+        'topics': {topic: _topic_document(each) for topic, each in report.topics.items()},
+        'without_partner': report.without_partner,
+        'lost': report.lost,
+        'damages': [_damage_document(damage) for damage in report.damages],
+        'faults': faults,
+    }
+    print_result(arguments, document, _info_text(report, faults))
+
+
+def _info_text(report: BagReport, faults: list[str]) -> str:
+    first = [min(topic.log_ns) for topic in report.topics.values()]
+    last = [max(topic.log_ns) for topic in report.topics.values()]
+    total = sum(len(topic.log_ns) for topic in report.topics.values())
+    lines = [f'{total} messages in {len(report.files)} files']
+    if first:
+        seconds = (max(last) - min(first)) * 1e-9
+        lines.append(f'from {_time(min(first))} to {_time(max(last))} ({seconds:.3f} s)')
+    for topic, each in report.topics.items():
+        rate = f', {1e9 / each.interval_ns:.1f} Hz' if each.interval_ns > 0 else ''
+        lines.append(f'  {topic} [{each.type}]: {len(each.log_ns)} messages{rate}')
+    lines += [f'fault: {fault}' for fault in faults] or ['no faults found']
+    return '\n'.join(lines)
+
+
+def _topic_document(topic: TopicReport) -> dict[str, Any]:
+    return {
+        'type': topic.type,
+        'messages': len(topic.log_ns),
+        'start_ns': min(topic.log_ns),
+        'end_ns': max(topic.log_ns),
+        'rate_hz': 1e9 / topic.interval_ns if topic.interval_ns > 0 else None,
+        'longest_gap_s': topic.longest_gap_s,
+        'backward_jumps': topic.backward_jumps,
+        'missing_frames': topic.missing_frames,
+        'repeated_frames': topic.repeated_frames,
+        'restarts': topic.restarts,
+        'undecodable': topic.undecodable,
+    }
+
+
+def _damage_document(damage: Damage) -> dict[str, Any]:
+    return {
+        'path': damage.path,
+        'cause': damage.cause,
+        'start_ns': damage.start_ns,
+        'end_ns': damage.end_ns,
+        'lost': damage.lost,
+    }
+
+
+def _damage_text(damage: Damage) -> str:
+    """Return what is gone: the time range, and the topics where they are known."""
+    if damage.start_ns is None and damage.end_ns is None:
+        when = 'all of the file'
+    elif damage.end_ns is None:
+        when = f'after {_time(damage.start_ns or 0)}'
+    elif damage.start_ns is None:
+        when = f'before {_time(damage.end_ns)}'
+    else:
+        when = f'between {_time(damage.start_ns)} and {_time(damage.end_ns)}'
+    counts = ', '.join(f'{topic} {count}' for topic, count in damage.lost.items())
+    return f'gone: {when} ({damage.path}: {damage.cause})' + (f': {counts}' if counts else '')
+
+
+def _time(ns: int) -> str:
+    """Return a time as UTC to the millisecond."""
+    seconds, rest = divmod(ns, 10**9)
+    try:
+        text = datetime.fromtimestamp(seconds, timezone.utc).strftime('%Y-%m-%dT%H:%M:%S')
+    except (OverflowError, ValueError, OSError):
+        return f'{ns} ns'
+    return f'{text}.{rest // 10**6:03d}Z'

@@ -205,9 +205,7 @@ class CollocationTerms(AdjustedTerms):
         """Add terms of the exposures where the residuals show that they differ; True if any."""
         for f, size in enumerate(self.sizes):
             rows = self.network.rows(f)
-            functions = exposure_functions(
-                self.network.uv[rows], size, self.interior[f], self.interior_held
-            )
+            functions = exposure_functions(self.network.uv[rows], size, self.interior[f])
             exposure = self.network.exposure[rows]
             core = adjustment.inliers[rows]
             found = variation(adjustment.residuals[rows][core], exposure[core], functions[core])

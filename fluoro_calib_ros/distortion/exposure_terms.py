@@ -51,10 +51,7 @@ class Variation:
 
 
 def exposure_functions(
-    uv: np.ndarray,
-    image_size: tuple[int, int],
-    interior: np.ndarray,
-    interior_held: bool = False,
+    uv: np.ndarray, image_size: tuple[int, int], interior: np.ndarray
 ) -> np.ndarray:
     """Values (N, 2, 14) of the terms at pixels uv (N, 2), orthogonal and with an RMS of one.
 
@@ -63,7 +60,7 @@ def exposure_functions(
     to_terms, count = trend_transformation(TREND_DEGREE)
     as_polynomials = np.linalg.inv(to_terms)[:, :count].reshape(2, -1, count)
     values = np.einsum('nm,amt->nat', Functions(image_size, TREND_DEGREE)(uv), as_polynomials)
-    gauge = gauge_basis(uv, interior, interior_held)
+    gauge = gauge_basis(uv, interior)
     both = np.concatenate([gauge, values], axis=2).reshape(2 * len(uv), -1)
     q, _ = np.linalg.qr(both)
     return q[:, gauge.shape[2] :].reshape(len(uv), 2, count) * np.sqrt(2 * len(uv))

@@ -32,12 +32,7 @@ def variation_of(evidence: Evidence, name: str) -> Variation | None:
     residuals = evidence.trends[name].inliers
     if not is_determined(residuals.exposure, MIN_EXPOSURES):
         return None
-    functions = exposure_functions(
-        residuals.uv,
-        calibration.image_size,
-        calibration.interior,
-        not calibration.interior_estimated,
-    )
+    functions = exposure_functions(residuals.uv, calibration.image_size, calibration.interior)
     return variation(residuals.r, residuals.exposure, functions)
 
 

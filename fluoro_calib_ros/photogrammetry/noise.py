@@ -29,6 +29,11 @@ NU_RANGE = (3.0, 200.0)
 GROSS_AREA = 1e6
 # Share of gross errors.
 GROSS_RANGE = (1e-5, 0.4)
+# Degrees of freedom up to which, and share up to which, gross errors may be hidden in the tails;
+# the degrees of freedom with which they are looked for.
+HEAVY_NU = 4.0
+FEW_GROSS = 0.02
+MANY_GROSS_NU = 30.0
 # Smallest redundancy of an image point: with less, its residual says nothing about the noise.
 MIN_REDUNDANCY = 0.05
 # 0.9999 quantile of chi-square with two degrees of freedom: about four sigma of each coordinate.
@@ -147,7 +152,7 @@ class Noise:
         values: np.ndarray = np.maximum(np.asarray(squared, dtype=float), 1e-300)
         missing = np.broadcast_to(np.asarray(unresolved, dtype=float), values.shape)
         if self.loss == 'student_t':
-            return self._estimate_student_t(values, missing)
+            return self._estimate_student_t(values, missing)._or_with_gross(values, missing)
         redundancy = np.maximum(1 - missing / 2, MIN_REDUNDANCY)
         if self.loss == 'gaussian':
             variance = np.sum(values) / (2 * np.sum(redundancy))
@@ -155,6 +160,21 @@ class Noise:
             median = _weighted_median(values / redundancy, redundancy)
             variance = median / (2 * np.log(2))  # median of chi-square, two degrees of freedom
         return replace(self, scale=float(np.sqrt(variance)))
+
+    def _or_with_gross(self, squared: np.ndarray, unresolved: np.ndarray) -> Noise:
+        """Return the more likely of this noise and one with a large share of gross errors.
+
+        Many gross errors that are not large look like heavy tails at first, from which the share
+        of gross errors does not grow.
+        """
+        if not self.gross or self.nu > HEAVY_NU or self.gross > FEW_GROSS:
+            return self
+        scale = float(np.sqrt(np.quantile(squared, 0.25) / (2 * np.log(4 / 3))))
+        start = replace(self, scale=scale, nu=MANY_GROSS_NU, gross=GROSS_RANGE[1])
+        other = start._estimate_student_t(squared, unresolved)
+        sigma = np.ones(len(squared))
+        costs = [n.cost(squared / n.scale**2, sigma) for n in (self, other)]
+        return other if costs[1] < costs[0] else self
 
     def _estimate_student_t(self, squared: np.ndarray, unresolved: np.ndarray) -> Noise:
         """Student-t with scale, nu and share of gross errors."""

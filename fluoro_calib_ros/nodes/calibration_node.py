@@ -24,7 +24,8 @@ from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import qos_policy_name_from_kind
+from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
+from rclpy.subscription import Subscription
 from rclpy.task import Future
 
 from ..calibration import result as calibration_result
@@ -66,7 +67,7 @@ from .messages.self_calibration import (
 from .messages.target_observations import frame_from_message
 from .orientation_service import CaptureSettings, OrientationService
 from .runtime.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, Status
-from .runtime.discovery import publisher_conflict
+from .runtime.discovery import best_effort_message, needs_best_effort, publisher_conflict
 from .runtime.errors import StartError
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
@@ -230,6 +231,7 @@ class CalibrationNode(Node):
         # Services that await must not keep others from being answered.
         services = ReentrantCallbackGroup()
         self._calibration_outputs = {}
+        self._inputs: dict[str, Subscription] = {}
         self._status_outputs = {}
         for name in self._names:
             # The status first: by its publishers, receivers of calibrations recognise that two
@@ -274,8 +276,8 @@ class CalibrationNode(Node):
         self._diagnostics = DiagnosticsPublisher(self)
         self.create_timer(1.0, self._on_timer)
 
-    def _subscribe(self, fluoroscope: _Fluoroscope) -> None:
-        """Subscribe to the observations of a fluoroscope."""
+    def _subscribe(self, fluoroscope: _Fluoroscope, qos: QoSProfile | None = None) -> None:
+        """Subscribe to the observations of a fluoroscope; by default reliable."""
         topic = f'{fluoroscope.name}/target_observations'
 
         def on_message(message: TargetObservations) -> None:
@@ -289,14 +291,26 @@ class CalibrationNode(Node):
             fluoroscope.incompatible = incompatible_qos_message(topic, policy)
             self._limited_logger.warning(fluoroscope.incompatible)
 
-        self.create_subscription(
+        self._inputs[fluoroscope.name] = self.create_subscription(
             TargetObservations,
             topic,
             on_message,
-            observations_qos(),
+            qos or observations_qos(),
             event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible),
-            qos_overriding_options=qos_overrides(),
+            qos_overriding_options=None if qos else qos_overrides(),
         )
+
+    def _accept_best_effort(self, fluoroscope: _Fluoroscope) -> None:
+        """Subscribe best effort where all publishers offer no more."""
+        old = self._inputs[fluoroscope.name]
+        if not needs_best_effort(self, old):
+            return
+        qos = observations_qos()
+        qos.reliability = ReliabilityPolicy.BEST_EFFORT
+        self.destroy_subscription(old)
+        self._subscribe(fluoroscope, qos)
+        fluoroscope.incompatible = ''
+        self.get_logger().warning(best_effort_message(f'{fluoroscope.name}/target_observations'))
 
     def _start_collection(self) -> None:
         self._pairer = CompletePairer(self._names, self._pairing)
@@ -715,6 +729,7 @@ class CalibrationNode(Node):
         statuses = []
         stamp = self.get_clock().now().to_msg()
         for fluoroscope in self._fluoroscopes.values():
+            self._accept_best_effort(fluoroscope)
             progress = self._progress_of(fluoroscope)
             self._status_outputs[fluoroscope.name].publish(message_from_progress(progress, stamp))
             statuses.append(self._diagnose(fluoroscope, progress))

@@ -3,6 +3,7 @@ interrupt.
 """
 
 import shutil
+from dataclasses import replace
 
 import pytest
 from fluoro_calib_msgs.msg import TargetObservations
@@ -14,6 +15,7 @@ from ros_graph import BAGS, NAMES, standing, value_of
 
 from fluoro_calib_ros.files.calibration import load_calibrations
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
+from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
 
 TROUBLE = ('Traceback', 'Exception', 'exception', 'Error:', 'never retrieved', 'never awaited')
 
@@ -315,8 +317,38 @@ def test_player_latches_recorded_latched_topics(graph, by_command):
     assert player.wait() == 0
 
 
-def test_incompatible_publisher_is_reported(graph, tmp_path):
-    """The diagnostics report that a reliable subscription needs a reliable publisher."""
+def test_best_effort_publisher_is_received(graph, calibrated, exposures):
+    """As drivers publish; the log says that lost messages are not sent again."""
+    client = graph.client
+    client.listen('a/corrected_observations')
+    qos = QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT)
+    publisher = client.create_publisher(TargetObservations, 'relay', qos)
+    remaps = {f'{name}/target_observations': 'relay' for name in NAMES}
+    nodes = [
+        graph.start(
+            'calibration_node',
+            {'phantom': BAGS / 'phantom.csv', 'calibration_directory': calibrated},
+            remaps,
+            wait=False,
+        ),
+        graph.start('correction_node', {'fluoroscopes': '[a]'}, remaps, wait=False),
+    ]
+    corrected = client.messages['a/corrected_observations']
+    numbers = iter(range(1, 10_000))
+
+    def received():
+        frame = replace(exposures['a'][0], number=next(numbers))
+        publisher.publish(message_from_frame(frame))
+        status = client.statuses.get('calibration_node: a')
+        return corrected and status and int(value_of(status, 'frames received'))
+
+    client.wait_until(received, what='frames from the relay')
+    for node in nodes:
+        assert 'a/target_observations: its publishers offer best effort only' in node.log
+
+
+def test_mixed_publishers_are_reported(graph, tmp_path):
+    """A reliable subscription stays while one publisher is reliable, and the other is named."""
     client = graph.client
     graph.calibration_node(tmp_path)
     graph.start('correction_node')

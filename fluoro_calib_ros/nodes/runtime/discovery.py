@@ -9,6 +9,8 @@ from collections.abc import Iterable
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import ReliabilityPolicy
+from rclpy.subscription import Subscription
 
 # Time in which readers discover a publisher that has discovered them, several times the measured
 # one.
@@ -32,6 +34,24 @@ def wait_for_readers(
             return
     if count:
         stop.wait(SETTLING_S)
+
+
+def needs_best_effort(node: Node, subscription: Subscription) -> bool:
+    """Return whether a reliable subscription has publishers, all of them best effort."""
+    if subscription.qos_profile.reliability != ReliabilityPolicy.RELIABLE:
+        return False
+    publishers = node.get_publishers_info_by_topic(subscription.topic_name)
+    return bool(publishers) and all(
+        p.qos_profile.reliability == ReliabilityPolicy.BEST_EFFORT for p in publishers
+    )
+
+
+def best_effort_message(topic: str) -> str:
+    """Return the message about a topic that is subscribed best effort from now on."""
+    return (
+        f'topic {topic}: its publishers offer best effort only; it is subscribed best effort now, '
+        'so lost messages are not sent again'
+    )
 
 
 def publisher_conflict(node: Node, topic: str) -> str:

@@ -14,6 +14,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 
 from .diagnostics import DiagnosticsPublisher, Status
+from .discovery import best_effort_message
 from .errors import USER_ERRORS, StartError, one_line
 from .logging import RateLimitedLogger
 from .qos import qos_overrides
@@ -197,6 +198,8 @@ class StreamNode(ManagedNode):
         """Return a message for every topic with an incompatible publisher, and log them."""
         found: dict[str, str] = {}
         for reader in self.readers:
+            for topic in reader.accept_best_effort():
+                self.get_logger().warning(best_effort_message(topic))
             found.update(reader.incompatible_publishers())
         for message in found.values():
             self.limited_logger.warning(message)

@@ -16,6 +16,7 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Callable
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,10 +25,16 @@ from rclpy.callback_groups import CallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.impl.implementation_singleton import rclpy_implementation
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
+from rclpy.qos import (
+    QoSCompatibility,
+    QoSProfile,
+    ReliabilityPolicy,
+    qos_check_compatible,
+)
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
+from .discovery import needs_best_effort
 from .qos import incompatible_qos_message, qos_overrides
 
 WAIT_NS = 50_000_000  # after which the thread checks whether it has to end
@@ -116,6 +123,39 @@ class StreamReader:
         decode = decode or (lambda data: deserialize_message(data, kind))
         self._routes.append((topic, subscription, decode, callback))
 
+    def accept_best_effort(self) -> list[str]:
+        """Subscribe best effort to topics that are only published so; returns them.
+
+        Drivers of cameras often publish so, and a reliable subscription receives nothing from
+        them. To be called from the thread that made the subscriptions.
+        """
+        lowered = [
+            number for number, route in enumerate(self._routes) if self._is_unreliable(route)
+        ]
+        if not lowered:
+            return []
+        self._halt()
+        for number in lowered:
+            topic, old, decode, callback = self._routes[number]
+            qos = copy(old.qos_profile)
+            qos.reliability = ReliabilityPolicy.BEST_EFFORT
+            self._node.destroy_subscription(old)
+            new = self._node.create_subscription(
+                old.msg_type,
+                topic,
+                lambda _: None,
+                qos,
+                callback_group=self._group,
+                event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
+            )
+            self._routes[number] = (topic, new, decode, callback)
+        self.start()
+        return [self._routes[number][0] for number in lowered]
+
+    def _is_unreliable(self, route: tuple[str, Subscription, Callable, Callable]) -> bool:
+        """Return whether a reliable subscription has best-effort publishers only."""
+        return needs_best_effort(self._node, route[1])
+
     def incompatible_publishers(self) -> dict[str, str]:
         """Return a message for every topic with a publisher that offers less than is requested.
 
@@ -140,13 +180,17 @@ class StreamReader:
 
     def stop(self) -> None:
         """Stop after the message that is being handled, and destroy the subscriptions."""
+        self._halt()
+        for _, subscription, *_ in self._routes:
+            self._node.destroy_subscription(subscription)
+        self._routes = []
+
+    def _halt(self) -> None:
+        """Stop the thread."""
         self._stopping.set()
         if self._thread is not None and self._thread is not threading.current_thread():
             self._thread.join()
         self._thread = None
-        for _, subscription, *_ in self._routes:
-            self._node.destroy_subscription(subscription)
-        self._routes = []
 
     def _run(self) -> None:
         try:

@@ -7,7 +7,11 @@ and z [mm]; 0 where that is unknown. C3D holds coordinates as float32, and resid
 
 from __future__ import annotations
 
+import io
 import os
+import struct
+import subprocess
+import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -18,6 +22,7 @@ from ..errors import DataError
 from ..exposures.names import Names, number_names
 from ..files.access import read_bytes
 from ..files.atomic import write_bytes
+from . import c3d_process
 from .base import Format, Sample
 from .content import UNITS_MM, Content, FileSettings, Points, Written
 from .frames_of_points import at_constant_rate, labels
@@ -25,8 +30,11 @@ from .labels import named_targets
 
 MISSING = -1.0
 STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
+MAX_SECONDS = 60
 MAX_FRAME = 65535  # the header counts in uint16
 _MAGIC = 0x50
+_INTEL = 84  # processor type
+BLOCK = 512  # bytes
 
 
 def recognise(sample: Sample) -> bool:
@@ -46,21 +54,15 @@ def _ezc3d() -> Any:
 
 def read(path: Path, settings: FileSettings) -> Content:
     """Read points in space. Raises DataError."""
-    if read_bytes(path)[1:2] != bytes([_MAGIC]):
-        raise DataError(f'{path}: this is not a C3D file')
-    try:
-        file = _ezc3d().c3d(os.fspath(path))
-        parameters = file['parameters']['POINT']
-        names = [str(label).strip() for label in _labels(parameters)]
-        unit = str(parameters['UNITS']['value'][0]).strip()
-        rate = float(file['header']['points']['frame_rate'])
-        first = int(file['header']['points']['first_frame'])
-        xyz = np.asarray(file['data']['points'], dtype=float)[:3].transpose(2, 1, 0)
-        residual = np.asarray(file['data']['meta_points']['residuals'], dtype=float)[0].T
-    except DataError:
-        raise
-    except Exception as error:  # ezc3d raises whatever comes to its mind
-        raise DataError(f'{path}: this C3D file cannot be read ({error})') from None
+    _check_size(path, read_bytes(path))
+    _ezc3d()
+    arrays = _arrays(path)
+    names = arrays['labels'].tolist()
+    unit = str(arrays['unit'])
+    rate = float(arrays['rate'])
+    first = int(arrays['first'])
+    xyz = arrays['xyz']
+    residual = arrays['residual']
     if not xyz.size:
         raise DataError(f'{path}: the file has no points')
     mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(unit)
@@ -74,7 +76,7 @@ def read(path: Path, settings: FileSettings) -> Content:
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
     sd = np.where(residual > 0, residual * mm, np.nan)
     points = Points(
-        np.arange(first + 1, first + 1 + len(xyz)),
+        np.arange(first, first + len(xyz)),
         np.array([ids[name] for name in names], dtype=np.int64),
         xyz,
         sd,
@@ -84,14 +86,48 @@ def read(path: Path, settings: FileSettings) -> Content:
     return Content(points=points, names=Names(named_targets({n: ids[n] for n in names})))
 
 
-def _labels(parameters: Any) -> list[str]:
-    """Return the names of all points: a parameter holds 255, the others follow in LABELS2, ..."""
-    found = list(parameters['LABELS']['value'])
-    number = 2
-    while f'LABELS{number}' in parameters:
-        found += parameters[f'LABELS{number}']['value']
-        number += 1
-    return found
+def _check_size(path: Path, content: bytes) -> None:
+    """Raise DataError for a file that is no C3D file or shorter than its header says.
+
+    The header is that of c3d.org, of a file with the numbers of Intel processors.
+    """
+    if content[1:2] != bytes([_MAGIC]):
+        raise DataError(f'{path}: this is not a C3D file')
+    if len(content) < BLOCK:
+        raise DataError(f'{path}: this C3D file is truncated')
+    start = (content[0] - 1) * BLOCK
+    if content[start + 3 : start + 4] != bytes([_INTEL]):
+        return
+    points, analog, first, last = struct.unpack_from('<4H', content, 2)
+    (scale,) = struct.unpack_from('<f', content, 12)
+    (data,) = struct.unpack_from('<H', content, 16)
+    values = (last - first + 1) * (4 * points + analog)
+    if last < MAX_FRAME and (data - 1) * BLOCK + values * (4 if scale < 0 else 2) > len(content):
+        raise DataError(f'{path}: this C3D file is truncated, or its header is damaged')
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of `c3d_process`. Raises DataError for a file that ezc3d cannot read."""
+    command = [sys.executable, '-m', c3d_process.__name__, os.fspath(path.resolve())]
+    root = Path(__file__).resolve().parents[2]
+    known = os.environ.get('PYTHONPATH')
+    environment = {
+        **os.environ,
+        'PYTHONPATH': os.pathsep.join([str(root), *filter(None, [known])]),
+    }
+    try:
+        done = subprocess.run(
+            command, capture_output=True, timeout=MAX_SECONDS, env=environment, check=False
+        )
+    except subprocess.TimeoutExpired:
+        raise DataError(f'{path}: this C3D file cannot be read, it is damaged') from None
+    if done.returncode:
+        cause = done.stderr.decode('utf-8', 'replace').strip() if done.returncode == 1 else ''
+        raise DataError(
+            f'{path}: this C3D file cannot be read ({cause or "it is damaged"})'
+        ) from None
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+        return dict(arrays)
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:

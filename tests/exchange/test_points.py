@@ -1,6 +1,7 @@
 """Formats of image points, phantoms, points in space and poses: written, read, refused."""
 
 import csv
+import pathlib
 
 import numpy as np
 import pytest
@@ -335,6 +336,20 @@ def test_c3d_is_read_by_ezc3d(tmp_path):
     np.testing.assert_allclose(residual[seen[..., 0]], points().sd_mm[seen[..., 0]], atol=2e-4)
 
 
+def test_damaged_c3d_is_refused(tmp_path):
+    """A truncated file, and one whose parameters make ezc3d fail."""
+    pytest.importorskip('ezc3d')
+    path = tmp_path / 'points.c3d'
+    registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
+    whole = path.read_bytes()
+    for length in (100, 700, len(whole) - 512):
+        path.write_bytes(whole[:length])
+        assert 'this C3D file is truncated' in refused(path)
+    place = whole.index(b'LABELS')
+    path.write_bytes(whole[:place] + b'LOBELS' + whole[place + 6 :])
+    assert refused(path) == f'{path}: 3 points, but 0 different names'
+
+
 @pytest.mark.parametrize('kind', ['c3d', 'trc', 'xmalab3d', 'points'])
 def test_points_in_space_return(tmp_path, kind):
     if kind == 'c3d':
@@ -436,3 +451,53 @@ def test_lookup_table_returns(tmp_path):
     np.testing.assert_array_equal(registry.read(path, FileSettings()).lookups['a'], maps)
     path.write_text('\n'.join(rows[:95]))
     assert '95 rows, but a lookup table has as many for the rows' in refused(path, FileSettings())
+
+
+# ---- damage
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(
+    'kind', registry.kinds(lambda f: f.write and f.kind not in ('c3d', 'lut'))
+)
+def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind):
+    """Truncated, with rows left out or doubled, or with other bytes: no other exception."""
+    matrix = np.array([[4000.0, 0, 500], [0, 4000, 380], [0, 0, 1]])
+    camera = Camera('cam1', matrix, SIZE, np.eye(3), np.zeros(3))
+    bodies = Bodies(('f',), np.array([1]), np.eye(3)[None, None], np.ones((1, 1, 3)))
+    shifted = Camera('cam1', matrix, SIZE, np.eye(3), np.array([0.0, 0, 1000]))
+    content = Content(
+        observations={'cam1': frames(sigma=True)['cam1']},
+        survey=phantom(),
+        cameras=(shifted if kind == 'dlt' else camera,),
+        stations=stations()[:2],
+        points=points(),
+        bodies=bodies,
+        grids={'a': np.arange(8.0).reshape(2, 4)},
+    )
+    out = tmp_path / {'anipose': 'a.toml', 'trc': 'a.trc'}.get(kind, 'a.csv')
+    written = registry.write(out, kind, content, SETTINGS)
+    rng = np.random.default_rng(7)
+    for path in map(pathlib.Path, written.paths):
+        whole = path.read_bytes()
+        for _ in range(8):
+            for damaged in _damaged(whole, rng):
+                path.write_bytes(damaged)
+                for as_kind in (None, kind):
+                    try:
+                        registry.read(path, SETTINGS, as_kind)
+                    except DataError as error:
+                        assert '\n' not in str(error)
+        path.write_bytes(whole)
+
+
+def _damaged(whole, rng):
+    """The content of a file, damaged in three ways."""
+    yield whole[: rng.integers(len(whole))]
+    content = bytearray(whole)
+    for _ in range(3):
+        content[rng.integers(len(whole))] = rng.integers(256)
+    yield bytes(content)
+    lines = whole.split(b'\n')
+    lines[rng.integers(len(lines))] = lines[rng.integers(len(lines))]
+    yield b'\n'.join(lines)

@@ -239,7 +239,7 @@ def result_content(
     found: dict[str, Any] = {'names': read_names(directory)}
     stations: tuple[Station, ...] = ()
     if {'stations', 'bodies'} & wanted or exposure is not None:
-        stations = tuple(_stations(directory / RESULT))
+        stations = tuple(stations_of(directory / RESULT))
         found['stations'] = stations
     orientation = _orientation(directory, calibrations)
     if 'cameras' in wanted:
@@ -272,7 +272,7 @@ def _orientation(
     return orientation
 
 
-def _stations(path: Path) -> Iterable[Station]:
+def stations_of(path: Path) -> Iterable[Station]:
     """Yield the exterior orientations of a result.json. Raises DataError."""
     document = read_json(path)
     try:

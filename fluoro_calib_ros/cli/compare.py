@@ -1,0 +1,45 @@
+"""fluoro-calib compare."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+from .output import print_notes, print_result
+
+NAME = 'compare'
+HELP = 'Tell what changed between two calibrations, where in the image, and whether significantly.'
+EXAMPLE = 'fluoro-calib compare result.previous result --figure changes.png'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument('first', type=Path, metavar='DIR', help='result folder of calibrate')
+    parser.add_argument(
+        'second', type=Path, metavar='DIR', help='result folder to compare with it'
+    )
+    parser.add_argument(
+        '--figure', type=Path, metavar='FILE.png', help='draw the difference of the corrections'
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Compare, and draw the figure. Raises DataError."""
+    from ..files.atomic import write_bytes
+    from ..jobs.comparison import compare_folders
+    from ..report.comparison import comparison_document, comparison_png, comparison_text
+
+    compared = compare_folders(arguments.first, arguments.second)
+    if arguments.figure is not None:
+        write_bytes(arguments.figure, comparison_png(compared.comparisons))
+    print_notes(compared.notes)
+    scales = compared.mm_per_px
+    document = {
+        'fluoroscopes': {
+            name: comparison_document(comparison, scales.get(name))
+            for name, comparison in compared.comparisons.items()
+        },
+        'notes': list(compared.notes),
+    }
+    texts = [comparison_text(c, scales.get(name)) for name, c in compared.comparisons.items()]
+    print_result(arguments, document, '\n'.join(texts))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from datetime import datetime, timezone
 
 import numpy as np
 from threadpoolctl import threadpool_limits
@@ -16,6 +17,12 @@ from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.precision import Precision, geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
+from .adjustment_report import (
+    AdjustmentStatistics,
+    ResidualTable,
+    residuals_of_adjustment,
+    statistics_of,
+)
 from .constraints import RelativeOrientation, relative_orientations
 from .diagnostics import correlations_of, misfitting_exposures, outliers_of
 from .held_calibration import (
@@ -124,6 +131,12 @@ class CalibrationResult:
         Dicts of the image points and of the targets that fail their tests.
     correlations : tuple of (str, str, float)
         Correlations above 0.95 between unknowns.
+    statistics : tuple of AdjustmentStatistics
+        Of each adjustment.
+    residuals : ResidualTable or None
+        Of all image points; None where they were not kept.
+    created : str
+        Date and time of the end (UTC, ISO 8601).
     """
 
     fluoroscopes: dict[str, FluoroscopeResult]
@@ -137,6 +150,9 @@ class CalibrationResult:
     relative: tuple[RelativeOrientation, ...] = ()
     outliers: tuple[tuple, tuple] = ((), ())
     correlations: tuple[tuple[str, str, float], ...] = ()
+    statistics: tuple[AdjustmentStatistics, ...] = ()
+    residuals: ResidualTable | None = None
+    created: str = ''
 
 
 def calibrate(
@@ -229,7 +245,20 @@ def calibrate_request(
         tuple(one for of_run in relative for one in of_run),
         _outliers_of_all(runs.values()),
         tuple(one for run in runs.values() for one in correlations_of(run)),
+        tuple(statistics_of(run.measured, run.after, run.precision) for run in runs.values()),
+        ResidualTable.joined(
+            [
+                residuals_of_adjustment(run.measured, run.after, run.precision, run.correction)
+                for run in runs.values()
+            ]
+        ),
+        _now(),
     )
+
+
+def _now() -> str:
+    """Date and time (UTC, ISO 8601)."""
+    return datetime.now(timezone.utc).isoformat(timespec='seconds')
 
 
 def _figures_of_run(run: SelfCalibration) -> dict[str, FluoroscopeResult]:
@@ -383,6 +412,9 @@ def adjust_with_calibrations(
         measured.left_out,
         after.converged,
         time.perf_counter() - began,
+        statistics=(statistics_of(replace(measured, network=network), after, precise),),
+        residuals=residuals_of_adjustment(measured, after, precise, correction),
+        created=_now(),
     )
 
 

@@ -7,12 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.adjustment_report import AdjustmentStatistics
 from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
 from ..calibration.constraints import RelativeOrientation
 from ..calibration.rounds import Round
 from ..drift.recording_watch import DriftVerdict
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
+
+FORMAT_VERSION = 2  # 1 had neither version, date, units nor adjustments
+UNITS = {'lengths': 'mm', 'image': 'px', 'angles': 'rad', 'seconds': 's'}
 
 
 def result_document(job: CalibrationResult) -> dict[str, Any]:
@@ -21,6 +25,9 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
     Lengths are in mm, pixels in px and angles in rad, each with the unit in its name.
     """
     return {
+        'format_version': FORMAT_VERSION,
+        'created': job.created,
+        'units': UNITS,
         'fluoroscopes': {
             name: _fluoroscope(figures) for name, figures in job.fluoroscopes.items()
         },
@@ -34,6 +41,7 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
         ],
         'relative_orientation': _relative(job.relative),
         'outliers': {'image_points': list(job.outliers[0]), 'targets': list(job.outliers[1])},
+        'adjustments': [_statistics(one) for one in job.statistics],
         'correlations': [
             {'unknowns': [one, other], 'value': value} for one, other, value in job.correlations
         ],
@@ -41,6 +49,36 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
         'converged': job.converged,
         'left_out': list(job.left_out),
         'seconds': job.seconds,
+    }
+
+
+def _statistics(statistics: AdjustmentStatistics) -> dict[str, Any]:
+    """Return the statistics of an adjustment and of its network."""
+    return {
+        'fluoroscopes': list(statistics.fluoroscopes),
+        'noise': {
+            'loss': statistics.loss,
+            'sigma0': statistics.sigma0,
+            'degrees_of_freedom': statistics.nu,
+        },
+        'variance_factor': statistics.variance_factor,
+        'observations': statistics.observations,
+        'unknowns': statistics.unknowns,
+        'degrees_of_freedom': statistics.degrees_of_freedom,
+        'network': {
+            'exposures': statistics.exposures,
+            'image_points': statistics.image_points,
+            'outliers': statistics.outliers,
+            'targets': statistics.targets,
+            'image_points_per_target': {
+                'least': statistics.least_rays,
+                'mean': statistics.mean_rays,
+            },
+            'redundancy': {
+                'least': statistics.least_redundancy,
+                'mean': statistics.mean_redundancy,
+            },
+        },
     }
 
 

@@ -21,6 +21,8 @@ from ..files.calibration_request import (
 from ..files.folder import FolderKind, check_output_folder, replaced_folder
 from ..files.json_file import write_json
 from ..files.result_document import result_document
+from ..files.result_tables import NAMES as TABLES
+from ..files.result_tables import write_tables
 from ..files.rig_orientation import NAME as ORIENTATION
 from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
 from ..files.validation import write_validation
@@ -39,9 +41,7 @@ _OWN = (
     ORIENTATION,
     names.NAME,
     validation.NAME,
-    'residuals.csv',
-    'exposures.csv',
-    'targets.csv',
+    *TABLES,
     'figures',
     REPORT,
 )
@@ -67,9 +67,9 @@ def save_outcome(
 ) -> RigOrientation | None:
     """Write the outcome of a calibration job as a result folder, which replaces an earlier one.
 
-    Writes the calibrations, result.json, the sources (observations, phantom, options), the
-    orientation of the rig and, where there is one, the validation. The folder is exchanged as a
-    whole, and the earlier one is kept as DIRECTORY.previous.
+    Writes the calibrations, result.json and its tables, the sources (observations, phantom,
+    options), the orientation of the rig and, where there is one, the validation. The folder is
+    exchanged as a whole, and the earlier one is kept as DIRECTORY.previous.
 
     Parameters
     ----------
@@ -150,6 +150,7 @@ def _write_result(folder: Path, result: CalibrationResult, doubts: Sequence[str]
     for calibration in result.calibrations.values():
         save_calibration(folder, calibration)
     write_json(folder / RESULT, {**result_document(result), 'doubts': list(doubts)})
+    write_tables(folder, result)
 
 
 def _saved_ids(

@@ -41,6 +41,7 @@ ROOMS = (
     'simulation',
     'files',
     'bags',
+    'exchange',
     'report',
     'jobs',
 )

@@ -192,7 +192,7 @@ def test_tf_has_the_positions_of_the_sources(rig, by_command):
         ],
         what='the transform of b',
     )[-1]
-    assert found.header.frame_id == 'a_optical'
+    assert found.header.frame_id == 'rig'
     t = found.transform.translation
     assert np.allclose([t.x, t.y, t.z], orientation.position_mm[1] / 1000, atol=1e-9)
 

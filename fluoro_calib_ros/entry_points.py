@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import sys
 from importlib import import_module
+from importlib.util import find_spec
 
 _MESSAGES = 'fluoro_calib_msgs'
 # Where the installation of a missing module is described, by its top-level name.
@@ -72,5 +73,6 @@ def _run(module: str) -> None:
     except ModuleNotFoundError as error:
         if error.name is None or error.name.startswith(__package__ or ''):
             raise
-        sys.exit(missing_module_message(program, error.name))
+        without_ros = error.name.startswith(_MESSAGES) and find_spec('rclpy') is None
+        sys.exit(missing_module_message(program, 'rclpy' if without_ros else error.name))
     sys.exit(main())

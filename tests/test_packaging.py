@@ -116,7 +116,7 @@ def test_lock_is_exact():
     ]
     assert all(re.fullmatch(r'[\w.-]+==[\w.]+( ; python_version .*)?', pin) for pin in pins)
     wanted = [
-        re.split(r'[\[<=>]', line)[0].strip()
+        re.split(r'[\[<=>;]', line)[0].strip()
         for line in (ROOT / 'requirements.in').read_text().splitlines()
         if line.strip() and not line.startswith('#')
     ]

@@ -26,9 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Compare, and draw the figure. Raises DataError."""
     from ..files.atomic import write_bytes
+    from ..files.folder import check_output_file
     from ..jobs.comparison import compare_folders
     from ..report.comparison import comparison_document, comparison_png, comparison_text
 
+    if arguments.figure is not None:
+        check_output_file(arguments.figure, (arguments.first, arguments.second))
     compared = compare_folders(arguments.first, arguments.second)
     if arguments.figure is not None:
         write_bytes(arguments.figure, comparison_png(compared.comparisons))

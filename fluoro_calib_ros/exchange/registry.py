@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..errors import DataError
-from ..files.access import PathLike, os_error_reason
+from ..files.access import PathLike, check_regular_file, os_error_reason
 from . import (
     anipose,
     bundle,
@@ -71,6 +71,7 @@ def kinds(condition: Callable[[Format], object]) -> tuple[str, ...]:
 def sample_of(path: PathLike) -> Sample:
     """Return how a file begins. Raises DataError for a file that cannot be read."""
     path = Path(path)
+    check_regular_file(path)
     try:
         with path.open('rb') as file:
             head = file.read(HEAD)

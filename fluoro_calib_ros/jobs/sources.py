@@ -17,6 +17,7 @@ from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
 from ..exposures.names import Names
 from ..exposures.phantom import Phantom
+from ..files.access import check_regular_file
 from ..files.calibration import load_calibrations
 from ..files.image_points import PointsFile, points_of_frames, read_points
 from ..files.known_orientation import holds_known_orientations, read_known_orientations
@@ -62,6 +63,7 @@ def is_bag(path: str | os.PathLike[str]) -> bool:
     path = Path(path)
     if path.is_dir() or path.suffix.lower() in ('', '.mcap'):
         return True
+    check_regular_file(path)
     try:
         with path.open('rb') as file:
             return file.read(len(MAGIC)) == MAGIC

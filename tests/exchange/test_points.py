@@ -1,6 +1,7 @@
 """Formats of image points, phantoms, points in space and poses: written, read, refused."""
 
 import csv
+import os
 import pathlib
 import sys
 
@@ -22,6 +23,7 @@ from fluoro_calib_ros.exchange.content import (
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.names import Names, number_names, safe_names
 from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.jobs.sources import read_source
 
 SIZE = (1024, 768)
 SETTINGS = FileSettings(image_size=SIZE, units='mm')
@@ -458,6 +460,16 @@ def test_lookup_table_returns(tmp_path):
 
 
 # ---- damage
+
+
+@pytest.mark.skipif(not hasattr(os, 'mkfifo'), reason='there are no pipes')
+def test_pipe_is_refused(tmp_path):
+    """Reading it would never end."""
+    for name in ('points.csv', 'points.pho', 'points.dat'):
+        os.mkfifo(tmp_path / name)
+        assert 'this is a pipe, device or socket' in refused(tmp_path / name)
+        with pytest.raises(DataError, match='this is a pipe'):
+            read_source(tmp_path / name, image_size=SIZE)
 
 
 @pytest.mark.filterwarnings('error')

@@ -64,6 +64,7 @@ setup(
             'reconstruction_node = fluoro_calib_ros.entry_points:reconstruction_node',
             'image_node = fluoro_calib_ros.entry_points:image_node',
             'player_node = fluoro_calib_ros.entry_points:player_node',
+            'recorder_node = fluoro_calib_ros.entry_points:recorder_node',
             'simulator_node = fluoro_calib_ros.entry_points:simulator_node',
             'fluoro_calib_demo = fluoro_calib_ros.entry_points:demo',
             'fluoro-calib = fluoro_calib_ros.cli:main',

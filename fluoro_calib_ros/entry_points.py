@@ -47,6 +47,11 @@ def player_node() -> None:
     _run('nodes.player_node')
 
 
+def recorder_node() -> None:
+    """Run the recorder."""
+    _run('nodes.recorder_node')
+
+
 def simulator_node() -> None:
     """Run the simulator."""
     _run('nodes.simulator_node')

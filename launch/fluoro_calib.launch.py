@@ -64,6 +64,8 @@ OTHERS = (
     Argument('bag', '', 'bag to play (default: none)'),
     Argument('bag_topics', '', 'topics of the bag to play, e.g. [/a/target_observations]'),
     Argument('bag_rate', '', 'speed relative to the recording'),
+    Argument('record', '', 'folder of a new bag, into which all topics are recorded'),
+    Argument('record_topics', '', 'topics to record, e.g. [/a/target_observations]'),
     Argument('scene', '', 'scene of the simulator: phantom or markers'),
     Argument('rate', '', 'frame rate of the simulator [Hz]'),
 )
@@ -98,7 +100,7 @@ def nodes_of_rig(context):
 
     def node(executable, parameters, needed=False):
         given = {name: yaml.safe_load(text) for name, text in parameters.items() if text}
-        for name in ('phantom', 'calibration_directory', 'rig_frame', 'bag'):
+        for name in ('phantom', 'calibration_directory', 'rig_frame', 'bag', 'folder'):
             if name in given:
                 given[name] = parameters[name]  # also where it reads like a number
         if 'rate' in given:
@@ -136,6 +138,9 @@ def nodes_of_rig(context):
                 arguments=['-d', display, '-f', values['rig_frame'] or 'rig'],
             )
         )
+    if values['record']:
+        recorded = {'folder': values['record'], 'topics': values['record_topics']}
+        actions.append(node('recorder_node', recorded))
     if values['bag']:
         bag = {'bag': values['bag'], 'topics': values['bag_topics'], 'rate': values['bag_rate']}
         actions.append(node('player_node', {**bag, 'wait_for_readers': '2'}))

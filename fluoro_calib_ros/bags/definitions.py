@@ -19,7 +19,7 @@ PACKAGE = 'fluoro_calib_msgs'
 TARGET_OBSERVATIONS = f'{PACKAGE}/msg/TargetObservations'
 PADDING = 4  # bytes at the end of a message that Fast DDS reserves for an empty float64[]
 MAX_PADDING = 10 * PADDING  # of a message with ten of them
-_SEPARATOR = '=' * 80  # between the definitions of a schema
+SEPARATOR = '=' * 80  # between the definitions of a schema
 
 
 @dataclasses.dataclass(frozen=True)
@@ -154,15 +154,15 @@ def _with_dependencies(msg_type: str, seen: set[str]) -> str:
     """Return the definition of a type and of those it depends on, unless they were seen."""
     store = typestore()
     text = _package_texts().get(msg_type) or store.gendefhash(msg_type, {}, ros_version=2)[0]
-    for name in sorted(_nested_types(store.fielddefs[msg_type][1])):
+    for name in sorted(nested_types(store.fielddefs[msg_type][1])):
         if name not in seen:
             seen.add(name)
-            heading = f'\n{_SEPARATOR}\nMSG: {name.replace("/msg/", "/")}\n'
+            heading = f'\n{SEPARATOR}\nMSG: {name.replace("/msg/", "/")}\n'
             text += heading + _with_dependencies(name, seen)
     return text
 
 
-def _nested_types(fields: Iterable[Any]) -> set[str]:
+def nested_types(fields: Iterable[Any]) -> set[str]:
     """Return the names of the message types of fields, including those of array elements."""
     names = set()
     for _, description in fields:

@@ -50,19 +50,25 @@ class TopicReport:
 
     @property
     def interval_ns(self) -> float:
-        """Usual time between two messages, NaN for fewer than two."""
-        return float(np.median(np.diff(self.log_ns))) if len(self.log_ns) > 1 else float('nan')
+        """Usual time between two messages, by their stamps if they have some; NaN for one."""
+        times = self.stamp_ns if len(self.stamp_ns) > 1 else self.log_ns
+        return float(np.median(np.diff(times))) if len(times) > 1 else float('nan')
 
     @property
     def longest_gap_s(self) -> float:
-        """Longest time between two messages."""
-        return float(np.diff(self.log_ns).max()) * 1e-9 if len(self.log_ns) > 1 else 0.0
+        """Longest time between two messages, by stamps or when they were received."""
+        steps = [np.diff(t).max() for t in (self.stamp_ns, self.log_ns) if len(t) > 1]
+        return float(max(steps, default=0)) * 1e-9
 
     @property
     def has_gap(self) -> bool:
-        """Whether a stream was interrupted."""
+        """Whether a stream was interrupted; only messages with a header are a stream."""
         usual = self.interval_ns
-        return 0 < usual < STREAM_NS and self.longest_gap_s * 1e9 > max(GAP * usual, STREAM_NS)
+        return (
+            len(self.stamp_ns) > 1
+            and 0 < usual < STREAM_NS
+            and self.longest_gap_s * 1e9 > max(GAP * usual, STREAM_NS)
+        )
 
     @property
     def backward_jumps(self) -> int:

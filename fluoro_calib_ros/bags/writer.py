@@ -211,10 +211,32 @@ class BagWriter:
         self._register(self._topics[topic])
         return self._topics[topic]
 
-    def flush(self) -> None:
-        """Hand all messages to the operating system: they survive the end of the process."""
+    def flush(self, to_disk: bool = False) -> None:
+        """Close the open chunk: its messages survive the end of the process.
+
+        to_disk: they survive a power failure, too.
+        """
         with _writing(self.path):
             self._mcap.flush()
+            self._file.flush()
+            if to_disk:
+                os.fsync(self._file.fileno())
+
+    @property
+    def file_bytes(self) -> int:
+        """Size of the file that is being written, without the open chunk [bytes]."""
+        return self._file.tell()
+
+    @property
+    def file_count(self) -> int:
+        """Number of files so far."""
+        return len(self._files)
+
+    def split(self) -> None:
+        """Close the file and begin the next one."""
+        with _writing(self.path):
+            self._close_file()
+            self._open_file()
 
     def _file_is_full(self) -> bool:
         return bool(

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
+import json
+import os
+import sys
 from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
+from ..options import declared
+from .arguments import add_option, names, number_in
 from .output import print_result
 
 if TYPE_CHECKING:
@@ -15,12 +20,14 @@ if TYPE_CHECKING:
     from ..bags.salvage import Damage
 
 NAME = 'bag'
-HELP = 'Look into a bag, or recover a damaged one.'
+HELP = 'Record, play, look into and recover bags.'
 EXAMPLE = 'fluoro-calib bag recover cut.mcap --out recovered'
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
+    from ..bags.recording import RecordingOptions
+
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
     recover = _add_action(
         actions, 'recover', 'Write all intact messages of a damaged or cut-off bag to a new one.'
@@ -31,6 +38,30 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     info = _add_action(actions, 'info', 'Say what is in a bag and what is wrong with it.')
     info.add_argument('source', type=Path, metavar='BAG', help='bag (file or folder)')
+
+    record = _add_action(
+        actions, 'record', 'Record topics into a new bag until interrupted (needs ROS 2).'
+    )
+    record.add_argument(
+        'topics', nargs='*', metavar='TOPIC', help='topics to record (default: all)'
+    )
+    record.add_argument(
+        '--out', required=True, type=Path, metavar='FOLDER', help='new bag, which must not exist'
+    )
+    for option in declared(RecordingOptions).values():
+        add_option(record, option)
+    play = _add_action(
+        actions, 'play', 'Publish the messages of a bag as they were recorded (needs ROS 2).'
+    )
+    play.add_argument('source', type=Path, metavar='BAG', help='bag (file or folder)')
+    play.add_argument('--topics', type=names, metavar='T,T', help='topics to play (default: all)')
+    play.add_argument(
+        '--rate',
+        type=number_in(0.001, 1e6),
+        default=1.0,
+        help='speed relative to the recording (default: 1)',
+    )
+    play.add_argument('--loop', action='store_true', help='play over and over')
 
 
 def _add_action(actions: Any, name: str, text: str) -> argparse.ArgumentParser:
@@ -49,6 +80,8 @@ def run(arguments: argparse.Namespace) -> None:
     actions: Mapping[str, Callable[[argparse.Namespace], None]] = {
         'recover': _recover,
         'info': _info,
+        'record': _record,
+        'play': _play,
     }
     actions[arguments.action](arguments)
 
@@ -92,6 +125,36 @@ def _info(arguments: argparse.Namespace) -> None:
         'faults': faults,
     }
     print_result(arguments, document, _info_text(report, faults))
+
+
+def _record(arguments: argparse.Namespace) -> None:
+    from ..bags.recording import RecordingOptions
+
+    parameters = {name: getattr(arguments, name) for name in declared(RecordingOptions)}
+    parameters['folder'] = str(arguments.out.absolute())
+    if arguments.topics:
+        parameters['topics'] = arguments.topics
+    _become_node('recorder_node', parameters)
+
+
+def _play(arguments: argparse.Namespace) -> None:
+    parameters = {
+        'bag': str(arguments.source.absolute()),
+        'rate': arguments.rate,
+        'loop': arguments.loop,
+    }
+    if arguments.topics:
+        parameters['topics'] = arguments.topics
+    _become_node('player_node', parameters)
+
+
+def _become_node(node: str, parameters: Mapping[str, Any]) -> NoReturn:
+    """Replace this process by a node, which gets the signals and gives the exit status."""
+    code = f'from fluoro_calib_ros.entry_points import {node}; {node}()'
+    words = ['--ros-args']
+    for name, value in parameters.items():
+        words += ['-p', f'{name}:={json.dumps(value)}']  # JSON is YAML
+    os.execv(sys.executable, [sys.executable, '-c', code, *words])
 
 
 def _info_text(report: BagReport, faults: list[str]) -> str:

@@ -7,14 +7,11 @@ import time
 import traceback
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
 
 import rclpy
-from ament_index_python.packages import PackageNotFoundError, get_package_prefix
 from rclpy.exceptions import NameValidationException
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.type_support import check_for_type_support
 
 from ..bags.reader import TopicInfo, iterate_messages, topics_of
 from ..errors import DataError
@@ -22,6 +19,7 @@ from ..options import option
 from .runtime.discovery import wait_for_readers, wait_until_acknowledged
 from .runtime.errors import StartError, one_line
 from .runtime.main import run
+from .runtime.message_types import installed_type
 from .runtime.parameters import ParameterGroup
 from .runtime.qos import observations_qos, qos_overrides, recorded_latched_qos
 
@@ -90,13 +88,8 @@ class PlayerNode(Node):
 
         Returns None for a type that is not installed. Raises StartError.
         """
-        package, _, name = info.type.partition('/msg/')
-        try:
-            # Only packages in the ament index: a bag must not name any module to be imported.
-            get_package_prefix(package)
-            message_type = getattr(import_module(f'{package}.msg'), name)
-            check_for_type_support(message_type)
-        except (PackageNotFoundError, ValueError, ImportError, AttributeError):
+        message_type = installed_type(info.type)
+        if message_type is None:
             self.get_logger().warning(
                 f'{topic} is not played: the type {info.type or "(none)"} is not installed'
             )

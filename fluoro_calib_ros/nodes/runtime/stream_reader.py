@@ -97,7 +97,7 @@ class StreamReader:
         qos: QoSProfile,
         decode: Callable[[bytes], Any] | None = None,
     ) -> None:
-        """Subscribe to a topic.
+        """Subscribe to a topic, also while messages are being received.
 
         Parameters
         ----------
@@ -202,14 +202,22 @@ class StreamReader:
                 self._faults.reader_error(traceback.format_exc())
 
     def _serve(self) -> None:
-        routes = {
-            s.handle.pointer: (topic, s.msg_type, s.handle, decode, callback)
-            for topic, s, decode, callback in self._routes
-        }
-        wait_set = rclpy_implementation.WaitSet(
-            len(routes), 0, 0, 0, 0, 0, self._node.context.handle
-        )
+        served = -1
+        routes: dict[int, tuple[str, type, Any, Callable, Callable]] = {}
+        wait_set: Any = None
         while not self._stopping.is_set() and self._node.context.ok():
+            if len(self._routes) != served:  # a topic was added meanwhile
+                routes = {
+                    s.handle.pointer: (topic, s.msg_type, s.handle, decode, callback)
+                    for topic, s, decode, callback in list(self._routes)
+                }
+                served = len(routes)
+                wait_set = rclpy_implementation.WaitSet(
+                    served, 0, 0, 0, 0, 0, self._node.context.handle
+                )
+            if not routes:
+                self._stopping.wait(WAIT_NS * 1e-9)
+                continue
             wait_set.clear_entities()
             for _, _, handle, *_ in routes.values():
                 wait_set.add_subscription(handle)

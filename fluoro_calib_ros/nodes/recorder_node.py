@@ -1,0 +1,220 @@
+"""Node that records topics into a bag, as bytes, until it is interrupted."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.topic_endpoint_info import TopicEndpointInfo
+
+from ..bags.recording import MEGABYTE, Recording, RecordingOptions, TopicToRecord, lost_text
+from ..errors import DataError
+from ..options import option
+from .runtime.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, Status
+from .runtime.errors import StartError
+from .runtime.logging import RateLimitedLogger
+from .runtime.main import run
+from .runtime.message_types import definition_of, installed_type
+from .runtime.parameters import ParameterGroup, expand_path
+from .runtime.stream_reader import FaultHandlers, StreamReader
+
+DISCOVERY_S = 0.1  # period in which new topics are looked for
+DEPTH = 1000  # messages that wait for the reading thread, of one topic
+LATCHED_DEPTH = 100  # messages of latched topics that are kept for the next file
+
+
+@dataclass(frozen=True)
+class RecorderParameters:
+    """Parameters of the recorder."""
+
+    folder: str = option('', 'folder of the new bag, which must not exist')
+    topics: tuple[str, ...] = option(('',), 'topics to record; empty: all')
+
+
+_NODE = ParameterGroup(RecorderParameters)
+_RECORDING = ParameterGroup(RecordingOptions)
+PARAMETERS = (_NODE, _RECORDING)
+
+
+class RecorderNode(Node):
+    """Records the messages of topics as they are, from their first publisher on."""
+
+    def __init__(self) -> None:
+        super().__init__('recorder_node')
+        self._settings = _NODE.declare(self)
+        options = _RECORDING.declare(self)
+        if not self._settings.folder:
+            raise StartError('parameter folder is not set: it names the bag to record')
+        try:
+            self._recording = Recording(expand_path(self._settings.folder), options)
+            self._recording.start()
+        except DataError as error:
+            raise StartError(str(error)) from None
+        self.failed = False
+        self._wanted = {self.resolve_topic_name(topic) for topic in self._settings.topics if topic}
+        self._topics: dict[str, str] = {}  # type by topic
+        self._passed_over: set[str] = set()
+        self._limited_logger = RateLimitedLogger(self.get_logger())
+        self._reader = StreamReader(
+            self,
+            FaultHandlers(
+                lambda topic: self._limited_logger.error(f'{topic}: a message cannot be taken'),
+                lambda topic, error: self._limited_logger.error(f'{topic}: {error!r}'),
+                self._on_reader_error,
+            ),
+        )
+        self._reader.start()
+        self._diagnostics = DiagnosticsPublisher(self)
+        self._discover()
+        self.create_timer(DISCOVERY_S, self._discover)
+        self.create_timer(1.0, self._on_timer)
+        self.get_logger().info(f'recording to {self._recording.path}')
+
+    def _discover(self) -> None:
+        """Subscribe to topics that have been published since the last time."""
+        for topic, types in self.get_topic_names_and_types():
+            if topic in self._topics or topic in self._passed_over:
+                continue
+            if self._wanted:
+                if topic not in self._wanted:
+                    continue
+            elif any(part.startswith('_') for part in topic.split('/')):
+                continue  # hidden
+            publishers = self.get_publishers_info_by_topic(topic)
+            if publishers:
+                self._subscribe(topic, types, publishers)
+
+    def _subscribe(
+        self, topic: str, types: Sequence[str], publishers: Sequence[TopicEndpointInfo]
+    ) -> None:
+        """Record a topic, or say why that is not possible."""
+        kind = installed_type(types[0]) if len(types) == 1 else None
+        if kind is None:
+            reason = (
+                f'it has the types {", ".join(types)}'
+                if len(types) > 1
+                else f'the type {types[0]} is not installed'
+            )
+            self.get_logger().warning(f'{topic} is not recorded: {reason}')
+            self._passed_over.add(topic)
+            return
+        qos = adapted_qos(publishers)
+        is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        self._topics[topic] = types[0]
+        self._recording.add_topic(
+            TopicToRecord(
+                topic,
+                types[0],
+                [qos_document(publisher.qos_profile) for publisher in publishers],
+                definition_of(types[0], type_hash_text(publishers[0])),
+                LATCHED_DEPTH if is_latched else 0,
+            )
+        )
+
+        def on_message(data: bytes, info: dict[str, int]) -> None:
+            received = info.get('received_timestamp') or time.time_ns()
+            sent = info.get('source_timestamp') or received
+            if not self._recording.put(topic, data, received, sent):
+                self._limited_logger.error(self._loss())
+
+        self._reader.subscribe(kind, topic, on_message, qos, decode=lambda data: data)
+        self.get_logger().info(f'recording {topic} [{types[0]}]')
+
+    def _loss(self) -> str:
+        """Return what was dropped, and why."""
+        dropped = lost_text(self._recording.dropped)
+        cause = self._recording.fault or 'the disk is too slow'
+        return f'messages are dropped, {cause}: {dropped}' if dropped else ''
+
+    def _on_reader_error(self, text: str) -> None:
+        self.failed = True
+        self.get_logger().fatal(text)
+
+    def _on_timer(self) -> None:
+        """Publish the diagnostics."""
+        recording = self._recording
+        loss = self._loss()
+        level = ERROR if recording.fault else WARN if loss else OK
+        if recording.fault:
+            self._limited_logger.error(recording.fault)
+        counts = {
+            'messages': recording.counts.total(),
+            'messages dropped': recording.dropped.total(),
+            'topics': len(self._topics),
+            'files': recording.files,
+            'waiting [MB]': f'{recording.waiting_bytes / MEGABYTE:.1f}',
+        }
+        message = loss or recording.fault or 'recording'
+        self._diagnostics.publish([Status('recorder', level, message, counts)])
+
+    def stop(self) -> None:
+        """Write what was received, and close the bag."""
+        self._reader.stop()
+        self._recording.stop()
+        loss = self._loss()
+        if loss or self._recording.fault:
+            self.failed = self.failed or bool(self._recording.fault)
+            self.get_logger().error(loss or self._recording.fault)
+        missing = sorted(self._wanted - set(self._topics))
+        if missing:
+            self.get_logger().warning(f'nobody has published {", ".join(missing)}')
+        self.get_logger().info(
+            f'{self._recording.counts.total()} messages of {len(self._topics)} topics recorded to '
+            f'{self._recording.path}, {self._recording.dropped.total()} dropped; at most '
+            f'{self._recording.most_waiting_bytes / MEGABYTE:.1f} MB waited'
+        )
+
+
+def adapted_qos(publishers: Sequence[TopicEndpointInfo]) -> QoSProfile:
+    """Return the profile with which the messages of all publishers are received."""
+    profiles = [publisher.qos_profile for publisher in publishers]
+    reliable = all(p.reliability == ReliabilityPolicy.RELIABLE for p in profiles)
+    latched = all(p.durability == DurabilityPolicy.TRANSIENT_LOCAL for p in profiles)
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST,
+        depth=DEPTH,
+        reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
+        durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+    )
+
+
+def qos_document(profile: QoSProfile) -> dict[str, Any]:
+    """Return an offered QoS profile as bags contain it."""
+    return {
+        'history': profile.history.name.lower(),
+        'depth': profile.depth,
+        'reliability': profile.reliability.name.lower(),
+        'durability': profile.durability.name.lower(),
+        'deadline': _duration(profile.deadline),
+        'lifespan': _duration(profile.lifespan),
+        'liveliness': profile.liveliness.name.lower(),
+        'liveliness_lease_duration': _duration(profile.liveliness_lease_duration),
+        'avoid_ros_namespace_conventions': profile.avoid_ros_namespace_conventions,
+    }
+
+
+def _duration(duration: Duration) -> dict[str, int]:
+    seconds, rest = divmod(duration.nanoseconds, 10**9)
+    return {'sec': seconds, 'nsec': rest}
+
+
+def type_hash_text(publisher: TopicEndpointInfo) -> str:
+    """Return the hash of the type of a publisher, '' where the middleware does not tell it."""
+    found = publisher.topic_type_hash
+    if found is None or found.version != 1 or not any(found.value):
+        return ''
+    return f'RIHS01_{bytes(found.value).hex()}'
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node."""
+    run(RecorderNode, args)
+
+
+if __name__ == '__main__':
+    main()

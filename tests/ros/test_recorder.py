@@ -1,0 +1,125 @@
+"""The recorder: what was published is in the bag, as rosbag2 would have written it."""
+
+import signal
+
+import numpy as np
+from ros_graph import NAMES, Process, entry_point, value_of
+from rosbags.rosbag2 import Reader
+from std_msgs.msg import String
+
+from fluoro_calib_ros.bags.definitions import type_hash
+from fluoro_calib_ros.bags.inspection import inspect_bag
+from fluoro_calib_ros.bags.reader import read_frames, topics_of
+from fluoro_calib_ros.bags.recovery import recover_bag
+from fluoro_calib_ros.nodes.runtime.qos import latched_qos
+
+
+def recorded(status, key='messages'):
+    return int(value_of(status, key) or 0)
+
+
+def wait_for_recorder(client, topics):
+    """Wait until the recorder receives these topics, and the publishers know it."""
+    client.wait_for_diagnostics(
+        'recorder_node', lambda s: recorded(s, 'topics') == topics, 'recorder'
+    )
+    client.wait_until(
+        lambda: client._outputs['a'].get_subscription_count() == 1, what='the subscription'
+    )
+
+
+def publish_all(client, exposures):
+    for pair in zip(*exposures.values()):
+        for frame in pair:
+            client.publish(frame)
+
+
+def test_recorded_bag_holds_what_was_published(graph, exposures, tmp_path):
+    """To the last bit, with types, hashes, QoS and metadata; latched messages of before, too."""
+    client = graph.client
+    latched = client.create_publisher(String, 'note', latched_qos())
+    latched.publish(String(data='before the recording'))
+    topics = [f'{graph.namespace}/{n}/target_observations' for n in NAMES]
+    recorder = graph.start(
+        'recorder_node',
+        {'folder': tmp_path / 'bag', 'topics': str([*topics, f'{graph.namespace}/note'])},
+    )
+    wait_for_recorder(client, 3)
+    client.wait_for_diagnostics('recorder_node', lambda s: recorded(s) == 1, 'recorder')
+    publish_all(client, exposures)
+    total = 1 + sum(map(len, exposures.values()))
+    status = client.wait_for_diagnostics(
+        'recorder_node', lambda s: recorded(s) == total, 'recorder'
+    )
+    assert value_of(status, 'messages dropped') == '0'
+    recorder.interrupt()
+    assert recorder.wait() == 0 and 'Traceback' not in recorder.log
+    found = read_frames(tmp_path / 'bag')
+    for name, topic in zip(NAMES, topics):
+        for one, other in zip(found.frames[name], exposures[name], strict=True):
+            assert np.array_equal(one.uv, other.uv)
+            assert np.array_equal(one.target_id, other.target_id)
+            assert (one.number, one.stamp_ns) == (other.number, other.stamp_ns)
+        (profile,) = topics_of(tmp_path / 'bag')[topic].offered_qos
+        assert (profile['reliability'], profile['durability']) == ('reliable', 'volatile')
+    assert topics_of(tmp_path / 'bag')[f'{graph.namespace}/note'].offered_qos[0]['durability'] == (
+        'transient_local'
+    )
+    with Reader(tmp_path / 'bag') as bag:  # checks metadata.yaml against the file
+        assert bag.message_count == total
+        for connection in bag.connections:
+            assert connection.digest == type_hash(connection.msgtype)
+    assert not inspect_bag(tmp_path / 'bag').damages
+
+
+def test_killed_recording_is_recovered(graph, exposures, tmp_path):
+    """All but the messages of the last second, and those that are on disk are said to be."""
+    client = graph.client
+    topic = f'{graph.namespace}/a/target_observations'
+    recorder = graph.start(
+        'recorder_node',
+        {'folder': tmp_path / 'bag', 'topics': f"['{topic}']", 'flush_period': 0.05},
+    )
+    wait_for_recorder(client, 1)
+    for frame in exposures['a']:
+        client.publish(frame)
+    count = len(exposures['a'])
+    client.wait_for_diagnostics('recorder_node', lambda s: recorded(s) == count, 'recorder')
+    # Diagnostics come once a second, long after the flush.
+    client.publish(exposures['b'][0])
+    recorder._process.send_signal(signal.SIGKILL)
+    recorder.wait()
+    assert recover_bag(tmp_path / 'bag', tmp_path / 'out').counts == {topic: count}
+
+
+def test_command_ends_at_sigterm_with_a_complete_bag(graph, exposures, tmp_path):
+    """`bag record` is the node: it gets the signal, and gives its exit status."""
+    client = graph.client
+    topic = f'{graph.namespace}/a/target_observations'
+    process = Process(
+        [*entry_point('cli'), 'bag', 'record', '--out', str(tmp_path / 'bag'), topic],
+        tmp_path / 'log',
+    )
+    graph.processes.append(process)
+    client.wait_until(lambda: f'recording {topic}' in process.log, what='the recorder')
+    output = client._outputs['a']
+    client.wait_until(lambda: output.get_subscription_count() == 1, what='the subscription')
+    for frame in exposures['a']:
+        client.publish(frame)
+    assert output.wait_for_all_acked()
+    process._process.send_signal(signal.SIGTERM)
+    assert process.wait() == 0, process.log
+    assert 'Traceback' not in process.log
+    assert len(read_frames(tmp_path / 'bag').frames['a']) == len(exposures['a'])
+
+
+def test_recorder_says_why_it_cannot_start(graph, tmp_path):
+    (tmp_path / 'there').mkdir()
+    for parameters, sentence in (
+        ({}, 'parameter folder is not set'),
+        ({'folder': tmp_path / 'there'}, 'already exists'),
+        ({'folder': '/proc/bag'}, 'cannot be written'),
+    ):
+        process = graph.start('recorder_node', parameters, wait=False)
+        assert process.wait() == 1
+        assert sentence in process.log and 'Traceback' not in process.log

@@ -1,8 +1,10 @@
 """Formats of image points, phantoms, points in space and poses: written, read, refused."""
 
 import csv
+import json
 import os
 import pathlib
+import subprocess
 import sys
 
 import numpy as np

@@ -32,16 +32,15 @@ if TYPE_CHECKING:
     from ..photogrammetry.network import Network
 
 TREND_DEGREE = 3  # pincushion, S-shape and spiral are cubic to first order (Gronenschild 1997)
-START_MODES = 18  # half waves along the image, until the signal is known
+START_MODES = 16  # half waves along the image, until the signal is known
 MIN_MODES = 10
 MAX_MODES = 30  # the time grows with the sixth power
 # Prior variance times information of a sine below which the image points say nothing about it.
-NEGLIGIBLE = 0.1
+NEGLIGIBLE = 0.3
 FEWER_MODES = 0.75  # part of the present modes from which fewer are worth a change
 MODE_CHANGES = 3  # at most
-SETTLED_PRIOR = (
-    0.3  # mean change of the logarithms of the variances that changes no correction visibly
-)
+# Mean change of the logarithms of the variances of the signal that changes no correction visibly.
+SETTLED_PRIOR = 0.3
 SETTLED_VARIATION = 0.05  # relative change of the size of what differs between exposures
 MAX_VARYING_EXPOSURES = 60  # of a fluoroscope that can have terms of their own, to limit the time
 # Renewals without visible change after which the priors are held. Noise and signal would otherwise

@@ -21,6 +21,7 @@ def validation_document(validation: Validation) -> dict[str, Any]:
         'findings': list(validation.findings),
         'checks': [dataclasses.asdict(check) for check in validation.checks],
         'calibration_id': dict(validation.calibration_id),
+        'achieved_sd_px': dict(validation.achieved_sd_px),
         'seconds': validation.seconds,
     }
 

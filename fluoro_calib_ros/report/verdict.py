@@ -39,6 +39,8 @@ def verdict_text(validation: Validation) -> str:
         ]
         lines.append('  '.join(cells).rstrip())
     lines += ['', f'Verdict: {validation.verdict} ({validation.seconds:.1f} s)']
+    for name, sd in validation.achieved_sd_px.items():
+        lines.append(f'Achieved, fluoroscope {_shortened(name)}: corrections to {sd:.3f} px (sd)')
     for sentence in validation.findings:
         lines += textwrap.wrap(f'- {sentence}', TERMINAL_WIDTH, subsequent_indent='  ')
     return '\n'.join(lines) + '\n'

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -54,12 +54,16 @@ class Validation:
         Id of the calibration by fluoroscope.
     seconds : float
         Duration of the validation [s].
+    achieved_sd_px : mapping of str to float
+        Standard deviation of a coordinate of the correction that the checks confirm [px], by
+        fluoroscope; whatever the verdict is, it says what the calibration is good for.
     """
 
     verdict: str
     checks: tuple[Check, ...]
     calibration_id: Mapping[str, str]
     seconds: float
+    achieved_sd_px: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def findings(self) -> tuple[str, ...]:

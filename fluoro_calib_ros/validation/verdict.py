@@ -11,6 +11,8 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations
 from ..calibration.request import CalibrationRequest
 from ..calibration.result import FluoroscopeCalibration
@@ -85,7 +87,25 @@ def validate(
         tuple(checks),
         _identities(calibrations),
         time.perf_counter() - began,
+        {name: _achieved_sd(evidence, name, checks) for name in request.frames},
     )
+
+
+def _achieved_sd(evidence: Evidence, name: str, checks: Sequence[Check]) -> float:
+    """Standard deviation of a coordinate of the correction of a fluoroscope [px].
+
+    It is what the calibration claims, times the ratio of the difference of its halves to their
+    claims where that is above 1, together with the trend and the variation in the residuals.
+    """
+    values = {
+        check.name: check.value
+        for check in checks
+        if check.fluoroscope == name and np.isfinite(check.value)
+    }
+    common = evidence.trends[name]
+    claimed = common.claimed_sd * max(1.0, values.get('halves', 1.0))
+    parts = (claimed, values.get('whiteness', 0.0), values.get('variation', 0.0))
+    return float(np.linalg.norm(parts))
 
 
 def validate_or_report(

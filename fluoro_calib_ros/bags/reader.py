@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Collection, Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from mcap.records import Schema
@@ -14,6 +14,7 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.strays import without_strays
 from ..files.access import check_safe_name
 from .definitions import TARGET_OBSERVATIONS, fields_of, from_cdr, type_hash, typestore
+from .foreign import channels_of_bag, is_foreign, messages_of_bag
 from .frames import fluoroscope_of_topic, frame_from_message
 from .mcap_file import BagMessage, ChannelInfo, channels_of_file, messages_of_file
 from .qos import parse_profiles
@@ -43,7 +44,8 @@ class BagContents:
 def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     """Read all frames of a bag: those of every topic of type TargetObservations.
 
-    The fluoroscope is the part of the topic's name before the last.
+    The fluoroscope is the part of the topic's name before the last. Where the frame numbers of a
+    stream begin again, a power of ten is added to those that follow, so that they differ.
 
     Parameters
     ----------
@@ -67,7 +69,9 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
     _check_definitions(source, fluoroscopes)
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(fluoroscopes.values())}
     notes: list[str] = []
-    first: dict[tuple[str, int], int] = {}  # message in which a frame occurred first
+    first: dict[tuple[str, int, int], int] = {}  # message in which a frame occurred first
+    restarts = dict.fromkeys(frames, 0)
+    segments: dict[str, list[int]] = {name: [] for name in frames}
     for message in iterate_messages(source, fluoroscopes):
         name = fluoroscopes[message.topic]
         number = len(frames[name]) + 1
@@ -80,13 +84,23 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
                 validate_frame(frame)
         except DataError as error:
             raise DataError(f'{where}: {error}') from None
-        key = (name, frame.number)
+        if frames[name] and _is_restart(frames[name][-1], frame):
+            restarts[name] += 1
+        segments[name].append(restarts[name])
+        key = (name, restarts[name], frame.number)
         if validate and key in first:
             raise DataError(
                 f'{where}: frame {frame.number} is already given in message {first[key]}'
             )
         first[key] = number
         frames[name].append(frame)
+    if validate and any(restarts.values()):
+        frames, step = _renumbered(frames, segments)
+        counts = ', '.join(f'{name} {count}' for name, count in restarts.items() if count)
+        notes.append(
+            f'{source}: the frame numbers begin again ({counts} times), '
+            f'{step} is added to those that follow each time'
+        )
     topics = {name: topic for topic, name in fluoroscopes.items() if frames[name]}
     if not topics:
         raise DataError(f'{source}: the bag has no message on {" or ".join(fluoroscopes)}')
@@ -95,6 +109,27 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
         dict(sorted(topics.items())),
         tuple(notes),
     )
+
+
+def _is_restart(last: Frame, frame: Frame) -> bool:
+    """Return whether the numbers of a stream begin again while time goes on."""
+    return frame.number < last.number and frame.stamp_ns > last.stamp_ns
+
+
+def _renumbered(
+    frames: Mapping[str, Sequence[Frame]], segments: Mapping[str, Sequence[int]]
+) -> tuple[dict[str, list[Frame]], int]:
+    """Return frames with numbers that differ between segments of their streams, and the step."""
+    largest = max(frame.number for each in frames.values() for frame in each)
+    step = 10 ** len(str(largest))
+    renumbered = {
+        name: [
+            replace(frame, number=frame.number + step * segment)
+            for frame, segment in zip(each, segments[name], strict=True)
+        ]
+        for name, each in frames.items()
+    }
+    return renumbered, step
 
 
 def iterate_messages(
@@ -106,6 +141,9 @@ def iterate_messages(
     for a damaged or truncated bag.
     """
     wanted = None if topics is None else set(topics)
+    if is_foreign(source):
+        yield from messages_of_bag(source, wanted)
+        return
     parts = [messages_of_file(path, wanted) for path in storage_files(source)]
     yield from heapq.merge(*parts, key=lambda message: message.log_time_ns)
 
@@ -113,8 +151,8 @@ def iterate_messages(
 def topics_of(source: PathLike) -> dict[str, TopicInfo]:
     """Return the topics of a bag, sorted by name. Raises DataError."""
     out: dict[str, TopicInfo] = {}
-    for path in storage_files(source):
-        for info in channels_of_file(path):
+    for path, channels in _channels(source):
+        for info in channels:
             topic = info.channel.topic
             name = info.schema.name if info.schema else ''
             known = out.get(topic, TopicInfo(name, 0, []))
@@ -127,6 +165,15 @@ def topics_of(source: PathLike) -> dict[str, TopicInfo]:
             )
             out[topic] = TopicInfo(name, known.count + info.count, profiles)
     return dict(sorted(out.items()))
+
+
+def _channels(source: PathLike) -> Iterator[tuple[PathLike, list[ChannelInfo]]]:
+    """Yield every file of a bag and its channels. Raises DataError."""
+    if is_foreign(source):
+        yield source, channels_of_bag(source)
+        return
+    for path in storage_files(source):
+        yield path, channels_of_file(path)
 
 
 def _observation_topics(source: PathLike) -> dict[str, str]:
@@ -153,8 +200,8 @@ def _observation_topics(source: PathLike) -> dict[str, str]:
 
 def _check_definitions(source: PathLike, topics: Collection[str]) -> None:
     """Raise DataError unless a bag defines TargetObservations as this program does."""
-    for path in storage_files(source):
-        for info in channels_of_file(path):
+    for path, channels in _channels(source):
+        for info in channels:
             if info.channel.topic not in topics:
                 continue
             try:

@@ -67,17 +67,11 @@ def _listed_files(source: PathLike, path: str) -> list[str]:
         information = yaml.safe_load(read_text(path))['rosbag2_bagfile_information']
         storage = str(information['storage_identifier'])
         names = list(information['relative_file_paths'])
-        compressed = information.get('compression_mode')
     except (yaml.YAMLError, KeyError, TypeError, AttributeError):
         raise DataError(f'{path}: this is not the metadata of a bag, or it is damaged') from None
     if storage != 'mcap':
         raise DataError(
-            f'{path}: the bag is stored as {storage}, only mcap is supported; '
-            f'convert it with ros2 bag convert'
-        )
-    if compressed and str(compressed).lower() != 'none':
-        raise DataError(
-            f'{path}: the files of the bag are compressed as a whole; '
+            f'{path}: the bag is stored as {storage}, only mcap and sqlite3 are supported; '
             f'convert it with ros2 bag convert'
         )
     if not names or not all(isinstance(name, str) for name in names):

@@ -6,8 +6,16 @@ import argparse
 from pathlib import Path
 
 from ..options import declared
-from .arguments import add_calibration, add_option, add_phantom, add_source, file_settings
-from .output import print_note, print_notes, print_result
+from .arguments import (
+    add_bag_options,
+    add_calibration,
+    add_option,
+    add_phantom,
+    add_source,
+    bag_selection,
+    file_settings,
+)
+from .output import print_note, print_notes, print_result, print_unpaired
 
 NAME = 'adjust'
 HELP = 'Adjust the exposures of a bag or CSV file with the calibration held (out-of-sample test).'
@@ -22,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         parser,
         'image size of a file that does not contain it [px] (default: that of the calibration)',
     )
+    add_bag_options(parser)
     add_phantom(parser)
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
@@ -50,8 +59,10 @@ def run(arguments: argparse.Namespace) -> None:
         image_size=arguments.image_size or next(iter(calibrations.values())).image_size,
         fluoroscopes=arguments.fluoroscopes,
         settings=file_settings(arguments, names=known.merged(survey.names)),
+        selection=bag_selection(arguments),
     )
     print_notes((*survey.notes, *recording.notes))
+    print_unpaired(arguments.source, recording.unpaired)
     frames = recording.frames
     calibrations = select_calibrations(calibrations, frames, arguments.calibration)
     result = adjust(frames, survey.phantom, calibrations, arguments.loss)

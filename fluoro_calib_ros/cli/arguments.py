@@ -8,10 +8,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..options import Option
+from ..options import Option, declared
 
 if TYPE_CHECKING:
     from ..exchange.content import FileSettings
+    from ..jobs.sources import BagSelection
 
 UNITS = ('mm', 'cm', 'm')
 
@@ -109,6 +110,39 @@ def add_source(parser: argparse.ArgumentParser, image_size_help: str) -> None:
     parser.add_argument('--image-size', type=image_size, metavar='WxH', help=image_size_help)
     add_fluoroscopes(parser)
     add_file_options(parser)
+
+
+def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> None:
+    """Add what is used of a bag: time window and, where it is not an option already, pairing."""
+    from ..exposures.pairing import PairingOptions
+
+    group = parser.add_argument_group('bags')
+    for name, text in (('start', 'first'), ('end', 'last')):
+        group.add_argument(
+            f'--{name}',
+            type=number_in(0, 1e9),
+            metavar='S',
+            help=f'{text} time that is used [s from the stamp of the first frame] (default: all)',
+        )
+    options = declared(PairingOptions)
+    if pairing:
+        add_option(group, options['pair_by'])
+    tolerance = options['tolerance_s']
+    group.add_argument(
+        '--pair-tolerance',
+        type=number_in(0.0, 1.0),
+        default=tolerance.default,
+        metavar='S',
+        help=f'{tolerance.description}, with --pair-by stamp [s] (default: {tolerance.default})',
+    )
+
+
+def bag_selection(arguments: argparse.Namespace, pairing: bool = True) -> BagSelection:
+    """Return the selection of `add_bag_options`."""
+    from ..jobs.sources import BagSelection
+
+    pair_by = arguments.pair_by if pairing else 'frame_number'
+    return BagSelection(arguments.start, arguments.end, pair_by, arguments.pair_tolerance)
 
 
 def add_file_options(parser: argparse.ArgumentParser) -> None:

@@ -9,10 +9,12 @@ from typing import Any
 
 from ..options import Option, declared
 from .arguments import (
+    add_bag_options,
     add_collect,
     add_option,
     add_phantom,
     add_source,
+    bag_selection,
     file_settings,
     number_in,
 )
@@ -29,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from ..calibration.options import CalibrationOptions
 
     add_source(parser, 'image size of a file that does not contain it [px]')
+    add_bag_options(parser)
     add_phantom(parser)
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
@@ -152,6 +155,7 @@ def run(arguments: argparse.Namespace) -> None:
         fluoroscopes=arguments.fluoroscopes,
         collect=arguments.collect,
         settings=file_settings(arguments, names=names),
+        selection=bag_selection(arguments),
     )
     print_notes((*(() if survey is None else survey.notes), *recording.notes))
     print_unpaired(arguments.source, recording.unpaired)

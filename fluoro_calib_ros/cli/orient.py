@@ -5,8 +5,15 @@ from __future__ import annotations
 import argparse
 
 from ..errors import DataError
-from .arguments import add_calibration, add_phantom, add_source, file_settings
-from .output import print_notes, print_result
+from .arguments import (
+    add_bag_options,
+    add_calibration,
+    add_phantom,
+    add_source,
+    bag_selection,
+    file_settings,
+)
+from .output import print_notes, print_result, print_unpaired
 
 NAME = 'orient'
 HELP = 'Orient the rig from a capture of the phantom, which stands still in the rig frame.'
@@ -34,6 +41,7 @@ def exposure_numbers(text: str) -> set[int]:
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     add_source(parser, 'image size of a file [px] (default: that of the calibration)')
+    add_bag_options(parser)
     add_calibration(parser)
     add_phantom(parser)
     parser.add_argument(
@@ -67,8 +75,10 @@ def run(arguments: argparse.Namespace) -> None:
         image_size=arguments.image_size,
         fluoroscopes=arguments.fluoroscopes,
         settings=file_settings(arguments, names=survey.names),
+        selection=bag_selection(arguments),
     )
     print_notes((*survey.notes, *recording.notes))
+    print_unpaired(arguments.source, recording.unpaired)
     frames = recording.frames
     if arguments.exposures is not None:
         frames = {

@@ -9,7 +9,14 @@ from typing import TYPE_CHECKING
 
 from ..errors import DataError
 from ..options import declared
-from .arguments import add_calibration, add_option, add_source, file_settings
+from .arguments import (
+    add_bag_options,
+    add_calibration,
+    add_option,
+    add_source,
+    bag_selection,
+    file_settings,
+)
 from .output import print_notes, print_result, print_unpaired
 
 if TYPE_CHECKING:
@@ -25,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from ..jobs.reconstruction import ReconstructionOptions
 
     add_source(parser, 'image size of a file [px] (default: that of the calibration)')
+    add_bag_options(parser, pairing=False)
     add_calibration(parser)
     parser.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
     parser.add_argument(
@@ -87,6 +95,7 @@ def run(arguments: argparse.Namespace) -> None:
         # A frame without points, or with an invalid one, must not reject a recording.
         validate=False,
         settings=file_settings(arguments),
+        selection=bag_selection(arguments, pairing=False),
     )
     print_notes(recording.notes)
     frames = recording.frames
@@ -97,6 +106,7 @@ def run(arguments: argparse.Namespace) -> None:
         not arguments.no_drift_watch,
         arguments.clusters,
         is_bag(arguments.source),
+        arguments.pair_tolerance,
     )
     names = [name for name in orientation.fluoroscopes if name in frames]
     try:

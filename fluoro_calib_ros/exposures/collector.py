@@ -14,7 +14,7 @@ from ..errors import DataError
 from ..options import option
 from .coverage import Coverage
 from .frame import Frame
-from .pairing import CompletePairer, recording_options
+from .pairing import CompletePairer, PairingOptions, recording_options
 
 MIN_COMMON_TARGETS = 8  # with fewer targets in common two frames cannot be compared
 MAX_RECENT = 1000  # pairs that are remembered
@@ -203,6 +203,7 @@ def collect_recorded(
     mode: str = 'auto',
     pair_by: str = 'frame_number',
     still: StillOptions | None = None,
+    tolerance_s: float = PairingOptions.tolerance_s,
 ) -> tuple[dict[str, list[Frame]], dict[str, int]]:
     """Collect the exposures of a recording, as the calibration node would.
 
@@ -215,6 +216,8 @@ def collect_recorded(
         'auto' is 'still' for a stream and 'all' for single shots.
     pair_by : {'frame_number', 'stamp'}
     still : StillOptions, optional
+    tolerance_s : float
+        Largest difference between the stamps of an exposure [s].
 
     Returns
     -------
@@ -224,7 +227,7 @@ def collect_recorded(
         Number of frames without partner by fluoroscope.
     """
     still = still or StillOptions()
-    pairer = CompletePairer(frames, recording_options(pair_by))
+    pairer = CompletePairer(frames, recording_options(pair_by, tolerance_s))
     collector = ExposureCollector(frames, still)
     if mode == 'auto':
         mode = 'still' if any(_is_stream(f, still) for f in frames.values()) else 'all'

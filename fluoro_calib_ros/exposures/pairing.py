@@ -120,14 +120,20 @@ def exposure_pairer(fluoroscopes: Iterable[str], options: PairingOptions | None 
     return PartialPairer(names, options)
 
 
-def recorded_pairer(fluoroscopes: Iterable[str], pair_by: str = 'frame_number') -> Pairer:
+def recorded_pairer(
+    fluoroscopes: Iterable[str],
+    pair_by: str = 'frame_number',
+    tolerance_s: float = PairingOptions.tolerance_s,
+) -> Pairer:
     """Pairer for the reconstruction of a recording, with waiting and patience unlimited."""
-    return exposure_pairer(fluoroscopes, recording_options(pair_by))
+    return exposure_pairer(fluoroscopes, recording_options(pair_by, tolerance_s))
 
 
-def recording_options(pair_by: str = 'frame_number') -> PairingOptions:
+def recording_options(
+    pair_by: str = 'frame_number', tolerance_s: float = PairingOptions.tolerance_s
+) -> PairingOptions:
     """Options for a recording: all its frames are there, so none has to be given up."""
-    return PairingOptions(pair_by, waiting=UNLIMITED, patience=UNLIMITED)
+    return PairingOptions(pair_by, tolerance_s, waiting=UNLIMITED, patience=UNLIMITED)
 
 
 class CompletePairer:

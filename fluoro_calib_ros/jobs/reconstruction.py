@@ -12,7 +12,7 @@ from ..drift.clusters import Cluster
 from ..drift.recording_watch import DriftVerdict, RecordingDriftWatch
 from ..errors import DataError
 from ..exposures.frame import Frame
-from ..exposures.pairing import PAIR_BY
+from ..exposures.pairing import PAIR_BY, PairingOptions
 from ..options import option, validate_options
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
@@ -41,6 +41,7 @@ class ReconstructionOptions:
     drift_watch: bool = True
     clusters: tuple[Cluster, ...] = ()
     has_stamps: bool = True
+    pair_tolerance: float = PairingOptions.tolerance_s
 
     def __post_init__(self) -> None:
         validate_options(self)
@@ -120,7 +121,12 @@ def reconstruct(
     orientation = orientation.subset(names)
     watch, drift = _drift_watch(orientation, calibrations, options)
     found, unpaired = reconstruct_recording(
-        frames, calibrations, Intersector(orientation, options.reject), options.pair_by, watch
+        frames,
+        calibrations,
+        Intersector(orientation, options.reject),
+        options.pair_by,
+        watch,
+        options.pair_tolerance,
     )
     if not found:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,6 +17,7 @@ from ..exchange.content import PARTS, Content, FileSettings
 from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
 from ..exposures.names import Names
+from ..exposures.pairing import PairingOptions
 from ..exposures.phantom import Phantom
 from ..files.access import check_regular_file
 from ..files.calibration import load_calibrations
@@ -50,6 +52,51 @@ class Recording:
 
 
 @dataclass(frozen=True)
+class BagSelection:
+    """What is used of a bag, and how its frames are paired.
+
+    Attributes
+    ----------
+    start_s, end_s : float or None
+        Time window from the stamp of the first frame [s]; None: not limited.
+    pair_by : {'frame_number', 'stamp'}
+    tolerance_s : float
+        Largest difference between the stamps of an exposure [s].
+    """
+
+    start_s: float | None = None
+    end_s: float | None = None
+    pair_by: str = 'frame_number'
+    tolerance_s: float = PairingOptions.tolerance_s
+
+    def check_file(self, path: object) -> None:
+        """Raise DataError where a file without times is to be selected from by time."""
+        if self.start_s is not None or self.end_s is not None or self.pair_by == 'stamp':
+            raise DataError(
+                f'{path}: a time window and the pairing by stamp need a bag, this file does not '
+                'contain the times of its exposures'
+            )
+
+    def frames(self, path: object, found: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]]:
+        """Return the frames in the time window. Raises DataError where there are none."""
+        origin = min(frame.stamp_ns for each in found.values() for frame in each)
+        low = -math.inf if self.start_s is None else self.start_s
+        high = math.inf if self.end_s is None else self.end_s
+        kept = {
+            name: [frame for frame in each if low <= (frame.stamp_ns - origin) * 1e-9 <= high]
+            for name, each in found.items()
+        }
+        for name, each in kept.items():
+            if not each:
+                last = max(frame.stamp_ns for frame in found[name])
+                raise DataError(
+                    f'{path}: there is no frame of fluoroscope {name} in the time window, its '
+                    f'last frame is at {(last - origin) * 1e-9:.3f} s'
+                )
+        return kept
+
+
+@dataclass(frozen=True)
 class Survey:
     """A phantom, the names of its beads, and what a user has to know about them."""
 
@@ -61,7 +108,7 @@ class Survey:
 def is_bag(path: str | os.PathLike[str]) -> bool:
     """Return whether a source is a bag, which contains times; else it is a file of exposures."""
     path = Path(path)
-    if path.is_dir() or path.suffix.lower() in ('', '.mcap'):
+    if path.is_dir() or path.suffix.lower() in ('', '.mcap', '.db3'):
         return True
     check_regular_file(path)
     try:
@@ -141,6 +188,7 @@ def read_source(
     collect: str | None = None,
     validate: bool = True,
     settings: FileSettings | None = None,
+    selection: BagSelection | None = None,
 ) -> Recording:
     """Read the frames of a bag, or of a file with image points of any format.
 
@@ -161,6 +209,8 @@ def read_source(
         Whether every frame of a bag is validated; else only the lengths of its arrays.
     settings : exchange.content.FileSettings, optional
         What the file does not say, and known names.
+    selection : BagSelection, optional
+        Time window and pairing; pairing by stamp also numbers the frames anew, by exposure.
 
     Returns
     -------
@@ -172,13 +222,15 @@ def read_source(
         For a source that cannot be read, and for a fluoroscope that it does not contain.
     """
     settings = settings or FileSettings()
+    selection = selection or BagSelection()
     content = Content()
     bag = is_bag(path)
     if bag:
         contents = read_frames(path, validate)
-        found = contents.frames
+        found = selection.frames(path, contents.frames)
         content = Content(notes=contents.notes)
     else:
+        selection.check_file(path)
         settings = replace(settings, image_size=image_size, fluoroscopes=tuple(fluoroscopes or ()))
         content = read_content(path, settings, 'observations', 'observations')
         found = {name: list(frames) for name, frames in (content.observations or {}).items()}
@@ -190,9 +242,12 @@ def read_source(
         if name not in found:
             raise DataError(f'{path}: there is no fluoroscope {name!r}, only {", ".join(found)}')
     frames = {name: found[name] for name in wanted}
-    if collect is None or not bag:
+    if not bag or (collect is None and selection.pair_by == 'frame_number'):
         return Recording(frames, {}, names, content.notes)
-    return Recording(*collect_recorded(frames, collect), names, content.notes)
+    collected = collect_recorded(
+        frames, collect or 'all', selection.pair_by, tolerance_s=selection.tolerance_s
+    )
+    return Recording(*collected, names, content.notes)
 
 
 def select_calibrations(
@@ -244,6 +299,7 @@ def read_calibrated_source(
     fluoroscopes: Sequence[str] | None = None,
     validate: bool = True,
     settings: FileSettings | None = None,
+    selection: BagSelection | None = None,
 ) -> tuple[Recording, dict[str, FluoroscopeCalibration]]:
     """Read all frames of a source whose fluoroscopes are calibrated, and all calibrations.
 
@@ -255,7 +311,7 @@ def read_calibrated_source(
         The result folder with the calibrations, whose names are known.
     image_size : (int, int), optional
         Of a file; by default that of the calibration.
-    fluoroscopes, validate, settings
+    fluoroscopes, validate, settings, selection
         As in `read_source`.
 
     Returns
@@ -278,6 +334,7 @@ def read_calibrated_source(
         fluoroscopes=fluoroscopes,
         validate=validate,
         settings=replace(settings, names=read_names(directory).merged(settings.names)),
+        selection=selection,
     )
     select_calibrations(calibrations, recording.frames, directory)
     return recording, calibrations

@@ -16,7 +16,7 @@ from ..calibration.result import FluoroscopeCalibration
 from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 from ..exposures.frame import Frame, image_size_error, repeated_target_error
-from ..exposures.pairing import recorded_pairer
+from ..exposures.pairing import PairingOptions, recorded_pairer
 from .correspondence import CorrectedView, MatchedViews, match_views
 from .intersection import IntersectedPoints, Intersector
 
@@ -166,6 +166,7 @@ def reconstruct_recording(
     intersector: Intersector,
     pair_by: str = 'frame_number',
     watch: ExposureWatch | None = None,
+    tolerance_s: float = PairingOptions.tolerance_s,
 ) -> tuple[list[ReconstructedFrame], dict[str, int]]:
     """Reconstruct the exposures of a recording.
 
@@ -180,6 +181,8 @@ def reconstruct_recording(
         What the frames of an exposure have in common.
     watch : ExposureWatch, optional
         Examines the exposures.
+    tolerance_s : float
+        Largest difference between the stamps of an exposure [s].
 
     Returns
     -------
@@ -199,7 +202,7 @@ def reconstruct_recording(
             raise DataError(
                 f'there are no frames of fluoroscope {name}, only of {", ".join(frames)}'
             )
-    pairer = recorded_pairer(names, pair_by)
+    pairer = recorded_pairer(names, pair_by, tolerance_s)
     ordered = sorted(
         (frame for name in names for frame in frames[name]), key=lambda f: (f.stamp_ns, f.number)
     )

@@ -70,6 +70,7 @@ __all__ = [
     'Validation',
     'adjust',
     'calibrate',
+    'calibrate_with_known_orientations',
     'convert',
     'correct',
     'load_orientation',
@@ -99,7 +100,6 @@ def calibrate(
     *,
     joint: bool = False,
     principal_distance: float | None = None,
-    known_orientations: Mapping[str, KnownOrientation] | None = None,
     validated: bool = False,
     force: bool = False,
 ) -> CalibrationOutcome:
@@ -116,10 +116,6 @@ def calibrate(
         Whether all fluoroscopes are adjusted together; else one after the other.
     principal_distance : float, optional
         Start value, or with interior 'fixed' the held value [px].
-    known_orientations : mapping of str to KnownOrientation, optional
-        By fluoroscope, where K, R and t are known and only the distortion is to be estimated. The
-        phantom is then given in the frame of the lab; `MovingPoints.as_phantom` makes one of
-        points in motion.
     validated : bool
         Whether the calibration is validated with its own exposures, which takes some six times as
         long.
@@ -144,7 +140,46 @@ def calibrate(
         options or CalibrationOptions(),
         joint,
         principal_distance,
-        known_orientations=known_orientations or {},
+    )
+    return run_calibration(request, validate=validated, force=force)
+
+
+def calibrate_with_known_orientations(
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    known: Mapping[str, KnownOrientation],
+    options: CalibrationOptions | None = None,
+    *,
+    validated: bool = False,
+    force: bool = False,
+) -> CalibrationOutcome:
+    """Estimate the distortion of fluoroscopes whose K, R and t are known.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        Exposures by fluoroscope.
+    phantom : Phantom
+        Targets in the frame of the lab; `MovingPoints.as_phantom` makes one of points in motion.
+    known : mapping of str to KnownOrientation
+        By fluoroscope; held, or weighted by its standard deviations.
+    options : CalibrationOptions, optional
+    validated : bool
+        Whether the calibration is validated with its own exposures.
+    force : bool
+        Whether to calibrate also input that cannot be right.
+
+    Returns
+    -------
+    CalibrationOutcome
+
+    Raises
+    ------
+    DataError
+        For observations that do not suffice or cannot be right: place and cause in a sentence.
+    """
+    request = CalibrationRequest(
+        frames, phantom, options or CalibrationOptions(), known_orientations=known
     )
     return run_calibration(request, validate=validated, force=force)
 

@@ -212,11 +212,15 @@ def test_calibrate_writes_result_and_calibrations(result):
     assert sorted(p.name for p in result.iterdir()) == [
         'a.calibration.npz',
         'b.calibration.npz',
+        'exposures.csv',
+        'interior.csv',
         'observations.csv',
         'options.json',
         'phantom.csv',
+        'residuals.csv',
         'result.json',
         'rig_orientation.npz',
+        'targets.csv',
     ]
 
 

@@ -429,7 +429,7 @@ def test_impossible_outputs_are_refused(one, both, tmp_path, capfd):
         (eight, 'x.xyz', 'the ending .xyz is none of an image'),
         (eight, 'x', 'the ending (none) is none'),
         (eight, 'x.avi', 'the ending .avi is none of an image'),
-        (eight, '8.png', 'this is the source itself'),
+        (eight, '8.png', '8.png would be overwritten, choose another output file'),
         (eight, 'folder', 'this is a folder'),
         (deep, 'x.jpg', '16 bits cannot be written as jpg'),
         (deep, 'x.bmp', '16 bits cannot be written as bmp'),

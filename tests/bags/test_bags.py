@@ -552,6 +552,7 @@ def test_truncated_bag_is_reported(tmp_path):
             assert str(path) in message_of(read, str(tmp_path / 'run'))
 
 
+@pytest.mark.long
 def test_changed_byte_is_reported_or_irrelevant(tmp_path):
     frames = some_frames(20)
     write_bag(tmp_path / 'run', frames)
@@ -570,6 +571,7 @@ def test_changed_byte_is_reported_or_irrelevant(tmp_path):
     assert told > 200
 
 
+@pytest.mark.long
 def test_damaged_bag_without_checksums_raises_only_data_errors(tmp_path):
     path = mcap_file(
         tmp_path / 'x.mcap', [(TOPIC, i, cdr(frame(number=i, targets=5))) for i in range(5)]

@@ -105,6 +105,7 @@ def assert_same_bits(one, other):
 # ---- accuracy
 
 
+@pytest.mark.long
 def test_self_calibration_estimates_the_distortion():
     """15 exposures: it converges, the residuals are noise, the correction and the object points
     are near the truth.
@@ -124,6 +125,7 @@ def test_self_calibration_estimates_the_distortion():
     )
 
 
+@pytest.mark.long
 def test_local_linear_is_more_accurate_than_knn():
     knn = rigs.calibrated(model='knn')
     assert knn.fluoroscopes['a'].rmse_after.max() < NOISE_PX
@@ -202,6 +204,7 @@ def test_joint_adjustment_has_common_object_points():
 
 
 @pytest.mark.parametrize('model', ['auto', 'local_linear', 'hybrid', 'knn', 'parametric'])
+@pytest.mark.long
 def test_fitted_correction_is_orthogonal_to_the_gauge(model):
     """While the interior orientation is estimated, no shift, scale or rotation remains in the
     correction.
@@ -413,6 +416,7 @@ def test_same_observations_give_the_same_bits():
 
 
 @pytest.mark.parametrize('options', [{}, {'model': 'local_linear', 'k': 60}])
+@pytest.mark.long
 def test_order_of_frames_and_targets_does_not_matter(options):
     """To the last bit, also over accelerated rounds."""
     rng = np.random.default_rng(1)

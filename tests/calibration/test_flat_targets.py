@@ -115,6 +115,7 @@ def test_the_adjustment_of_a_board_is_that_of_opencv():
     np.testing.assert_allclose(ours, [k[0, 2], k[1, 2], k[0, 0]], rtol=0, atol=0.05)
 
 
+@pytest.mark.long
 def test_a_tilted_grid_calibrates_nearly_as_well_as_known_distortion_allows():
     frames = exposures([12, 18, 24, 30, 36, 21, 27, 33])
     found = calibrate({'a': frames}, SURVEY).calibrations['a']
@@ -157,6 +158,7 @@ def test_a_grid_that_is_not_in_plane_with_its_survey_is_refused():
     assert find_wrong_input({'a': frames}, SURVEY) == {}
 
 
+@pytest.mark.long
 def test_a_grid_completes_a_cube_that_leaves_the_rim_uncovered():
     cube = small_cube(rigs.rig(), 1, 6)
     large = 1.4 * POINTS

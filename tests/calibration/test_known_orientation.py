@@ -70,6 +70,7 @@ def test_four_markers_an_exposure_give_the_distortion(outcome):
 
 
 @pytest.mark.parametrize('model', ['local_linear', 'parametric'])
+@pytest.mark.long
 def test_other_models_learn_shift_and_scale_too(motion, model):
     """The principal point given is 5 px off: with the orientation held the correction has it."""
     shifted = replace(motion.known['a'], interior=motion.known['a'].interior + [5.0, -3.0, 0.0])
@@ -80,6 +81,7 @@ def test_other_models_learn_shift_and_scale_too(motion, model):
     np.testing.assert_allclose(model.predict(pixels), wanted, atol=1.0)
 
 
+@pytest.mark.long
 def test_an_orientation_with_standard_deviations_is_improved(motion):
     sd = ((20.0, 20.0, 20.0), (1.0, 1e-3))
     wrong = motion.known['a'].interior + [0.0, 0.0, 30.0]

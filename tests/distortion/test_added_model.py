@@ -34,6 +34,7 @@ def added(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures('added')
+@pytest.mark.long
 def test_added_model_calibrates_saves_loads_and_looks_up(tmp_path):
     frames = {'a': rigs.exposures()['a'][:8]}
     result = calibrate(frames, rigs.rig().phantom, CalibrationOptions(NAME))

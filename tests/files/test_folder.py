@@ -68,6 +68,7 @@ def hidden(path):
     return [name for name in os.listdir(path) if name.startswith('.')]
 
 
+@pytest.mark.long
 def test_killed_calibrations_leave_a_whole_folder(tmp_path, outcomes):
     """Old or new at every kill, and so is the previous one; the next run cleans up."""
     path = tmp_path / 'result'

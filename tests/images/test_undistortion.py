@@ -104,6 +104,7 @@ def test_corrected_source_of_a_pixel_is_the_pixel(kind):
 
 @pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
 @pytest.mark.parametrize('dtype', DEPTHS)
+@pytest.mark.long
 def test_beads_move_as_points_do(dtype, interpolation):
     """Blobs drawn at observed positions lie where calibration.correct puts them; the distortion is
     up to 17 px.
@@ -242,6 +243,7 @@ def test_fold_is_left_empty():
     assert np.abs(corrected - np.argwhere(this.mask)[:, ::-1]).max() < LIMIT_PX
 
 
+@pytest.mark.long
 def test_steps_of_nearest_neighbours_leave_few_holes():
     """The model knn is piecewise constant, but nearly all pixels have a source."""
     this = corrector(kind='knn')

@@ -274,6 +274,7 @@ def test_standard_deviations_of_gaussian_noise_against_monte_carlo():
     assert np.mean(errors['points']) == pytest.approx(1, abs=0.05)
 
 
+@pytest.mark.long
 def test_standard_deviations_of_heavy_tailed_noise_against_monte_carlo():
     """The same for t noise with four degrees of freedom.
 

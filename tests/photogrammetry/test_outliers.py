@@ -32,6 +32,7 @@ def adjusted(network, truth, loss='student_t'):
 
 
 @pytest.mark.parametrize('loss', ['gaussian', 'student_t', 'huber'])
+@pytest.mark.long
 def test_false_alarms_on_clean_data(loss):
     """At 1 % a network, 20 networks raise hardly any; the statistics have their quantiles."""
     alarms = 0

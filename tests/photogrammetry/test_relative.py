@@ -328,6 +328,7 @@ def test_constraint_reduces_scatter_and_errors():
     assert error[2] < error[0]
 
 
+@pytest.mark.long
 def test_standard_deviations_against_monte_carlo():
     """Errors of the relative orientation agree with its covariance."""
     squares = []

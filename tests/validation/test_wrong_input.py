@@ -368,6 +368,7 @@ def test_few_targets_of_a_facade_start_near_the_truth(depth_mm):
 
 @pytest.mark.filterwarnings('error')
 @pytest.mark.parametrize('kind', ['phantom in m', 'all ids shuffled'])
+@pytest.mark.long
 def test_forced_input_is_validated_without_a_traceback(kind):
     make_frames, make_phantom, _ = WRONG[kind]
     phantom = PHANTOM if make_phantom is None else make_phantom()

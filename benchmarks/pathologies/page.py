@@ -17,7 +17,7 @@ matches. `benchmarks/pathologies/cases.py` declares the cases. The base rig has 
 15 exposures of at most 132 of 480 beads, Gaussian noise of 0.25 px, 1 % false matches and a survey
 with a standard deviation of 0.1 mm. Model: {model}.
 
-- **ratio**: RMS error of corrected points out of sample, with noise, over that of an oracle: a
+{note}- **ratio**: RMS error of corrected points out of sample, with noise, over that of an oracle: a
   Gaussian adjustment of the same exposures that knows the distortion of every exposure and has no
   false matches. Test points are free of noise, in new poses; each is resected with the true
   beads, and the noise is added in variance. Where the distortion varies, test points have its
@@ -61,13 +61,14 @@ def judge(result, case):
     return 'open' if result['verdict'] == 'cannot tell' else 'wrong'
 
 
-def page(results, cases):
+def page(results, cases, note=''):
     """Text of the page."""
     known = {case.name: case for case in cases}
     results = [r for r in results if r['case'] in known]
     good = [r for r in results if 'said' not in r]
     models = sorted({r['model'] for r in results})
     return TEXT.format(
+        note=f'{note}\n\n' if note else '',
         cases=len({r['case'] for r in results}),
         seeds=len({r['seed'] for r in results}),
         model='auto' if models[:1] == ['auto'] else ', '.join(models),

@@ -73,6 +73,7 @@ def main(arguments=None):
     parser.add_argument('--results', type=Path, default=RESULTS, help='JSON lines of the results')
     parser.add_argument('--out', type=Path, default=PAGE, help='page to write')
     parser.add_argument('--resume', action='store_true', help='keep results that are there')
+    parser.add_argument('--note', default='', help='a paragraph for the page')
     options = parser.parse_args(arguments)
     wanted = {name.strip() for name in options.cases.split(',') if name.strip()}
     cases = [case for case in CASES if not wanted or {case.name, case.group} & wanted]
@@ -93,7 +94,7 @@ def main(arguments=None):
             with options.results.open('a') as file:
                 file.write(json.dumps(result) + '\n')
             print(f'{number}/{len(jobs)} {summary(result)}', file=sys.stderr, flush=True)
-    text = page(read(options.results), cases)
+    text = page(read(options.results), cases, options.note)
     if wanted:
         print(text)
     else:

@@ -22,6 +22,7 @@ from .exposure_terms import (
     variation,
     without_exposure_terms,
 )
+from .misfit import FittedPoints, has_common_error
 from .priors import Prior, gauge_precision, most_likely_prior, prior_precision, starting_prior
 from .series import Functions, Series, sd_over_image
 from .series_model import SeriesModel
@@ -36,7 +37,7 @@ START_MODES = 16  # half waves along the image, until the signal is known
 MIN_MODES = 10
 MAX_MODES = 30  # the time grows with the sixth power
 # Prior variance times information of a sine below which the image points say nothing about it.
-NEGLIGIBLE = 0.3
+NEGLIGIBLE = 0.2
 FEWER_MODES = 0.75  # part of the present modes from which fewer are worth a change
 MODE_CHANGES = 3  # at most
 # Mean change of the logarithms of the variances of the signal that changes no correction visibly.
@@ -170,8 +171,34 @@ class CollocationTerms(AdjustedTerms):
                 return False, tuple(
                     np.concatenate([old, new[len(old) :]]) for old, new in zip(coefficients, zeros)
                 )
+            found_short = self._add_sines(adjustment, coefficients)
+            if found_short is not None:
+                return False, found_short
         self._settled = self._settled + 1 if settled else 0
         return settled, coefficients
+
+    def _add_sines(
+        self, adjustment: Adjustment, coefficients: tuple[np.ndarray, ...]
+    ) -> tuple[np.ndarray, ...] | None:
+        """Use all sines where residuals show ripples that the present ones are too long for.
+
+        Returns the coefficients for them, None where the residuals show nothing.
+        """
+        modes = []
+        for f, functions in enumerate(self.functions):
+            rows = self.network.rows(f)
+            rows = rows[adjustment.inliers[rows]]
+            points = FittedPoints(
+                self.network.uv[rows], adjustment.residuals[rows], self.network.exposure[rows]
+            )
+            missing = functions.modes < MAX_MODES and has_common_error(points)
+            modes.append(MAX_MODES if missing else functions.modes)
+            if missing:
+                signal = self.priors[f].signal.with_ripples(max(self.sizes[f]))
+                self.priors[f] = replace(self.priors[f], signal=signal)
+        if modes == [functions.modes for functions in self.functions]:
+            return None
+        return self._with_modes(modes, coefficients)
 
     def _renew_prior(
         self, f: int, network: Network, matrix: FactorizedNormalMatrix, coefficients: np.ndarray

@@ -15,11 +15,11 @@ from scipy.spatial import cKDTree
 
 from .series import SD_GRID, Series, sd_grid_pixels
 
-NEIGHBOURS = 12  # of an image point, those of its own exposure not counted
+NEIGHBOURS = 5  # of an image point, those of its own exposure not counted
 POINTS = 60  # image points about a node of the grid
 # Standard errors above which a mean product is not chance: of all image points, of those about one
 # of the nodes.
-SIGNIFICANT = 3.0
+SIGNIFICANT = 4.0
 SIGNIFICANT_LOCAL = 4.5
 
 
@@ -48,6 +48,13 @@ def neighbour_products(points: FittedPoints) -> np.ndarray:
     number = other.sum(axis=1)
     with np.errstate(invalid='ignore'):
         return np.where(other, products, 0.0).sum(axis=1) / np.where(number, number, np.nan)
+
+
+def has_common_error(points: FittedPoints) -> bool:
+    """Whether residuals show an error that all exposures have in common."""
+    products = neighbour_products(points)
+    usable = np.isfinite(products)
+    return _is_significant(products[usable], points.exposure[usable])
 
 
 def misfit_over_image(points: FittedPoints, series: Series) -> np.ndarray:

@@ -25,6 +25,8 @@ FINE_RANGE = (0.012, 0.2)
 START_REACH = 0.15
 START_FINE_REACH = 0.06
 START_FINE_SHARE = 0.1  # of the standard deviation of the long field
+RIPPLES_PX = 0.2  # standard deviation of ripples that residuals show, to start with
+RIPPLES_REACH = 0.03
 MAX_STEP = 0.8  # of the logarithm of a standard deviation or length
 STEPS = 4  # of the likelihood in one renewal
 MIN_GAIN = 0.02  # of the logarithm of the likelihood that is worth another step
@@ -57,6 +59,10 @@ class Signal:
             a = 2 * MATERN / reach**2
             variance += sd**2 * (a / (a + frequency**2)) ** MATERN
         return float(np.sqrt(variance))
+
+    def with_ripples(self, side: float) -> Signal:
+        """Return a signal with a short field to start with; side: of the image [px]."""
+        return Signal(self.sd, self.reach, RIPPLES_PX, RIPPLES_REACH * side)
 
     def change(self, other: Signal, frequency: np.ndarray) -> float:
         """Mean change of the logarithms of the variances at frequency (s,) from another signal."""

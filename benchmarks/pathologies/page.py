@@ -17,11 +17,11 @@ matches. `benchmarks/pathologies/cases.py` declares the cases. The base rig has 
 15 exposures of at most 132 of 480 beads, Gaussian noise of 0.25 px, 1 % false matches and a survey
 with a standard deviation of 0.1 mm. Model: {model}.
 
-{note}- **ratio**: RMS error of corrected points out of sample, with noise, over that of an oracle: a
-  Gaussian adjustment of the same exposures that knows the distortion of every exposure and has no
-  false matches. Test points are free of noise, in new poses; each is resected with the true
-  beads, and the noise is added in variance. Where the distortion varies, test points have its
-  mean.
+{note}- **ratio**: RMS error of corrected points out of sample, with noise, over that of an
+  oracle: a Gaussian adjustment of the same exposures that knows the distortion of every exposure
+  and has no false matches. Test points are free of noise, in new poses; each is resected with the
+  true beads, and the noise is added in variance. Where the distortion varies, test points have
+  its mean.
 - **stereo**: the same for points intersected from both fluoroscopes, with noise, in mm.
 - **NSE**: mean of (error / claimed standard deviation)^2 of the correction (grid within the
   calibrated area, in the gauge of the calibration), the object points and the sources of

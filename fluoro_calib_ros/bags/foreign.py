@@ -16,6 +16,7 @@ from rosbags.rosbag2 import Reader
 
 from ..errors import DataError
 from ..files.access import check_regular_file, read_text
+from ..files.yaml_text import parse_yaml
 from .mcap_file import BagMessage, ChannelInfo
 from .qos import to_yaml
 from .storage import PathLike
@@ -31,7 +32,7 @@ def is_foreign(source: PathLike) -> bool:
         if not os.path.isfile(path):
             return False
         try:
-            information = yaml.safe_load(read_text(path))['rosbag2_bagfile_information']
+            information = parse_yaml(read_text(path))['rosbag2_bagfile_information']
             mode = str(information.get('compression_mode') or 'none').lower()
             return str(information['storage_identifier']) == 'sqlite3' or mode != 'none'
         except (DataError, yaml.YAMLError, KeyError, TypeError, AttributeError):

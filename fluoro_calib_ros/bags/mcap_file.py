@@ -6,10 +6,11 @@ import os
 import struct
 import zlib
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from typing import BinaryIO, NamedTuple
 
+import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.reader import SeekingReader
 from mcap.records import Channel, McapRecord, Message, Schema
@@ -17,11 +18,16 @@ from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
 
 from ..errors import DataError
-from ..files.access import os_error_reason
+from ..files.access import check_regular_file, os_error_reason
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER_SIZE = 1 + 8 + 8 + 8 + 4  # bytes: opcode, length, two offsets, CRC
 FOOTER_OPCODE = 2
+CHUNK_OPCODE = 6
+DATA_END_OPCODE = 15
+CHUNK_HEAD = 100  # bytes that contain sizes and compression of a chunk
+MAX_CHUNK = 2**29  # bytes of a chunk without compression
+_RECORD = struct.Struct('<BQ')  # opcode and length
 MAX_CAUSE = 120  # characters
 
 
@@ -71,6 +77,7 @@ def channels_of_file(path: str) -> list[ChannelInfo]:
             channels = summary.channels
             counts = summary.statistics.channel_message_counts
         else:
+            _check_chunks(file)
             scan = _scan(file)
             schemas = scan.schemas
             channels = scan.channels
@@ -87,6 +94,7 @@ def messages_of_file(path: str, topics: Collection[str] | None) -> Iterator[BagM
     topics are the names of those to read, None for all. Raises DataError for a damaged file.
     """
     with _open_checked(path) as file:
+        _check_chunks(file)
         summary = _complete_summary(file)
         if summary is None or not summary.chunk_indexes:
             yield from _unindexed_messages(file, topics)
@@ -102,6 +110,7 @@ def messages_of_file(path: str, topics: Collection[str] | None) -> Iterator[BagM
 def _open_checked(path: str) -> Iterator[BinaryIO]:
     """Open a file and check both of its ends; errors of the MCAP reader become DataError."""
     try:
+        check_regular_file(path)
         with open(path, 'rb') as file:
             _check_ends(path, file)
             yield file
@@ -134,6 +143,32 @@ def _check_ends(path: str, file: BinaryIO) -> None:
         file.seek(start)
         if zlib.crc32(file.read(size - len(MAGIC) - 4 - start)) != crc:
             raise DataError(f'{path}: the bag is damaged, its summary has a wrong checksum')
+    file.seek(0)
+
+
+def _check_chunks(file: BinaryIO) -> None:
+    """Raise DataError for a chunk that would take too much memory; none is decompressed."""
+    position = len(MAGIC)
+    size = file.seek(0, os.SEEK_END)
+    while position + _RECORD.size <= size:
+        file.seek(position)
+        head = file.read(CHUNK_HEAD)
+        opcode, length = _RECORD.unpack_from(head)
+        if opcode == CHUNK_OPCODE and len(head) == CHUNK_HEAD:
+            (held,) = struct.unpack_from('<Q', head, _RECORD.size + 16)
+            (name_length,) = struct.unpack_from('<I', head, _RECORD.size + 28)
+            start = _RECORD.size + 32 + name_length + 8
+            if head[_RECORD.size + 32 : start - 8] == b'zstd':
+                with suppress(zstandard.ZstdError):
+                    held = max(held, zstandard.frame_content_size(head[start:]))
+            if held > MAX_CHUNK:
+                raise DataError(
+                    f'{file.name}: a chunk of the bag takes {held / 1e6:.0f} MB, more than '
+                    f'{MAX_CHUNK / 1e6:.0f} MB are not read'
+                )
+        elif opcode == DATA_END_OPCODE:
+            break
+        position += _RECORD.size + length
     file.seek(0)
 
 

@@ -6,6 +6,8 @@ from typing import Any
 
 import yaml
 
+from ..files.yaml_text import parse_yaml
+
 _INFINITE = {'sec': 9223372036, 'nsec': 854775807}  # RMW_DURATION_INFINITE
 # Bags from before Jazzy number the policies (rmw/types.h).
 _POLICY_NAMES = {
@@ -59,7 +61,7 @@ def parse_profiles(value: Any) -> list[dict[str, Any]]:
     A text that cannot be parsed gives no profiles: a bag can be read without them.
     """
     try:
-        items = yaml.safe_load(value) if isinstance(value, str) else value
+        items = parse_yaml(value) if isinstance(value, str) else value
     except yaml.YAMLError:
         return []
     if not isinstance(items, list):

@@ -20,6 +20,8 @@ from .mcap_file import BagMessage, ChannelInfo, channels_of_file, messages_of_fi
 from .qos import parse_profiles
 from .storage import PathLike, storage_files
 
+MAX_OBSERVATIONS = 4 * 2**20  # bytes of a message: 150,000 image points
+
 
 class TopicInfo(NamedTuple):
     """A topic of a bag: type, number of messages, and offered QoS profiles [{policy: value}]."""
@@ -77,6 +79,11 @@ def read_frames(source: PathLike, validate: bool = True) -> BagContents:
         number = len(frames[name]) + 1
         where = f'{source}, topic {message.topic}, message {number}'
         try:
+            if len(message.data) > MAX_OBSERVATIONS:
+                raise DataError(
+                    f'the message has {len(message.data)} bytes, more than {MAX_OBSERVATIONS} '
+                    'are not read'
+                )
             frame = frame_from_message(from_cdr(message.data, TARGET_OBSERVATIONS), name)
             if validate:
                 frame, stray = without_strays(frame)

@@ -11,6 +11,7 @@ import yaml
 
 from ..errors import DataError
 from ..files.access import read_text
+from ..files.yaml_text import parse_yaml
 from .definitions import Definition
 from .qos import parse_profiles, profile
 from .salvage import Damage, FileSalvage, SalvagedMessage, SalvagedTopic
@@ -141,7 +142,7 @@ def _expected_of_metadata(source: PathLike) -> dict[str, int]:
     if not os.path.isdir(source) or not os.path.exists(path):
         return {}
     try:
-        information = yaml.safe_load(read_text(path))['rosbag2_bagfile_information']
+        information = parse_yaml(read_text(path))['rosbag2_bagfile_information']
         return {
             str(entry['topic_metadata']['name']): int(entry['message_count'])
             for entry in information['topics_with_message_count']

@@ -9,6 +9,7 @@ import yaml
 
 from ..errors import DataError
 from ..files.access import os_error_reason, read_text
+from ..files.yaml_text import parse_yaml
 
 PathLike = str | os.PathLike[str]
 
@@ -64,7 +65,7 @@ def _natural_order(name: str) -> list[tuple[int, str]]:
 def _listed_files(source: PathLike, path: str) -> list[str]:
     """Return the files that metadata.yaml lists. Raises DataError."""
     try:
-        information = yaml.safe_load(read_text(path))['rosbag2_bagfile_information']
+        information = parse_yaml(read_text(path))['rosbag2_bagfile_information']
         storage = str(information['storage_identifier'])
         names = list(information['relative_file_paths'])
     except (yaml.YAMLError, KeyError, TypeError, AttributeError):

@@ -16,6 +16,7 @@ import yaml
 
 from ..errors import DataError
 from ..files.access import read_text
+from ..files.yaml_text import parse_yaml
 from .anipose import numbers_of
 from .base import Format, Sample
 from .camera_files import check_matrix, write_cameras
@@ -36,7 +37,7 @@ def recognise(sample: Sample) -> bool:
 def read(path: Path, settings: FileSettings) -> Content:
     """Read a camera. Raises DataError."""
     try:
-        document = yaml.safe_load(read_text(path))
+        document = parse_yaml(read_text(path))
     except yaml.YAMLError as error:
         mark = getattr(error, 'problem_mark', None)
         row = '' if mark is None else f', row {mark.line + 1}'

@@ -10,6 +10,9 @@ from ..errors import DataError
 
 _SAFE_NAME = re.compile(r'[A-Za-z0-9_-]{1,100}')
 
+# Largest file that is read as a whole [bytes]: some five million image points.
+MAX_FILE = 256 * 2**20
+
 PathLike = str | os.PathLike[str]
 
 
@@ -39,6 +42,12 @@ def read_bytes(path: PathLike) -> bytes:
     check_regular_file(path)
     try:
         with open(path, 'rb') as file:
+            size = os.fstat(file.fileno()).st_size
+            if size > MAX_FILE:
+                raise DataError(
+                    f'{path}: the file has {size / 1e6:.0f} MB, more than {MAX_FILE / 1e6:.0f} MB '
+                    'are not read'
+                )
             content = file.read()
     except FileNotFoundError:
         raise DataError(f'{path}: there is no such file') from None

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError
-from .access import PathLike, read_bytes
+from .access import MAX_FILE, PathLike, read_bytes
 from .atomic import atomic_file
 
 _DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same arrays give the same bytes
@@ -152,6 +152,12 @@ def _read_members(
 ) -> dict[str, np.ndarray]:
     """Return the arrays of an archive; its version is checked first."""
     members = archive.namelist()
+    total = sum(info.file_size for info in archive.infolist())
+    if total > MAX_FILE:
+        raise DataError(
+            f'{path}: its arrays take {total / 1e6:.0f} MB, more than {MAX_FILE / 1e6:.0f} MB are '
+            'not read'
+        )
     version = _read_version(path, archive, layout)
     defaults = layout.defaults.get(version, {})
     arrays = {}

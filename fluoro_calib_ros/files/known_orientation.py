@@ -13,6 +13,7 @@ from ..errors import DataError
 from ..photogrammetry.known_orientation import KnownOrientation
 from .access import PathLike, read_text
 from .atomic import write_text
+from .yaml_text import parse_yaml
 
 VERSION = 1
 KEYS = ('K', 'R', 't_mm', 'interior_sd_px', 'exterior_sd')
@@ -31,7 +32,7 @@ def read_known_orientations(path: PathLike) -> dict[str, KnownOrientation]:
     Raises DataError with path and fluoroscope for a file that cannot be read or is wrong.
     """
     try:
-        document = yaml.safe_load(read_text(path))
+        document = parse_yaml(read_text(path))
     except yaml.YAMLError:
         raise DataError(f'{path}: this is not a YAML file') from None
     if not isinstance(document, Mapping) or not isinstance(document.get('fluoroscopes'), Mapping):

@@ -1,0 +1,27 @@
+"""YAML of others, without aliases: a small text must not become a large value."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import yaml
+
+
+class _Loader(yaml.SafeLoader):
+    """Plain values only; a text with aliases may grow without bound."""
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            mark = self.peek_event().start_mark
+            raise yaml.constructor.ConstructorError(None, None, 'aliases are not allowed', mark)
+        return super().compose_node(parent, index)
+
+
+def parse_yaml(text: str) -> Any:
+    """Return the value of a YAML text. Raises yaml.YAMLError, also for aliases."""
+    try:
+        return yaml.load(text, Loader=_Loader)  # derived from the safe loader
+    except RecursionError:
+        raise yaml.YAMLError('nested too deeply') from None
+    except (ValueError, OverflowError) as error:  # a date such as 2024-99-99
+        raise yaml.YAMLError(str(error)) from None

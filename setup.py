@@ -41,6 +41,7 @@ setup(
         'matplotlib',
         'mcap',
         'zstandard',
+        'lz4',
         'rosbags',
         'threadpoolctl',
         'tifffile',

@@ -24,12 +24,13 @@ from .evidence import Evidence
 from .exposure_variation import VARIATION
 from .halves import HALVES
 from .held_out import HELD_OUT
+from .precision import PRECISION
 from .residual_trends import TRENDS
 
 Progress = Callable[[str, int, int], None]
 
 # A new check is a module with a Subject, and its entry here; docs/verdict.md describes it.
-SUBJECTS = (BEADS, HALVES, TRENDS, VARIATION, HELD_OUT)
+SUBJECTS = (BEADS, HALVES, TRENDS, VARIATION, HELD_OUT, PRECISION)
 
 
 def validate(

@@ -49,6 +49,7 @@ CHECKS = [
     'variation',
     'held_out',
     'exposures',
+    'precision',
     'beads',
     'distances',
 ]
@@ -569,3 +570,16 @@ def test_table_fits_a_terminal_and_gives_advice():
         and 'fine' not in text
     )
     json.dumps(validation_document(Validation('fail', checks[:1], {'a': 'x'}, 1.0)))
+
+
+def test_imprecise_correction_does_not_pass():
+    """A neighbour model that follows the noise: 50 % larger errors than with known distortion."""
+    job = calibrated(count=8, model='knn')
+    request = CalibrationRequest(
+        {'a': exposures()['a'][:8]}, rig().phantom, CalibrationOptions('knn')
+    )
+    verdict = validate(request, job.calibrations)
+    (check,) = [c for c in verdict.checks if c.name == 'precision']
+    assert verdict.verdict == 'fail' and not check.passed and check.value > check.limit
+    assert 'it makes the errors of corrected points' in check.sentence
+    assert 'take 7 more exposures' in check.sentence

@@ -1,0 +1,43 @@
+"""Check 'precision': corrected points are nearly as precise as with perfectly known distortion."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .check import Check, Finding, judge, more_exposures
+from .evidence import Evidence, Subject
+
+NAME = 'precision'
+# Standard deviation of the correction over that of an image coordinate. Independent errors add in
+# square: with this ratio, those of corrected points are 1.14 times those with known distortion.
+MAX_RATIO = 0.55
+
+
+def check_precision(evidence: Evidence, names: Sequence[str]) -> list[Check]:
+    """Compare the claimed precision of the correction with the noise, for each fluoroscope."""
+    return [_check(evidence, name) for name in names]
+
+
+def _check(evidence: Evidence, name: str) -> Check:
+    common = evidence.trends[name]
+    noise = float(np.sqrt(np.mean(common.inliers.r**2)))
+    ratio = common.claimed_sd / noise if noise > 0 else np.inf
+    growth = 100 * (np.sqrt(1 + ratio**2) - 1)
+    return judge(
+        NAME,
+        name,
+        Finding(
+            ratio,
+            MAX_RATIO,
+            'noise sd',
+            f'fluoroscope {name}: the correction has a standard deviation of '
+            f'{common.claimed_sd:.2f} px, at an image noise of {noise:.2f} px: it makes the '
+            f'errors of corrected points {growth:.0f} % larger',
+            f'{more_exposures(len(evidence.frames[name]))}, or a phantom with more beads',
+        ),
+    )
+
+
+PRECISION = Subject(check_precision)

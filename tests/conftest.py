@@ -1,5 +1,7 @@
 """Distribution of the tests over the workers of pytest-xdist."""
 
+import os
+
 import pytest
 
 try:
@@ -28,3 +30,18 @@ if LoadFileScheduling is not None:
         if config.getvalue('dist') == 'loadfile':
             return OneWorkerForRos(config, log)
         return None
+
+
+LOWER_PRIORITY = 10  # as that of the calibration jobs of the nodes
+_seen = set()  # what this worker has run: 'ros', 'others'
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Let the worker with ROS nodes go first: streams and jobs must not starve beside it.
+
+    The nodes inherit the priority of their worker, so the one that begins with them keeps its own.
+    """
+    kind = 'ros' if item.nodeid.startswith('tests/ros/') else 'others'
+    if kind == 'others' and not _seen and hasattr(item.config, 'workerinput'):
+        os.nice(LOWER_PRIORITY)
+    _seen.add(kind)

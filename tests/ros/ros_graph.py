@@ -50,6 +50,7 @@ from fluoro_calib_ros.nodes.runtime.qos import OBSERVATION_DEPTH, latched_qos, o
 ROOT = Path(__file__).parents[2]
 BAGS = ROOT / 'bags'
 DEADLINE = 60.0  # seconds; nothing takes a tenth of it on an idle machine
+JOB_DEADLINE = 240.0  # of a self-calibration, which has a low priority
 NAMES = ('a', 'b')
 SUCCEEDED = GoalStatus.STATUS_SUCCEEDED
 CANCELED = GoalStatus.STATUS_CANCELED
@@ -446,8 +447,9 @@ class Client(Node):
 
     def call(self, kind, service, **fields):
         """Return the answer of a service."""
+        seconds = JOB_DEADLINE if kind is Calibrate else DEADLINE
         return self.result_of(
-            self.call_async(kind, service, **fields), what=f'the answer of {service}'
+            self.call_async(kind, service, **fields), seconds, f'the answer of {service}'
         )
 
     def goal(self, **fields):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from fluoro_calib_msgs.msg import CalibrationStatus
 from fluoro_calib_msgs.srv import Calibrate, Capture, Reset
-from ros_graph import ABORTED, CANCELED, NAMES, SUCCEEDED, standing
+from ros_graph import ABORTED, CANCELED, JOB_DEADLINE, NAMES, SUCCEEDED, standing
 
 REFUSED = 'refused: a self-calibration is already running'
 
@@ -92,7 +92,7 @@ def test_stream_continues_while_a_job_runs(rig, exposures):
         behind.append(client.published - came())
         return answer.done()
 
-    client.wait_until(done, 120, 'the self-calibration')
+    client.wait_until(done, JOB_DEADLINE, 'the self-calibration')
     during = client.published
     client.end_stream()
     assert answer.result().status == SUCCEEDED

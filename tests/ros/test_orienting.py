@@ -16,7 +16,7 @@ def test_calibration_publishes_an_orientation_in_mid_stream(graph, tmp_path, tra
     own.
     """
     client = graph.client
-    graph.both_nodes(tmp_path, collect='request', model='parametric')
+    graph.both_nodes(tmp_path / 'calibrations', collect='request', model='parametric')
     node = graph.start('reconstruction_node')
     published = client.listen('rig_orientation')
     points = client.listen('reconstruction/points_with_covariance')

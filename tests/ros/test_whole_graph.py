@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from fluoro_calib_msgs.msg import CalibrationStatus, CorrectedObservations
 from fluoro_calib_msgs.srv import Calibrate
-from ros_graph import BAGS, NAMES, SUCCEEDED
+from ros_graph import BAGS, JOB_DEADLINE, NAMES, SUCCEEDED
 
 from fluoro_calib_ros.files.calibration import load_calibrations
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import calibration_from_message
@@ -109,7 +109,9 @@ def test_service_calibrates(rig, by_service):
 
 def test_action_gives_feedback_and_the_same_result(rig, by_service):
     handle = rig.client.goal()
-    answer = rig.client.result_of(handle.get_result_async(), 120, 'the result of the action')
+    answer = rig.client.result_of(
+        handle.get_result_async(), JOB_DEADLINE, 'the result of the action'
+    )
     assert answer.status == SUCCEEDED and answer.result.success
     for field in RESULT_FIELDS:
         assert list(getattr(answer.result, field)) == list(getattr(by_service, field)), field

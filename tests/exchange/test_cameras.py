@@ -1,6 +1,7 @@
 """Formats of cameras: what other programs compute from the files is what we mean."""
 
 import json
+import sys
 
 import cv2
 import numpy as np
@@ -13,6 +14,11 @@ from fluoro_calib_ros.exchange import registry
 from fluoro_calib_ros.exchange.content import Camera, Content, FileSettings, camera_at
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.simulation.rig import looking_at_origin
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
 
 SIZE = (1024, 768)
 MM = FileSettings(image_size=SIZE, units='mm')
@@ -203,7 +209,6 @@ def test_dlt_gives_pixels_from_one_upwards(tmp_path):
 
 def test_anipose_file_projects_with_opencv(tmp_path):
     """Rodrigues vector, translation and matrix as aniposelib gives them to cv2.projectPoints."""
-    tomllib = pytest.importorskip('tomllib')
     path = tmp_path / 'calibration.toml'
     registry.write(path, 'anipose', Content(cameras=cameras()), MM)
     document = tomllib.loads(path.read_text())

@@ -98,7 +98,6 @@ def test_names_are_used_again_on_output(lab, reconstructed, capsys):
     """In the points, and in the C3D file made of them."""
     rows = rows_of(reconstructed)
     assert all(row['name'] == f'bead {int(row["target_id"]):03d}' for row in rows)
-    pytest.importorskip('ezc3d')
     path = lab / 'space.c3d'
     assert run('convert', reconstructed, '--to', 'c3d', '--out', path, '--rate', 50) == 0
     found = registry.read(path, FileSettings())

@@ -7,6 +7,7 @@ import pathlib
 import subprocess
 import sys
 
+import ezc3d
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -324,7 +325,6 @@ NAMED = Names({'tib lat': 1, 'tib med': 2, 'fem': 5})
 
 def test_c3d_is_read_by_ezc3d(tmp_path):
     """Names, unit, rate, first frame, coordinates, residual; a gap is a residual of -1."""
-    ezc3d = pytest.importorskip('ezc3d')
     path = tmp_path / 'points.c3d'
     registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
     file = ezc3d.c3d(str(path))
@@ -343,7 +343,6 @@ def test_c3d_is_read_by_ezc3d(tmp_path):
 
 def test_damaged_c3d_is_refused(tmp_path):
     """A truncated file, and one whose parameters make ezc3d fail."""
-    pytest.importorskip('ezc3d')
     path = tmp_path / 'points.c3d'
     registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
     whole = path.read_bytes()
@@ -357,8 +356,6 @@ def test_damaged_c3d_is_refused(tmp_path):
 
 @pytest.mark.parametrize('kind', ['c3d', 'trc', 'xmalab3d', 'points'])
 def test_points_in_space_return(tmp_path, kind):
-    if kind == 'c3d':
-        pytest.importorskip('ezc3d')
     path = tmp_path / f'out.{kind if kind in ("c3d", "trc") else "csv"}'
     registry.write(path, kind, Content(points=points(), names=NAMED), SETTINGS)
     content = registry.read(path, FileSettings(units='mm', names=NAMED))

@@ -104,6 +104,7 @@ def test_command_ends_at_sigterm_with_a_complete_bag(graph, exposures, tmp_path)
     client.wait_until(lambda: f'recording {topic}' in process.log, what='the recorder')
     output = client._outputs['a']
     client.wait_until(lambda: output.get_subscription_count() == 1, what='the subscription')
+    client.wait_until_known_to('/recorder_node')
     for frame in exposures['a']:
         client.publish(frame)
     assert output.wait_for_all_acked()

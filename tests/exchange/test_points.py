@@ -475,7 +475,6 @@ def test_lookup_table_returns(tmp_path):
 # ---- damage
 
 
-@pytest.mark.skipif(not hasattr(os, 'mkfifo'), reason='there are no pipes')
 def test_pipe_is_refused(tmp_path):
     """Reading it would never end."""
     for name in ('points.csv', 'points.pho', 'points.dat'):

@@ -7,7 +7,8 @@ without an output is lost. Latency is reported twice: within the node, from the 
 input (of the last view, for points) to the publication of the output, from the node's diagnostics
 (the median of its medians, and the largest of its 99 %, each of 2,000 frames); and from
 the stamp of the simulator, set just before it publishes, to the time stamp that DDS gives the
-output when it is published, which includes the transfer by DDS.
+output when it is published, which includes the transfer by DDS. The calibration node publishes
+nothing for the frames of markers, which it ignores: only its CPU time is measured.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.msg import (
+    CalibrationStatus,
     CorrectedObservations,
     FluoroscopeCalibration,
     ReconstructedPoints,
@@ -55,6 +57,7 @@ NAMES = ('a', 'b')
 CASES = {  # name: (scene, rate, nodes under test)
     'markers 250 Hz': ('markers', 250, ('correction_node', 'relay_plain')),
     'grid 30 Hz': ('grid', 30, ('correction_node', 'relay_plain')),
+    'markers 250 Hz, ignored': ('markers', 250, ('correction_node', 'calibration_node')),
     'markers 1000 Hz': ('markers', 1000, ('correction_node',)),
     'markers 1000 Hz, relay': ('markers', 1000, ('relay_plain',)),
     'markers 1000 Hz, streams': ('markers', 1000, ('relay_streams',)),
@@ -69,6 +72,12 @@ DEEP = {
     for name in 'ab'
     for end in ('publisher', 'subscription')
 }  # queues of a second instead of a tenth
+OWN_PARAMETERS = {
+    'calibration_node': {
+        'phantom': Path(__file__).parents[1] / 'bags' / 'phantom.csv',
+        'calibration_directory': Path(os.devnull) / 'none',
+    }
+}
 OUTPUTS = {
     'correction_node': ('corrected_observations', CorrectedObservations),
     'relay_plain': ('relayed_plain', TargetObservations),
@@ -105,11 +114,19 @@ class Reader(Node):
                 lambda _, name=name: self.ready.add(name),
                 latched_qos(),
             )
+        self.taken = dict.fromkeys(NAMES, 0)  # frames that a calibration node has received
+        for name in NAMES:
+            self.create_subscription(
+                CalibrationStatus, f'{name}/calibration_status', self._on_status, 10
+            )
         self.within: dict[str, list[tuple[float, float]]] = {}  # node: [(p50, p99), ...] [ms]
         self.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
         # (node, fluoroscope): [(frame number, latency [ns]), ...]
         self.came: dict[tuple[str, str], list[tuple[int, int]]] = {}
         self.reader: StreamReader | None = None
+
+    def _on_status(self, status: CalibrationStatus) -> None:
+        self.taken[status.fluoroscope] = status.frames_received
 
     def _on_diagnostics(self, array: DiagnosticArray) -> None:
         for status in array.status:
@@ -125,6 +142,8 @@ class Reader(Node):
         self.within = {}
         reader = StreamReader(self, logged(self))
         for node in nodes:
+            if node == 'calibration_node':
+                continue
             if node == 'reconstruction_node':
                 self._listen(
                     reader,
@@ -202,7 +221,9 @@ def measured(
 ) -> list[dict[str, Any]]:
     """[{node, lost, p50, p99, max [ms], cpu [us a message]}] of a case."""
     processes = {
-        node: subprocess.Popen(_command(node, **parameters), stdout=log, stderr=log)
+        node: subprocess.Popen(
+            _command(node, **parameters, **OWN_PARAMETERS.get(node, {})), stdout=log, stderr=log
+        )
         for node in nodes
     }
     frames = round(rate * seconds)
@@ -236,6 +257,8 @@ def measured(
         used = {node: _cpu(p) - began[node] for node, p in processes.items()}
         counted = {key: len(of_one) - first[key] for key, of_one in reader.came.items()}
         reader.wait(lambda: simulator.poll() is not None, 60, 'the end of the simulator')
+        if 'calibration_node' in nodes:
+            reader.wait(lambda: min(reader.taken.values()) == frames, 60, 'the calibration node')
     finally:
         for process in (*processes.values(), simulator):
             if process.poll() is None:
@@ -254,6 +277,19 @@ def _nearly(came: Mapping[Any, Sequence[tuple[int, int]]], frames: int) -> bool:
 def _figures(
     reader: Reader, node: str, frames: int, used: float, counted: Mapping[Any, int]
 ) -> dict[str, Any]:
+    if node == 'calibration_node':
+        # Of the same messages as the other node; it has been waited for until it had all.
+        messages = sum(counted.values())
+        unknown = dict.fromkeys(('within_p50', 'within_p99', 'p50', 'p99', 'max'), np.nan)
+        lost = len(NAMES) * frames - sum(reader.taken.values())
+        cpu_us = used / messages * 1e6
+        return {
+            'node': node,
+            'frames': len(NAMES) * frames,
+            'lost': lost,
+            **unknown,
+            'cpu_us': cpu_us,
+        }
     of_node = {key: np.array(of_one) for key, of_one in reader.came.items() if key[0] == node}
     latency = np.concatenate([of_one[:, 1] for of_one in of_node.values()]) * 1e-6
     lost = sum(frames - len(np.unique(of_one[:, 0])) for of_one in of_node.values())
@@ -316,20 +352,14 @@ def text_of(results: Mapping[str, Sequence[dict[str, Any]]]) -> str:
     rows = []
     for case, figures in results.items():
         for f in figures:
-            within = (
-                ['-', '-']
-                if np.isnan(f['within_p50'])
-                else [f'{f["within_p50"]:.2f}', f'{f["within_p99"]:.2f}']
-            )
+            latencies = [f[key] for key in ('within_p50', 'within_p99', 'p50', 'p99')]
             rows.append(
                 [
                     f'{case}: {f["node"]}',
                     str(f['frames']),
                     str(f['lost']),
-                    *within,
-                    f'{f["p50"]:.2f}',
-                    f'{f["p99"]:.2f}',
-                    f'{f["max"]:.1f}',
+                    *('-' if np.isnan(ms) else f'{ms:.2f}' for ms in latencies),
+                    '-' if np.isnan(f['max']) else f'{f["max"]:.1f}',
                     f'{f["cpu_us"]:.0f}',
                 ]
             )

@@ -72,7 +72,7 @@ OTHERS = (
 # Parameters of the nodes that launch arguments set.
 RIG = ('fluoroscopes', 'calibration_directory', 'autostart')
 OF_NODE = {
-    'calibration_node': ('phantom', 'fluoroscopes', 'calibration_directory', 'rig_frame'),
+    'calibration_node': ('phantom', *RIG, 'rig_frame'),
     'correction_node': RIG,
     'reconstruction_node': (*RIG, 'rig_frame'),
     'image_node': RIG,

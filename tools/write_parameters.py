@@ -13,7 +13,7 @@ import textwrap
 from importlib import import_module
 from pathlib import Path
 
-from fluoro_calib_ros.nodes.runtime.parameters import parameters_of
+from fluoro_calib_ros.nodes.runtime.parameters import parameters_of, settable_parameters
 from fluoro_calib_ros.options import Option
 
 ROOT = Path(__file__).parents[1]
@@ -33,6 +33,11 @@ def parameters(node: str) -> dict[str, Option]:
     return parameters_of(import_module(f'fluoro_calib_ros.nodes.{node}').PARAMETERS)
 
 
+def settable(node: str) -> frozenset[str]:
+    """Return the names of the parameters of a node that may change while it runs."""
+    return settable_parameters(import_module(f'fluoro_calib_ros.nodes.{node}').PARAMETERS)
+
+
 def yaml_text() -> str:
     """Return config/fluoro_calib.yaml."""
     lines = [HEAD.rstrip()]
@@ -47,13 +52,20 @@ def yaml_text() -> str:
 
 
 def table(node: str) -> str:
-    """Return the parameter table of a node for docs/nodes.md."""
-    rows = ['| parameter | default | values | description |', '| --- | --- | --- | --- |']
+    """Return the parameter table of a node for docs/nodes.md.
+
+    Settable are the parameters that may change while the node runs.
+    """
+    rows = [
+        '| parameter | default | values | settable | description |',
+        '| --- | --- | --- | --- | --- |',
+    ]
     for name, declaration in parameters(node).items():
         cells = (
             f'`{name}`',
             _default(declaration.default),
             _values(declaration),
+            'yes' if name in settable(node) else '',
             _description(declaration),
         )
         rows.append(f'| {" | ".join(cells)} |'.replace('  ', ' '))

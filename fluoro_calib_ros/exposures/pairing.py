@@ -104,6 +104,9 @@ class Pairer(Protocol):
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
         """Add a frame; returns the exposures that are ready now."""
 
+    def use(self, options: PairingOptions) -> None:
+        """Use other limits from now on. Raises ValueError where pair_by is another one."""
+
     def flush(self) -> Sequence[Exposure]:
         """Stop waiting; returns the exposures that were still waiting for a frame."""
 
@@ -159,8 +162,7 @@ class CompletePairer:
         options = options or PairingOptions()
         self.fluoroscopes = tuple(fluoroscopes)
         self._by_number = options.by_number
-        self._tolerance = options.tolerance_ns
-        self._max_waiting = options.waiting
+        self.use(options)
         self._exposures = 0
         self._waiting: dict[str, OrderedDict[int, Any]] = {
             name: OrderedDict() for name in self.fluoroscopes
@@ -171,6 +173,12 @@ class CompletePairer:
         self.late = dict.fromkeys(self.fluoroscopes, 0)
         self.incomplete = 0
         self.silent: frozenset[str] = frozenset()
+
+    def use(self, options: PairingOptions) -> None:
+        """Use other limits from now on. Raises ValueError where pair_by is another one."""
+        _check_same_key(self._by_number, options)
+        self._tolerance = options.tolerance_ns
+        self._max_waiting = options.waiting
 
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
         """Add a frame; returns the exposure that it completes, or none."""
@@ -267,9 +275,8 @@ class PartialPairer:
         options = options or PairingOptions()
         self.fluoroscopes = tuple(fluoroscopes)
         self._by_number = options.by_number
-        self._tolerance = 0 if self._by_number else options.tolerance_ns
-        self._max_waiting = options.waiting
-        self._patience = options.patience
+        self._recent: deque[int] = deque()  # keys of the last exposures
+        self.use(options)
         self._exposures = 0
         self.unpaired = dict.fromkeys(self.fluoroscopes, 0)
         self.late = dict.fromkeys(self.fluoroscopes, 0)
@@ -286,8 +293,16 @@ class PartialPairer:
         self._last: dict[str, tuple[int, int] | None] = dict.fromkeys(self.fluoroscopes)
         # Key up to which exposures went out without the fluoroscope.
         self._passed: dict[str, float] = dict.fromkeys(self.fluoroscopes, float('-inf'))
-        self._recent: deque[int] = deque(maxlen=self._patience)  # keys of the last exposures
+        self._recent.clear()
         self.silent: frozenset[str] = frozenset()
+
+    def use(self, options: PairingOptions) -> None:
+        """Use other limits from now on. Raises ValueError where pair_by is another one."""
+        _check_same_key(self._by_number, options)
+        self._tolerance = 0 if self._by_number else options.tolerance_ns
+        self._max_waiting = options.waiting
+        self._patience = options.patience
+        self._recent = deque(self._recent.copy(), maxlen=self._patience)
 
     def add(self, frame: PairableFrame) -> list[Exposure]:
         """Add a frame; returns the exposures that are ready now."""
@@ -389,6 +404,12 @@ class PartialPairer:
             ready += self._pop_exposure(names, end)
         self._start()
         return ready
+
+
+def _check_same_key(by_number: bool, options: PairingOptions) -> None:
+    """Raise ValueError where options pair by another key than the frames that are waiting."""
+    if options.by_number != by_number:
+        raise ValueError('pair_by cannot change while frames are being paired')
 
 
 def _renumbered(exposure: Exposure, number: int) -> Exposure:

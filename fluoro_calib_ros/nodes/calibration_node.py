@@ -1,18 +1,19 @@
 """Node that collects exposures of the phantom and self-calibrates the fluoroscopes on request.
 
-One thread runs all callbacks. Those that take long (calibrate, capture) are coroutines that await
-what they need, and the calibration itself is a process of its own. rclpy's MultiThreadedExecutor
-is no alternative: it schedules a callback again and again until it has started, which on a busy
-machine costs so much time that frames are lost.
+A thread of its own receives the frames. Another one runs all other callbacks: those that take long
+(calibrate, capture) are coroutines that await what they need, and the calibration itself is a
+process of its own. rclpy's MultiThreadedExecutor is no alternative: it schedules a callback again
+and again until it has started, which on a busy machine costs so much time that frames are lost.
 """
 
 from __future__ import annotations
 
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,24 +21,24 @@ from fluoro_calib_msgs.action import SelfCalibrate
 from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration, TargetObservations
 from fluoro_calib_msgs.srv import Calibrate, Capture, LoadCalibration, Reset, SaveCalibration
 from rclpy.action import ActionServer, CancelResponse, GoalResponse
-from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.callback_groups import CallbackGroup, ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy, qos_policy_name_from_kind
-from rclpy.subscription import Subscription
+from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.lifecycle.node import LifecycleState
+from rclpy.parameter import Parameter
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from rclpy.task import Future
 
 from ..calibration import result as calibration_result
-from ..calibration.initial_network import MIN_TARGETS_OF_EXPOSURE
 from ..calibration.options import CalibrationOptions
 from ..calibration.request import CalibrationRequest
 from ..calibration.rounds import Round
 from ..errors import DataError
-from ..exposures.collector import ExposureCollector, StillOptions
-from ..exposures.frame import Frame, validate_frame
+from ..exposures.collector import StillOptions
+from ..exposures.frame import Frame
 from ..exposures.names import Names
-from ..exposures.pairing import CompletePairer, PairingOptions
+from ..exposures.pairing import PairingOptions
 from ..exposures.phantom import Phantom
 from ..files.calibration import SUFFIX, load_calibrations
 from ..files.calibration_request import PHANTOM as PHANTOM_FILE
@@ -54,6 +55,7 @@ from ..jobs.worker_process import run_in_worker_process
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..validation.check import Validation
+from .exposure_input import CollectOptions, ExposureInput
 from .messages.calibration_status import FluoroscopeProgress, message_from_progress
 from .messages.fluoroscope_calibration import message_from_calibration
 from .messages.self_calibration import (
@@ -64,33 +66,30 @@ from .messages.self_calibration import (
     fill_verdict,
     options_of_request,
 )
-from .messages.target_observations import frame_from_message
+from .messages.target_observations import ObservedFrame, decode_target_observations
 from .orientation_service import CaptureSettings, OrientationService
-from .runtime.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, Status
-from .runtime.discovery import best_effort_message, needs_best_effort, publisher_conflict
+from .runtime.diagnostics import ERROR, OK, WARN, Status
+from .runtime.discovery import publisher_conflict
 from .runtime.errors import StartError
-from .runtime.logging import RateLimitedLogger
+from .runtime.lifecycle import StreamNode
 from .runtime.main import run
 from .runtime.parameters import (
+    ManagedParameters,
     ParameterGroup,
-    RigParameters,
     check_timeout,
     default_calibration_directory,
     expand_path,
 )
-from .runtime.qos import (
-    incompatible_qos_message,
-    latched_qos,
-    observations_qos,
-    qos_overrides,
-)
-from .runtime.refusals import RefusalLog
+from .runtime.qos import latched_qos, observations_qos
+from .runtime.stream_reader import FaultHandlers
 
 COLLECT_MODES = ('still', 'request')
+OBSERVATIONS = 'target_observations'
+NOT_ACTIVE = 'the node is not active, so no frames come in'
 
 
 @dataclass(frozen=True)
-class CalibrationParameters(RigParameters):
+class CalibrationParameters(ManagedParameters):
     """Parameters of the calibration node."""
 
     phantom: str = option(
@@ -123,24 +122,22 @@ class CalibrationParameters(RigParameters):
     )
 
 
-_NODE = ParameterGroup(CalibrationParameters)
-_STILL = ParameterGroup(
-    StillOptions, {'still_time_s': 'still_time', 'still_px': 'still_px', 'new_px': 'new_px'}
+_OF_REQUESTS = ('model', 'interior', 'loss', 'max_iterations', 'relative_orientation', 'datum')
+_NODE = ParameterGroup(
+    CalibrationParameters, settable=('collect', 'joint', 'rig_frame', 'capture_timeout')
 )
-_PAIRING = ParameterGroup(PairingOptions, {'pair_by': 'pair_by', 'tolerance_s': 'pair_tolerance'})
+_STILL = ParameterGroup(
+    StillOptions,
+    {'still_time_s': 'still_time', 'still_px': 'still_px', 'new_px': 'new_px'},
+    settable=('still_time', 'still_px', 'new_px'),
+)
+_PAIRING = ParameterGroup(
+    PairingOptions,
+    {'pair_by': 'pair_by', 'tolerance_s': 'pair_tolerance'},
+    settable=('pair_tolerance',),
+)
 _CALIBRATION = ParameterGroup(
-    CalibrationOptions,
-    {
-        name: name
-        for name in (
-            'model',
-            'interior',
-            'loss',
-            'max_iterations',
-            'relative_orientation',
-            'datum',
-        )
-    },
+    CalibrationOptions, {name: name for name in _OF_REQUESTS}, settable=_OF_REQUESTS
 )
 PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION)
 
@@ -150,15 +147,10 @@ class Cancelled(Exception):
 
 
 class _Fluoroscope:
-    """What the node knows of one fluoroscope."""
+    """What the node knows of the calibration of one fluoroscope."""
 
-    def __init__(self, name: str, logger: RateLimitedLogger) -> None:
+    def __init__(self, name: str) -> None:
         self.name = name
-        self.received = 0
-        self.refusals = RefusalLog('frame', logger)
-        self.incompatible = ''  # message about a publisher whose frames are not received
-        self.image_size: tuple[int, int] | None = None
-        self.is_other_object_logged = False
         self.last_round: Round | None = None
         self.calibration: calibration_result.FluoroscopeCalibration | None = None
         self.calibrated_at = float('nan')
@@ -171,7 +163,7 @@ class _Fluoroscope:
         self.calibrated_at = time.monotonic()
 
 
-class CalibrationNode(Node):
+class CalibrationNode(StreamNode):
     """Collects exposures of the fluoroscopes, and runs one self-calibration at a time."""
 
     def __init__(self) -> None:
@@ -180,23 +172,61 @@ class CalibrationNode(Node):
         self._still = _STILL.declare(self)
         self._pairing = _PAIRING.declare(self)
         self._options = _CALIBRATION.declare(self)
-        self._read_files()
+        self.autostart = self._settings.autostart
         self._names = self._settings.fluoroscopes
-        self._collect = self._settings.collect
-        self._limited_logger = RateLimitedLogger(self.get_logger())
-        self._fluoroscopes = {
-            name: _Fluoroscope(name, self._limited_logger) for name in self._names
-        }
-        self._captures: deque[Future] = deque()  # one for every capture that waits for its pair
-        self._capture_refusal = ''  # why the last pair was not captured
-        self._start_collection()
-        self._load_fault = ''
-        self._save_fault = ''
+        self._read_files()
         self._stopping = threading.Event()
         self._running: tuple[str, ...] = ()  # fluoroscopes of the running job
         self._job: threading.Thread | None = None  # waits for the worker process
-        self._create_interfaces()
-        self._load_at_start()
+        self._requests = 0  # that have not been answered yet
+        self.reset()
+        _NODE.follow(self, self._use_settings)
+        _STILL.follow(self, self._use_still)
+        _PAIRING.follow(self, self._use_pairing)
+        _CALIBRATION.follow(self, self._use_calibration_options)
+
+    def reset(self) -> None:
+        """Forget calibrations and exposures, and start counting from zero."""
+        self._fluoroscopes = {name: _Fluoroscope(name) for name in self._names}
+        self._load_fault = ''
+        self._save_fault = ''
+        self._exposures = ExposureInput(
+            self._names,
+            self._phantom,
+            self._collect_options(),
+            self._on_pair,
+            self._wake,
+            self.get_logger(),
+        )
+
+    # -- parameters
+
+    def _collect_options(self) -> CollectOptions:
+        return CollectOptions(self._settings.collect, self._still, self._pairing)
+
+    def _capture_settings(self) -> CaptureSettings:
+        return CaptureSettings(
+            self._names,
+            self._phantom,
+            self._settings.rig_frame,
+            self._settings.capture_timeout,
+            self._directory,
+        )
+
+    def _use_settings(self, settings: CalibrationParameters) -> None:
+        self._settings = settings
+        self._exposures.use(self._collect_options())
+
+    def _use_still(self, still: StillOptions) -> None:
+        self._still = still
+        self._exposures.use(self._collect_options())
+
+    def _use_pairing(self, pairing: PairingOptions) -> None:
+        self._pairing = pairing
+        self._exposures.use(self._collect_options())
+
+    def _use_calibration_options(self, options: CalibrationOptions) -> None:
+        self._options = options
 
     def _read_files(self) -> None:
         """Read the phantom, if one is named. Raises StartError."""
@@ -227,35 +257,37 @@ class CalibrationNode(Node):
         self._phantom = survey.phantom
         self._target_names = survey.names
 
-    def _create_interfaces(self) -> None:
+    # -- lifecycle
+
+    def create_outputs(self) -> None:
+        """Make topics, services and action, and publish the saved calibrations."""
+        self._stopping.clear()
+        # The status first: by its publishers, receivers of calibrations recognise that two nodes
+        # serve the same fluoroscope.
+        self._status_outputs = self._create_publishers(CalibrationStatus, 'calibration_status', 10)
+        self._calibration_outputs = self._create_publishers(
+            FluoroscopeCalibration, 'calibration', latched_qos()
+        )
         # Services that await must not keep others from being answered.
         services = ReentrantCallbackGroup()
-        self._calibration_outputs = {}
-        self._inputs: dict[str, Subscription] = {}
-        self._status_outputs = {}
-        for name in self._names:
-            # The status first: by its publishers, receivers of calibrations recognise that two
-            # nodes serve the same fluoroscope.
-            self._status_outputs[name] = self.create_publisher(
-                CalibrationStatus, f'{name}/calibration_status', 10
-            )
-            self._calibration_outputs[name] = self.create_publisher(
-                FluoroscopeCalibration, f'{name}/calibration', latched_qos()
-            )
-            self._subscribe(self._fluoroscopes[name])
         self._orientation = OrientationService(
-            self,
-            CaptureSettings(
-                self._names,
-                self._phantom,
-                self._settings.rig_frame,
-                self._settings.capture_timeout,
-                self._directory,
-            ),
-            self._calibrations,
-            services,
+            self, self._capture_settings, self._calibrations, self._request, services
         )
-        for kind, service, callback in (
+        self.own(self._orientation, self._orientation.close)
+        self._create_services(services)
+        self._load_at_start()
+
+    def _create_publishers(
+        self, kind: type, topic: str, qos: QoSProfile | int
+    ) -> dict[str, Publisher]:
+        """Return publishers, also of the inactive node, by fluoroscope."""
+        publishers = {n: self.create_publisher(kind, f'{n}/{topic}', qos) for n in self._names}
+        for publisher in publishers.values():
+            self.own(publisher, self.destroy_publisher, publisher)
+        return publishers
+
+    def _create_services(self, group: CallbackGroup) -> None:
+        for kind, name, callback in (
             (Calibrate, 'calibrate', self._on_calibrate),
             (Capture, 'capture', self._on_capture),
             (Reset, 'reset', self._on_reset),
@@ -263,58 +295,74 @@ class CalibrationNode(Node):
             (SaveCalibration, 'save_calibration', self._on_save),
             (LoadCalibration, 'load_calibration', self._on_load),
         ):
-            self.create_service(kind, service, callback, callback_group=services)
-        self._action = ActionServer(
+            service = self.create_service(kind, name, callback, callback_group=group)
+            self.own(service, self.destroy_service, service)
+        action = ActionServer(
             self,
             SelfCalibrate,
             'self_calibrate',
             self._on_action,
             goal_callback=lambda _: GoalResponse.ACCEPT,
             cancel_callback=lambda _: CancelResponse.ACCEPT,
-            callback_group=services,
+            callback_group=group,
         )
-        self._diagnostics = DiagnosticsPublisher(self)
-        self.create_timer(1.0, self._on_timer)
+        self.own(action, action.destroy)
 
-    def _subscribe(self, fluoroscope: _Fluoroscope, qos: QoSProfile | None = None) -> None:
-        """Subscribe to the observations of a fluoroscope; by default reliable."""
-        topic = f'{fluoroscope.name}/target_observations'
-
-        def on_message(message: TargetObservations) -> None:
-            try:
-                self._on_frame(fluoroscope, message)
-            except Exception as error:  # a message may hold anything and must not end the node
-                fluoroscope.refusals.fail(topic, error)
-
-        def on_incompatible(event: Any) -> None:
-            policy = qos_policy_name_from_kind(event.last_policy_kind)
-            fluoroscope.incompatible = incompatible_qos_message(topic, policy)
-            self._limited_logger.warning(fluoroscope.incompatible)
-
-        self._inputs[fluoroscope.name] = self.create_subscription(
-            TargetObservations,
-            topic,
-            on_message,
-            qos or observations_qos(),
-            event_callbacks=SubscriptionEventCallbacks(incompatible_qos=on_incompatible),
-            qos_overriding_options=None if qos else qos_overrides(),
+    def create_readers(self) -> None:
+        """Receive the observations of all fluoroscopes in one thread."""
+        reader = self.create_reader(
+            FaultHandlers(
+                self._on_undecodable,
+                self._on_lost_frame,
+                self.fail,
+            )
         )
+        for name in self._names:
+            reader.subscribe(
+                TargetObservations,
+                f'{name}/{OBSERVATIONS}',
+                partial(self._on_frame, name),
+                observations_qos(),
+                decode_target_observations,
+            )
 
-    def _accept_best_effort(self, fluoroscope: _Fluoroscope) -> None:
-        """Subscribe best effort where all publishers offer no more."""
-        old = self._inputs[fluoroscope.name]
-        if not needs_best_effort(self, old):
-            return
-        qos = observations_qos()
-        qos.reliability = ReliabilityPolicy.BEST_EFFORT
-        self.destroy_subscription(old)
-        self._subscribe(fluoroscope, qos)
-        fluoroscope.incompatible = ''
-        self.get_logger().warning(best_effort_message(f'{fluoroscope.name}/target_observations'))
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Take everything down, but not while a request is being answered."""
+        if self._requests:
+            self.get_logger().error(
+                'cleanup refused: a request is being answered; cancel it or wait for its end'
+            )
+            return TransitionCallbackReturn.FAILURE
+        return super().on_cleanup(state)
 
-    def _start_collection(self) -> None:
-        self._pairer = CompletePairer(self._names, self._pairing)
-        self._collector = ExposureCollector(self._names, self._still)
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """End a running job; what answers it goes with the process."""
+        if not self._requests:
+            return super().on_shutdown(state)
+        self._stopping.set()
+        self.deactivate()
+        return TransitionCallbackReturn.SUCCESS
+
+    def stop(self) -> None:
+        """End the running job before the node is destroyed."""
+        self._stopping.set()
+        if self._job is not None:
+            self._job.join()
+        super().stop()
+
+    @contextmanager
+    def _request(self) -> Iterator[None]:
+        """Count a request that awaits something."""
+        self._requests += 1
+        try:
+            yield
+        finally:
+            self._requests -= 1
+
+    def _wake(self) -> None:
+        """Make the executor continue what awaits a result of another thread."""
+        if self.executor is not None:
+            self.executor.wake()
 
     def _required_phantom(self) -> Phantom:
         """Return the phantom. Raises DataError where the node has none."""
@@ -332,75 +380,19 @@ class CalibrationNode(Node):
             if fluoroscope.calibration is not None
         }
 
-    # -- observations
+    # -- observations, in the thread of the streams
 
-    def _on_frame(self, fluoroscope: _Fluoroscope, message: TargetObservations) -> None:
-        """Validate a frame, pair it, and collect the pair where it is wanted."""
-        fluoroscope.received += 1
-        if self._phantom is None:
-            return
-        try:
-            frame = self._validated(fluoroscope, message)
-        except DataError as error:
-            fluoroscope.refusals.refuse(error)
-            return
-        if frame is not None:
-            for pair in self._pairer.add(frame):
-                self._collect_pair(pair)
+    def _on_frame(self, name: str, frame: ObservedFrame, _: Mapping[str, int]) -> None:
+        self._exposures.add(name, frame)
 
-    def _validated(self, fluoroscope: _Fluoroscope, message: TargetObservations) -> Frame | None:
-        """Return the frame of a message, None where it does not show the phantom.
-
-        Raises DataError for an invalid frame.
-        """
-        name = fluoroscope.name
-        assert self._phantom is not None
-        frame = frame_from_message(message, name)
-        if len(frame.target_id) and (self._phantom.index(frame.target_id) < 0).all():
-            if not fluoroscope.is_other_object_logged:
-                fluoroscope.is_other_object_logged = True
-                self.get_logger().info(
-                    f'fluoroscope {name}: frames without any target of the phantom, such as '
-                    f'frame {frame.number}, are ignored'
-                )
-            return None
-        frame = frame.sorted()
-        validate_frame(frame, self._phantom, fluoroscope.image_size)
-        if len(frame.target_id) < MIN_TARGETS_OF_EXPOSURE:
-            raise DataError(
-                f'fluoroscope {name}, frame {frame.number}: {len(frame.target_id)} targets are '
-                f'too few, {MIN_TARGETS_OF_EXPOSURE} are needed'
-            )
-        if fluoroscope.image_size is None:
-            fluoroscope.image_size = frame.image_size
-        return frame
-
-    def _collect_pair(self, pair: Mapping[str, Frame]) -> None:
-        """Collect a pair for the oldest capture, or because the phantom stands still."""
+    def _on_pair(self, pair: Mapping[str, Frame]) -> None:
         self._orientation.add(pair)
-        if self._captures:
-            refusal = self._capture_refusal = self._collector.add(pair)
-            if not refusal:
-                self._captures.popleft().set_result(pair)
-        elif self._collect == 'still':
-            before = len(self._collector.exposures)
-            refusal = self._collector.offer(pair)
-            if len(self._collector.exposures) < before:
-                self.get_logger().info(
-                    f'exposure {before} discarded: it is the first frame of a stream in which the '
-                    'phantom moves'
-                )
-        else:
-            return
-        if not refusal:
-            counts = ', '.join(
-                f'{name}: {len(pair[name].target_id)} targets, '
-                f'{100 * coverage.fraction:.0f} % of the image covered'
-                for name, coverage in self._collector.coverage.items()
-            )
-            self.get_logger().info(
-                f'exposure {len(self._collector.exposures)} collected ({counts})'
-            )
+
+    def _on_undecodable(self, topic: str) -> None:
+        self._exposures.refuse_undecodable(topic)
+
+    def _on_lost_frame(self, topic: str, error: Exception) -> None:
+        self._exposures.streams[topic.partition('/')[0]].refusals.fail(topic, error)
 
     # -- services
 
@@ -411,45 +403,49 @@ class CalibrationNode(Node):
         try:
             self._required_phantom()
             check_timeout(timeout)
+            if not self.readers:
+                raise DataError(NOT_ACTIVE)
         except ValueError as error:  # DataError among them
             response.message = str(error)
             return response
-        captured = Future()
-        self._capture_refusal = ''
-        self._captures.append(captured)
-        timer = self.create_timer(
-            timeout,
-            lambda: captured.done() or captured.set_result(None),
-            clock=Clock(clock_type=ClockType.STEADY_TIME),
-        )
-        pair = await captured
-        self.destroy_timer(timer)
-        response.exposures = len(self._collector.exposures)
-        response.success = pair is not None
-        if pair is not None:
-            number = pair[self._names[0]].number
+        with self._request():
+            captured = await self._captured(timeout)
+        response.success = captured is not None
+        if captured is not None:
+            number, response.exposures = captured
             response.message = f'frame {number} captured, {response.exposures} exposures now'
         else:
-            self._captures.remove(captured)
-            received = ', '.join(f'{f.name} {f.received}' for f in self._fluoroscopes.values())
-            response.message = self._capture_refusal or (
+            response.exposures = self._exposures.collected(self._names[0]).exposures
+            streams = self._exposures.streams.values()
+            received = ', '.join(f'{stream.name} {stream.received}' for stream in streams)
+            response.message = self._exposures.capture_refusal or (
                 f'no frame of all fluoroscopes ({", ".join(self._names)}) came within '
                 f'{timeout:g} s; frames received: {received}'
             )
         return response
 
+    async def _captured(self, timeout_s: float) -> tuple[int, int] | None:
+        """Return frame number and exposures of the next pair, None where none came in time."""
+        captured = self._exposures.capture()
+        timer = self.create_timer(
+            timeout_s,
+            lambda: self._exposures.give_up(captured),
+            clock=Clock(clock_type=ClockType.STEADY_TIME),
+        )
+        found = await captured
+        self.destroy_timer(timer)
+        return found
+
     def _on_reset(self, _: Reset.Request, response: Reset.Response) -> Reset.Response:
-        count = len(self._collector.exposures)
-        self._start_collection()
+        count = self._exposures.reset()
         for fluoroscope in self._fluoroscopes.values():
-            fluoroscope.image_size = None
             fluoroscope.refused_calibration = ''
         response.success = True
         response.message = f'{count} exposures discarded, the calibration stays in use'
         return response
 
     def _on_collect_anew(self, request: Reset.Request, response: Reset.Response) -> Reset.Response:
-        self._collect = 'still'
+        self.set_parameters([Parameter('collect', value='still')])
         self._on_reset(request, response)
         response.message += (
             '; new exposures are collected whenever the phantom stands still in a new pose'
@@ -542,7 +538,8 @@ class CalibrationNode(Node):
     async def _on_calibrate(
         self, request: Calibrate.Request, response: Calibrate.Response
     ) -> Calibrate.Response:
-        await self._run_job(request, response, lambda *_: None, lambda: False)
+        with self._request():
+            await self._run_job(request, response, lambda *_: None, lambda: False)
         return response
 
     async def _on_action(self, goal: Any) -> SelfCalibrate.Result:
@@ -553,9 +550,10 @@ class CalibrationNode(Node):
             fill_feedback(feedback, label, last)
             goal.publish_feedback(feedback)
 
-        cancelled = await self._run_job(
-            goal.request, result, progress, lambda: goal.is_cancel_requested
-        )
+        with self._request():
+            cancelled = await self._run_job(
+                goal.request, result, progress, lambda: goal.is_cancel_requested
+            )
         if result.success:
             goal.succeed()
         elif cancelled:
@@ -675,8 +673,7 @@ class CalibrationNode(Node):
                 )
             except Exception as error:
                 done.set_exception(error)
-            if self.executor is not None:
-                self.executor.wake()  # to continue what awaits the result
+            self._wake()
 
         self._running = tuple(job.frames)
         self._job = threading.Thread(target=wait, daemon=True)
@@ -688,7 +685,7 @@ class CalibrationNode(Node):
 
         Raises DataError and ValueError.
         """
-        frames = self._collector.frames(list(request.fluoroscopes))
+        frames = self._exposures.frames(request.fluoroscopes)
         joint = self._settings.joint and len(frames) > 1
         job = CalibrationRequest(
             frames,
@@ -699,7 +696,7 @@ class CalibrationNode(Node):
             self._target_names,
         )
         others = {n: c for n, c in self._calibrations().items() if n not in frames}
-        all_frames = self._collector.frames()
+        all_frames = self._exposures.frames()
         rig = Rig(self._names, {name: all_frames[name] for name in others}, others)
         return job, rig
 
@@ -724,60 +721,66 @@ class CalibrationNode(Node):
 
     # -- status
 
-    def _on_timer(self) -> None:
-        """Publish the status and the diagnostics of every fluoroscope."""
-        statuses = []
+    def diagnose(self) -> list[Status]:
+        """Return the status of every fluoroscope, and publish it."""
         stamp = self.get_clock().now().to_msg()
+        incompatible = self.incompatible_publishers()
+        statuses = []
         for fluoroscope in self._fluoroscopes.values():
-            self._accept_best_effort(fluoroscope)
             progress = self._progress_of(fluoroscope)
             self._status_outputs[fluoroscope.name].publish(message_from_progress(progress, stamp))
-            statuses.append(self._diagnose(fluoroscope, progress))
-        self._diagnostics.publish(statuses)
+            fault = incompatible.get(f'{fluoroscope.name}/{OBSERVATIONS}', '')
+            statuses.append(self._diagnose(fluoroscope, progress, fault))
+        return statuses
 
     def _progress_of(self, fluoroscope: _Fluoroscope) -> FluoroscopeProgress:
         name = fluoroscope.name
-        exposures = self._collector.exposures
-        coverage = self._collector.coverage.get(name)
+        collected = self._exposures.collected(name)
         return FluoroscopeProgress(
             fluoroscope=name,
-            frames_received=fluoroscope.received,
-            frames_rejected=fluoroscope.refusals.total + fluoroscope.refusals.failures,
-            frames_unpaired=self._pairer.unpaired[name],
-            exposures=len(exposures),
-            observations=sum(len(pair[name].target_id) for pair in exposures),
-            coverage=coverage.fraction if coverage else 0.0,
+            frames_received=collected.received,
+            frames_rejected=collected.rejected,
+            frames_unpaired=collected.unpaired,
+            exposures=collected.exposures,
+            observations=collected.observations,
+            coverage=collected.coverage,
             is_calibrating=name in self._running,
             last_round=fluoroscope.last_round,
             calibration=fluoroscope.calibration,
             calibration_age_s=time.monotonic() - fluoroscope.calibrated_at,
         )
 
-    def _diagnose(self, fluoroscope: _Fluoroscope, progress: FluoroscopeProgress) -> Status:
-        """Return the diagnostics of a fluoroscope."""
+    def _diagnose(
+        self, fluoroscope: _Fluoroscope, progress: FluoroscopeProgress, incompatible: str
+    ) -> Status:
+        """Return the diagnostics of a fluoroscope.
+
+        incompatible: message about a publisher whose frames are not received, or ''.
+        """
         return Status(
             fluoroscope.name,
-            *self._verdict(fluoroscope, progress),
+            *self._verdict(fluoroscope, progress, incompatible),
             {
                 'exposures': progress.exposures,
                 'coverage': f'{progress.coverage:.2f}',
                 'frames received': progress.frames_received,
                 'frames rejected': progress.frames_rejected,
                 'frames unpaired': progress.frames_unpaired,
-                'last fault': fluoroscope.refusals.last_fault,
+                'last fault': self._exposures.streams[fluoroscope.name].refusals.last_fault,
                 'calibration': progress.calibration_id,
             },
         )
 
     def _verdict(
-        self, fluoroscope: _Fluoroscope, progress: FluoroscopeProgress
+        self, fluoroscope: _Fluoroscope, progress: FluoroscopeProgress, incompatible: str
     ) -> tuple[bytes, str]:
         """Return level and message of the diagnostics of a fluoroscope."""
-        failure = fluoroscope.refusals.failure_status()
+        stream = self._exposures.streams[fluoroscope.name]
+        failure = stream.refusals.failure_status()
         if failure:
             return failure
-        if fluoroscope.incompatible:
-            return WARN, fluoroscope.incompatible
+        if incompatible:
+            return WARN, incompatible
         conflict = publisher_conflict(self, f'{fluoroscope.name}/calibration_status')
         if conflict:
             return ERROR, conflict
@@ -792,32 +795,22 @@ class CalibrationNode(Node):
                 f'the last calibration was refused: {fluoroscope.refused_calibration}; '
                 f'{in_use} is in use',
             )
-        topic = self.resolve_topic_name(f'{fluoroscope.name}/target_observations')
-        if not fluoroscope.received and not self.count_publishers(topic):
+        if not self.readers:
+            return WARN, 'the node is not active'
+        if not stream.received and not self.has_publisher(f'{fluoroscope.name}/{OBSERVATIONS}'):
             return WARN, 'no publisher of target observations'
         if progress.frames_unpaired:
             return (
                 WARN,
                 f'{progress.frames_unpaired} frames without partner of the other fluoroscopes',
             )
-        refusals = fluoroscope.refusals.refusal_status()
+        refusals = stream.refusals.refusal_status()
         if refusals:
             return refusals
         if progress.is_calibrating:
             last = progress.last_round
             return OK, f'self-calibration running, round {last.iteration if last else 0}'
         return OK, 'collecting exposures' if progress.calibration is None else 'calibrated'
-
-    def stop(self) -> None:
-        """End the running job before the node is destroyed."""
-        self._stopping.set()
-        if self._job is not None:
-            self._job.join()
-
-    def destroy_node(self) -> None:
-        """Destroy the action server with the node."""
-        self._action.destroy()
-        super().destroy_node()
 
 
 def main(args: Sequence[str] | None = None) -> None:

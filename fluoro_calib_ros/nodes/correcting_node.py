@@ -14,7 +14,7 @@ from .runtime.diagnostics import ERROR, OK, WARN, LatencyWindow, Status
 from .runtime.errors import one_line
 from .runtime.lifecycle import StreamNode
 from .runtime.logging import RateLimitedLogger
-from .runtime.parameters import ManagedParameters, expand_path
+from .runtime.parameters import CalibratedParameters, expand_path
 from .runtime.refusals import RefusalLog
 from .runtime.stream_reader import FaultHandlers
 
@@ -75,7 +75,7 @@ class CorrectingNode(StreamNode):
         self._directory = ''
         self.streams: dict[str, Any] = {}
 
-    def use_parameters(self, parameters: ManagedParameters) -> None:
+    def use_parameters(self, parameters: CalibratedParameters) -> None:
         """Take the parameters that all these nodes have; subclasses call it in __init__."""
         self.autostart = parameters.autostart
         self._directory = parameters.calibration_directory

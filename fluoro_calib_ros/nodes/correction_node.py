@@ -19,13 +19,13 @@ from .messages.corrected_observations import encode_corrected_observations
 from .messages.target_observations import ObservedFrame, decode_target_observations
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
-from .runtime.parameters import ManagedParameters, ParameterGroup
+from .runtime.parameters import CalibratedParameters, ParameterGroup
 from .runtime.qos import latched_qos, observations_qos
 from .runtime.refusals import Refused
 
 # An integer: comparing an array with an enum member takes longer than the rest of the node.
 INVALID = int(CorrectionStatus.INVALID)
-_NODE = ParameterGroup(ManagedParameters)
+_NODE = ParameterGroup(CalibratedParameters)
 PARAMETERS = (_NODE,)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from fluoro_calib_msgs.srv import Reset
 from rclpy.client import Client
@@ -76,6 +76,17 @@ class DriftMonitor:
         self._clusters = parameters.rigid_clusters()
         self._logger = logger
         self.reset()
+
+    def use(self, parameters: DriftParameters) -> bool:
+        """Use other parameters; returns whether the watches have to be made anew."""
+        old = self._parameters
+        self._parameters = parameters
+        self._clusters = parameters.rigid_clusters()
+        return replace(old, collect_on_drift=parameters.collect_on_drift) != parameters
+
+    def use_options(self, options: DriftOptions) -> None:
+        """Use other options for the watches that are made from now on."""
+        self._options = options
 
     def reset(self) -> None:
         """Forget image sizes, exposures and alarms."""

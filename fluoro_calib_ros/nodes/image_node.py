@@ -27,7 +27,7 @@ from .messages.image import (
 )
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
-from .runtime.parameters import ManagedParameters, ParameterGroup
+from .runtime.parameters import CalibratedParameters, ParameterGroup
 from .runtime.qos import images_qos
 from .runtime.refusals import Refused
 
@@ -38,7 +38,7 @@ CORRECTED = 'image_corrected'
 
 
 @dataclass(frozen=True)
-class ImageParameters(ManagedParameters):
+class ImageParameters(CalibratedParameters):
     """Parameters of the image node."""
 
     interpolation: str = option(
@@ -59,7 +59,7 @@ class ImageParameters(ManagedParameters):
     jpeg_quality: int = option(95, 'quality of jpeg images', minimum=1, maximum=100)
 
 
-_NODE = ParameterGroup(ImageParameters)
+_NODE = ParameterGroup(ImageParameters, settable=('compressed_format', 'jpeg_quality'))
 PARAMETERS = (_NODE,)
 
 
@@ -96,7 +96,11 @@ class ImageNode(CorrectingNode):
         self._inputs = INPUTS[self._settings.inputs]
         self.topics = tuple(topic for _, topic in self._inputs)
         self.use_parameters(self._settings)
+        _NODE.follow(self, self._use_settings)
         use_single_thread()
+
+    def _use_settings(self, settings: ImageParameters) -> None:
+        self._settings = settings
 
     def make_stream(self, name: str) -> _ImageStream:
         """Return the state of one fluoroscope before the first image."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,6 @@ from fluoro_calib_msgs.msg import RigOrientation
 from fluoro_calib_msgs.srv import Orient
 from rclpy.callback_groups import CallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.task import Future
 
 from ..calibration.result import FluoroscopeCalibration
@@ -24,6 +24,7 @@ from ..jobs.orientation import orient
 from ..jobs.result_folder import belongs_to
 from ..photogrammetry import rig_orientation
 from .messages.rig_orientation import message_from_orientation
+from .runtime.lifecycle import StreamNode
 from .runtime.parameters import check_timeout
 from .runtime.qos import latched_qos
 
@@ -54,53 +55,83 @@ class CaptureSettings:
 
 
 class _Capture:
-    """Collects frames of the phantom in the rig frame until there are enough."""
+    """Collects frames of the phantom in the rig frame until there are enough, or too late."""
 
     def __init__(self, names: Sequence[str], count: int) -> None:
         self.frames: dict[str, list[Frame]] = {name: [] for name in names}
-        self.done = Future()
+        self.done = Future()  # of whether there are enough
         self._count = count
+        self._lock = threading.Lock()
 
-    def add(self, pair: Mapping[str, Frame]) -> None:
-        """Add a frame of every fluoroscope."""
+    def add(self, pair: Mapping[str, Frame]) -> bool:
+        """Add a frame of every fluoroscope; returns whether there are enough."""
         for name, frame in pair.items():
             self.frames[name].append(frame)
-        if len(self.frames[frame.fluoroscope]) == self._count and not self.done.done():
-            self.done.set_result(True)
+        if len(self.frames[frame.fluoroscope]) == self._count:
+            self.finish(True)
+        return self.done.done()
+
+    def finish(self, is_complete: bool) -> None:
+        """End the capture, unless it has ended: frames and timeout come from two threads."""
+        with self._lock:
+            if not self.done.done():
+                self.done.set_result(is_complete)
 
 
 class OrientationService:
     """The service orient of a node, and the orientation published on rig_orientation.
 
-    calibrations: returns the present calibrations by fluoroscope.
+    Parameters
+    ----------
+    node : StreamNode
+    settings : callable
+        Returns the present CaptureSettings.
+    calibrations : callable
+        Returns the present calibrations by fluoroscope.
+    request : callable
+        Returns a context manager that is entered while a request is being answered.
+    group : CallbackGroup
+        Callback group of the service.
     """
 
     def __init__(
         self,
-        node: Node,
-        settings: CaptureSettings,
+        node: StreamNode,
+        settings: Callable[[], CaptureSettings],
         calibrations: Callable[[], Mapping[str, FluoroscopeCalibration]],
+        request: Callable[[], AbstractContextManager[None]],
         group: CallbackGroup,
     ) -> None:
         self._node = node
-        self._settings = settings
+        self._present_settings = settings
         self._calibrations = calibrations
+        self._request = request
         self._capture: _Capture | None = None
         self._present: rig_orientation.RigOrientation | None = None
         self._output = node.create_publisher(RigOrientation, 'rig_orientation', latched_qos())
-        node.create_service(Orient, 'orient', self._on_orient, callback_group=group)
+        self._service = node.create_service(
+            Orient, 'orient', self._on_orient, callback_group=group
+        )
 
     @property
     def present(self) -> rig_orientation.RigOrientation | None:
         """The orientation in use."""
         return self._present
 
+    def close(self) -> None:
+        """Destroy service and publisher."""
+        self._node.destroy_service(self._service)
+        self._node.destroy_publisher(self._output)
+
     def add(self, pair: Mapping[str, Frame]) -> None:
-        """Give frames of the phantom to the capture that waits for them, if any."""
-        if self._capture is not None:
-            self._capture.add(pair)
-            if self._capture.done.done():
-                self._capture = None
+        """Give frames of the phantom to the capture that waits for them, if any.
+
+        Called in the thread of the streams.
+        """
+        capture = self._capture
+        if capture is not None and capture.add(pair):
+            self._capture = None
+            self._wake()
 
     def publish(self, orientation: rig_orientation.RigOrientation | None) -> None:
         """Use an orientation and publish it; None: there is no new one."""
@@ -134,9 +165,11 @@ class OrientationService:
         self, request: Orient.Request, response: Orient.Response
     ) -> Orient.Response:
         """Orient the rig from the next frames of the phantom."""
+        settings = self._present_settings()
         try:
-            orientation = await self._orient(request)
-            save_orientation(self._settings.directory, orientation)
+            with self._request():
+                orientation = await self._orient(request, settings)
+            save_orientation(settings.directory, orientation)
         except (DataError, ValueError, OSError) as error:
             response.message = f'the orientation of the rig is unchanged: {error}'
             self._node.get_logger().error(response.message)
@@ -152,38 +185,42 @@ class OrientationService:
         self._node.get_logger().info(response.message)
         return response
 
-    async def _orient(self, request: Orient.Request) -> rig_orientation.RigOrientation:
+    async def _orient(
+        self, request: Orient.Request, settings: CaptureSettings
+    ) -> rig_orientation.RigOrientation:
         """Capture frames and orient the rig. Raises DataError and ValueError."""
-        names = self._settings.names
-        phantom = self._settings.phantom
+        names = settings.names
+        phantom = settings.phantom
         if phantom is None:
             raise DataError(
                 'parameter phantom is not set: the node only serves saved calibrations'
             )
-        check_timeout(request.timeout_sec or self._settings.timeout_s)
+        timeout = request.timeout_sec or settings.timeout_s
+        check_timeout(timeout)
+        if not self._node.readers:
+            raise DataError('the node is not active, so no frames come in')
         missing = [name for name in names if name not in self._calibrations()]
         if missing:
             raise DataError(f'fluoroscope {missing[0]} is not calibrated yet')
-        frames = await self._captured(request)
+        frames = await self._captured(names, request.frames or 1, timeout)
         calibrations = dict(self._calibrations())
         outcome = await self._in_thread(
-            lambda: orient(frames, phantom, calibrations, self._settings.rig_frame)
+            lambda: orient(frames, phantom, calibrations, settings.rig_frame)
         )
         if not belongs_to(outcome.orientation, self._calibrations()):
             raise DataError('the calibrations have changed meanwhile, capture the phantom again')
         return outcome.orientation
 
-    async def _captured(self, request: Orient.Request) -> dict[str, list[Frame]]:
+    async def _captured(
+        self, names: Sequence[str], count: int, timeout: float
+    ) -> dict[str, list[Frame]]:
         """Return the next frames of all fluoroscopes. Raises DataError when the time is up."""
         if self._capture is not None:
             raise DataError('another capture is waiting for its frames')
-        names = self._settings.names
-        timeout = request.timeout_sec or self._settings.timeout_s
-        count = request.frames or 1
         capture = self._capture = _Capture(names, count)
         timer = self._node.create_timer(
             timeout,
-            lambda: capture.done.done() or capture.done.set_result(False),
+            lambda: capture.finish(False),
             clock=Clock(clock_type=ClockType.STEADY_TIME),
         )
         is_complete = await capture.done
@@ -205,8 +242,12 @@ class OrientationService:
                 done.set_result(function())
             except Exception as error:
                 done.set_exception(error)
-            if self._node.executor is not None:
-                self._node.executor.wake()  # to continue what awaits the result
+            self._wake()
 
         threading.Thread(target=work, daemon=True).start()
         return done
+
+    def _wake(self) -> None:
+        """Make the executor continue what awaits a result."""
+        if self._node.executor is not None:
+            self._node.executor.wake()

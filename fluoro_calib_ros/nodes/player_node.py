@@ -10,7 +10,6 @@ from dataclasses import dataclass
 
 import rclpy
 from rclpy.exceptions import NameValidationException
-from rclpy.node import Node
 from rclpy.publisher import Publisher
 
 from ..bags.reader import TopicInfo, iterate_messages, topics_of
@@ -20,7 +19,8 @@ from .runtime.discovery import wait_for_readers, wait_until_acknowledged
 from .runtime.errors import StartError, one_line
 from .runtime.main import run
 from .runtime.message_types import installed_type
-from .runtime.parameters import ParameterGroup
+from .runtime.pace import Pace
+from .runtime.parameters import ParameterGroup, ParameterNode
 from .runtime.qos import observations_qos, qos_overrides, recorded_latched_qos
 
 # Message types of the streams that the nodes process.
@@ -44,11 +44,11 @@ class PlayerParameters:
     topics: tuple[str, ...] = option(('',), 'topics to play; empty: all')
 
 
-_NODE = ParameterGroup(PlayerParameters)
+_NODE = ParameterGroup(PlayerParameters, settable=('rate', 'loop'))
 PARAMETERS = (_NODE,)
 
 
-class PlayerNode(Node):
+class PlayerNode(ParameterNode):
     """Plays a bag once, or over and over; stamps are those of the recording."""
 
     def __init__(self) -> None:
@@ -57,10 +57,17 @@ class PlayerNode(Node):
         if not self._settings.bag:
             raise StartError('parameter bag is not set: it names the bag to play')
         self._outputs = self._create_outputs(self._settings.bag)
+        self._pace = Pace(self._settings.rate)
+        _NODE.follow(self, self._use)
         self.failed = False
         self._stopping = threading.Event()
         self._worker = threading.Thread(target=self._play, daemon=True)
         self._worker.start()
+
+    def _use(self, settings: PlayerParameters) -> None:
+        """Use other settings from now on."""
+        self._settings = settings
+        self._pace.change(settings.rate)
 
     def _create_outputs(self, bag: str) -> dict[str, Publisher]:
         """Return the publishers of the topics to play. Raises StartError."""
@@ -144,9 +151,10 @@ class PlayerNode(Node):
         first_ns = None
         count = 0
         for message in iterate_messages(self._settings.bag, list(self._outputs)):
-            first_ns = message.log_time_ns if first_ns is None else first_ns
-            due = start + (message.log_time_ns - first_ns) * 1e-9 / self._settings.rate
-            if self._stopping.wait(max(0.0, due - time.monotonic())):
+            if first_ns is None:
+                first_ns = message.log_time_ns
+                self._pace.start()
+            if self._pace.wait((message.log_time_ns - first_ns) * 1e-9, self._stopping):
                 return
             self._outputs[message.topic].publish(message.data)
             count += 1

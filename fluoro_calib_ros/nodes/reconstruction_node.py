@@ -60,7 +60,7 @@ from .messages.transforms import transforms_of_orientation
 from .runtime.diagnostics import OK, WARN, LatencyWindow, Status
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run
-from .runtime.parameters import ManagedParameters, ParameterGroup, expand_path
+from .runtime.parameters import CalibratedParameters, ParameterGroup, expand_path
 from .runtime.qos import latched_qos, observations_qos
 from .runtime.refusals import RefusalLog, Refused
 from .runtime.stream_reader import FaultHandlers
@@ -75,7 +75,7 @@ COUNTED_STATUSES = {
 
 
 @dataclass(frozen=True)
-class ReconstructionParameters(ManagedParameters):
+class ReconstructionParameters(CalibratedParameters):
     """Parameters of the reconstruction node."""
 
     reject: float = option(
@@ -104,7 +104,9 @@ class ReconstructionParameters(ManagedParameters):
     min_fluoroscopes = 2
 
 
-_NODE = ParameterGroup(ReconstructionParameters)
+_NODE = ParameterGroup(
+    ReconstructionParameters, settable=('reject', 'ellipsoid_sigmas', 'ellipsoid_rate')
+)
 _PAIRING = ParameterGroup(
     PairingOptions,
     {
@@ -113,11 +115,15 @@ _PAIRING = ParameterGroup(
         'waiting': 'waiting',
         'patience': 'patience',
     },
+    settable=('pair_tolerance', 'waiting', 'patience'),
 )
-_DRIFT = ParameterGroup(DriftParameters)
+_DRIFT = ParameterGroup(
+    DriftParameters, settable=('drift_watch', 'drift_rate', 'clusters', 'collect_on_drift')
+)
 _DRIFT_OPTIONS = ParameterGroup(
     DriftOptions,
     {'warn_interval_h': 'drift_warn_interval', 'error_interval_h': 'drift_error_interval'},
+    settable=('drift_warn_interval', 'drift_error_interval'),
 )
 PARAMETERS = (_NODE, _PAIRING, _DRIFT, _DRIFT_OPTIONS)
 
@@ -150,11 +156,14 @@ class ReconstructionNode(StreamNode):
         self._pairing = _PAIRING.declare(self)
         self.autostart = self._settings.autostart
         self._names = self._settings.fluoroscopes
-        self._marker_interval_ns = round(1e9 / self._settings.ellipsoid_rate)
         self._drift = DriftMonitor(
             self._names, _DRIFT.declare(self), _DRIFT_OPTIONS.declare(self), self.get_logger()
         )
         self.reset()
+        _NODE.follow(self, self._use_settings)
+        _PAIRING.follow(self, self._use_pairing)
+        _DRIFT.follow(self, self._use_drift_parameters)
+        _DRIFT_OPTIONS.follow(self, self._use_drift_options)
 
     def reset(self) -> None:
         """Forget the orientations and start counting from zero."""
@@ -170,6 +179,38 @@ class ReconstructionNode(StreamNode):
         self._latencies = LatencyWindow()
         self._markers_published_ns = 0
         self._drift.reset()
+
+    # -- parameters
+
+    def _use_settings(self, settings: ReconstructionParameters) -> None:
+        self._settings = settings
+        self._rigs = {
+            ids: rig._replace(intersector=Intersector(rig.orientation, settings.reject))
+            for ids, rig in self._rigs.items()
+        }
+
+    def _use_pairing(self, pairing: PairingOptions) -> None:
+        self._pairing = pairing
+        self._pairer.use(pairing)
+
+    def _use_drift_parameters(self, parameters: DriftParameters) -> None:
+        if self._drift.use(parameters):
+            self._renew_watches()
+
+    def _use_drift_options(self, options: DriftOptions) -> None:
+        self._drift.use_options(options)
+        self._renew_watches()
+
+    def _renew_watches(self) -> None:
+        """Watch for drift from the beginning."""
+        try:
+            self._rigs = {
+                ids: rig._replace(watch=self._drift.make_watch(rig.orientation))
+                for ids, rig in self._rigs.items()
+            }
+        except ValueError as error:  # DataError among them
+            self._refusals.last_fault = f'no drift watch: {error}'
+            self.get_logger().error(self._refusals.last_fault)
 
     # -- lifecycle
 
@@ -273,15 +314,8 @@ class ReconstructionNode(StreamNode):
         except DataError as error:
             self._refusals.note(f'camera_info ignored: {error}')
             return
-        try:
-            if self._drift.set_image_size(name, size):
-                self._rigs = {
-                    ids: rig._replace(watch=self._drift.make_watch(rig.orientation))
-                    for ids, rig in self._rigs.items()
-                }
-        except ValueError as error:  # DataError among them
-            self._refusals.last_fault = f'no drift watch: {error}'
-            self.get_logger().error(self._refusals.last_fault)
+        if self._drift.set_image_size(name, size):
+            self._renew_watches()
 
     # -- corrected observations
 
@@ -368,7 +402,8 @@ class ReconstructionNode(StreamNode):
         if 'mocap_markers' in wanted:
             self._outputs['mocap_markers'].publish(mocap_markers(message, good))
         now = time.monotonic_ns()
-        if 'markers' in wanted and now - self._markers_published_ns >= self._marker_interval_ns:
+        interval_ns = round(1e9 / self._settings.ellipsoid_rate)
+        if 'markers' in wanted and now - self._markers_published_ns >= interval_ns:
             self._markers_published_ns = now
             self._outputs['markers'].publish(
                 ellipsoid_markers(message, good, self._settings.ellipsoid_sigmas)

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import Any
 
 from rclpy.duration import Duration
-from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
@@ -20,7 +19,7 @@ from .runtime.errors import StartError
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
 from .runtime.message_types import definition_of, installed_type
-from .runtime.parameters import ParameterGroup, expand_path
+from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
 from .runtime.stream_reader import FaultHandlers, StreamReader
 
 DISCOVERY_S = 0.1  # period in which new topics are looked for
@@ -41,7 +40,7 @@ _RECORDING = ParameterGroup(RecordingOptions)
 PARAMETERS = (_NODE, _RECORDING)
 
 
-class RecorderNode(Node):
+class RecorderNode(ParameterNode):
     """Records the messages of topics as they are, from their first publisher on."""
 
     def __init__(self) -> None:

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 import numpy as np
 import rclpy
 from fluoro_calib_msgs.msg import TargetObservations
-from rclpy.node import Node
 
 from ..exposures.frame import Frame
 from ..options import option
@@ -22,7 +21,7 @@ from ..simulation.tracking import CLUSTER_MARKERS, simulate_grid, simulate_track
 from .messages.target_observations import message_from_frame, set_number_and_stamp
 from .runtime.discovery import wait_for_readers, wait_until_acknowledged
 from .runtime.main import run
-from .runtime.parameters import ParameterGroup, RigParameters
+from .runtime.parameters import ParameterGroup, ParameterNode, RigParameters
 from .runtime.qos import observations_qos, qos_overrides
 
 SCENES = ('phantom', 'standing', 'markers', 'grid')
@@ -86,7 +85,7 @@ _NODE = ParameterGroup(SimulatorParameters)
 PARAMETERS = (_NODE,)
 
 
-class SimulatorNode(Node):
+class SimulatorNode(ParameterNode):
     """Publishes target observations of every fluoroscope at a rate, with present stamps."""
 
     def __init__(self) -> None:

@@ -5,6 +5,7 @@ import subprocess
 import sys
 import threading
 from array import array
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -190,16 +191,18 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
         create_service=lambda *_, **__: None,
         create_timer=lambda *_, **__: None,
         destroy_timer=lambda _: None,
+        readers=['active'],
+        executor=None,
     )
     settings = CaptureSettings(('a', 'b'), rigs.rig().phantom, 'rig', 5.0, Path())
-    service = OrientationService(node, settings, lambda: present, None)
+    service = OrientationService(node, lambda: settings, lambda: present, nullcontext, None)
 
     async def recalibrated(function):
         present.update(new)
         return outcome
 
     monkeypatch.setattr(service, '_in_thread', recalibrated)
-    capture = service._orient(SimpleNamespace(timeout_sec=1.0, frames=1))
+    capture = service._orient(SimpleNamespace(timeout_sec=1.0, frames=1), settings)
     capture.send(None)  # it waits for its frames
     service.add({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
     with pytest.raises(DataError, match='the calibrations have changed meanwhile'):

@@ -14,7 +14,6 @@ from .cdr import as_little_endian, read_float64_sequence, read_header
 from .fields import (
     NS_PER_S,
     float64_field,
-    nanoseconds_from_stamp,
     stamp_from_nanoseconds,
     uint32_field,
 )
@@ -79,25 +78,25 @@ def decode_target_observations(data: bytes) -> ObservedFrame:
     )
 
 
-def frame_from_message(message: TargetObservations, fluoroscope: str) -> Frame:
-    """Return the frame of a message. Raises DataError for arrays of different lengths."""
+def frame_from_observed(observed: ObservedFrame, fluoroscope: str) -> Frame:
+    """Return the Frame of a message. Raises DataError for arrays of different lengths."""
     try:
         target_id, uv, sigma = stack_image_points(
-            message.target_id, message.u, message.v, message.sigma
+            np.frombuffer(observed.target_id, np.uint32), observed.u, observed.v, observed.sigma
         )
     except DataError as error:
         raise DataError(
-            f'fluoroscope {fluoroscope}, frame {message.frame_number}: {error}'
+            f'fluoroscope {fluoroscope}, frame {observed.frame_number}: {error}'
         ) from None
     return Frame(
         fluoroscope,
-        message.frame_number,
+        observed.frame_number,
         target_id,
         uv,
-        (message.image_width, message.image_height),
+        observed.image_size,
         sigma,
-        nanoseconds_from_stamp(message.header.stamp),
-        message.header.frame_id,
+        NS_PER_S * observed.sec + observed.nanosec,
+        observed.frame_id,
     )
 
 

@@ -17,6 +17,7 @@ from .diagnostics import DiagnosticsPublisher, Status
 from .discovery import best_effort_message
 from .errors import USER_ERRORS, StartError, one_line
 from .logging import RateLimitedLogger
+from .parameters import ParameterNode
 from .qos import qos_overrides
 from .refusals import RefusalLog
 from .stream_reader import FaultHandlers, StreamReader
@@ -24,7 +25,7 @@ from .stream_reader import FaultHandlers, StreamReader
 T = TypeVar('T')
 
 
-class ManagedNode(LifecycleNode):
+class ManagedNode(ParameterNode, LifecycleNode):
     """Lifecycle node that configures and activates itself, unless autostart is false.
 
     Subclasses override configure(), activate(), deactivate() and cleanup(). The last two have to

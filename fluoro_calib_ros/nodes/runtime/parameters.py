@@ -5,14 +5,20 @@ from __future__ import annotations
 import os
 import re
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor
+from rcl_interfaces.msg import (
+    FloatingPointRange,
+    IntegerRange,
+    ParameterDescriptor,
+    SetParametersResult,
+)
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
+from rclpy.parameter import Parameter
 
 from ...errors import DataError
 from ...options import Option, declared, option
@@ -46,10 +52,34 @@ class ManagedParameters(RigParameters):
         True,
         'whether the node configures and activates itself; else a lifecycle manager does',
     )
+
+
+@dataclass(frozen=True)
+class CalibratedParameters(ManagedParameters):
+    """Parameters of every node that uses calibrations."""
+
     calibration_directory: str = option(
         '',
         'folder whose calibrations are used until others arrive; empty: the node waits for them',
     )
+
+
+class ParameterNode(Node):
+    """Node that says what to do where one tries to set a parameter that is read-only."""
+
+    def set_parameters_atomically(
+        self, parameter_list: Sequence[Parameter]
+    ) -> SetParametersResult:
+        """Set parameters, all or none."""
+        for parameter in parameter_list:
+            name = parameter.name
+            if self.has_parameter(name) and self.describe_parameter(name).read_only:
+                return SetParametersResult(
+                    successful=False,
+                    reason=f'parameter {name} is read when the node starts: set it in the '
+                    f'parameter file or with -p {name}:=VALUE, and start the node again',
+                )
+        return super().set_parameters_atomically(parameter_list)
 
 
 @dataclass(frozen=True)
@@ -62,57 +92,107 @@ class ParameterGroup(Generic[T]):
         Frozen dataclass that declares them.
     names : mapping of str to str
         Parameter names by option name; empty: all options under their own names.
+    settable : sequence of str
+        Names of the parameters that may change while the node runs; see follow(). All others are
+        read-only.
     """
 
     options: type[T]
     names: Mapping[str, str] = field(default_factory=dict)
+    settable: Sequence[str] = ()
+
+    @property
+    def _names(self) -> Mapping[str, str]:
+        """Parameter names by option name."""
+        return self.names or {name: name for name in declared(self.options)}
 
     @property
     def declarations(self) -> dict[str, Option]:
         """Declared options by parameter name, in the order of `names`."""
         options = declared(self.options)
-        names = self.names or {name: name for name in options}
         return {
-            parameter: replace(options[name], name=parameter) for name, parameter in names.items()
+            parameter: replace(options[name], name=parameter)
+            for name, parameter in self._names.items()
         }
 
     def declare(self, node: Node) -> T:
         """Declare the parameters of a node. Raises StartError for an invalid value."""
-        names = self.names or {name: name for name in declared(self.options)}
-        declarations = self.declarations
         values = {
-            name: declare_parameter(node, declarations[parameter])
-            for name, parameter in names.items()
+            parameter: declare_parameter(node, declaration, parameter not in self.settable)
+            for parameter, declaration in self.declarations.items()
         }
         try:
-            for name, parameter in names.items():
-                declarations[parameter].validate(values[name])
-            return self.options(**values)
+            return self._options_of(values)
         except ValueError as error:
             raise StartError(f'parameter {error}') from None
 
+    def follow(self, node: Node, use: Callable[[T], None]) -> None:
+        """Call use() with the new options whenever parameters of the group have been set.
 
-def declare_parameter(node: Node, declaration: Option) -> Any:
-    """Declare a read-only parameter and return its value. Raises StartError."""
+        A value that is not allowed is refused in one sentence, and nothing changes.
+        """
+        declarations = self.declarations
+
+        def options_with(parameters: Iterable[Parameter]) -> T:
+            values = {name: node.get_parameter(name).value for name in declarations}
+            values.update((p.name, p.value) for p in parameters)
+            return self._options_of(
+                {
+                    name: _tuple_or_value(declarations[name], value)
+                    for name, value in values.items()
+                }
+            )
+
+        def check(parameters: Sequence[Parameter]) -> SetParametersResult:
+            own = [p for p in parameters if p.name in declarations]
+            try:
+                for parameter in own:
+                    if parameter.type_ == Parameter.Type.NOT_SET:
+                        raise ValueError(f'{parameter.name} cannot be removed')
+                options_with(own)
+            except ValueError as error:
+                return SetParametersResult(successful=False, reason=f'parameter {error}')
+            return SetParametersResult(successful=True)
+
+        def apply(parameters: Sequence[Parameter]) -> None:
+            if any(p.name in declarations for p in parameters):
+                use(options_with(()))
+
+        node.add_on_set_parameters_callback(check)
+        node.add_post_set_parameters_callback(apply)
+
+    def _options_of(self, values: Mapping[str, Any]) -> T:
+        """Return the options of parameter values. Raises ValueError."""
+        for parameter, declaration in self.declarations.items():
+            declaration.validate(values[parameter])
+        return self.options(**{name: values[parameter] for name, parameter in self._names.items()})
+
+
+def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -> Any:
+    """Declare a parameter and return its value. Raises StartError."""
     default = declaration.default
-    is_list = isinstance(default, tuple)
     try:
         value = node.declare_parameter(
             declaration.name,
-            list(default) if is_list else default,
-            descriptor_of(declaration),
+            list(default) if isinstance(default, tuple) else default,
+            descriptor_of(declaration, read_only),
         ).value
     except ParameterException as error:
         raise StartError(f'parameter {declaration.name}: {error}') from None
-    if is_list:
+    return _tuple_or_value(declaration, value)
+
+
+def _tuple_or_value(declaration: Option, value: Any) -> Any:
+    """Return the value of a parameter as its option has it, a list as a tuple."""
+    if isinstance(declaration.default, tuple):
         return tuple(value or ())  # an empty list has no type and counts as not set
     return value
 
 
-def descriptor_of(declaration: Option) -> ParameterDescriptor:
+def descriptor_of(declaration: Option, read_only: bool = True) -> ParameterDescriptor:
     """Return the descriptor of a parameter: description, range and choices."""
     descriptor = ParameterDescriptor(
-        name=declaration.name, description=declaration.help, read_only=True
+        name=declaration.name, description=declaration.help, read_only=read_only
     )
     if declaration.choices:
         descriptor.additional_constraints = f'one of {", ".join(declaration.choices)}'
@@ -142,6 +222,11 @@ def parameters_of(groups: Iterable[ParameterGroup[Any]]) -> dict[str, Option]:
     return {
         name: declaration for group in groups for name, declaration in group.declarations.items()
     }
+
+
+def settable_parameters(groups: Iterable[ParameterGroup[Any]]) -> frozenset[str]:
+    """Return the names of the parameters of a node that may change while it runs."""
+    return frozenset(name for group in groups for name in group.settable)
 
 
 def check_fluoroscopes(names: tuple[str, ...], minimum: int = 1) -> None:

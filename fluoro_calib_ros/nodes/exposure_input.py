@@ -1,0 +1,259 @@
+"""Exposures of the phantom, collected from the streams of a calibration node."""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from rclpy.impl.rcutils_logger import RcutilsLogger
+from rclpy.task import Future
+
+from ..calibration.initial_network import MIN_TARGETS_OF_EXPOSURE
+from ..errors import DataError
+from ..exposures.collector import ExposureCollector, StillOptions
+from ..exposures.frame import Frame, validate_frame
+from ..exposures.pairing import CompletePairer, PairingOptions
+from ..exposures.phantom import Phantom
+from .messages.target_observations import ObservedFrame, frame_from_observed
+from .runtime.logging import RateLimitedLogger
+from .runtime.refusals import RefusalLog
+
+
+@dataclass(frozen=True)
+class CollectOptions:
+    """How exposures are collected.
+
+    Attributes
+    ----------
+    mode : str
+        'still': whenever the phantom stands still in a new pose; 'request': only for a capture.
+    still : StillOptions
+    pairing : PairingOptions
+    """
+
+    mode: str
+    still: StillOptions
+    pairing: PairingOptions
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What is collected of one fluoroscope.
+
+    Attributes
+    ----------
+    received, rejected, unpaired : int
+        Number of frames.
+    exposures, observations : int
+        Collected exposures, and the image points in them.
+    coverage : float
+        Covered part of the image, 0 to 1.
+    """
+
+    received: int
+    rejected: int
+    unpaired: int
+    exposures: int
+    observations: int
+    coverage: float
+
+
+class ObservationStream:
+    """What is known of the frames of one fluoroscope."""
+
+    def __init__(self, name: str, logger: RateLimitedLogger) -> None:
+        self.name = name
+        self.received = 0
+        self.refusals = RefusalLog('frame', logger)
+        self.image_size: tuple[int, int] | None = None
+        self.other_targets: bytes | None = None  # ids of the last frame without the phantom
+        self.is_other_object_logged = False
+
+
+class ExposureInput:
+    """Validates frames, pairs them, and collects the pairs that are wanted.
+
+    The thread of the streams adds frames, and the executor's thread asks for what is collected; a
+    lock keeps them apart. Frames that show nothing of the phantom, such as those of markers, are
+    dropped first of all: a stream shows the same targets frame after frame, so it takes a
+    comparison of their ids.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Fluoroscopes.
+    phantom : Phantom or None
+        Without one, frames are only counted.
+    options : CollectOptions
+    on_pair : callable
+        Called with every pair of frames of the phantom, in the thread of the streams.
+    on_captured : callable
+        Called in that thread after the Future of a capture has got its result.
+    logger : RcutilsLogger
+        Logger of the node.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        phantom: Phantom | None,
+        options: CollectOptions,
+        on_pair: Callable[[Mapping[str, Frame]], None],
+        on_captured: Callable[[], None],
+        logger: RcutilsLogger,
+    ) -> None:
+        self._names = tuple(names)
+        self._phantom = phantom
+        self._options = options
+        self._on_pair = on_pair
+        self._on_captured = on_captured
+        self._logger = logger
+        limited_logger = RateLimitedLogger(logger)
+        self.streams = {name: ObservationStream(name, limited_logger) for name in self._names}
+        self._captures: deque[Future] = deque()  # one for every capture that waits for its pair
+        self.capture_refusal = ''  # why the last pair was not captured
+        self._lock = threading.Lock()
+        self._start()
+
+    def _start(self) -> None:
+        self._pairer = CompletePairer(self._names, self._options.pairing)
+        self._collector = ExposureCollector(self._names, self._options.still)
+
+    # -- the executor's thread
+
+    def use(self, options: CollectOptions) -> None:
+        """Use other options from now on; what is collected stays."""
+        with self._lock:
+            self._options = options
+            self._pairer.use(options.pairing)
+            self._collector.still = options.still
+
+    def reset(self) -> int:
+        """Discard all exposures; returns their number. The counts of frames stay."""
+        with self._lock:
+            count = len(self._collector.exposures)
+            self._start()
+            for stream in self.streams.values():
+                stream.image_size = None
+            return count
+
+    def frames(self, fluoroscopes: Iterable[str] | None = None) -> dict[str, list[Frame]]:
+        """Return the collected frames of fluoroscopes, by default of all. Raises DataError."""
+        with self._lock:
+            return self._collector.frames(fluoroscopes)
+
+    def collected(self, name: str) -> Collected:
+        """Return what is collected of a fluoroscope."""
+        stream = self.streams[name]
+        with self._lock:
+            exposures = self._collector.exposures
+            coverage = self._collector.coverage.get(name)
+            return Collected(
+                stream.received,
+                stream.refusals.total + stream.refusals.failures,
+                self._pairer.unpaired[name],
+                len(exposures),
+                sum(len(pair[name].target_id) for pair in exposures),
+                coverage.fraction if coverage else 0.0,
+            )
+
+    def capture(self) -> Future:
+        """Collect the next pair in whatever mode.
+
+        Returns the Future of its frame number and of the number of exposures with it; the result
+        is None where the wait was given up.
+        """
+        captured = Future()
+        with self._lock:
+            self.capture_refusal = ''
+            self._captures.append(captured)
+        return captured
+
+    def give_up(self, captured: Future) -> None:
+        """End the wait of a capture."""
+        with self._lock:
+            if not captured.done():
+                self._captures.remove(captured)
+                captured.set_result(None)
+
+    # -- the thread of the streams
+
+    def add(self, name: str, observed: ObservedFrame) -> None:
+        """Take a frame: drop it, refuse it, or validate, pair and perhaps collect it."""
+        stream = self.streams[name]
+        stream.received += 1
+        if self._phantom is None or observed.target_id == stream.other_targets:
+            return
+        try:
+            with self._lock:
+                frame = self._validated(stream, observed, self._phantom)
+                if frame is not None:
+                    for pair in self._pairer.add(frame):
+                        self._collect(pair)
+        except DataError as error:
+            stream.refusals.refuse(error)
+
+    def refuse_undecodable(self, topic: str) -> None:
+        """Count a message on <fluoroscope>/<...> that cannot be decoded."""
+        stream = self.streams[topic.partition('/')[0]]
+        stream.received += 1
+        stream.refusals.refuse_undecodable(topic)
+
+    def _validated(
+        self, stream: ObservationStream, observed: ObservedFrame, phantom: Phantom
+    ) -> Frame | None:
+        """Return a valid frame, None where it does not show the phantom. Raises DataError."""
+        ids = np.frombuffer(observed.target_id, np.uint32)
+        if len(ids) and (phantom.index(ids) < 0).all():
+            stream.other_targets = observed.target_id
+            if not stream.is_other_object_logged:
+                stream.is_other_object_logged = True
+                self._logger.info(
+                    f'fluoroscope {stream.name}: frames without any target of the phantom, such '
+                    f'as frame {observed.frame_number}, are ignored'
+                )
+            return None
+        frame = frame_from_observed(observed, stream.name).sorted()
+        validate_frame(frame, phantom, stream.image_size)
+        if len(frame.target_id) < MIN_TARGETS_OF_EXPOSURE:
+            raise DataError(
+                f'fluoroscope {stream.name}, frame {frame.number}: {len(frame.target_id)} targets '
+                f'are too few, {MIN_TARGETS_OF_EXPOSURE} are needed'
+            )
+        if stream.image_size is None:
+            stream.image_size = frame.image_size
+        return frame
+
+    def _collect(self, pair: Mapping[str, Frame]) -> None:
+        """Collect a pair for the oldest capture, or because the phantom stands still."""
+        self._on_pair(pair)
+        collector = self._collector
+        if self._captures:
+            refusal = self.capture_refusal = collector.add(pair)
+            if not refusal:
+                captured = pair[self._names[0]].number, len(collector.exposures)
+                self._captures.popleft().set_result(captured)
+                self._on_captured()
+        elif self._options.mode == 'still':
+            before = len(collector.exposures)
+            refusal = collector.offer(pair)
+            if len(collector.exposures) < before:
+                self._logger.info(
+                    f'exposure {before} discarded: it is the first frame of a stream in which the '
+                    'phantom moves'
+                )
+        else:
+            return
+        if not refusal:
+            self._log_collected(pair)
+
+    def _log_collected(self, pair: Mapping[str, Frame]) -> None:
+        counts = ', '.join(
+            f'{name}: {len(pair[name].target_id)} targets, '
+            f'{100 * coverage.fraction:.0f} % of the image covered'
+            for name, coverage in self._collector.coverage.items()
+        )
+        self._logger.info(f'exposure {len(self._collector.exposures)} collected ({counts})')

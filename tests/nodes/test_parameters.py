@@ -13,7 +13,12 @@ from rclpy.parameter import Parameter
 
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.nodes.runtime.errors import StartError
-from fluoro_calib_ros.nodes.runtime.parameters import ParameterGroup, descriptor_of, parameters_of
+from fluoro_calib_ros.nodes.runtime.parameters import (
+    ParameterGroup,
+    ParameterNode,
+    descriptor_of,
+    parameters_of,
+)
 from fluoro_calib_ros.options import declared, option
 
 ROOT = Path(__file__).parents[2]
@@ -143,3 +148,70 @@ def test_shipped_rviz_and_aggregator_configurations_name_our_topics_and_nodes():
     groups = yaml.safe_load((config / 'diagnostics.yaml').read_text())['/**']['ros__parameters']
     nodes = {name for g in groups.values() if isinstance(g, dict) for name in g['contains']}
     assert nodes == {f'{n}_node' for n in ('calibration', 'correction', 'reconstruction', 'image')}
+
+
+# ---- setting them while the node runs
+
+
+SETTABLE = ParameterGroup(
+    Options, {'length_m': 'length', 'count': 'count'}, settable=('length', 'count')
+)
+
+
+class Settings(ParameterNode):
+    """Node with settable parameters, and one that is not."""
+
+    def __init__(self, context):
+        super().__init__('test', context=context)
+        self.used = []
+        SETTABLE.declare(self)
+        SETTABLE.follow(self, self.used.append)
+        ParameterGroup(Options, {'kind': 'kind'}).declare(self)
+
+
+@pytest.fixture
+def settings():
+    context = rclpy.Context()
+    rclpy.init(args=[], context=context)
+    node = Settings(context)
+    yield node
+    node.destroy_node()
+    rclpy.shutdown(context=context)
+
+
+def test_settable_parameters_are_used_at_once(settings):
+    (done,) = settings.set_parameters([Parameter('length', value=2.5)])
+    assert done.successful and settings.used == [Options(length_m=2.5)]
+    done = settings.set_parameters_atomically(
+        [Parameter('length', value=3.0), Parameter('count', value=7)]
+    )
+    assert done.successful and settings.used[-1] == Options(length_m=3.0, count=7)
+
+
+@pytest.mark.parametrize(
+    'name, value, sentence',
+    [
+        ('length', 11.0, 'length'),
+        ('length', 1, 'type'),  # an integer, not 1.0
+        ('count', 13, 'parameter count: 13 brings bad luck'),
+        ('count', None, 'cannot be'),  # undeclared
+        (
+            'kind',
+            'b',
+            'parameter kind is read when the node starts: set it in the parameter file or with '
+            '-p kind:=VALUE, and start the node again',
+        ),
+    ],
+)
+def test_what_cannot_be_set_says_why_and_changes_nothing(settings, name, value, sentence):
+    before = settings.get_parameter(name).value
+    done = settings.set_parameters_atomically([Parameter(name, value=value)])
+    assert not done.successful and sentence in done.reason and '\n' not in done.reason
+    assert settings.get_parameter(name).value == before and not settings.used
+
+
+@pytest.mark.parametrize('node', write_parameters.NODES)
+def test_settable_parameters_are_declared_and_not_read_only(node):
+    settable = write_parameters.settable(node)
+    assert settable <= set(write_parameters.parameters(node))
+    assert not settable & {'fluoroscopes', 'autostart', 'phantom', 'calibration_directory'}

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import pytest
 from builtin_interfaces.msg import Time
+from fluoro_calib_msgs.srv import Capture
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rcl_interfaces.srv import DescribeParameters, ListParameters
+from rcl_interfaces.srv import DescribeParameters, ListParameters, SetParameters
 from rclpy.lifecycle import TransitionCallbackReturn
+from rclpy.parameter import Parameter
 from ros_graph import NAMES, Graph, value_of
 from rosgraph_msgs.msg import Clock
 
@@ -74,6 +76,59 @@ def test_node_processes_frames_only_while_active(graph, by_command, tracking):
         )
         client.statuses.clear()
     assert [m.frame_number for m in corrected] == [2, 102]
+    assert node.end() == 0 and 'Traceback' not in node.log
+
+
+def test_paused_calibration_node_keeps_what_it_has(graph, exposures, tmp_path):
+    """Inactive it takes no frames, but answers; cleanup forgets; parameters can be set."""
+    client = graph.client
+    expect(client, 'calibration_node')
+    client.expect(SetParameters, 'calibration_node/set_parameters')
+    node = graph.calibration_node(tmp_path / 'none')
+
+    def publish(row):
+        for name in NAMES:
+            client.publish(exposures[name][row])
+
+    def set_parameter(name, value):
+        (done,) = client.call(
+            SetParameters,
+            'calibration_node/set_parameters',
+            parameters=[Parameter(name, value=value).to_parameter_msg()],
+        ).results
+        return done
+
+    publish(0)
+    client.wait_for_status(lambda s: s.exposures == 1)
+    assert not set_parameter('phantom', 'other.csv').successful
+    assert 'is one of still, request' in set_parameter('collect', 'luck').reason
+    assert set_parameter('collect', 'request').successful
+    publish(1)
+    client.wait_for_status(lambda s: s.frames_received == 2)
+    assert client.status().exposures == 1
+    assert set_parameter('collect', 'still').successful
+    assert change(client, 'calibration_node', Transition.TRANSITION_DEACTIVATE)
+    publish(2)  # to nobody
+    assert client.wait_for_diagnostics(
+        'calibration_node', lambda s: s.message == 'the node is not active'
+    )
+    answer = client.call(Capture, 'capture')
+    assert answer.message == 'the node is not active, so no frames come in'
+    assert change(client, 'calibration_node', Transition.TRANSITION_ACTIVATE)
+    client.wait_until(lambda: client.subscriptions_matched('calibration_node'), what='the reader')
+    client.wait_until_known_to('calibration_node')
+    publish(3)
+    status = client.wait_for_status(lambda s: s.frames_received == 3)
+    assert status.exposures == 2
+    assert change(client, 'calibration_node', Transition.TRANSITION_DEACTIVATE)
+    assert change(client, 'calibration_node', Transition.TRANSITION_CLEANUP)
+    client.wait_until(
+        lambda: not client.count_publishers('a/calibration_status'), what='the end of its topics'
+    )
+    assert change(client, 'calibration_node', Transition.TRANSITION_CONFIGURE)
+    client.messages['a/calibration_status'].clear()
+    assert client.wait_for_status(lambda s: True).exposures == 0
+    assert change(client, 'calibration_node', Transition.TRANSITION_INACTIVE_SHUTDOWN)
     assert node.end() == 0 and 'Traceback' not in node.log
 
 

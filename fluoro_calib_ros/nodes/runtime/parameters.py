@@ -146,9 +146,6 @@ class ParameterGroup(Generic[T]):
         def check(parameters: Sequence[Parameter]) -> SetParametersResult:
             own = [p for p in parameters if p.name in declarations]
             try:
-                for parameter in own:
-                    if parameter.type_ == Parameter.Type.NOT_SET:
-                        raise ValueError(f'{parameter.name} cannot be removed')
                 options_with(own)
             except ValueError as error:
                 return SetParametersResult(successful=False, reason=f'parameter {error}')

@@ -6,11 +6,13 @@ remap and the copies in and out of DDS, runs in parallel as far as Python's lock
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 
 from builtin_interfaces.msg import Time
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from ..calibration.result import FluoroscopeCalibration
@@ -28,7 +30,7 @@ from .messages.image import (
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
 from .runtime.parameters import CalibratedParameters, ParameterGroup
-from .runtime.qos import images_qos
+from .runtime.qos import images_qos, latched_qos
 from .runtime.refusals import Refused
 
 RAW = (Image, 'image_raw')
@@ -110,13 +112,17 @@ class ImageNode(CorrectingNode):
         """Make the outputs and subscribe to calibrations."""
         self._images = self._create_outputs(Image, CORRECTED)
         self._compressed = self._create_outputs(CompressedImage, f'{CORRECTED}/compressed')
-        self._infos = self._create_outputs(CameraInfo, f'{CORRECTED}/camera_info')
+        # image_transport looks for the CameraInfo in the namespace of the image. The correction
+        # node publishes there, too, latched, and subscribers ask for that.
+        beside = self._create_outputs(CameraInfo, 'camera_info', latched_qos)
+        below = self._create_outputs(CameraInfo, f'{CORRECTED}/camera_info')
+        self._infos = {name: (beside[name], below[name]) for name in self.names}
         self.subscribe_calibrations()
 
-    def _create_outputs(self, kind: type, topic: str) -> dict:
-        return {
-            name: self.create_output(kind, f'{name}/{topic}', images_qos()) for name in self.names
-        }
+    def _create_outputs(
+        self, kind: type, topic: str, qos: Callable[[], QoSProfile] = images_qos
+    ) -> dict[str, Publisher]:
+        return {name: self.create_output(kind, f'{name}/{topic}', qos()) for name in self.names}
 
     def create_readers(self) -> None:
         """Receive images, those of each fluoroscope in a thread of its own."""
@@ -170,7 +176,8 @@ class ImageNode(CorrectingNode):
         prepared.corrector.correct(image, pixels)
         self._images[name].publish(out)  # copies the image
         prepared.info.header = message.header
-        self._infos[name].publish(prepared.info)
+        for output in self._infos[name]:
+            output.publish(prepared.info)
         stream.count_corrected(info)
         if self._compressed[name].get_subscription_count():
             self._compressed[name].publish(

@@ -9,6 +9,7 @@ import pytest
 from fluoro_calib_msgs.msg import FluoroscopeCalibration
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
+from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
@@ -44,12 +45,17 @@ class Eyes:
         )
         self.images = []
         self.infos = []
+        self.beside = []  # where image_transport looks for the CameraInfo
         self.small = []
         self.client.create_subscription(
             Image, 'a/image_corrected', self.images.append, images_qos()
         )
         self.client.create_subscription(
             CameraInfo, 'a/image_corrected/camera_info', self.infos.append, images_qos()
+        )
+        # As a CameraSubscriber asks for it.
+        self.client.create_subscription(
+            CameraInfo, 'a/camera_info', self.beside.append, qos_profile_sensor_data
         )
 
     def connected(self):
@@ -58,6 +64,7 @@ class Eyes:
             self.raw.get_subscription_count()
             and self.compressed.get_subscription_count()
             and self.client.count_publishers('a/image_corrected/camera_info')
+            and self.client.count_publishers('a/camera_info')
         )
 
     def stamped(self, message):
@@ -162,6 +169,7 @@ def test_image_is_corrected_as_by_the_corrector(eyes, pictures, encoding, kind):
     assert out.header == info.header == message.header
     wanted = message_of_corrected_stream(eyes.calibration, message.header.stamp)
     assert info == wanted and info.k[0] == eyes.calibration.interior[2] and not any(info.d)
+    eyes.client.wait_until(lambda: wanted in eyes.beside, what='the CameraInfo beside the image')
 
 
 def test_images_are_compressed_for_subscribers_only(eyes, pictures):

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.msg import TargetObservations
 
 from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
@@ -40,6 +41,25 @@ PAGE_MB = os.sysconf('SC_PAGE_SIZE') / 2**20
 def resident_mb(process: subprocess.Popen) -> float:
     """Resident memory [MB] of a process."""
     return int(Path(f'/proc/{process.pid}/statm').read_text().split()[1]) * PAGE_MB
+
+
+def wait_for_orientation(reader: Reader) -> None:
+    """Wait until the reconstruction node has an orientation and all its corrected streams.
+
+    Exposures before that would not come out, and no more are published than a part of a queue.
+    """
+    known: list[str] = []
+
+    def on_diagnostics(array: DiagnosticArray) -> None:
+        values = {v.key: v.value for status in array.status for v in status.values}
+        known.append(values.get('orientation', ''))
+
+    subscription = reader.create_subscription(DiagnosticArray, '/diagnostics', on_diagnostics, 50)
+    reader.wait(lambda: any(known), 60, 'the orientation')
+    topics = [f'{name}/corrected_observations' for name in NAMES]
+    # One is the subscription of this process.
+    reader.wait(lambda: all(reader.count_subscribers(t) > 1 for t in topics), 30, 'the streams')
+    reader.destroy_subscription(subscription)
 
 
 def stream(reader: Reader, frames: int, rate_hz: float, note: Callable[[int], None]) -> None:
@@ -106,6 +126,7 @@ def run(hours: float, rate_hz: float) -> dict[str, Any]:
         reader.listen(NODES)
         reader.ready.clear()
         reader.wait(lambda: len(reader.ready) == len(NAMES), 60, 'the correction node')
+        wait_for_orientation(reader)
         began = time.monotonic()
         stream(reader, frames, rate_hz, note)
         seconds = time.monotonic() - began

@@ -206,7 +206,7 @@ def measured(
     path = Path(log.name)
     if node == 'image_node':
         wait(
-            lambda: 'images corrected with calibration' in path.read_text(errors='replace'),
+            lambda: 'pixels of the corrected image are empty' in path.read_text(errors='replace'),
             60,
             'the calibration',
         )

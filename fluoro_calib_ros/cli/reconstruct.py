@@ -17,7 +17,7 @@ from .arguments import (
     bag_selection,
     file_settings,
 )
-from .output import print_notes, print_result, print_unpaired
+from .output import print_note, print_notes, print_result, print_unpaired
 
 if TYPE_CHECKING:
     from ..jobs.reconstruction import ReconstructionOutcome
@@ -119,6 +119,8 @@ def run(arguments: argparse.Namespace) -> None:
         raise DataError(f'{arguments.source}: {error}') from None
     write_reconstruction(arguments.out, outcome.frames, recording.names)
     print_unpaired(arguments.source, outcome.unpaired)
+    if outcome.disagreement:
+        print_note(f'{arguments.source}: {outcome.disagreement}')
     _print(arguments, outcome)
 
 

@@ -11,11 +11,12 @@ limited time.
 from __future__ import annotations
 
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Protocol
 
 from ..options import option
+from .stamp_agreement import StampAgreement, StampedFrame
 
 PAIR_BY = ('frame_number', 'stamp')
 MIN_VIEWS = 2  # views of an exposure that can be intersected
@@ -28,20 +29,12 @@ UNLIMITED = 10**9  # frames
 Exposure = dict[str, Any]
 
 
-class PairableFrame(Protocol):
+class PairableFrame(StampedFrame, Protocol):
     """What the pairing needs to know of a frame; it must be a dataclass, too."""
 
     @property
     def fluoroscope(self) -> str:
         """Name of the fluoroscope."""
-
-    @property
-    def number(self) -> int:
-        """Frame number."""
-
-    @property
-    def stamp_ns(self) -> int:
-        """Time of the exposure [ns]."""
 
 
 @dataclass(frozen=True)
@@ -93,6 +86,8 @@ class Pairer(Protocol):
         Number of exposures without a frame of every fluoroscope.
     silent : frozenset of str
         Fluoroscopes that are no longer waited for.
+    stamps : StampAgreement
+        Times of the frames that were paired by number.
     """
 
     fluoroscopes: tuple[str, ...]
@@ -100,6 +95,7 @@ class Pairer(Protocol):
     late: dict[str, int]
     incomplete: int
     silent: frozenset[str]
+    stamps: StampAgreement
 
     def add(self, frame: PairableFrame) -> Sequence[Exposure]:
         """Add a frame; returns the exposures that are ready now."""
@@ -139,6 +135,21 @@ def recording_options(
     return PairingOptions(pair_by, tolerance_s, waiting=UNLIMITED, patience=UNLIMITED)
 
 
+def disagreement_of_recording(frames: Mapping[str, Iterable[PairableFrame]]) -> str:
+    """Return a sentence where recorded frames with the same number are far apart in time.
+
+    frames: by fluoroscope. '' where they agree; see StampAgreement.
+    """
+    if len(frames) < MIN_VIEWS:
+        return ''
+    pairer = CompletePairer(frames, recording_options())
+    pairer.stamps = StampAgreement(pairer.fluoroscopes, recent=None)
+    recorded = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
+    for frame in sorted(recorded, key=lambda f: (f.stamp_ns, f.number)):
+        pairer.add(frame)
+    return pairer.stamps.disagreement()
+
+
 class CompletePairer:
     """Pairer of exposures with a frame of every fluoroscope.
 
@@ -173,6 +184,7 @@ class CompletePairer:
         self.late = dict.fromkeys(self.fluoroscopes, 0)
         self.incomplete = 0
         self.silent: frozenset[str] = frozenset()
+        self.stamps = StampAgreement(self.fluoroscopes)
 
     def use(self, options: PairingOptions) -> None:
         """Use other limits from now on. Raises ValueError where pair_by is another one."""
@@ -214,7 +226,10 @@ class CompletePairer:
             if partner is not None:
                 del self._waiting[name][partner]
         self._exposures += 1
-        return exposure if self._by_number else _renumbered(exposure, self._exposures)
+        if self._by_number:
+            self.stamps.add(exposure)
+            return exposure
+        return _renumbered(exposure, self._exposures)
 
     def _is_late(self, fluoroscope: str, key: int) -> bool:
         """Whether a partner of the frame with that key was displaced already.
@@ -281,6 +296,7 @@ class PartialPairer:
         self.unpaired = dict.fromkeys(self.fluoroscopes, 0)
         self.late = dict.fromkeys(self.fluoroscopes, 0)
         self.incomplete = 0
+        self.stamps = StampAgreement(self.fluoroscopes)
         self._start()
 
     def _start(self) -> None:
@@ -392,7 +408,10 @@ class PartialPairer:
                     self._passed[name] = end
         self._exposures += 1
         self._recent.append(end - self._tolerance)
-        return [exposure if self._by_number else _renumbered(exposure, self._exposures)]
+        if self._by_number:
+            self.stamps.add(exposure)
+            return [exposure]
+        return [_renumbered(exposure, self._exposures)]
 
     def flush(self) -> list[Exposure]:
         """Stop waiting and start anew; returns the exposures that were waiting."""

@@ -12,7 +12,7 @@ from ..drift.clusters import Cluster
 from ..drift.recording_watch import DriftVerdict, RecordingDriftWatch
 from ..errors import DataError
 from ..exposures.frame import Frame
-from ..exposures.pairing import PAIR_BY, PairingOptions
+from ..exposures.pairing import PAIR_BY, PairingOptions, disagreement_of_recording
 from ..options import option, validate_options
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
@@ -61,12 +61,15 @@ class ReconstructionOutcome:
         Of the fluoroscopes that were used.
     drift : DriftVerdict or None
         None where the drift watch is switched off.
+    disagreement : str
+        Set where frames that were paired by number are far apart in time.
     """
 
     frames: list[ReconstructedFrame]
     unpaired: Mapping[str, int]
     orientation: RigOrientation
     drift: DriftVerdict | None
+    disagreement: str = ''
 
     @property
     def incomplete(self) -> int:
@@ -130,7 +133,11 @@ def reconstruct(
     )
     if not found:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
-    return ReconstructionOutcome(found, unpaired, orientation, watch.verdict() if watch else drift)
+    disagreement = ''
+    if options.has_stamps and options.pair_by == 'frame_number':
+        disagreement = disagreement_of_recording({name: frames[name] for name in names})
+    drift = watch.verdict() if watch else drift
+    return ReconstructionOutcome(found, unpaired, orientation, drift, disagreement)
 
 
 def check_orientation(

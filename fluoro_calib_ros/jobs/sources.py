@@ -17,7 +17,7 @@ from ..exchange.content import PARTS, Content, FileSettings
 from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
 from ..exposures.names import Names
-from ..exposures.pairing import PairingOptions
+from ..exposures.pairing import PairingOptions, disagreement_of_recording
 from ..exposures.phantom import Phantom
 from ..files.access import check_regular_file
 from ..files.calibration import load_calibrations
@@ -244,10 +244,14 @@ def read_source(
     frames = {name: found[name] for name in wanted}
     if not bag or (collect is None and selection.pair_by == 'frame_number'):
         return Recording(frames, {}, names, content.notes)
+    notes = content.notes
+    if selection.pair_by == 'frame_number':
+        disagreement = disagreement_of_recording(frames)
+        notes = (*notes, f'{path}: {disagreement}') if disagreement else notes
     collected = collect_recorded(
         frames, collect or 'all', selection.pair_by, tolerance_s=selection.tolerance_s
     )
-    return Recording(*collected, names, content.notes)
+    return Recording(*collected, names, notes)
 
 
 def select_calibrations(

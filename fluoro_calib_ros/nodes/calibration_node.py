@@ -807,6 +807,9 @@ class CalibrationNode(StreamNode):
         refusals = stream.refusals.refusal_status()
         if refusals:
             return refusals
+        disagreement = self._pairer.stamps.disagreement()
+        if disagreement:
+            return WARN, disagreement
         if progress.is_calibrating:
             last = progress.last_round
             return OK, f'self-calibration running, round {last.iteration if last else 0}'

@@ -16,6 +16,7 @@ from .runtime.lifecycle import StreamNode
 from .runtime.logging import RateLimitedLogger
 from .runtime.parameters import CalibratedParameters, expand_path
 from .runtime.refusals import RefusalLog
+from .runtime.stall import StallDetector
 from .runtime.stream_reader import FaultHandlers
 
 
@@ -29,6 +30,7 @@ class Stream:
     waiting : int
         Number of those that came before the first calibration.
     refusals : RefusalLog
+    stall : StallDetector
     latencies : LatencyWindow
         From the arrival of a message to the publication of its correction.
     """
@@ -39,6 +41,7 @@ class Stream:
         self.corrected = 0
         self.waiting = 0
         self.refusals = RefusalLog(item, logger)
+        self.stall = StallDetector()
         self.latencies = LatencyWindow()
 
     def count_corrected(self, info: Mapping[str, int]) -> None:
@@ -189,4 +192,7 @@ class CorrectingNode(StreamNode):
             return WARN, 'the node is not active'
         if not any(map(self.has_publisher, topics)):
             return WARN, f'no publisher of {self.subject}'
+        stalled = stream.stall.message(stream.received)
+        if stalled:
+            return WARN, stalled
         return stream.refusals.refusal_status() or (OK, 'correcting')

@@ -63,6 +63,7 @@ from .runtime.main import run
 from .runtime.parameters import CalibratedParameters, ParameterGroup, expand_path
 from .runtime.qos import latched_qos, observations_qos
 from .runtime.refusals import RefusalLog, Refused
+from .runtime.stall import StallDetector
 from .runtime.stream_reader import FaultHandlers
 
 MAX_ORIENTATIONS = 4  # frames of the previous calibrations may still come
@@ -171,6 +172,7 @@ class ReconstructionNode(StreamNode):
         self._rigs: dict[tuple[str | None, ...], _Rig] = {}
         self._pairer = exposure_pairer(self._names, self._pairing)
         self._received: Counter[str] = Counter()
+        self._stalls = {name: StallDetector() for name in self._names}
         self._refusals = RefusalLog('frame', self.limited_logger)
         self._points: Counter[str] = Counter()
         self._exposures = 0
@@ -449,7 +451,16 @@ class ReconstructionNode(StreamNode):
             )
         if not self.readers:
             return WARN, 'the node is not active'
-        return self._stream_fault(unpaired) or (OK, 'reconstructing')
+        level, message = self._stream_fault(unpaired) or (OK, '')
+        messages = [text for text in (self._stalled(), message) if text]
+        return (max(level, WARN), '; '.join(messages)) if messages else (OK, 'reconstructing')
+
+    def _stalled(self) -> str:
+        """Return a message where streams have stopped, else ''."""
+        messages = {
+            name: stall.message(self._received[name]) for name, stall in self._stalls.items()
+        }
+        return '; '.join(f'{name}: {message}' for name, message in messages.items() if message)
 
     def _stream_fault(self, unpaired: int) -> tuple[bytes, str] | None:
         """Return level and message where something is wrong with the streams."""
@@ -471,6 +482,9 @@ class ReconstructionNode(StreamNode):
         refusals = self._refusals.refusal_status()
         if refusals:
             return refusals
+        disagreement = self._pairer.stamps.disagreement()
+        if disagreement:
+            return WARN, disagreement
         if unpaired:
             return WARN, f'{unpaired} frames without partner of the other fluoroscopes'
         if self._pairer.incomplete:

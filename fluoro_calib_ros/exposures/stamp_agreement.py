@@ -1,0 +1,93 @@
+"""Whether frames that are paired by number agree in time.
+
+Frames with the same number are of one exposure only if the cameras count alike. Cameras that were
+started at different times, or one that has dropped a frame, count differently. The stamps show
+it: frames with the same number are then a frame interval or more apart.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+from typing import Protocol
+
+import numpy as np
+
+RECENT = 200  # exposures that are compared
+MIN_EXPOSURES = 5
+# Part of the frame interval from which the frame with another number is nearer in time.
+MAX_PART = 0.5
+
+
+class StampedFrame(Protocol):
+    """What is needed of a frame."""
+
+    @property
+    def number(self) -> int:
+        """Frame number."""
+
+    @property
+    def stamp_ns(self) -> int:
+        """Time of the exposure [ns], 0 where it is not known."""
+
+
+class StampAgreement:
+    """Compares the stamps of the frames of recent exposures.
+
+    fluoroscopes: names; recent: number of exposures, None for all. Frames without a stamp (0) are
+    not compared.
+    """
+
+    def __init__(self, fluoroscopes: tuple[str, ...], recent: int | None = RECENT) -> None:
+        self._fluoroscopes = fluoroscopes
+        self._recent: deque[tuple[int, dict[str, int]]] = deque(maxlen=recent)
+
+    def add(self, exposure: Mapping[str, StampedFrame]) -> None:
+        """Add an exposure whose frames have the same number."""
+        frames = list(exposure.values())
+        stamps = {name: frame.stamp_ns for name, frame in exposure.items() if frame.stamp_ns}
+        if len(stamps) > 1:
+            self._recent.append((frames[0].number, stamps))
+
+    def disagreement(self) -> str:
+        """Return a sentence where the frames of an exposure are far apart in time, else ''.
+
+        A constant difference of the clocks looks the same; the sentence says so.
+        """
+        first, *others = self._fluoroscopes
+        for other in others:
+            found = self._compare(first, other)
+            if found:
+                return found
+        return ''
+
+    def _compare(self, one: str, other: str) -> str:
+        rows = [
+            (number, stamps[one], stamps[other])
+            for number, stamps in list(self._recent)
+            if one in stamps and other in stamps
+        ]
+        if len(rows) < MIN_EXPOSURES:
+            return ''
+        number, first, second = np.array(rows, dtype=np.int64).T
+        interval = _frame_interval(number, first)
+        apart = (second - first).astype(float)
+        typical = float(np.median(np.abs(apart)))
+        if not interval or typical <= MAX_PART * interval:
+            return ''
+        count = typical / interval
+        return (
+            f'frames of {one} and {other} with the same number are {typical * 1e-6:.1f} ms apart '
+            f'({count:.1f} frame intervals): they are of different exposures, or the clocks of '
+            'the cameras differ; start the cameras together, or pair frames by stamp'
+        )
+
+
+def _frame_interval(number: np.ndarray, stamp_ns: np.ndarray) -> float:
+    """Return the time [ns] between frames of consecutive numbers; 0 where it is not known."""
+    numbers = np.diff(number)
+    times = np.diff(stamp_ns)
+    forward = (numbers > 0) & (times > 0)
+    if not forward.any():
+        return 0.0
+    return float(np.median(times[forward] / numbers[forward]))

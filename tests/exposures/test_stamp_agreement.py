@@ -1,0 +1,83 @@
+"""Frames that are paired by number, but are of different times."""
+
+from dataclasses import dataclass
+
+import pytest
+
+from fluoro_calib_ros.exposures.pairing import (
+    CompletePairer,
+    PairingOptions,
+    disagreement_of_recording,
+    exposure_pairer,
+)
+
+MS = 1_000_000
+INTERVAL = 40 * MS  # 25 Hz
+
+
+@dataclass(frozen=True)
+class Frame:
+    """What the pairing needs of a frame."""
+
+    fluoroscope: str
+    number: int
+    stamp_ns: int
+
+
+def stream(name, count=20, first=1, delay_ns=0, origin_ns=10**9):
+    return [
+        Frame(name, first + i, origin_ns + i * INTERVAL + delay_ns if origin_ns else 0)
+        for i in range(count)
+    ]
+
+
+def recording(**streams):
+    return {name: stream(name, **options) for name, options in streams.items()}
+
+
+@pytest.mark.parametrize('delay_ms', [0, 3, -15])
+def test_small_difference_is_no_disagreement(delay_ms):
+    assert not disagreement_of_recording(recording(a={}, b={'delay_ns': delay_ms * MS}))
+
+
+def test_one_frame_behind_is_told_with_time_and_frames():
+    found = disagreement_of_recording(recording(a={}, b={'delay_ns': INTERVAL}))
+    assert 'frames of a and b with the same number are 40.0 ms apart (1.0 frame int' in found
+
+
+def test_third_fluoroscope_is_compared_too():
+    found = disagreement_of_recording(recording(a={}, b={}, c={'delay_ns': -2 * INTERVAL}))
+    assert 'a and c' in found
+    assert '2.0 frame intervals' in found
+
+
+def test_frames_without_stamps_are_not_compared():
+    assert not disagreement_of_recording(recording(a={}, b={'origin_ns': 0}))
+
+
+def test_few_exposures_say_nothing():
+    found = disagreement_of_recording(
+        recording(a={'count': 4}, b={'count': 4, 'delay_ns': INTERVAL})
+    )
+    assert not found
+
+
+@pytest.mark.parametrize('names', ['ab', 'abc'])
+def test_live_pairer_tells_it_and_forgets_it(names):
+    pairer = exposure_pairer(names)
+    for wrong, right in zip(stream('b', delay_ns=INTERVAL), stream('a')):
+        for name in names:
+            pairer.add(wrong if name == 'b' else Frame(name, right.number, right.stamp_ns))
+    assert 'a and b' in pairer.stamps.disagreement()
+    # Cameras that were started again: the newest exposures count.
+    for frames in zip(*(stream(name, 300, origin_ns=2 * 10**12) for name in names)):
+        for frame in frames:
+            pairer.add(frame)
+    assert not pairer.stamps.disagreement()
+
+
+def test_pairing_by_stamp_has_no_disagreement():
+    pairer = CompletePairer('ab', PairingOptions('stamp'))
+    for frame in (*stream('a'), *stream('b', delay_ns=INTERVAL, first=7)):
+        pairer.add(frame)
+    assert not pairer.stamps.disagreement()

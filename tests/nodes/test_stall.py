@@ -1,0 +1,44 @@
+"""A stream that stops."""
+
+from fluoro_calib_ros.nodes.runtime.stall import StallDetector
+
+
+class Clock:
+    """A clock that is set by hand."""
+
+    def __init__(self):
+        self.time = 100.0
+
+    def __call__(self):
+        return self.time
+
+
+def messages(counts):
+    """What a detector says of counts that it is asked about once a second."""
+    clock = Clock()
+    detector = StallDetector(clock)
+    said = []
+    for count in counts:
+        clock.time += 1.0
+        said.append(detector.message(count))
+    return said
+
+
+def test_stop_of_a_stream_is_told_within_two_seconds_and_its_return_too():
+    said = messages([250, 500, 500, 500, 750])
+    assert said[:2] == ['', '']
+    assert said[2] == 'no frame for 1 s; before, there were 250 a second'
+    assert said[3].startswith('no frame for 2 s')
+    assert said[4] == ''
+
+
+def test_exposures_taken_one_by_one_are_no_stream():
+    assert messages([0, 1, 1, 1, 2, 2]) == [''] * 6
+
+
+def test_nothing_is_said_before_the_first_frame():
+    assert messages([0, 0, 0]) == [''] * 3
+
+
+def test_counts_that_start_again_are_no_stop():
+    assert messages([250, 500, 20, 270])[2:] == ['', '']

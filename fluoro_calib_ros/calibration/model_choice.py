@@ -7,12 +7,16 @@ from scipy.linalg import cho_factor, cho_solve
 
 from ..distortion.collocation import CollocationTerms
 from ..distortion.cross_validation import CrossValidation
-from ..distortion.estimation import AdjustedTerms, exposure_folds, prior_of_additional
+from ..distortion.estimation import (
+    AdjustedTerms,
+    AdjustmentProblem,
+    exposure_folds,
+    prior_of_additional,
+)
 from ..distortion.knn import KnnModel
 from ..distortion.local_linear import LocalLinearModel
 from ..distortion.neighbour_model import NeighbourModel
-from ..distortion.series import Functions
-from ..distortion.terms import HIGHEST
+from ..distortion.parametric import StepwiseTerms
 from .rounds import SelfCalibration
 
 START_MODEL = 'collocation'
@@ -40,10 +44,14 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
         return None  # no other model knows what differs between exposures
     network = run.measured.network
     after = run.after
+    inside = after.inliers
+    parametric = StepwiseTerms(
+        AdjustmentProblem(terms.network, run.measured.image_size, run.before, terms.gauge_kinds)
+    )
     scores = dict.fromkeys((START_MODEL, *ALTERNATIVES), 0.0)
-    for f, image_size in enumerate(run.measured.image_size):
+    for f in range(len(run.measured.fluoroscopes)):
         rows = network.rows(f)
-        rows = rows[after.inliers[rows]]
+        rows = rows[inside[rows]]
         if len(rows) > MAX_IMAGE_POINTS:
             return None
         uv = network.uv[rows]
@@ -60,8 +68,8 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
             START_MODEL: _held_out(
                 terms.functions[f](uv), prior_of_additional(network, f), values, weight, fold
             ),
-            'parametric': _held_out(
-                Functions(image_size, HIGHEST)(uv), None, values, weight, fold
+            'parametric': _held_out_of_terms(
+                parametric.values[f][inside[network.rows(f)]], values, weight, fold
             ),
         }
         for kind, predicted in held_out.items():
@@ -72,7 +80,7 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
 
 def _held_out(
     functions: np.ndarray,
-    prior: np.ndarray | None,
+    prior: np.ndarray,
     values: np.ndarray,
     weight: np.ndarray,
     fold: np.ndarray,
@@ -82,7 +90,7 @@ def _held_out(
     Parameters
     ----------
     functions : (N, m) ndarray
-    prior : (2m, 2m) ndarray or None
+    prior : (2m, 2m) ndarray
         Precision matrix of the coefficients.
     values : (N, 2) ndarray
     weight, fold : (N,) ndarray
@@ -99,12 +107,28 @@ def _held_out(
         weighted = weight[train, None] * functions[train]
         gram = weighted.T @ functions[train]
         right = weighted.T @ values[train]
-        if prior is None:
-            out[test] = functions[test] @ np.linalg.lstsq(gram, right, rcond=1e-12)[0]
-        else:
-            matrix = prior.copy()
-            matrix[:m, :m] += gram
-            matrix[m:, m:] += gram
-            found = cho_solve(cho_factor(matrix, lower=True), right.T.ravel())
-            out[test] = functions[test] @ found.reshape(2, m).T
+        matrix = prior.copy()
+        matrix[:m, :m] += gram
+        matrix[m:, m:] += gram
+        found = cho_solve(cho_factor(matrix, lower=True), right.T.ravel())
+        out[test] = functions[test] @ found.reshape(2, m).T
+    return out
+
+
+def _held_out_of_terms(
+    terms: np.ndarray, values: np.ndarray, weight: np.ndarray, fold: np.ndarray
+) -> np.ndarray:
+    """Predictions (N, 2) of values (N, 2) by terms (N, 2, t) fitted without the own fold.
+
+    weight, fold (N,).
+    """
+    out = np.empty_like(values)
+    root = np.sqrt(weight)[:, None]
+    scaled = terms * root[:, :, None]
+    right = values * root
+    for number in np.unique(fold):
+        test = fold == number
+        design = scaled[~test].reshape(-1, terms.shape[2])
+        found = np.linalg.lstsq(design, right[~test].ravel(), rcond=1e-12)[0]
+        out[test] = terms[test] @ found
     return out

@@ -53,6 +53,9 @@ setup(
     ],
     extras_require={'c3d': ['ezc3d'], 'test': ['pytest', 'pytest-timeout', 'pytest-xdist']},
     zip_safe=False,
+    url='https://arxiv.org/abs/1810.00138',
+    author='fluoro_calib_ros maintainers',
+    author_email='maintainers@fluoro-calib.example',
     maintainer='fluoro_calib_ros maintainers',
     maintainer_email='maintainers@fluoro-calib.example',
     description='Self-calibration of dual fluoroscopes for ROS 2: robust bundle adjustment and '

@@ -10,7 +10,7 @@ sys.path.insert(0, str(ROOT))
 
 project = 'fluoro_calib_ros'
 author = 'fluoro_calib_ros maintainers'
-copyright = author
+copyright = author  # noqa: A001 Sphinx wants this name
 release = '0.1.0'
 
 extensions = ['myst_parser', 'sphinx.ext.autodoc', 'sphinx.ext.napoleon', 'sphinx.ext.viewcode']

@@ -83,8 +83,8 @@ def rig(module_graph, by_command, exposures):
     frame = exposures['a'][0]
     graph.nodes = graph.both_nodes(by_command[0], collect='request')
     corrected = client.listen('a/corrected_observations')
-    id = load_calibrations(by_command[0])['a'].calibration_id
-    client.wait_for_diagnostics('correction_node', lambda s: id in [v.value for v in s.values])
+    used = load_calibrations(by_command[0])['a'].calibration_id
+    client.wait_for_diagnostics('correction_node', lambda s: used in [v.value for v in s.values])
     changes = [lambda message: None]
     for change, _, _ in BAD.values():
         changes += [change, lambda message: None]

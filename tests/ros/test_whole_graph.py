@@ -63,9 +63,9 @@ def by_service(rig):
 def tracked(rig, by_service, tracking):
     """Corrected messages of bags/tracking by fluoroscope."""
     client = rig.client
-    for name, id in zip(by_service.fluoroscope, by_service.calibration_id):
+    for name, used in zip(by_service.fluoroscope, by_service.calibration_id):
         client.wait_for_diagnostics(
-            'correction_node', lambda s, id=id: id in [v.value for v in s.values], name
+            'correction_node', lambda s, used=used: used in [v.value for v in s.values], name
         )
     rig.play(BAGS / 'tracking', readers=2, rate=0.5)
     got = {n: client.messages[f'{n}/corrected_observations'] for n in NAMES}

@@ -807,7 +807,7 @@ class CalibrationNode(StreamNode):
         refusals = stream.refusals.refusal_status()
         if refusals:
             return refusals
-        disagreement = self._pairer.stamps.disagreement()
+        disagreement = self._exposures.disagreement()
         if disagreement:
             return WARN, disagreement
         if progress.is_calibrating:

@@ -160,6 +160,11 @@ class ExposureInput:
                 coverage.fraction if coverage else 0.0,
             )
 
+    def disagreement(self) -> str:
+        """Return a sentence where frames with the same number are far apart in time, else ''."""
+        with self._lock:
+            return self._pairer.stamps.disagreement()
+
     def capture(self) -> Future:
         """Collect the next pair in whatever mode.
 

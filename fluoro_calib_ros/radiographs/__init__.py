@@ -1,0 +1,1 @@
+"""Beads of a phantom found, measured and matched in radiographs."""

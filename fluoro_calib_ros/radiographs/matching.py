@@ -1,0 +1,264 @@
+"""Match beads of an image with a phantom, from nothing or from a pose nearby.
+
+A pose is only accepted by evidence: most of the beads that it predicts are found, most of what is
+found is predicted, and no other pose, such as that of the phantom turned by a symmetry of its own,
+fits nearly as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..errors import DataError
+from .growth import Match, Seen, grow, settle, start_view
+from .pose_search import Triples, local_poses, nearby_map, triples_of
+from .view import Lens, View, fit_view
+
+MIN_BEADS = 10
+MIN_FOUND = 0.72
+MIN_EXPLAINED = 0.4
+SURE_FOUND = 0.85  # share found at which the search ends
+ALTERNATIVE = 0.25  # of the matches of the best pose that an alternative must lack
+# Levels of the search: neighbours of a bead in the phantom, in the image, beads tried, and limits
+# of the scale by the extent of what is seen. The first finds most poses, the second those that see
+# all faces of a phantom from the edge, the third a small part of a phantom.
+LEVELS = (
+    (8, 6, 8, (0.85, 1.4)),
+    (14, 8, 6, (0.85, 1.4)),
+    (8, 6, 6, (0.7, 3.0)),
+)
+RIVAL_STEPS = 3
+SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
+SYMMETRY_REACH = 0.3  # of the distance between neighbours
+SHIFTS = 6  # to neighbours, as candidates of symmetries
+SCALE_BY_SIZE = (0.55, 1.6)  # of a bead's image over its diameter, with the blur
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """A motion that takes many beads of a phantom near to others.
+
+    Attributes
+    ----------
+    rotation : (3, 3) ndarray
+    shift : (3,) ndarray
+        [mm]
+    row : (n,) ndarray of int
+        Rows of the beads that beads are taken to, -1 for none.
+    """
+
+    rotation: np.ndarray
+    shift: np.ndarray
+    row: np.ndarray
+
+    def turned(self, view: View) -> View:
+        """Return the view that sees the moved phantom as this view sees the phantom."""
+        return replace(
+            view,
+            rotation=view.rotation @ self.rotation.T,
+            position=self.rotation @ view.position + self.shift,
+        )
+
+
+@dataclass(frozen=True)
+class PhantomModel:
+    """Beads of a phantom, prepared for matching.
+
+    Attributes
+    ----------
+    xyz : (n, 3) ndarray
+        [mm]
+    diameter_mm : (n,) ndarray or None
+    triples : tuple of Triples
+        By level of the search.
+    symmetries : tuple of Symmetry
+    """
+
+    xyz: np.ndarray
+    diameter_mm: np.ndarray | None
+    triples: tuple[Triples, ...]
+    symmetries: tuple[Symmetry, ...]
+
+    @classmethod
+    def of(cls, xyz: np.ndarray, diameter_mm: np.ndarray | None = None) -> PhantomModel:
+        """Return the model of beads (n, 3) [mm] with diameters (n,) [mm], if they are known."""
+        by_count = {level[0]: triples_of(xyz, level[0]) for level in LEVELS}
+        triples = tuple(by_count[level[0]] for level in LEVELS)
+        return cls(xyz, diameter_mm, triples, tuple(_symmetries(xyz)))
+
+
+def match(seen: Seen, model: PhantomModel, lens: Lens, near: View | None = None) -> Match:
+    """Match what was found in an image with a phantom.
+
+    Parameters
+    ----------
+    seen : Seen
+    model : PhantomModel
+    lens : Lens
+    near : View, optional
+        A pose nearby, which is tried first.
+
+    Returns
+    -------
+    Match
+
+    Raises
+    ------
+    DataError
+        Where no pose is sure, with the reason.
+    """
+    if len(seen.uv) < MIN_BEADS:
+        raise DataError(
+            f'only {len(seen.uv)} beads are found in the image, at least {MIN_BEADS} are needed'
+        )
+    best: Match | None = None
+    for candidate in _candidates(seen, model, lens, near):
+        if best is None or candidate.score > best.score:
+            best = candidate
+        if best.found >= SURE_FOUND and best.explained >= MIN_EXPLAINED:
+            break
+    if best is None:
+        raise DataError('no pose of the phantom fits the beads in the image')
+    _check_evidence(best)
+    _check_alternatives(best, seen, model)
+    return best
+
+
+def _check_evidence(best: Match) -> None:
+    """Raise DataError where too few predicted beads are found, or the reverse."""
+    if best.found < MIN_FOUND or len(best.bead) < MIN_BEADS:
+        raise DataError(
+            f'the best pose of the phantom predicts {best.expected} beads in the image, of which '
+            f'only {best.found:.0%} are found'
+        )
+    if best.explained < MIN_EXPLAINED:
+        raise DataError(
+            f'the best pose of the phantom explains only {best.explained:.0%} of the '
+            'beads in the image'
+        )
+
+
+def _check_alternatives(best: Match, seen: Seen, model: PhantomModel) -> None:
+    """Raise DataError where the phantom, turned by a symmetry, fits nearly as well."""
+    for symmetry in model.symmetries:
+        other = symmetry.row[best.bead]
+        known = other >= 0
+        if np.count_nonzero(known) < MIN_BEADS:
+            continue
+        view, scale = fit_view(
+            symmetry.turned(best.view),
+            model.xyz[other[known]],
+            seen.uv[best.detection[known]],
+            RIVAL_STEPS,
+            0.3,
+        )
+        if scale > seen.tolerance_px:
+            continue
+        rival = settle(view, model.xyz, seen)
+        if rival is None or _same(rival, best):
+            continue
+        if rival.score > (1 - ALTERNATIVE) * best.score:
+            raise DataError(
+                'the pose is ambiguous: the phantom fits nearly as well in another one '
+                f'({len(rival.bead)} beads instead of {len(best.bead)}); mark it by beads that '
+                'break its symmetry'
+            )
+
+
+def _same(one: Match, other: Match) -> bool:
+    """Return whether most beads of the image are matched with the same beads of the phantom."""
+    a = dict(zip(one.detection.tolist(), one.bead.tolist()))
+    b = dict(zip(other.detection.tolist(), other.bead.tolist()))
+    same = sum(a.get(detection) == bead for detection, bead in b.items())
+    return same > 0.5 * min(len(a), len(b))
+
+
+def _candidates(seen: Seen, model: PhantomModel, lens: Lens, near: View | None) -> Iterator[Match]:
+    """Yield matches of poses, the likeliest first."""
+    if near is not None:
+        found = settle(near, model.xyz, seen)
+        if found is not None:
+            yield found
+    beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
+    beads[~seen.field] = 2
+    order = _seeds(seen)
+    done = 0
+    for triples, (_, neighbours, tried, limits) in zip(model.triples, LEVELS):
+        scales = _scales(seen, model, limits)
+        for seed in order[done : done + tried]:
+            _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
+            around = around[around != seed]
+            for pose in local_poses(seed, seen.uv, around, triples, beads, scales):
+                view = start_view(pose, lens, model.xyz)
+                found = grow(view, pose.bead, model.xyz, seen)
+                if found is not None:
+                    yield found
+        done += tried
+
+
+def _seeds(seen: Seen) -> np.ndarray:
+    """Rows of beads to begin with: from the middle outwards, far from each other."""
+    centre = np.median(seen.uv, axis=0)
+    distance = np.linalg.norm(seen.uv - centre, axis=1)
+    rest = np.argsort(distance, kind='stable')[: max(60, len(seen.uv) // 2)]
+    rng = np.random.default_rng(0)
+    return np.concatenate([rest[:1], rng.permutation(rest[1:])])
+
+
+def _scales(seen: Seen, model: PhantomModel, limits: tuple[float, float]) -> tuple[float, float]:
+    """Smallest and largest scale [px/mm]; limits are those by the extent of what is seen."""
+    spread = np.sqrt(np.mean(np.sum((seen.uv - np.median(seen.uv, axis=0)) ** 2, axis=1)))
+    extent = np.sqrt(np.mean(np.sum((model.xyz - model.xyz.mean(axis=0)) ** 2, axis=1)))
+    by_extent = spread / (np.sqrt(2 / 3) * extent)
+    low, high = (by_extent * factor for factor in limits)
+    if model.diameter_mm is None:
+        return low, high
+    by_size = 2 * seen.radius_px / float(np.median(model.diameter_mm))
+    return max(low, by_size * SCALE_BY_SIZE[0]), min(high, by_size * SCALE_BY_SIZE[1])
+
+
+def _symmetries(xyz: np.ndarray) -> Iterator[Symmetry]:
+    """Yield motions of a phantom (n, 3) onto itself: turns, and shifts by a neighbour.
+
+    The turns are the 24 of a cube, about the axes of the phantom's frame and its principal axes.
+    """
+    centre = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
+    tree = cKDTree(xyz)
+    distance, near = tree.query(xyz, k=min(SHIFTS + 1, len(xyz)))
+    reach = SYMMETRY_REACH * float(np.median(distance[:, 1]))
+    _, _, principal = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
+    seen: set[bytes] = {np.arange(len(xyz)).tobytes()}
+    turns = [axes.T @ turn @ axes for axes in (np.eye(3), principal) for turn in _turns_of_cube()]
+    candidates = [(turn, centre - turn @ centre) for turn in turns]
+    steps = (xyz[near[:, 1:]] - xyz[:, None]).reshape(-1, 3)
+    common = _common(steps, reach)
+    candidates += [(np.eye(3), step) for step in common]
+    for rotation, shift in candidates:
+        offset, row = tree.query(xyz @ rotation.T + shift)
+        row = np.where(offset < reach, row, -1)
+        if np.mean(row >= 0) >= SYMMETRY_SHARE and row.tobytes() not in seen:
+            seen.add(row.tobytes())
+            yield Symmetry(rotation, shift, row)
+
+
+def _turns_of_cube() -> Iterator[np.ndarray]:
+    """Yield the 24 rotations (3, 3) of a cube."""
+    for order in permutations(range(3)):
+        for signs in product((-1.0, 1.0), repeat=3):
+            turn = np.zeros((3, 3))
+            turn[range(3), order] = signs
+            if np.linalg.det(turn) > 0:
+                yield turn
+
+
+def _common(steps: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Return the steps (3,) to a neighbour that occur most often among steps (n, 3)."""
+    cell = np.rint(steps / max(2 * reach, 1e-9)).astype(int)
+    _, inverse, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    most = np.argsort(-count, kind='stable')[: 2 * SHIFTS]
+    return [steps[inverse.ravel() == number].mean(axis=0) for number in most]

@@ -1,0 +1,105 @@
+"""The shadow of a sphere in an image: attenuated light, blurred, as a function of the distance.
+
+A ray at a distance d from the centre of a sphere of radius r is attenuated by exp(-2 m sqrt(r^2 -
+d^2)) (Beer and Lambert). Focal spot, detector and pixel blur it, about as a Gaussian; scattered
+light adds a part that no bead takes away.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.interpolate import CubicSpline
+from scipy.ndimage import gaussian_filter
+from scipy.optimize import least_squares
+
+STEP = 0.2  # of the grid on which a profile is computed [px]
+TABLE_STEP = 0.05  # of the table of a profile [px]
+REACH_SIGMAS = 3.2
+# Bounds of radius, blur [px], attenuation along the radius, and scattered light.
+LOW = (0.5, 0.35, 0.05, 0.0)
+HIGH = (40.0, 6.0, 6.0, 0.6)
+
+
+@dataclass(frozen=True)
+class Profile:
+    """Shadow of a bead.
+
+    Attributes
+    ----------
+    radius_px : float
+    blur_px : float
+        Standard deviation.
+    attenuation : float
+        Along the radius: coefficient times radius.
+    scatter : float
+        Share of the light that is not attenuated.
+    """
+
+    radius_px: float
+    blur_px: float
+    attenuation: float
+    scatter: float = 0.0
+    _table: np.ndarray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, '_table', _tabulated(self))
+
+    @property
+    def reach_px(self) -> float:
+        """Distance from the centre at which the shadow has ended [px]."""
+        return self.radius_px + REACH_SIGMAS * self.blur_px
+
+    def shadow(self, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Absorbed share of the light at distances [px], and its derivative [1/px]."""
+        position = np.minimum(distance / TABLE_STEP, self._table.shape[1] - 2)
+        index = position.astype(np.intp)
+        part = position - index
+        value, slope = self._table
+        return (
+            value[index] + part * (value[index + 1] - value[index]),
+            slope[index] + part * (slope[index + 1] - slope[index]),
+        )
+
+
+def _tabulated(profile: Profile) -> np.ndarray:
+    """Absorbed shares and their derivatives (2, n) at multiples of TABLE_STEP from the centre."""
+    step = min(STEP, profile.radius_px / 4)
+    axis = np.arange(int(np.ceil((profile.reach_px + 3) / step)) + 4) * step
+    squared = axis[:, None] ** 2 + axis**2
+    chord = 2 * np.sqrt(np.maximum(profile.radius_px**2 - squared, 0)) / profile.radius_px
+    quarter = 1 - np.exp(-profile.attenuation * chord)
+    mirrored = np.concatenate([quarter[:0:-1], quarter])
+    mirrored = np.concatenate([mirrored[:, :0:-1], mirrored], axis=1)
+    # The blur of a square pixel has a variance of 1/12.
+    sigma = np.sqrt(profile.blur_px**2 + 1 / 12) / step
+    half = len(axis) - 1
+    blurred = gaussian_filter(mirrored, sigma, truncate=5)[half, half:]
+    spline = CubicSpline(axis, blurred, bc_type=((1, 0.0), (1, 0.0)))
+    wanted = np.arange(0, profile.reach_px + 2, TABLE_STEP)
+    return np.stack([spline(wanted), spline(wanted, 1)])
+
+
+def fit_profile(
+    distance: np.ndarray, absorbed: np.ndarray, weight: np.ndarray, start: Profile
+) -> Profile:
+    """Fit a profile to absorbed shares (n,) of the light at distances (n,) [px] from beads."""
+    edges = np.arange(0, start.reach_px + 1, 0.25)
+    cell = np.digitize(distance, edges)
+    total = np.bincount(cell, weights=weight, minlength=len(edges) + 1)[1:-1]
+    mean = np.bincount(cell, weights=weight * absorbed, minlength=len(edges) + 1)[1:-1]
+    place = np.bincount(cell, weights=weight * distance, minlength=len(edges) + 1)[1:-1]
+    used = total > 0
+    mean = mean[used] / total[used]
+    place = place[used] / total[used]
+    root = np.sqrt(total[used])
+
+    def residual(unknowns: np.ndarray) -> np.ndarray:
+        value, _ = Profile(*unknowns[:3]).shadow(place)
+        return root * ((1 - unknowns[3]) * value - mean)
+
+    first = [start.radius_px, start.blur_px, start.attenuation, start.scatter]
+    first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)
+    found = least_squares(residual, first, bounds=(LOW, HIGH), x_scale=first, max_nfev=25)
+    return Profile(*map(float, found.x))

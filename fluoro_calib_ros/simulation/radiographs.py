@@ -1,0 +1,332 @@
+"""Radiographs of a virtual fluoroscope: X-rays traced through beads and plates of the phantom.
+
+Every grey value is the mean over rays from several points of the focal spot to several points of
+the pixel, each attenuated by its path through the spheres (Beer and Lambert). The distortion is
+that of the observed pixel, so shadows are stretched as the image is. Blur and glare of the
+detector, quantum noise and digitisation follow (Rowlands and Yorkston, "Flat panel detectors for
+digital radiography", Handbook of Medical Imaging 1, 2000, section 4.3).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from .rig import CUBE_MM, Pose, VirtualFluoroscope
+
+OVERSAMPLING = 3  # rays across a pixel
+FOCAL_POINTS = 7  # one in the middle, the others around
+FIELD_RADIUS = 0.485  # of a round field, as a fraction of the width of the image
+FIELD_MARGIN = 0.03  # of a rectangular field
+FIELD_EDGE_PX = 1.5
+LEAKAGE = 0.004  # light outside of the field, as a fraction of that in it
+GLARE_PX = 60.0
+OPEN_BEAM = 0.85  # grey value of the open beam, as a fraction of the largest one
+DARK = 0.02  # grey value without light
+MARGIN_PX = 3  # around the shadow of a bead
+
+
+@dataclass(frozen=True)
+class RadiographSettings:
+    """How radiographs are taken.
+
+    Attributes
+    ----------
+    photons : float
+        Photons that a pixel of the open beam counts.
+    bits : int
+        8 or 16, of a grey value.
+    bead_mm : float
+        Diameter of the beads [mm], where the phantom gives none.
+    bead_attenuation : float
+        Linear attenuation coefficient of a bead [1/mm]; 1.5 is steel at 50 keV (NIST XCOM).
+    plate_mm, plate_attenuation : float
+        Thickness of the plates that hold the beads [mm] and their coefficient [1/mm].
+    focal_spot_mm : float
+        Diameter of the focal spot [mm].
+    detector_mm : float
+        Distance from the source to the detector [mm].
+    blur_px : float
+        Standard deviation of the detector's blur [px].
+    glare : float
+        Fraction of the light that is scattered widely.
+    round_field : bool
+        Round field of an image intensifier, else a rectangle.
+    clutter : int
+        Number of things in the image that are not the phantom.
+    inverted : bool
+        Beads are brighter than their surroundings.
+    noise_blur_px : float
+        Standard deviation of a blur of the quantum noise [px], which correlates it.
+    """
+
+    photons: float = 1500.0
+    bits: int = 16
+    bead_mm: float = 2.0
+    bead_attenuation: float = 1.5
+    plate_mm: float = 3.0
+    plate_attenuation: float = 0.006
+    focal_spot_mm: float = 0.6
+    detector_mm: float = 2000.0
+    blur_px: float = 0.8
+    glare: float = 0.08
+    round_field: bool = True
+    clutter: int = 0
+    inverted: bool = False
+    noise_blur_px: float = 0.0
+
+
+CLEAN = RadiographSettings()
+HARD = RadiographSettings(photons=400.0, bits=8, glare=0.15, blur_px=1.0, clutter=8)
+
+
+class Radiography:
+    """Takes radiographs with a virtual fluoroscope.
+
+    Parameters
+    ----------
+    fluoroscope : VirtualFluoroscope
+    settings : RadiographSettings, optional
+    """
+
+    def __init__(
+        self, fluoroscope: VirtualFluoroscope, settings: RadiographSettings | None = None
+    ) -> None:
+        self.fluoroscope = fluoroscope
+        self.settings = settings or CLEAN
+        width, height = fluoroscope.image_size
+        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+        self._rays = self._detector_mm(grid.reshape(-1, 2).astype(float)).reshape(height, width, 3)
+
+    def centres(self, points_mm: np.ndarray, pose: Pose) -> np.ndarray:
+        """Observed pixels (n, 2) of points of the phantom (n, 3) [mm]."""
+        rotation, shift = pose
+        return self.fluoroscope.distortion.distort(
+            self.fluoroscope.ideal(points_mm @ rotation.T + shift)
+        )
+
+    def in_field(self, uv: np.ndarray, margin_px: float = 0.0) -> np.ndarray:
+        """Return (n,) whether pixels (n, 2) lie in the field, a margin from its edge."""
+        return _depth_in_field(uv, self.fluoroscope.image_size, self.settings) > margin_px
+
+    def image(
+        self,
+        points_mm: np.ndarray,
+        pose: Pose,
+        seed: int = 0,
+        diameter_mm: np.ndarray | None = None,
+        plates: bool = True,
+    ) -> np.ndarray:
+        """Take a radiograph.
+
+        Parameters
+        ----------
+        points_mm : ndarray
+            (n, 3), centres of the beads in the frame of the phantom.
+        pose : Pose
+            Of the phantom in the rig frame.
+        seed : int
+            The same seed gives the same noise and clutter.
+        diameter_mm : ndarray, optional
+            (n,), of the beads; by default that of the settings.
+        plates : bool
+            Whether there are the four side faces of the cube.
+
+        Returns
+        -------
+        ndarray
+            (h, w) of uint8 or uint16.
+        """
+        settings = self.settings
+        rng = np.random.default_rng([seed, 11])
+        rotation, shift = pose
+        to_sensor = self.fluoroscope.rotation @ rotation
+        origin = self.fluoroscope.rotation @ (shift - self.fluoroscope.position_mm)
+        if diameter_mm is None:
+            diameter_mm = np.full(len(points_mm), settings.bead_mm)
+        light = self._beads(
+            points_mm @ to_sensor.T + origin, self.centres(points_mm, pose), diameter_mm / 2
+        )
+        if plates:
+            light *= self._plates(to_sensor, origin)
+        if settings.clutter:
+            light *= _clutter(rng, light.shape, settings.clutter)
+        width, height = self.fluoroscope.image_size
+        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+        light *= _illumination(grid, (width, height), settings)
+        return _digitised(_detected(light, settings), settings, rng)
+
+    def _detector_mm(self, uv: np.ndarray) -> np.ndarray:
+        """Points of the detector (n, 3) in the sensor frame [mm] of observed pixels (n, 2)."""
+        xp, yp, c = self.fluoroscope.interior
+        ideal = uv - self.fluoroscope.distortion(uv)
+        scaled = (ideal - (xp, yp)) * (self.settings.detector_mm / c)
+        return np.column_stack([scaled, np.full(len(uv), self.settings.detector_mm)])
+
+    def _beads(self, sensor_mm: np.ndarray, uv: np.ndarray, radius_mm: np.ndarray) -> np.ndarray:
+        """Transmission (h, w) of beads: sensor frame (n, 3) [mm], pixels (n, 2), radii (n,)."""
+        width, height = self.fluoroscope.image_size
+        fine = OVERSAMPLING
+        reach = radius_mm * self.fluoroscope.interior[2] / sensor_mm[:, 2] * 1.15 + MARGIN_PX
+        low = np.floor(uv - reach[:, None]).astype(int)
+        count = 2 * int(np.ceil(reach.max(initial=1.0))) + 2
+        # Shadows that do not touch the image are left out; the others are cut at its edge.
+        seen = np.flatnonzero(((low < (width, height)) & (low + count > 0)).all(axis=1))
+        sub = (np.arange(count * fine) + 0.5) / fine - 0.5
+        offsets = np.stack(np.meshgrid(sub, sub), axis=-1)
+        patches = low[seen, None, None] + offsets
+        detector = self._detector_mm(patches.reshape(-1, 2)).reshape(len(seen), -1, 3)
+        total = np.zeros((height, width), dtype=np.float32)
+        for spot in _focal_spot(self.settings.focal_spot_mm):
+            transmission = np.ones(
+                ((height + 2 * count) * fine, (width + 2 * count) * fine), dtype=np.float32
+            )
+            path = _chords(sensor_mm[seen, None] - spot, detector - spot, radius_mm[seen, None])
+            passed = np.exp(-self.settings.bead_attenuation * path).astype(np.float32)
+            passed = passed.reshape(len(seen), count * fine, count * fine)
+            for (column, row), part in zip((low[seen] + count) * fine, passed):
+                transmission[row : row + count * fine, column : column + count * fine] *= part
+            inner = transmission[count * fine : -count * fine, count * fine : -count * fine]
+            total += inner.reshape(height, fine, width, fine).mean(axis=(1, 3)) / FOCAL_POINTS
+        return total
+
+    def _plates(self, rotation: np.ndarray, origin: np.ndarray) -> np.ndarray:
+        """Transmission (h, w) of the four plates of the cube.
+
+        rotation (3, 3) and origin (3,) [mm] take points of the phantom to the sensor frame.
+        """
+        source = -origin @ rotation
+        rays = (self._rays.reshape(-1, 3) @ rotation).reshape(self._rays.shape)
+        rays = rays / np.linalg.norm(rays, axis=-1, keepdims=True)
+        half = CUBE_MM / 2
+        thick = self.settings.plate_mm
+        path = np.zeros(rays.shape[:2])
+        for axis in (0, 1):
+            for side in (-1, 1):
+                low = np.full(3, -half)
+                high = np.full(3, half)
+                low[axis], high[axis] = sorted((side * half, side * (half + thick)))
+                path += _path_in_box(source, rays, low, high)
+        return np.exp(-self.settings.plate_attenuation * path).astype(np.float32)
+
+
+def _focal_spot(diameter_mm: float) -> np.ndarray:
+    """Points (k, 3) of a uniform disc: its middle, and a ring that gives its second moment."""
+    angle = np.arange(FOCAL_POINTS - 1) * 2 * np.pi / (FOCAL_POINTS - 1)
+    ring = diameter_mm / 4 * np.sqrt(2 * FOCAL_POINTS / (FOCAL_POINTS - 1))
+    around = ring * np.column_stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)])
+    return np.concatenate([np.zeros((1, 3)), around])
+
+
+def _chords(centre: np.ndarray, ray: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Lengths of rays from the origin inside spheres; all arguments broadcast, the last axis 3."""
+    along = np.sum(centre * ray, axis=-1) / np.sqrt(np.sum(ray * ray, axis=-1))
+    squared = radius**2 - np.sum(centre * centre, axis=-1) + along**2
+    return 2 * np.sqrt(np.maximum(squared, 0))
+
+
+def _path_in_box(
+    source: np.ndarray, rays: np.ndarray, low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Lengths (h, w) of rays (h, w, 3) of unit length inside a box, by the slab method."""
+    direction = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
+    first = (low - source) / direction
+    second = (high - source) / direction
+    enter = np.minimum(first, second).max(axis=-1)
+    leave = np.maximum(first, second).min(axis=-1)
+    return np.maximum(leave - enter, 0)
+
+
+def _depth_in_field(
+    uv: np.ndarray, image_size: tuple[int, int], settings: RadiographSettings
+) -> np.ndarray:
+    """Distances [px] of pixels (..., 2) from the edge of the field, negative outside."""
+    size = np.asarray(image_size)
+    from_centre = uv - (size - 1) / 2
+    if settings.round_field:
+        return FIELD_RADIUS * min(image_size) - np.linalg.norm(from_centre, axis=-1)
+    return np.min(size * (0.5 - FIELD_MARGIN) - np.abs(from_centre), axis=-1)
+
+
+def _illumination(
+    uv: np.ndarray, image_size: tuple[int, int], settings: RadiographSettings
+) -> np.ndarray:
+    """Open beam (h, w) from 0 to 1 at pixels (h, w, 2): darker to the rim and to the anode."""
+    x = (uv - (np.asarray(image_size) - 1) / 2) / (max(image_size) / 2)
+    light = 1 - 0.16 * np.sum(x * x, axis=-1) + 0.06 * x[..., 0] - 0.05 * x[..., 1] ** 3
+    depth = _depth_in_field(uv, image_size, settings)
+    inside = 1 / (1 + np.exp(-np.clip(depth / FIELD_EDGE_PX, -40, 40)))
+    return (light * (LEAKAGE + (1 - LEAKAGE) * inside)).astype(np.float32)
+
+
+def _clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> np.ndarray:
+    """Transmission (h, w) of cables, bone-like shadows, screws and specks."""
+    height, width = shape
+    size = np.array([width, height])
+    out = np.ones(shape, dtype=np.float32)
+    for number in range(count):
+        depth = np.zeros(shape, dtype=np.float32)
+        kind = number % 4
+        centre = rng.uniform(0.1, 0.9, 2) * size
+        if kind == 0:  # a cable
+            ends = rng.uniform(0, 1, (4, 2)) * size
+            t = np.linspace(0, 1, 60)[:, None]
+            curve = (
+                (1 - t) ** 3 * ends[0]
+                + 3 * t * (1 - t) ** 2 * ends[1]
+                + 3 * t**2 * (1 - t) * ends[2]
+                + t**3 * ends[3]
+            )
+            points = np.round(curve * 8).astype(np.int32)
+            thick = int(rng.integers(3, 9))
+            cv2.polylines(depth, [points], False, float(rng.uniform(0.2, 0.9)), thick, 16, 3)
+        elif kind == 1:  # a bone
+            axes = rng.uniform(0.05, 0.3, 2) * size
+            turn = float(rng.uniform(0, 180))
+            box = (tuple(map(float, centre)), tuple(map(float, axes)), turn)
+            cv2.ellipse(depth, box, float(rng.uniform(0.3, 0.8)), -1, 16)
+            depth = cv2.GaussianBlur(depth, (0, 0), float(rng.uniform(1.5, 6)))
+        elif kind == 2:  # screws
+            for _ in range(3):
+                place = np.round((centre + rng.normal(0, 40, 2)) * 8).astype(int)
+                radius = round(8 * rng.uniform(4.5, 11))
+                cv2.circle(depth, tuple(map(int, place)), radius, 2.5, -1, 16, 3)
+        else:  # specks, smaller than a bead
+            for _ in range(12):
+                place = np.round(rng.uniform(0, 1, 2) * size * 8).astype(int)
+                radius = round(8 * rng.uniform(0.4, 1.3))
+                cv2.circle(depth, tuple(map(int, place)), radius, 0.8, -1, 16, 3)
+        out *= np.exp(-depth)
+    return out
+
+
+def _detected(light: np.ndarray, settings: RadiographSettings) -> np.ndarray:
+    """Light (h, w) after blur and glare of the detector."""
+    sharp = cv2.GaussianBlur(light, (0, 0), settings.blur_px) if settings.blur_px else light
+    if not settings.glare:
+        return sharp
+    small = cv2.resize(light, None, fx=0.125, fy=0.125, interpolation=cv2.INTER_AREA)
+    wide = cv2.GaussianBlur(small, (0, 0), GLARE_PX / 8, borderType=cv2.BORDER_REPLICATE)
+    wide = cv2.resize(wide, light.shape[::-1], interpolation=cv2.INTER_CUBIC)
+    return (1 - settings.glare) * sharp + settings.glare * wide
+
+
+def _digitised(
+    light: np.ndarray, settings: RadiographSettings, rng: np.random.Generator
+) -> np.ndarray:
+    """Grey values (h, w) of light from 0 to 1, with quantum noise."""
+    expected = np.maximum(light, 0) * settings.photons
+    counted = rng.poisson(expected).astype(np.float32)
+    if settings.noise_blur_px:
+        noise = cv2.GaussianBlur(
+            (counted - expected).astype(np.float32), (0, 0), settings.noise_blur_px
+        )
+        counted = expected + noise
+    largest = 2**settings.bits - 1
+    grey = largest * (DARK + (OPEN_BEAM - DARK) * counted / settings.photons)
+    if settings.inverted:
+        grey = largest - grey
+    dtype = np.uint8 if settings.bits == 8 else np.uint16
+    return np.clip(np.rint(grey), 0, largest).astype(dtype)

@@ -1,0 +1,203 @@
+"""Beads of rendered radiographs: found, measured, matched; what is not the phantom is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.radiographs.detection import detect_beads
+from fluoro_calib_ros.radiographs.extraction import Extraction, extract_beads
+from fluoro_calib_ros.radiographs.growth import Seen
+from fluoro_calib_ros.radiographs.matching import PhantomModel, match
+from fluoro_calib_ros.radiographs.measurement import estimate_noise, measure_beads
+from fluoro_calib_ros.radiographs.profile import Profile
+from fluoro_calib_ros.radiographs.view import Lens, View, exponents, fit_view
+from fluoro_calib_ros.simulation.exposures import phantom_poses
+from fluoro_calib_ros.simulation.radiographs import HARD, Radiography
+from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+
+LENS = Lens((1024, 1024), 4000.0)
+
+
+@cache
+def rig() -> VirtualRig:
+    return virtual_rig(8)
+
+
+@cache
+def model() -> PhantomModel:
+    return PhantomModel.of(rig().phantom.xyz_mm)
+
+
+@cache
+def radiograph() -> tuple[np.ndarray, np.ndarray, Radiography]:
+    """A noisy image with clutter, and the true centres."""
+    radiography = Radiography(rig().fluoroscopes[0], HARD)
+    pose = phantom_poses(np.random.default_rng(4), 3)[1]
+    image = radiography.image(rig().true_mm, pose, seed=4)
+    return image, radiography.centres(rig().true_mm, pose), radiography
+
+
+@cache
+def extraction() -> Extraction:
+    return extract_beads(radiograph()[0], model(), LENS)
+
+
+def test_free_beads_are_found_and_no_match_is_false():
+    found = extraction()
+    _, true, radiography = radiograph()
+    error = found.uv - true[found.bead]
+    assert np.abs(error).max() < 1.0
+    free = radiography.in_field(true, 10) & (cKDTree(true).query(true, k=2)[0][:, 1] > 10)
+    assert free.sum() > 200
+    assert np.isin(np.flatnonzero(free), found.bead).mean() > 0.95
+
+
+def test_centres_are_as_precise_as_their_sigma_says():
+    found = extraction()
+    _, true, _ = radiograph()
+    free = ~found.overlapped
+    error = (found.uv - true[found.bead])[free]
+    assert np.median(np.abs(error)) / 0.6745 < 0.055
+    normalised = np.median(np.abs(error) / found.sigma[free, None]) / 0.6745
+    assert 0.8 < normalised < 1.25
+    assert np.all(np.abs(np.median(error, axis=0)) < 0.01)
+
+
+def test_bright_beads_are_the_same_beads():
+    image, _, _ = radiograph()
+    dark = detect_beads(image)
+    bright = detect_beads(255 - image)
+    assert bright.inverted and not dark.inverted
+    assert np.allclose(dark.uv, bright.uv, atol=0.01)
+
+
+def test_each_refused_bead_has_a_reason():
+    found = extraction()
+    assert found.refused
+    assert all(refusal.reason for refusal in found.refused)
+    assert not set(found.bead.tolist()) & {refusal.bead for refusal in found.refused}
+
+
+def test_two_overlapping_beads_have_honest_sigmas():
+    profile = Profile(2.8, 0.9, 1.2, 0.0)
+    rng = np.random.default_rng(3)
+    grid = np.stack(np.meshgrid(np.arange(24), np.arange(24)), axis=-1).astype(float)
+    true = np.array([[10.3, 11.8], [14.1, 12.4]])
+    light = 800.0 * np.ones((24, 24))
+    for centre in true:
+        light *= 1 - profile.shadow(np.linalg.norm(grid - centre, axis=2))[0]
+    normalised = []
+    sigmas = []
+    for _ in range(60):
+        image = rng.poisson(light).astype(np.float32)
+        noise = replace(
+            estimate_noise(image, np.ones(image.shape, bool)),
+            constant=0.1,
+            gain=1.0,
+            correlation=np.ones((1, 1)),
+        )
+        start = true + rng.normal(0, 0.3, true.shape)
+        beads = measure_beads(image, np.ones(image.shape, bool), start, np.ones(2), profile, noise)
+        assert beads.overlapped.all()
+        normalised.append((beads.uv - true) / beads.sigma[:, None])
+        sigmas.append(beads.sigma)
+    assert 0.8 < np.sqrt(np.mean(np.square(normalised))) < 1.25
+    assert np.mean(sigmas) > 0.015
+
+
+def test_profile_is_the_convolution_of_the_sphere():
+    profile = Profile(3.0, 1.0, 0.8)
+    axis = np.arange(-120, 121) * 0.1
+    x, y = np.meshgrid(axis, axis)
+    chord = 2 * np.sqrt(np.maximum(9 - x * x - y * y, 0)) / 3
+    blurred = cv2.GaussianBlur(1 - np.exp(-0.8 * chord), (0, 0), 10 * np.sqrt(1 + 1 / 12))
+    distance = np.array([0.0, 1.3, 2.7, 4.2])
+    value, slope = profile.shadow(distance)
+    assert np.allclose(value, np.interp(distance, axis[120:], blurred[120, 120:]), atol=2e-3)
+    step = 0.05
+    ahead, behind = (profile.shadow(distance[1:] + side)[0] for side in (step, -step))
+    numeric = (ahead - behind) / (2 * step)
+    assert np.allclose(slope[1:], numeric, atol=2e-3)
+
+
+def test_a_view_is_fitted_to_its_own_projection():
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(-130, 130, (200, 3))
+    coefficients = rng.normal(0, 1, (2, len(exponents(5)))) * LENS.deviations(5)
+    true = View(LENS, np.eye(3), np.array([0, 0, -1500.0]), 4100.0, coefficients, 5)
+    start = replace(
+        true,
+        rotation=matrix_from_vector([0.01, -0.02, 0.03]),
+        position=np.array([5.0, -5, -1480]),
+        principal_distance_px=4000.0,
+        coefficients=0 * coefficients,
+    )
+    fitted, _ = fit_view(start, xyz, true.project(xyz), 12, 0.01)
+    assert np.abs(fitted.project(xyz) - true.project(xyz)).max() < 0.05
+
+
+def test_the_pose_of_a_regular_phantom_is_refused():
+    axis = np.arange(4) * 40.0 - 60
+    cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    view = View(
+        LENS, matrix_from_vector([0.4, 0.3, 0.2]), np.zeros(3), 4000.0, np.zeros((2, 2)), 1
+    )
+    view = replace(view, position=-view.rotation.T @ np.array([0, 0, 1500.0]))
+    field = np.ones((1024, 1024), bool)
+    uv = view.project(cube)
+    with pytest.raises(DataError, match='ambiguous'):
+        match(Seen.of(uv, field, 3.0), PhantomModel.of(cube), LENS)
+    # A few beads off the grid make it unique.
+    rng = np.random.default_rng(1)
+    marked = cube + rng.uniform(-6, 6, cube.shape)
+    uv = view.project(marked)
+    found = match(Seen.of(uv, field, 3.0), PhantomModel.of(marked), LENS)
+    assert np.array_equal(found.bead, found.detection)
+    assert len(found.bead) > 60
+
+
+def test_another_phantom_is_refused():
+    other = virtual_rig(9).phantom.xyz_mm
+    found = extraction()
+    seen = Seen.of(found.detections.uv, found.detections.field, found.detections.radius_px)
+    with pytest.raises(DataError, match=r'pose of the phantom'):
+        match(seen, PhantomModel.of(other), LENS)
+
+
+def test_a_survey_with_wrong_beads_gives_no_wrong_observation():
+    _, true, _ = radiograph()
+    xyz = rig().phantom.xyz_mm.copy()
+    rng = np.random.default_rng(2)
+    wrong = rng.permutation(len(xyz))[:40]
+    xyz[wrong] += rng.normal(0, 6, (40, 3))
+    seen_of = extraction().detections
+    seen = Seen.of(seen_of.uv, seen_of.field, seen_of.radius_px)
+    found = match(seen, PhantomModel.of(xyz), Lens((1024, 1024), 4400.0))
+    error = np.linalg.norm(seen.uv[found.detection] - true[found.bead], axis=1)
+    right = ~np.isin(found.bead, wrong)
+    assert np.mean(error[right] < 1.5) > 0.98
+    assert right.sum() > 300
+
+
+@pytest.mark.parametrize(
+    ('image', 'sentence'),
+    [
+        (np.zeros((1, 1), np.uint8), 'only 1 x 1 px'),
+        (np.zeros((200, 200), np.uint16), 'empty'),
+        (np.full((200, 200), 255, np.uint8), 'empty'),
+        (np.where(np.arange(40000) % 3, 255, 90).reshape(200, 200).astype(np.uint8), 'saturated'),
+        (np.zeros((64, 64, 3), np.uint8), 'shape'),
+        (np.random.default_rng(0).poisson(200, (300, 300)).astype(np.uint16), 'bead'),
+    ],
+)
+def test_an_image_without_beads_is_refused(image, sentence):
+    with pytest.raises(DataError, match=sentence):
+        extract_beads(image, model(), LENS)

@@ -143,7 +143,9 @@ def nodes_of_rig(context):
         actions.append(node('recorder_node', recorded))
     if values['bag']:
         bag = {'bag': values['bag'], 'topics': values['bag_topics'], 'rate': values['bag_rate']}
-        actions.append(node('player_node', {**bag, 'wait_for_readers': '2'}))
+        # Readers of target observations: the correction node, and those that are started with it.
+        readers = 1 + (values['calibration'] == 'true') + bool(values['record'])
+        actions.append(node('player_node', {**bag, 'wait_for_readers': str(readers)}))
     if values['simulate'] == 'true':
         simulated = ('fluoroscopes', 'scene', 'rate')
         actions.append(node('simulator_node', {name: values[name] for name in simulated}))

@@ -23,8 +23,9 @@ from .runtime.pace import Pace
 from .runtime.parameters import ParameterGroup, ParameterNode
 from .runtime.qos import observations_qos, qos_overrides, recorded_latched_qos
 
-# Message types of the streams that the nodes process.
-STREAM_TYPES = ('TargetObservations', 'CorrectedObservations', 'Image', 'CompressedImage')
+OBSERVATIONS = 'TargetObservations'
+# Message types of the other streams that the nodes process, each with one reader at least.
+OTHER_STREAMS = ('CorrectedObservations', 'Image', 'CompressedImage')
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class PlayerParameters:
     loop: bool = option(False, 'whether the bag is played over and over')
     wait_for_readers: int = option(
         1,
-        'subscriptions to wait for, of every topic with observations or images, or else of all',
+        'subscriptions to wait for, of every topic with target observations; without any, one of '
+        'every topic with corrected observations or images, or else of all topics',
         minimum=0,
         maximum=100,
     )
@@ -114,17 +116,20 @@ class PlayerNode(ParameterNode):
                 f'{topic} cannot be played as {relative!r}: {one_line(error)}'
             ) from None
 
-    def _awaited_outputs(self) -> list[Publisher]:
-        """Return the publishers whose readers are waited for: /rosout of a bag has none."""
-        streams = [o for o in self._outputs.values() if o.msg_type.__name__ in STREAM_TYPES]
-        return streams or list(self._outputs.values())
+    def _wait_for_readers(self) -> None:
+        """Wait for the readers of streams: /rosout of a bag has none, and others may have none."""
+        kinds = {output: output.msg_type.__name__ for output in self._outputs.values()}
+        count = self._settings.wait_for_readers
+        awaited = [output for output, kind in kinds.items() if kind == OBSERVATIONS]
+        if not awaited:
+            awaited = [output for output, kind in kinds.items() if kind in OTHER_STREAMS]
+            count = min(count, 1) if awaited else count
+        wait_for_readers(self, awaited or list(kinds), count, self._stopping)
 
     def _play(self) -> None:
         try:
             outputs = self._outputs.values()
-            wait_for_readers(
-                self, self._awaited_outputs(), self._settings.wait_for_readers, self._stopping
-            )
+            self._wait_for_readers()
             while not self._stopping.is_set():
                 self._play_once()
                 if not self._settings.loop:

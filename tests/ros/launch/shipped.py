@@ -1,0 +1,28 @@
+"""The shipped launch file with arguments, as part of a launch test."""
+
+import os
+from pathlib import Path
+
+from launch import LaunchDescription
+from launch.actions import IncludeLaunchDescription, SetEnvironmentVariable
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch_testing.actions import ReadyToTest
+
+ROOT = Path(__file__).resolve().parents[3]
+BAGS = ROOT / 'bags'
+FOLDER = Path(os.environ['LAUNCH_TEST_FOLDER'])  # of files that a test writes
+DEADLINE = 60.0  # seconds
+
+
+def rig(**arguments):
+    """Return a LaunchDescription of the shipped launch file, whose tests begin at once."""
+    source = PythonLaunchDescriptionSource(str(ROOT / 'launch' / 'fluoro_calib.launch.py'))
+    return LaunchDescription(
+        [
+            SetEnvironmentVariable('PYTHONUNBUFFERED', '1'),
+            IncludeLaunchDescription(
+                source, launch_arguments=[(k, str(v)) for k, v in arguments.items()]
+            ),
+            ReadyToTest(),
+        ]
+    )

@@ -14,6 +14,7 @@ from . import (
     compare,
     convert,
     correct,
+    extract,
     orient,
     reconstruct,
     report,
@@ -25,6 +26,7 @@ from . import (
 # arguments depend on each other, check(arguments, error).
 COMMANDS = (
     simulate,
+    extract,
     calibrate,
     adjust,
     correct,

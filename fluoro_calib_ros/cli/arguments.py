@@ -98,14 +98,14 @@ def _text(default: Any) -> str:
     return ','.join(f'{v:g}' for v in default) if isinstance(default, tuple) else str(default)
 
 
-def add_source(parser: argparse.ArgumentParser, image_size_help: str) -> None:
-    """Add SOURCE, --image-size and --fluoroscopes."""
+def add_source(parser: argparse.ArgumentParser, image_size_help: str, more: str = '') -> None:
+    """Add SOURCE, --image-size and --fluoroscopes; more: what else SOURCE may be."""
     parser.add_argument(
         'source',
         type=Path,
         metavar='SOURCE',
         help='bag (file or folder), CSV file fluoroscope,exposure,target_id,u,v[,sigma], or image '
-        'points of another program: XMALab 2-D points or project, .pho (docs/formats.md)',
+        'points of another program: XMALab 2-D points or project, .pho (docs/formats.md)' + more,
     )
     parser.add_argument('--image-size', type=image_size, metavar='WxH', help=image_size_help)
     add_fluoroscopes(parser)

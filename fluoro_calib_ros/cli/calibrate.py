@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from ..errors import DataError
 from ..options import Option, declared
 from .arguments import (
     add_bag_options,
@@ -18,10 +19,13 @@ from .arguments import (
     file_settings,
     number_in,
 )
-from .output import print_note, print_notes, print_result, print_round, print_unpaired
+from .output import ProgressBar, print_note, print_notes, print_result, print_round, print_unpaired
+
+if TYPE_CHECKING:
+    from ..jobs.sources import Recording, Survey
 
 NAME = 'calibrate'
-HELP = 'Self-calibrate the fluoroscopes of a bag or file of image points.'
+HELP = 'Self-calibrate the fluoroscopes of a bag, file of image points or folder of radiographs.'
 EXAMPLE = 'fluoro-calib calibrate bags/calibration --phantom bags/phantom.csv --out result'
 INTERNAL = ('tolerance',)  # options that the command does not offer
 
@@ -30,7 +34,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..calibration.options import CalibrationOptions
 
-    add_source(parser, 'image size of a file that does not contain it [px]')
+    add_source(
+        parser,
+        'image size of a file that does not contain it [px]',
+        '; or radiographs: a folder with a folder of images for each fluoroscope, a bag with '
+        'images',
+    )
     add_bag_options(parser)
     add_phantom(parser)
     parser.add_argument(
@@ -139,6 +148,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..files.phantom import has_exposures, read_moving_points
     from ..files.result_document import result_document
     from ..jobs.calibration import run_calibration
+    from ..jobs.image_sources import contains_images
     from ..jobs.result_folder import check_result_folder, save_outcome
     from ..jobs.sources import read_orientations, read_source, read_survey
     from ..report.tables import summary_table
@@ -149,14 +159,17 @@ def run(arguments: argparse.Namespace) -> None:
     moving = bool(known) and has_exposures(arguments.phantom)
     survey = None if moving else read_survey(arguments.phantom, file_settings(arguments))
     names = Names() if survey is None else survey.names
-    recording = read_source(
-        arguments.source,
-        image_size=arguments.image_size,
-        fluoroscopes=arguments.fluoroscopes,
-        collect=arguments.collect,
-        settings=file_settings(arguments, names=names),
-        selection=bag_selection(arguments),
-    )
+    if contains_images(arguments.source):
+        recording = _extracted(arguments, survey)
+    else:
+        recording = read_source(
+            arguments.source,
+            image_size=arguments.image_size,
+            fluoroscopes=arguments.fluoroscopes,
+            collect=arguments.collect,
+            settings=file_settings(arguments, names=names),
+            selection=bag_selection(arguments),
+        )
     print_notes((*(() if survey is None else survey.notes), *recording.notes))
     print_unpaired(arguments.source, recording.unpaired)
     options = CalibrationOptions(
@@ -199,3 +212,22 @@ def run(arguments: argparse.Namespace) -> None:
         print_note(f'this cannot be right: {sentence}')
     document = {**result_document(outcome.result), 'doubts': list(outcome.doubts)}
     print_result(arguments, document, summary_table(outcome.result))
+
+
+def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recording:
+    """Return the observations of images. Raises DataError."""
+    from ..jobs.extraction import recording_of_images
+
+    if survey is None:
+        raise DataError(
+            f'{arguments.source}: beads are only found in images of a phantom that does not move '
+            'in its own frame, without a column exposure'
+        )
+    with ProgressBar('extract') as bar:
+        return recording_of_images(
+            arguments.source,
+            survey,
+            arguments.fluoroscopes,
+            arguments.principal_distance,
+            bar,
+        )

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ..options import declared
 from .arguments import add_option
-from .output import print_result
+from .output import ProgressBar, print_result
 
 NAME = 'simulate'
 HELP = 'Simulate a rig: write bags, CSV files, phantom and truth.'
@@ -21,7 +21,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
     parser.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder to write')
     for option in declared(SimulationOptions).values():
-        add_option(parser, option)
+        if option.name == 'images':
+            add_option(parser, option, nargs='?', const='clean')
+        else:
+            add_option(parser, option)
 
 
 def run(arguments: argparse.Namespace) -> None:
@@ -30,6 +33,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     values = {name: getattr(arguments, name) for name in declared(SimulationOptions)}
     options = SimulationOptions(**values)
-    simulate(arguments.out, options)
+    with ProgressBar('radiographs') as bar:
+        simulate(arguments.out, options, bar)
     document = {'out': str(arguments.out), **dataclasses.asdict(options)}
     print_result(arguments, document, f'written to {arguments.out}')

@@ -28,11 +28,14 @@ class Phantom:
         Coordinates [mm].
     sd_mm : (n,) ndarray
         Standard deviation of each coordinate [mm].
+    diameter_mm : (n,) ndarray, optional
+        Of the beads [mm], where it is known.
     """
 
     target_id: np.ndarray
     xyz_mm: np.ndarray
     sd_mm: np.ndarray
+    diameter_mm: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         ids = np.asarray(self.target_id, dtype=np.int64)
@@ -40,7 +43,13 @@ class Phantom:
         sd = np.asarray(self.sd_mm, dtype=float)
         _validate(ids, xyz, sd)
         order = np.argsort(ids, kind='stable')
-        for name, values in (('target_id', ids), ('xyz_mm', xyz), ('sd_mm', sd)):
+        arrays = [('target_id', ids), ('xyz_mm', xyz), ('sd_mm', sd)]
+        if self.diameter_mm is not None:
+            diameter = np.asarray(self.diameter_mm, dtype=float)
+            if diameter.shape != sd.shape or not is_positive(diameter).all():
+                raise DataError('phantom: a diameter above 0 is needed for every target, or none')
+            arrays.append(('diameter_mm', diameter))
+        for name, values in arrays:
             ordered = values[order]
             ordered.setflags(write=False)
             object.__setattr__(self, name, ordered)

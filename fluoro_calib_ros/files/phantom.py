@@ -1,4 +1,4 @@
-"""The file of the phantom: CSV `target_id,x,y,z,sd`, in millimetres.
+"""The file of the phantom: CSV `target_id,x,y,z,sd[,diameter]`, in millimetres.
 
 Files of a lab may have names of beads instead of ids. Points in motion have a further column
 `exposure`.
@@ -20,6 +20,7 @@ from .csv_table import read_blocks, write_rows
 from .named_column import NamedColumn
 
 COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
+DIAMETER = 'diameter'  # of the beads, optional
 EXPOSURE = 'exposure'
 
 
@@ -42,12 +43,17 @@ def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
     id_parts = []
     number_parts = []
     line_parts = []
+    diameter_parts = []
     for block in read_blocks(path, COLUMNS):
         numbers = np.column_stack([block.floats(name) for name in COLUMNS[1:]])
         id_parts.append(column.read(block))
         block.require('sd', numbers[:, 3] > 0, 'not above 0')
         number_parts.append(numbers)
         line_parts.append(block.lines)
+        if DIAMETER in block:
+            diameter = block.floats(DIAMETER)
+            block.require(DIAMETER, diameter > 0, 'not above 0')
+            diameter_parts.append(diameter)
     ids = column.numbers(np.concatenate(id_parts))
     numbers = np.concatenate(number_parts)
     repeated = first_repeated(ids)
@@ -59,7 +65,8 @@ def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
             f'{lines[first]}'
         )
     try:
-        return Phantom(ids, numbers[:, :3], numbers[:, 3])
+        diameters = np.concatenate(diameter_parts) if diameter_parts else None
+        return Phantom(ids, numbers[:, :3], numbers[:, 3], diameters)
     except DataError as error:
         raise DataError(f'{path}: {error}') from None
 
@@ -108,13 +115,14 @@ def write_phantom(
     if not all(target in labels for target in phantom.target_id.tolist()):
         labels = {}
     with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS])
+        numbers = [phantom.xyz_mm, phantom.sd_mm[:, None]]
+        if phantom.diameter_mm is not None:
+            numbers.append(phantom.diameter_mm[:, None])
+        write_rows(file, [(*COLUMNS, DIAMETER)[: sum(part.shape[1] for part in numbers) + 1]])
         write_rows(
             file,
             (
-                [labels.get(int(target), int(target)), *map(repr, xyz), repr(sd)]
-                for target, xyz, sd in zip(
-                    phantom.target_id, phantom.xyz_mm.tolist(), phantom.sd_mm.tolist()
-                )
+                [labels.get(int(target), int(target)), *map(repr, row)]
+                for target, row in zip(phantom.target_id, np.hstack(numbers).tolist())
             ),
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,15 +12,18 @@ from ..bags.writer import BagWriter
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..files.access import PathLike, make_folder
-from ..files.atomic import write_text
+from ..files.atomic import write_bytes, write_text
 from ..files.json_file import write_json
 from ..files.observations import write_observations_csv
 from ..files.phantom import write_phantom
+from ..images.codec import encode
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..simulation.exposures import SimulatedExposures
+from ..simulation.radiographs import RadiographSettings, Radiography
 from ..simulation.rig import VirtualFluoroscope, VirtualRig
 from ..simulation.tracking import SimulatedTracking
 
+IMAGES = 'images'  # folder of radiographs, a folder for each fluoroscope
 TRUTH = 'truth'  # folder of what a data set was made with
 TRUE_SD_MM = 1e-6  # the file of the true coordinates has to contain a standard deviation
 
@@ -59,6 +62,41 @@ def write_exposures(
             numbers = [f'{x:.9f}' for x in (*position, *quaternion_from_matrix(rotation))]
             lines.append(','.join([fluoroscope.name, str(frame.number), *numbers]))
     write_text(directory / TRUTH / f'{name}_exposures.csv', '\n'.join(lines) + '\n')
+
+
+def write_radiographs(
+    directory: PathLike,
+    rig: VirtualRig,
+    simulated: SimulatedExposures,
+    settings: RadiographSettings,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write a radiograph of every exposure as images/FLUOROSCOPE/NUMBER.png, with its truth.
+
+    truth/images.csv contains the centres of all beads in the field of view. progress is called
+    after every image with the number of images that are done, and their total. Raises DataError.
+    """
+    directory = Path(directory)
+    lines = ['fluoroscope,exposure,target_id,u,v']
+    total = len(rig.fluoroscopes) * len(simulated.poses)
+    done = 0
+    for fluoroscope in rig.fluoroscopes:
+        folder = directory / IMAGES / fluoroscope.name
+        make_folder(folder)
+        radiography = Radiography(fluoroscope, settings)
+        for frame, pose in zip(simulated.frames[fluoroscope.name], simulated.poses):
+            image = radiography.image(rig.true_mm, pose, frame.number)
+            write_bytes(folder / f'{frame.number:04d}.png', encode(image, '.png'))
+            centres = radiography.centres(rig.true_mm, pose)
+            seen = np.flatnonzero(radiography.in_field(centres))
+            lines += [
+                f'{fluoroscope.name},{frame.number},{target},{u:.4f},{v:.4f}'
+                for target, (u, v) in zip(rig.phantom.target_id[seen], centres[seen])
+            ]
+            done += 1
+            if progress is not None:
+                progress(done, total)
+    write_text(directory / TRUTH / 'images.csv', '\n'.join(lines) + '\n')
 
 
 def write_tracking(directory: PathLike, tracking: SimulatedTracking) -> None:

@@ -4,18 +4,36 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 from ..files.folder import FolderKind, replaced_folder
 from ..options import option, validate_options
 from ..simulation.exposures import Detection, simulate_exposures
+from ..simulation.radiographs import CLEAN, HARD
 from ..simulation.rig import virtual_rig
 from ..simulation.streams import START_NS, StreamStart
 from ..simulation.tracking import simulate_tracking
-from .dataset import TRUTH, write_exposures, write_rig, write_tracking
+from .dataset import (
+    IMAGES,
+    TRUTH,
+    write_exposures,
+    write_radiographs,
+    write_rig,
+    write_tracking,
+)
 
 HOUR_NS = 3600 * 10**9
-_PARTS = ('calibration', 'calibration.csv', 'test', 'test.csv', 'tracking', 'phantom.csv', TRUTH)
+_PARTS = (
+    'calibration',
+    'calibration.csv',
+    'test',
+    'test.csv',
+    'tracking',
+    'phantom.csv',
+    IMAGES,
+    TRUTH,
+)
 
 
 def _is_own(name: str) -> bool:
@@ -53,29 +71,46 @@ class SimulationOptions:
         0.01, 'fraction of the targets with a wrong id', minimum=0, maximum=0.5
     )
     strength: float = option(1.0, 'strength of the distortion', minimum=0, maximum=10)
+    images: str = option(
+        'none',
+        'radiographs of the exposures of the phantom, clean or with clutter and little dose',
+        choices=('none', 'clean', 'hard'),
+    )
 
     def __post_init__(self) -> None:
         validate_options(self)
 
 
-def simulate(directory: str | os.PathLike[str], options: SimulationOptions | None = None) -> None:
+def simulate(
+    directory: str | os.PathLike[str],
+    options: SimulationOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
     """Write bags, CSV files, phantom and truth of a virtual rig into a folder.
 
-    An earlier data set is replaced as a whole and kept as DIRECTORY.previous. Raises DataError
-    where the folder cannot be written, or is no data set.
+    An earlier data set is replaced as a whole and kept as DIRECTORY.previous. progress is called
+    after every radiograph with their number and total. Raises DataError where the folder cannot
+    be written, or is no data set.
     """
     options = options or SimulationOptions()
     with replaced_folder(directory, DATA_SET) as folder:
-        _write(folder, options)
+        _write(folder, options, progress)
 
 
-def _write(directory: Path, options: SimulationOptions) -> None:
+def _write(
+    directory: Path,
+    options: SimulationOptions,
+    progress: Callable[[int, int], None] | None,
+) -> None:
     """Write the parts of a data set."""
     rig = virtual_rig(options.seed, options.strength)
     write_rig(directory, rig, dataclasses.asdict(options))
     detection = Detection(options.noise, options.false_matches)
     calibration = simulate_exposures(rig, options.exposures, options.seed, detection)
     write_exposures(directory, 'calibration', rig, calibration)
+    settings = {'clean': CLEAN, 'hard': HARD}.get(options.images)
+    if settings is not None:
+        write_radiographs(directory, rig, calibration, settings, progress)
     # Each part has its own seed, so that its size does not change the others.
     if options.test_exposures:
         test = simulate_exposures(

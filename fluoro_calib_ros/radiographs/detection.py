@@ -7,6 +7,7 @@ cables and the edge of the field have one small eigenvalue, so the smaller one i
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -14,6 +15,7 @@ import numpy as np
 
 from ..errors import DataError
 
+MIN_MIDDLE = 256  # size of the middle of an image that is looked at alone [px]
 MIN_SIZE = 32  # of an image [px]
 SCALES = (1.1, 1.5, 2.1, 3.0, 4.2, 6.0, 8.5)  # standard deviations of the blur [px]
 BLOB_RADIUS = 1.25  # radius of a blurred disc over the scale at which its response is largest
@@ -63,14 +65,7 @@ def detect_beads(image: np.ndarray, radius_px: float | None = None) -> Detection
     _check(image)
     grey = image.astype(np.float32)
     scales = SCALES if radius_px is None else (max(radius_px / BLOB_RADIUS, 1.0),)
-    best: tuple[float, float, bool] | None = None
-    for scale in scales:
-        for inverted, response in zip((False, True), _responses(grey, scale)):
-            if (strength := _typical(response, scale)) and (best is None or strength > best[0]):
-                best = (strength, scale, inverted)
-    if best is None:
-        raise DataError('there is nothing round in the image, so no beads')
-    _, scale, inverted = best
+    scale, inverted = _scale_and_polarity(grey, scales)
     light = float(grey.max()) - grey if inverted else grey
     field = field_of_view(light, scale)
     response = _responses(light, scale)[0]
@@ -95,6 +90,24 @@ def field_of_view(light: np.ndarray, scale: float) -> np.ndarray:
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (margin, margin))
     eroded = cv2.erode(filled, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1)
     return eroded.astype(bool)
+
+
+def _scale_and_polarity(grey: np.ndarray, scales: Sequence[float]) -> tuple[float, bool]:
+    """Return the scale with the strongest blobs, and whether they are bright. Raises DataError."""
+    height, width = grey.shape
+    best: tuple[float, float, bool] | None = None
+    # The middle is a quarter of the work, and has beads in most images.
+    middle = grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    for part in (middle, grey) if min(middle.shape) >= MIN_MIDDLE else (grey,):
+        for scale in scales:
+            for inverted, response in zip((False, True), _responses(part, scale)):
+                strength, count = _typical(response, scale)
+                enough = count >= (TYPICAL // 2 if part is middle else 1)
+                if enough and (best is None or strength > best[0]):
+                    best = (strength, scale, inverted)
+        if best is not None:
+            return best[1], best[2]
+    raise DataError('there is nothing round in the image, so no beads')
 
 
 def _check(image: np.ndarray) -> None:
@@ -132,11 +145,11 @@ def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
     return dark, bright
 
 
-def _typical(response: np.ndarray, scale: float) -> float:
-    """Median response of the strongest blobs of a scale, 0 without any."""
+def _typical(response: np.ndarray, scale: float) -> tuple[float, int]:
+    """Median response of the strongest blobs of a scale, 0 without any, and their number."""
     values, _ = _maxima(response, scale)
     values = np.sort(values)[::-1][:TYPICAL]
-    return float(np.median(values)) if len(values) else 0.0
+    return (float(np.median(values)) if len(values) else 0.0), len(values)
 
 
 def _maxima(response: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:

@@ -139,6 +139,21 @@ class Radiography:
         ndarray
             (h, w) of uint8 or uint16.
         """
+        light = self.light(points_mm, pose, seed, diameter_mm, plates)
+        return _digitised(light, self.settings, np.random.default_rng([seed, 12]))
+
+    def light(
+        self,
+        points_mm: np.ndarray,
+        pose: Pose,
+        seed: int = 0,
+        diameter_mm: np.ndarray | None = None,
+        plates: bool = True,
+    ) -> np.ndarray:
+        """Return the light (h, w) that reaches the detector, 1 in the open beam, without noise.
+
+        The parameters are those of `image`.
+        """
         settings = self.settings
         rng = np.random.default_rng([seed, 11])
         rotation, shift = pose
@@ -156,7 +171,7 @@ class Radiography:
         width, height = self.fluoroscope.image_size
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
         light *= _illumination(grid, (width, height), settings)
-        return _digitised(_detected(light, settings), settings, rng)
+        return _detected(light, settings)
 
     def _detector_mm(self, uv: np.ndarray) -> np.ndarray:
         """Points of the detector (n, 3) in the sensor frame [mm] of observed pixels (n, 2)."""
@@ -189,8 +204,8 @@ class Radiography:
             for (column, row), part in zip((low[seen] + count) * fine, passed):
                 transmission[row : row + count * fine, column : column + count * fine] *= part
             inner = transmission[count * fine : -count * fine, count * fine : -count * fine]
-            total += inner.reshape(height, fine, width, fine).mean(axis=(1, 3)) / FOCAL_POINTS
-        return total
+            total += cv2.resize(inner, (width, height), interpolation=cv2.INTER_AREA)
+        return total / FOCAL_POINTS
 
     def _plates(self, rotation: np.ndarray, origin: np.ndarray) -> np.ndarray:
         """Transmission (h, w) of the four plates of the cube.
@@ -222,9 +237,10 @@ def _focal_spot(diameter_mm: float) -> np.ndarray:
 
 def _chords(centre: np.ndarray, ray: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Lengths of rays from the origin inside spheres; all arguments broadcast, the last axis 3."""
-    along = np.sum(centre * ray, axis=-1) / np.sqrt(np.sum(ray * ray, axis=-1))
-    squared = radius**2 - np.sum(centre * centre, axis=-1) + along**2
-    return 2 * np.sqrt(np.maximum(squared, 0))
+    x, y, z = np.moveaxis(ray, -1, 0)
+    a, b, c = np.moveaxis(centre, -1, 0)
+    along = (a * x + b * y + c * z) ** 2 / (x * x + y * y + z * z)
+    return 2 * np.sqrt(np.maximum(radius**2 - (a * a + b * b + c * c) + along, 0))
 
 
 def _path_in_box(
@@ -234,9 +250,11 @@ def _path_in_box(
     direction = np.where(np.abs(rays) < 1e-12, 1e-12, rays)
     first = (low - source) / direction
     second = (high - source) / direction
-    enter = np.minimum(first, second).max(axis=-1)
-    leave = np.maximum(first, second).min(axis=-1)
-    return np.maximum(leave - enter, 0)
+    enter = np.minimum(first, second)
+    leave = np.maximum(first, second)
+    last_in = np.maximum(np.maximum(enter[..., 0], enter[..., 1]), enter[..., 2])
+    first_out = np.minimum(np.minimum(leave[..., 0], leave[..., 1]), leave[..., 2])
+    return np.maximum(first_out - last_in, 0)
 
 
 def _depth_in_field(

@@ -1,0 +1,67 @@
+"""Images of a bag: sensor_msgs/Image and CompressedImage, without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from ..errors import DataError
+from ..images.codec import decode
+from .definitions import from_cdr
+from .frames import fluoroscope_of_topic
+from .reader import iterate_messages, topics_of
+from .storage import PathLike
+
+IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
+PIXEL_TYPES = {'mono8': 'u1', '8UC1': 'u1', 'mono16': 'u2', '16UC1': 'u2'}
+
+
+def image_topics(source: PathLike) -> dict[str, str]:
+    """Return the topics of a bag with images by fluoroscope, the part of the name before the last.
+
+    Where a fluoroscope has both, the images that are not compressed are taken. Raises DataError.
+    """
+    out: dict[str, str] = {}
+    for kind in (COMPRESSED_IMAGE, IMAGE):
+        for topic, info in topics_of(source).items():
+            if info.type == kind and info.count:
+                parts = [part for part in topic.split('/') if part]
+                name = parts[0] if len(parts) == 1 else fluoroscope_of_topic(topic)
+                out[name] = topic
+    return out
+
+
+def images_of_topic(source: PathLike, topic: str) -> Iterator[tuple[str, np.ndarray | DataError]]:
+    """Yield the images (h, w) of a topic with their places in words.
+
+    In place of an image that cannot be read there is the DataError that says why. Raises DataError
+    for a damaged bag.
+    """
+    kind = topics_of(source)[topic].type
+    for number, message in enumerate(iterate_messages(source, [topic]), 1):
+        try:
+            content = from_cdr(message.data, kind)
+            image = decode(content.data) if kind == COMPRESSED_IMAGE else _pixels(content)
+        except DataError as error:
+            yield f'{source}, topic {topic}, message {number}', error
+        else:
+            yield f'{source}, topic {topic}, message {number}', image
+
+
+def _pixels(message: Any) -> np.ndarray:
+    """Grey values (h, w) of an Image. Raises DataError."""
+    if message.encoding not in PIXEL_TYPES:
+        raise DataError(f'the encoding {message.encoding} is none of {", ".join(PIXEL_TYPES)}')
+    order = '>' if message.is_bigendian else '<'
+    dtype = np.dtype(order + PIXEL_TYPES[message.encoding])
+    if message.step < message.width * dtype.itemsize:
+        raise DataError(f'a row has {message.step} bytes, too few for {message.width} px')
+    data = np.asarray(message.data, dtype=np.uint8)
+    if len(data) < message.step * message.height:
+        raise DataError('the image has fewer pixels than it says')
+    rows = data[: message.step * message.height].reshape(message.height, message.step)
+    grey = np.ascontiguousarray(rows[:, : message.width * dtype.itemsize]).view(dtype)
+    return grey.astype(dtype.newbyteorder('='), copy=False)

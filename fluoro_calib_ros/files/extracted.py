@@ -1,0 +1,46 @@
+"""Observations of images as CSV: `fluoroscope,exposure,target_id,u,v,sigma,overlapped`."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Mapping
+
+import numpy as np
+
+from ..exposures.frame import Frame
+from .access import check_safe_name
+from .atomic import atomic_file
+from .csv_table import write_rows
+from .observations import COLUMNS
+
+DECIMALS = 4  # of a pixel, and of its standard deviation
+
+
+def write_extracted(
+    path: str | os.PathLike[str],
+    frames: Iterable[tuple[Frame, np.ndarray]],
+    target_names: Mapping[int, str],
+) -> None:
+    """Write frames, each with its flags (n,) of overlapped beads, to a CSV file.
+
+    Beads with a name are written by it. Raises DataError where the file cannot be written.
+    """
+    with atomic_file(path, 'w') as file:
+        write_rows(file, [(*COLUMNS, 'sigma', 'overlapped')])
+        for frame, overlapped in frames:
+            check_safe_name(frame.fluoroscope, path)
+            assert frame.sigma is not None
+            numbers = np.round(np.column_stack([frame.uv, frame.sigma]), DECIMALS).tolist()
+            write_rows(
+                file,
+                (
+                    [
+                        frame.fluoroscope,
+                        frame.number,
+                        target_names.get(int(target), int(target)),
+                        *row,
+                        int(flag),
+                    ]
+                    for target, row, flag in zip(frame.target_id, numbers, overlapped)
+                ),
+            )

@@ -1,0 +1,167 @@
+"""Images of files, folders, stacks, videos and bags, one after the other, with their exposures."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..bags.images import image_topics, images_of_topic
+from ..bags.reader import topics_of
+from ..errors import DataError
+from ..files.image_formats import IMAGE_SUFFIXES, VIDEO_CODECS, listed, suffix_of
+from ..files.image_reading import open_images
+
+BAG_SUFFIXES = ('.mcap', '.db3')
+
+
+@dataclass(frozen=True)
+class SourceImage:
+    """An image of a source.
+
+    Attributes
+    ----------
+    exposure : int
+    place : str
+        File, page or message, in words.
+    image : (h, w) ndarray or DataError
+        The error says why it cannot be read.
+    """
+
+    exposure: int
+    place: str
+    image: np.ndarray | DataError
+
+
+@dataclass(frozen=True)
+class ImageSources:
+    """Images of one fluoroscope: how many, 0 where it is not known, and the images."""
+
+    count: int
+    images: Callable[[], Iterator[SourceImage]]
+
+
+def open_sources(sources: Sequence[Path], fluoroscope: str = '') -> ImageSources:
+    """Open images of one fluoroscope.
+
+    An exposure has the number in the name of its file if all files have a different one, else its
+    place in the order of the sources. fluoroscope selects the topic of a bag with several. Raises
+    DataError for a source that cannot contain images.
+    """
+    files: list[Path] = []
+    topics: dict[Path, str] = {}
+    for source in sources:
+        if is_image_bag(source):
+            topics[source] = _topic(source, fluoroscope)
+            files.append(source)
+        elif source.is_dir():
+            files += _images_in(source)
+        else:
+            files.append(source)
+    if not files:
+        raise DataError('there are no images')
+    readers = [_reader(path, topics.get(path)) for path in files]
+    single = all(count == 1 for count, _ in readers)
+    numbers = [_number(path) for path in files]
+    numbered = single and None not in numbers and len(set(numbers)) == len(numbers)
+
+    def images() -> Iterator[SourceImage]:
+        exposure = 0
+        for (_, read), number in zip(readers, numbers):
+            for place, image in read():
+                exposure = number if numbered and number is not None else exposure + 1
+                yield SourceImage(exposure, place, image)
+
+    return ImageSources(sum(count for count, _ in readers), images)
+
+
+def is_image_bag(source: Path) -> bool:
+    """Return whether a source is a bag with images. Raises DataError for a damaged bag."""
+    folder = source.is_dir() and (source / 'metadata.yaml').exists()
+    if not folder and suffix_of(source) not in BAG_SUFFIXES:
+        return False
+    return bool(image_topics(source))
+
+
+def fluoroscope_folders(source: Path) -> dict[str, Path]:
+    """Return the folders with images in a folder, by name; empty for any other source."""
+    if not source.is_dir():
+        return {}
+    return {
+        path.name: path
+        for path in sorted(source.iterdir())
+        if path.is_dir() and any(suffix_of(file) in IMAGE_SUFFIXES for file in path.iterdir())
+    }
+
+
+def contains_images(source: Path) -> bool:
+    """Return whether a source is an image, a folder of images, a video, or a bag of images."""
+    if suffix_of(source) in (*IMAGE_SUFFIXES, *VIDEO_CODECS) and not source.is_dir():
+        return True
+    if source.is_dir() and not (source / 'metadata.yaml').exists():
+        direct = any(suffix_of(path) in IMAGE_SUFFIXES for path in source.iterdir())
+        return direct or bool(fluoroscope_folders(source))
+    if source.is_dir() or suffix_of(source) in BAG_SUFFIXES:
+        observations = 'fluoro_calib_msgs/msg/TargetObservations'
+        try:
+            known = [info.type for info in topics_of(source).values()]
+            return observations not in known and bool(image_topics(source))
+        except DataError:
+            return False  # the reader of bags says what is wrong
+    return False
+
+
+def _images_in(folder: Path) -> list[Path]:
+    """Return the images of a folder in the order of their names. Raises DataError for none."""
+    found = [path for path in folder.iterdir() if suffix_of(path) in IMAGE_SUFFIXES]
+    if not found:
+        raise DataError(f'{folder}: there are no images in this folder ({listed(IMAGE_SUFFIXES)})')
+    return sorted(found, key=lambda path: (_number(path) is None, _number(path) or 0, path.name))
+
+
+def _number(path: Path) -> int | None:
+    """Return the last number in the name of a file, None for none."""
+    numbers = re.findall(r'\d+', path.stem)
+    return int(numbers[-1][-9:]) if numbers else None
+
+
+def _topic(source: Path, fluoroscope: str) -> str:
+    """Return the topic of a fluoroscope in a bag. Raises DataError."""
+    topics = image_topics(source)
+    if fluoroscope in topics:
+        return topics[fluoroscope]
+    if len(topics) == 1:
+        return next(iter(topics.values()))
+    raise DataError(
+        f'{source}: there are no images of fluoroscope {fluoroscope!r}, only of '
+        f'{", ".join(sorted(topics))}'
+    )
+
+
+def _reader(
+    path: Path, topic: str | None
+) -> tuple[int, Callable[[], Iterator[tuple[str, np.ndarray | DataError]]]]:
+    """Return the number of images of a file, and a function that reads them."""
+    if topic is not None:
+        return topics_of(path)[topic].count, lambda: images_of_topic(path, topic)
+    try:
+        count = open_images(path).count
+    except DataError as error:
+        if not os.path.exists(path):
+            raise
+        damaged = error
+        return 1, lambda: iter([(str(path), damaged)])
+    return count, lambda: _read(path)
+
+
+def _read(path: Path) -> Iterator[tuple[str, np.ndarray | DataError]]:
+    """Yield the images of a file; an error in place of what cannot be read ends it."""
+    try:
+        for place, image in open_images(path).images:
+            yield place, image.copy()
+    except DataError as error:
+        yield str(path), error

@@ -31,7 +31,7 @@ from .held_calibration import (
     noise_of_calibrations,
     too_few_rays_for_noise,
 )
-from .initial_network import MIN_EXPOSURES, Frames, Measured, measured_network
+from .initial_network import MIN_EXPOSURES, Frames, Measured, StartValues, measured_network
 from .options import CalibrationOptions
 from .request import CalibrationRequest
 from .result import FluoroscopeCalibration, digest_of_sources
@@ -204,8 +204,11 @@ def calibrate_request(
     request: CalibrationRequest,
     progress: Callable[[str, Round], None] | None = None,
     raise_if_cancelled: Callable[[], None] | None = None,
+    starts: StartValues | None = None,
 ) -> CalibrationResult:
     """Self-calibrate the fluoroscopes of a request; see `calibrate` for the other arguments.
+
+    starts: of an earlier calibration with these exposures.
 
     Raises DataError and ValueError as `calibrate`, ValueError also for options that exclude known
     orientations.
@@ -223,7 +226,7 @@ def calibrate_request(
             label = '+'.join(group)
             of_group = {name: request.frames[name] for name in group}
             run = _calibrated_group(
-                request, of_group, _progress_of(label, progress), raise_if_cancelled
+                request, of_group, _progress_of(label, progress), raise_if_cancelled, starts
             )
             seconds = time.perf_counter() - start
             runs[label] = run
@@ -287,6 +290,7 @@ def _calibrated_group(
     frames: Frames,
     progress: Callable[[Round], None] | None,
     raise_if_cancelled: Callable[[], None] | None,
+    starts: StartValues | None,
 ) -> SelfCalibration:
     """Calibrate fluoroscopes in one adjustment, without exposures of which too little fits."""
     left_out: tuple[str, ...] = ()
@@ -297,6 +301,7 @@ def _calibrated_group(
             request.principal_distance,
             raise_if_cancelled,
             request.known_orientations,
+            starts,
         )
         run = self_calibrate(measured, request.options, progress, raise_if_cancelled)
         misfits = misfitting_exposures(run)
@@ -351,6 +356,7 @@ def adjust_with_calibrations(
     loss: str = 'student_t',
     raise_if_cancelled: Callable[[], None] | None = None,
     known: Mapping[str, KnownOrientation] | None = None,
+    starts: StartValues | None = None,
 ) -> CalibrationResult:
     """Adjust frames with calibrations held: interior orientations and corrections do not change.
 
@@ -364,6 +370,11 @@ def adjust_with_calibrations(
         Noise model of the image points.
     raise_if_cancelled : callable, optional
         Called before every step; may raise to stop.
+    known : mapping of str to KnownOrientation, optional
+        Orientations that are known beforehand, by fluoroscope.
+    starts : StartValues, optional
+        Of an earlier adjustment of the frames. The residuals without correction are then not
+        computed again, their RMSE is NaN.
 
     Returns
     -------
@@ -380,7 +391,7 @@ def adjust_with_calibrations(
             validate_frame(frame, phantom, calibrations[name].image_size)
     with threadpool_limits(1):
         measured = network_of_calibrations(
-            frames, phantom, calibrations, raise_if_cancelled, known
+            frames, phantom, calibrations, raise_if_cancelled, known, starts
         )
         correction, network = held_corrections(measured, calibrations)
         after, precise = adjusted_with_precision(
@@ -391,14 +402,16 @@ def adjust_with_calibrations(
             raise_if_cancelled=raise_if_cancelled,
             noise_held=too_few_rays_for_noise(network),
         )
-        before, _ = adjusted_with_precision(
-            network,
-            after.parameters,
-            np.zeros_like(correction),
-            after.noise,
-            TOLERANCE_WITHOUT_CORRECTION,
-            raise_if_cancelled,
-        )
+        before = None
+        if starts is None:
+            before, _ = adjusted_with_precision(
+                network,
+                after.parameters,
+                np.zeros_like(correction),
+                after.noise,
+                TOLERANCE_WITHOUT_CORRECTION,
+                raise_if_cancelled,
+            )
     figures = {
         name: _figures(measured, before, after, precise, f, calibrations[name].model)
         for f, name in enumerate(frames)
@@ -457,13 +470,13 @@ def _rows_of(measured: Measured, f: int) -> np.ndarray:
 
 def _figures(
     measured: Measured,
-    before: Adjustment,
+    before: Adjustment | None,
     after: Adjustment,
     precise: Precision,
     f: int,
     model: CorrectionModel,
 ) -> FluoroscopeResult:
-    """Figures of fluoroscope number f of an adjustment."""
+    """Figures of fluoroscope number f of an adjustment; before: the one without correction."""
     rows = _rows_of(measured, f)
     exposures = []
     for j in np.flatnonzero(measured.network.fluoroscope == f):
@@ -483,7 +496,7 @@ def _figures(
         measured.image_size[f],
         model.kind,
         model.k,
-        rmse_of_inliers(before, rows),
+        np.full(2, np.nan) if before is None else rmse_of_inliers(before, rows),
         rmse_of_inliers(after, rows),
         len(rows),
         int(after.inliers[rows].sum()),

@@ -10,7 +10,14 @@ import numpy as np
 from ..exposures.phantom import Phantom
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
-from .initial_network import Frames, Known, KnownSensor, Measured, network_of_known_sensors
+from .initial_network import (
+    Frames,
+    Known,
+    KnownSensor,
+    Measured,
+    StartValues,
+    network_of_known_sensors,
+)
 from .result import FluoroscopeCalibration
 from .robust_adjustment import start_noise
 
@@ -25,18 +32,19 @@ def network_of_calibrations(
     calibrations: Mapping[str, FluoroscopeCalibration],
     raise_if_cancelled: Callable[[], None] | None = None,
     known: Known | None = None,
+    starts: StartValues | None = None,
 ) -> Measured:
     """Return network and start values of frames {fluoroscope: [Frame, ...]}.
 
     calibrations {fluoroscope: FluoroscopeCalibration} are held, as are exterior orientations that
-    are known {fluoroscope: KnownOrientation}. Raises DataError as
-    `measured_network`.
+    are known {fluoroscope: KnownOrientation}. starts: of an earlier adjustment of the frames.
+    Raises DataError as `measured_network`.
     """
     sensors = {
         name: KnownSensor(calibrations[name].interior, calibrations[name].model.predict)
         for name in frames
     }
-    return network_of_known_sensors(frames, phantom, sensors, raise_if_cancelled, known)
+    return network_of_known_sensors(frames, phantom, sensors, raise_if_cancelled, known, starts)
 
 
 def held_corrections(

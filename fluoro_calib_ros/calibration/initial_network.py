@@ -14,7 +14,7 @@ from ..photogrammetry.exterior_prior import HELD_SD_MM, HELD_SD_RAD, ExteriorPri
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.network import Network
 from ..photogrammetry.plane_resection import flatness, plane_of, tilt_of
-from ..photogrammetry.resection import MIN_FLATNESS, Resection, resection_at
+from ..photogrammetry.resection import MIN_FLATNESS, Resection, refine_resection, resection_at
 from ..photogrammetry.rotations import rotation_angle
 from ..photogrammetry.unknowns import EXTERIOR_SIZE, Parameters
 from .start_orientation import (
@@ -91,6 +91,22 @@ class KnownSensor:
 
 
 @dataclass(frozen=True)
+class StartValues:
+    """Start values from an earlier adjustment of the same exposures, instead of resections.
+
+    Attributes
+    ----------
+    interior : mapping of str to (3,) ndarray
+        xp, yp, c [px] by fluoroscope.
+    exterior : mapping of (str, int) to ((3, 3) ndarray, (3,) ndarray)
+        Rotation and position [mm] by fluoroscope and exposure.
+    """
+
+    interior: Mapping[str, np.ndarray]
+    exterior: Mapping[tuple[str, int], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True)
 class _Task:
     """What start values are made from; sensors None: the fluoroscopes are to be calibrated."""
 
@@ -99,6 +115,16 @@ class _Task:
     principal_distance: float | None
     known: Known
     raise_if_cancelled: Callable[[], None] | None
+    starts: StartValues | None = None
+
+    def has_starts(self, name: str, frames: Sequence[Frame]) -> bool:
+        """Whether there are start values of all these exposures of a fluoroscope."""
+        starts = self.starts
+        return (
+            starts is not None
+            and name in starts.interior
+            and all((name, frame.number) in starts.exterior for frame in frames)
+        )
 
     def min_exposures(self, name: str, untilted: bool = True) -> int:
         """Number of exposures that a fluoroscope needs; untilted: of flat targets at rest."""
@@ -133,6 +159,7 @@ def measured_network(
     principal_distance: float | None = None,
     raise_if_cancelled: Callable[[], None] | None = None,
     known: Known | None = None,
+    starts: StartValues | None = None,
 ) -> Measured:
     """Return network and start values of the frames of fluoroscopes that are to be calibrated.
 
@@ -146,6 +173,8 @@ def measured_network(
         Called for every exposure; may raise to stop.
     known : mapping of str to KnownOrientation, optional
         Orientations that are known beforehand, by fluoroscope.
+    starts : StartValues, optional
+        Used for a fluoroscope with start values of all its exposures.
 
     Returns
     -------
@@ -157,7 +186,7 @@ def measured_network(
         If a frame is invalid, if exposures or targets are too few, or if all exposures show one
         pose.
     """
-    task = _Task(phantom, None, principal_distance, known or {}, raise_if_cancelled)
+    task = _Task(phantom, None, principal_distance, known or {}, raise_if_cancelled, starts)
     return _measured(
         task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
     )
@@ -169,13 +198,14 @@ def network_of_known_sensors(
     sensors: Mapping[str, KnownSensor],
     raise_if_cancelled: Callable[[], None] | None = None,
     known: Known | None = None,
+    starts: StartValues | None = None,
 ) -> Measured:
     """Return network and start values with interior orientations and corrections held.
 
     One exposure of a fluoroscope is enough. The arguments and errors are those of
     `measured_network`; sensors {fluoroscope: KnownSensor}.
     """
-    task = _Task(phantom, sensors, None, known or {}, raise_if_cancelled)
+    task = _Task(phantom, sensors, None, known or {}, raise_if_cancelled, starts)
     return _measured(
         task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
     )
@@ -224,11 +254,12 @@ def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
     untilted = False
     if name in task.known:
         found, interior, misfits = _place_all(task, name, ordered)
+    elif task.has_starts(name, ordered):
+        found, interior, misfits = _start_all(task, name, ordered)
     else:
         found, interior, misfits = _resect_all(task, name, ordered)
-        if task.sensors is None:
-            untilted = _are_untilted(task, ordered, found)
     if task.sensors is None and name not in task.known:
+        untilted = _are_untilted(task, ordered, found)
         _require_determined(task, name, found, untilted)
     left_out += misfits
     fitting = [(frame, one) for frame, one in zip(ordered, found) if one is not None]
@@ -264,6 +295,25 @@ def _place_all(
             resection_at(
                 known.rotation, known.position_mm, xyz, frame.uv - predict(frame.uv), interior
             )
+        )
+    return found, interior, _reject_misfits(frames, found)
+
+
+def _start_all(
+    task: _Task, name: str, frames: Sequence[Frame]
+) -> tuple[list[Resection | None], np.ndarray, list[str]]:
+    """Start values that are given for the frames of one fluoroscope; returns as _resect_all."""
+    assert task.starts is not None
+    sensor = None if task.sensors is None else task.sensors[name]
+    predict = np.zeros_like if sensor is None else sensor.predict
+    interior = task.starts.interior[name] if sensor is None else np.asarray(sensor.interior)
+    found: list[Resection | None] = []
+    for frame in frames:
+        rotation, position = task.starts.exterior[name, frame.number]
+        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        # The sensor may have another gauge than that of the earlier adjustment.
+        found.append(
+            refine_resection(xyz, frame.uv - predict(frame.uv), interior, rotation, position)
         )
     return found, interior, _reject_misfits(frames, found)
 

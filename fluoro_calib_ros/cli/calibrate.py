@@ -19,7 +19,15 @@ from .arguments import (
     file_settings,
     number_in,
 )
-from .output import ProgressBar, print_note, print_notes, print_result, print_round, print_unpaired
+from .output import (
+    ProgressBar,
+    print_note,
+    print_notes,
+    print_result,
+    print_round,
+    print_step,
+    print_unpaired,
+)
 
 if TYPE_CHECKING:
     from ..jobs.sources import Recording, Survey
@@ -80,6 +88,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='calibrate even if the input or the result cannot be right, for example with another '
         'phantom; the reasons are written to result.json',
+    )
+    parser.add_argument(
+        '--fast',
+        action='store_true',
+        help='write neither the verdict (see validate) nor the report; they take two to '
+        'three times as long as the calibration',
     )
     parser.add_argument(
         '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
@@ -147,11 +161,13 @@ def run(arguments: argparse.Namespace) -> None:
     from ..exposures.names import Names
     from ..files.phantom import has_exposures, read_moving_points
     from ..files.result_document import result_document
+    from ..files.validation import validation_document
     from ..jobs.calibration import run_calibration
     from ..jobs.image_sources import contains_images
     from ..jobs.result_folder import check_result_folder, save_outcome
     from ..jobs.sources import read_orientations, read_source, read_survey
     from ..report.tables import summary_table
+    from ..report.verdict import verdict_line
 
     inputs = (arguments.source, arguments.phantom, *arguments.known_orientation)
     check_result_folder(arguments.out, inputs)
@@ -195,7 +211,13 @@ def run(arguments: argparse.Namespace) -> None:
         names,
         known,
     )
-    outcome = run_calibration(request, force=arguments.force, progress=print_round)
+    outcome = run_calibration(
+        request,
+        validate=not arguments.fast,
+        force=arguments.force,
+        progress=print_round,
+        report_step=print_step,
+    )
 
     def write_more(folder: Path) -> None:
         if arguments.figures:
@@ -211,7 +233,27 @@ def run(arguments: argparse.Namespace) -> None:
     for sentence in outcome.doubts:
         print_note(f'this cannot be right: {sentence}')
     document = {**result_document(outcome.result), 'doubts': list(outcome.doubts)}
-    print_result(arguments, document, summary_table(outcome.result))
+    lines = [summary_table(outcome.result).rstrip()]
+    if outcome.validation is not None:
+        report = _report(arguments.out)
+        document |= {'validation': validation_document(outcome.validation), 'report': report}
+        lines += ['', verdict_line(outcome.validation)]
+        lines += [f'Report: {report}'] if report else []
+    print_result(arguments, document, '\n'.join(lines))
+
+
+def _report(directory: Path) -> str | None:
+    """Write the report and return its path; None where it cannot be written, which is no failure.
+
+    A regressor of the user is not named by files, and the report reads files.
+    """
+    from ..jobs.report import write_report
+
+    try:
+        return write_report(directory)
+    except DataError as error:
+        print_note(f'no report: {error}')
+        return None
 
 
 def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recording:

@@ -100,6 +100,7 @@ def run_calibration(
     force: bool = False,
     rig: Rig | None = None,
     progress: Progress | None = None,
+    report_step: Callable[[str, int, int], None] | None = None,
     raise_if_cancelled: Cancellation | None = None,
 ) -> CalibrationOutcome:
     """Self-calibrate the fluoroscopes of a request, and orient the rig.
@@ -119,6 +120,8 @@ def run_calibration(
         Further fluoroscopes of the rig.
     progress : callable, optional
         Called with the names of the fluoroscopes and the Round after every round.
+    report_step : callable, optional
+        Called as the progress of `validation.verdict.validate`.
     raise_if_cancelled : callable, optional
         Called before every step; may raise to stop the job.
 
@@ -152,7 +155,7 @@ def run_calibration(
     validation = None
     if validate:
         validation = validate_or_report(
-            request, result.calibrations, raise_if_cancelled=raise_if_cancelled
+            request, result.calibrations, report_step, raise_if_cancelled
         )
     return CalibrationOutcome(request, result, rig, orientation, note, validation, tuple(doubts))
 

@@ -184,7 +184,11 @@ class _NielsenDamping:
         self._growth = 2.0
 
     def accept(self, gain: float) -> None:
-        """Update after an accepted step; gain: actual over predicted decrease."""
+        """Update after an accepted step; gain: actual over predicted decrease.
+
+        At a minimum both are rounding errors, and their ratio may be any number.
+        """
+        gain = min(max(gain, 0.0), 2.0)
         self.mu = max(self.mu * max(1 / 3, 1 - (2 * gain - 1) ** 3), self.MIN)
         self._growth = 2.0
 

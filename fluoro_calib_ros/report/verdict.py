@@ -46,5 +46,18 @@ def verdict_text(validation: Validation) -> str:
     return '\n'.join(lines) + '\n'
 
 
+def verdict_line(validation: Validation) -> str:
+    """Format the verdict in one line, with the accuracy achieved or the first thing to do."""
+    text = f'Verdict: {validation.verdict}'
+    if validation.verdict == 'pass':
+        achieved = [
+            f'{_shortened(name)} {sd:.3f} px' for name, sd in validation.achieved_sd_px.items()
+        ]
+        return f'{text}; corrections to (sd) {", ".join(achieved)}'
+    findings = validation.findings
+    more = f' ({len(findings) - 1} more in the report)' if len(findings) > 1 else ''
+    return f'{text}; {findings[0]}{more}' if findings else text
+
+
 def _shortened(name: str) -> str:
     return name if len(name) <= MAX_NAME else name[: MAX_NAME - 3] + '...'

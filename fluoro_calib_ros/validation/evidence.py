@@ -9,10 +9,14 @@ from functools import cached_property
 import numpy as np
 
 from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations, calibrate_request
+from ..calibration.initial_network import StartValues
+from ..calibration.options import AUTO
 from ..calibration.request import CalibrationRequest
 from ..calibration.result import FluoroscopeCalibration
+from ..distortion.registry import selectable_models
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
+from ..photogrammetry.rotations import matrix_from_quaternion
 from .check import Check
 from .residual_tests import Residuals, ResidualTrend, common_trend, residuals_of
 
@@ -94,6 +98,18 @@ class Evidence:
         claimed = float(np.sqrt(np.mean(calibration.model.evaluate(inliers.uv).sd ** 2)))
         return CommonTrend(inliers, common_trend(inliers, calibration.image_size), claimed)
 
+    @cached_property
+    def starts(self) -> StartValues:
+        """Start values of the adjustments of parts."""
+        return StartValues(
+            {name: calibration.interior for name, calibration in self.calibrations.items()},
+            {
+                (name, e.exposure): (matrix_from_quaternion(e.quaternion_wxyz), e.position_mm)
+                for name, figures in self.result.fluoroscopes.items()
+                for e in figures.exposures
+            },
+        )
+
     def fewest_exposures(self, names: Sequence[str]) -> int:
         """Return the number of exposures of the fluoroscope that has the fewest."""
         return min(len(self.frames[name]) for name in names)
@@ -115,8 +131,13 @@ class Evidence:
         if options.interior == 'fixed':  # as in the calibration that is validated
             distance = float(np.mean([self.calibrations[name].interior[2] for name in frames]))
         options = replace(options, max_iterations=min(options.max_iterations, MAX_ROUNDS))
+        kinds = {self.calibrations[name].model.kind for name in frames}
+        if options.model == AUTO and len(kinds) == 1 and kinds <= set(selectable_models()):
+            options = replace(options, model=kinds.pop())  # the one that is validated
         part = replace(self.request, frames=frames, options=options, principal_distance=distance)
-        return calibrate_request(part, raise_if_cancelled=self.raise_if_cancelled).calibrations
+        return calibrate_request(
+            part, raise_if_cancelled=self.raise_if_cancelled, starts=self.starts
+        ).calibrations
 
     def adjust(
         self,
@@ -131,6 +152,7 @@ class Evidence:
             self.request.options.loss,
             self.raise_if_cancelled,
             self.request.known_orientations,
+            self.starts,
         )
 
 

@@ -108,6 +108,14 @@ def test_pairing_by_stamp(tmp_path, frames, capsys):
         assert one.number == other.number and other.stamp_ns - one.stamp_ns == 1_500_000
     narrow = BagSelection(pair_by='stamp', tolerance_s=0.001)
     assert read_source(tmp_path / 'bag', selection=narrow).unpaired == {'a': 4, 'b': 3}
-    arguments = ('calibrate', tmp_path / 'bag', '--phantom', 'p.csv', '--out', tmp_path / 'o')
+    arguments = (
+        'calibrate',
+        tmp_path / 'bag',
+        '--phantom',
+        'p.csv',
+        '--out',
+        tmp_path / 'o',
+        '--fast',
+    )
     assert run(*arguments, '--pair-by', 'color') == 2
     assert 'invalid choice' in capsys.readouterr().err

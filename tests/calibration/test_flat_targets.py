@@ -178,6 +178,13 @@ def test_the_command_calibrates_a_grid(tmp_path):
     write_observations_csv(tmp_path / 'grid.csv', {'a': exposures([15, 30, 35, 25])})
     write_phantom(tmp_path / 'phantom.csv', SURVEY)
     arguments = ('calibrate', tmp_path / 'grid.csv', '--image-size', '1024x1024', '--phantom')
-    arguments += (tmp_path / 'phantom.csv', '--model', 'none', '--out', tmp_path / 'result')
+    arguments += (
+        tmp_path / 'phantom.csv',
+        '--model',
+        'none',
+        '--out',
+        tmp_path / 'result',
+        '--fast',
+    )
     assert rigs.run(*arguments) == 0
     assert load_calibrations(tmp_path / 'result')['a'].exposures == 4

@@ -225,6 +225,7 @@ def test_command_line_constrains_the_relative_orientation(files):
             '50,50,200',
             '--principal-distance',
             '4000',
+            '--fast',
         ]
     )
     document = json.loads((files[1] / 'result.json').read_text())

@@ -224,6 +224,7 @@ def test_the_command_takes_markers_in_motion(motion, tmp_path, capsys):
         '1024x1024',
         '--model',
         'none',
+        '--fast',
     )
     arguments += ('--phantom', tmp_path / 'points.csv', '--out', tmp_path / 'result')
     assert rigs.run(*arguments, '--known-orientation', tmp_path / 'known.yaml', '--force') == 0

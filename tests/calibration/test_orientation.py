@@ -528,6 +528,7 @@ def test_calibrate_writes_an_orientation(folder, tmp_path, capsys):
         folder / 'phantom.csv',
         '--model',
         'none',
+        '--fast',
     )
     path = tmp_path / 'both' / 'rig_orientation.npz'
     assert run(*write, '--out', tmp_path / 'one', '--fluoroscopes', 'a') == 0

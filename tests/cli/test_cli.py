@@ -2,6 +2,7 @@
 
 import csv
 import filecmp
+import html
 import json
 import os
 import pathlib
@@ -65,6 +66,7 @@ def result(rig, tmp_path_factory):
             folder,
             '--max-iterations',
             2,
+            '--fast',
         )
         == 0
     )
@@ -72,7 +74,8 @@ def result(rig, tmp_path_factory):
 
 
 def calibrate(rig, out, *more, source='calibration', phantom='phantom.csv'):
-    return ('calibrate', rig / source, '--phantom', rig / phantom, '--out', out, *more)
+    files = ('--phantom', rig / phantom, '--out', out)
+    return ('calibrate', rig / source, *files, '--fast', *more)
 
 
 def said(capsys, arguments, status=1):
@@ -642,3 +645,14 @@ def test_exposures_that_are_left_out_are_reported(rig, tmp_path, capsys):
     document = json.loads(out)
     assert document['left_out'] == [err[len('not used: ') : -1]]
     check_result(document, ['a'], [n for n in range(1, 16) if n != 3])
+
+
+def test_calibrate_ends_with_verdict_and_report(rig, tmp_path, capsys):
+    arguments = (rig / 'calibration', '--phantom', rig / 'phantom.csv', '--out', tmp_path / 'new')
+    assert run('calibrate', *arguments, '--fluoroscopes', 'a', '--model', 'none') == 0
+    *_, verdict, report = capsys.readouterr().out.strip().splitlines()
+    found = json.loads((tmp_path / 'new' / 'validation.json').read_text())
+    assert verdict.startswith(f'Verdict: {found["verdict"]}; ')
+    assert report == f'Report: {tmp_path / "new" / "report.html"}'
+    text = (tmp_path / 'new' / 'report.html').read_text()
+    assert found['findings'][0].split(';')[0] in html.unescape(text)

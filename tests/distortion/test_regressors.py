@@ -285,7 +285,14 @@ def test_command_calibrates_with_a_user_regressor(tmp_path, capsys):
     write_observations_csv(tmp_path / 'points.csv', {'a': rigs.exposures()['a'][:6]})
     write_phantom(tmp_path / 'phantom.csv', rigs.rig().phantom)
     source = ['--phantom', tmp_path / 'phantom.csv', '--image-size', '1024x1024']
-    command = ['calibrate', tmp_path / 'points.csv', *source, '--out', tmp_path / 'result']
+    command = [
+        'calibrate',
+        tmp_path / 'points.csv',
+        *source,
+        '--out',
+        tmp_path / 'result',
+        '--fast',
+    ]
     status = rigs.run(*command, '--model', 'test_regressors:cubic', '--max-iterations', 2)
     assert status == 0, capsys.readouterr().err
     assert load_calibration(str(tmp_path / 'result' / 'a.calibration.npz')).model.kind == 'lookup'

@@ -19,7 +19,7 @@ from fluoro_calib_ros.files.phantom import read_phantom
 from fluoro_calib_ros.jobs.sources import read_source, read_survey
 
 IMAGE = ('--image-size', '1024x1024')
-FAST = ('--model', 'parametric', '--max-iterations', '3')
+FAST = ('--model', 'parametric', '--max-iterations', '3', '--fast')
 
 
 @pytest.fixture(scope='module')

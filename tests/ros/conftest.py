@@ -87,6 +87,7 @@ def by_command(tmp_path_factory):
                 BAGS / 'phantom.csv',
                 '--out',
                 folder,
+                '--fast',
             ],
             cwd=ROOT,
             stdout=subprocess.DEVNULL,

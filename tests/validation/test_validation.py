@@ -415,6 +415,7 @@ def folder(tmp_path_factory):
         run(
             'calibrate',
             place / 'few.csv',
+            '--fast',
             '--image-size',
             '1024x1024',
             '--phantom',

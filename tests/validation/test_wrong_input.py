@@ -316,7 +316,7 @@ def test_single_points_that_cannot_be_used_are_left_out_and_counted(tmp_path, ca
     write_observations_csv(tmp_path / 'observations.csv', {'a': seen})
     write_phantom(tmp_path / 'phantom.csv', PHANTOM)
     arguments = ('--image-size', '1024x1024', '--phantom', tmp_path / 'phantom.csv')
-    arguments += ('--model', 'none', '--out', tmp_path / 'result')
+    arguments += ('--model', 'none', '--out', tmp_path / 'result', '--fast')
     assert run('calibrate', tmp_path / 'observations.csv', *arguments) == 0
     said = capsys.readouterr().err
     assert 'the point (1024.2, ' in said

@@ -30,6 +30,9 @@ from .output import (
 )
 
 if TYPE_CHECKING:
+    from ..calibration.options import CalibrationOptions
+    from ..calibration.request import CalibrationRequest
+    from ..jobs.calibration import CalibrationOutcome
     from ..jobs.sources import Recording, Survey
 
 NAME = 'calibrate'
@@ -156,63 +159,13 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Self-calibrate and write the result folder. Raises DataError."""
-    from ..calibration.options import CalibrationOptions
-    from ..calibration.request import CalibrationRequest
-    from ..exposures.names import Names
-    from ..files.phantom import has_exposures, read_moving_points
-    from ..files.result_document import result_document
-    from ..files.validation import validation_document
     from ..jobs.calibration import run_calibration
-    from ..jobs.image_sources import contains_images
     from ..jobs.result_folder import check_result_folder, save_outcome
-    from ..jobs.sources import read_orientations, read_source, read_survey
-    from ..report.tables import summary_table
-    from ..report.verdict import verdict_line
 
     inputs = (arguments.source, arguments.phantom, *arguments.known_orientation)
     check_result_folder(arguments.out, inputs)
-    known = read_orientations(arguments.known_orientation, file_settings(arguments))
-    moving = bool(known) and has_exposures(arguments.phantom)
-    survey = None if moving else read_survey(arguments.phantom, file_settings(arguments))
-    names = Names() if survey is None else survey.names
-    if contains_images(arguments.source):
-        recording = _extracted(arguments, survey)
-    else:
-        recording = read_source(
-            arguments.source,
-            image_size=arguments.image_size,
-            fluoroscopes=arguments.fluoroscopes,
-            collect=arguments.collect,
-            settings=file_settings(arguments, names=names),
-            selection=bag_selection(arguments),
-        )
-    print_notes((*(() if survey is None else survey.notes), *recording.notes))
-    print_unpaired(arguments.source, recording.unpaired)
-    options = CalibrationOptions(
-        **{
-            name: getattr(arguments, name)
-            for name in declared(CalibrationOptions)
-            if name not in INTERNAL
-        }
-    )
-    if survey is None:
-        # Its targets have an id in every exposure.
-        frames, phantom = read_moving_points(arguments.phantom).as_phantom(recording.frames)
-    else:
-        frames = recording.frames
-        phantom = survey.phantom
-        names = recording.names
-    request = CalibrationRequest(
-        frames,
-        phantom,
-        options,
-        arguments.joint,
-        arguments.principal_distance,
-        names,
-        known,
-    )
     outcome = run_calibration(
-        request,
+        _request(arguments),
         validate=not arguments.fast,
         force=arguments.force,
         progress=print_round,
@@ -226,7 +179,76 @@ def run(arguments: argparse.Namespace) -> None:
             write_figures(outcome.result, folder / 'figures')
 
     save_outcome(arguments.out, outcome, write_more=write_more)
-    if outcome.orientation is None and len(recording.frames) > 1:
+    _print(arguments, outcome)
+
+
+def _request(arguments: argparse.Namespace) -> CalibrationRequest:
+    """Read what the arguments name. Raises DataError."""
+    from ..calibration.request import CalibrationRequest
+    from ..exposures.names import Names
+    from ..files.phantom import has_exposures, read_moving_points
+    from ..jobs.sources import read_orientations, read_survey
+
+    known = read_orientations(arguments.known_orientation, file_settings(arguments))
+    moving = bool(known) and has_exposures(arguments.phantom)
+    survey = None if moving else read_survey(arguments.phantom, file_settings(arguments))
+    recording = _recording(arguments, survey)
+    print_notes((*(() if survey is None else survey.notes), *recording.notes))
+    print_unpaired(arguments.source, recording.unpaired)
+    if survey is None:
+        # Its targets have an id in every exposure.
+        frames, phantom = read_moving_points(arguments.phantom).as_phantom(recording.frames)
+        names = Names()
+    else:
+        frames = recording.frames
+        phantom = survey.phantom
+        names = recording.names
+    return CalibrationRequest(
+        frames,
+        phantom,
+        _options(arguments),
+        arguments.joint,
+        arguments.principal_distance,
+        names,
+        known,
+    )
+
+
+def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recording:
+    """Read or extract the observations. Raises DataError."""
+    from ..exposures.names import Names
+    from ..jobs.image_sources import contains_images
+    from ..jobs.sources import read_source
+
+    if contains_images(arguments.source):
+        return _extracted(arguments, survey)
+    names = Names() if survey is None else survey.names
+    return read_source(
+        arguments.source,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+        collect=arguments.collect,
+        settings=file_settings(arguments, names=names),
+        selection=bag_selection(arguments),
+    )
+
+
+def _options(arguments: argparse.Namespace) -> CalibrationOptions:
+    """Return the options of the calibration."""
+    from ..calibration.options import CalibrationOptions
+
+    names = [name for name in declared(CalibrationOptions) if name not in INTERNAL]
+    return CalibrationOptions(**{name: getattr(arguments, name) for name in names})
+
+
+def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
+    """Print notes, the summary, and the verdict with the report."""
+    from ..files.result_document import result_document
+    from ..files.validation import validation_document
+    from ..report.tables import summary_table
+    from ..report.verdict import verdict_line
+
+    if outcome.orientation is None and len(outcome.request.frames) > 1:
         print_note(f'no orientation of the rig: {outcome.orientation_note}')
     for sentence in outcome.result.left_out:
         print_note(f'not used: {sentence}')

@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from fluoro_calib_msgs.msg import CorrectedObservations
+from rcl_interfaces.srv import SetParameters
+from rclpy.parameter import Parameter
 from ros_graph import BAGS, NAMES, entry_point, value_of
 
 from fluoro_calib_ros.files.rig_orientation import load_orientation, orientation_path
@@ -218,6 +220,37 @@ def test_only_the_false_match_is_rejected(rig, tracking):
         and np.isfinite(np.array(message.x)[1:23]).all()
     )
     assert min(np.array(message.residual)[[0, 23]]) > 1.0
+
+
+def test_thresholds_can_be_set_while_it_runs(rig, tracking):
+    """With a threshold of 1000 standard deviations a shift of 5 px is accepted."""
+    client = rig.client
+    client.expect(SetParameters, 'reconstruction_node/set_parameters')
+    client.wait_until_known_to('reconstruction_node')
+
+    def set_parameter(name, value):
+        parameter = Parameter(name, value=value).to_parameter_msg()
+        answer = client.call(
+            SetParameters, 'reconstruction_node/set_parameters', parameters=[parameter]
+        )
+        return answer.results[0]
+
+    def rejected(number):
+        def shifted(frame):
+            uv = frame.uv + ([[0.0, 5.0]] if frame.fluoroscope == 'b' else 0.0)
+            return replace(frame, number=number, uv=uv)
+
+        publish(client, tracking, [7], shifted)
+        (message,) = [m for m in rig.points if m.frame_number == number]
+        return message.REJECTED in message.status
+
+    assert rejected(90_101)
+    assert set_parameter('reject', 1000.0).successful
+    assert not rejected(90_102)
+    assert 'reject' in set_parameter('reject', 0.5).reason
+    assert set_parameter('reject', 4.0).successful
+    assert rejected(90_103)
+    assert 'is read when the node starts' in set_parameter('rig_frame', 'other').reason
 
 
 def test_target_in_a_single_view_is_reported(rig, tracking):

@@ -3,6 +3,7 @@ interrupt.
 """
 
 import shutil
+import signal
 from dataclasses import replace
 
 import pytest
@@ -206,6 +207,7 @@ def test_interrupt_in_the_stream_ends_every_node_cleanly(graph, by_command, expo
     )
     for node in reversed(nodes):
         node.interrupt()
+        node._process.send_signal(signal.SIGTERM)  # service managers send both at the same time
     client.wait_until(lambda: not any(n.running for n in nodes), 15, 'the nodes to end')
     for node in nodes:
         assert node.wait() == 0

@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable, Sequence
 
 import rclpy
@@ -18,6 +19,9 @@ from rclpy.signals import SignalHandlerOptions
 from .errors import USER_ERRORS, StartError, one_line
 
 INTERRUPTED = 130  # exit status after a second interrupt
+# Time in which further signals belong to the first one: launch and service managers signal a group
+# of processes and each of them, with SIGINT and SIGTERM.
+ONE_INTERRUPT_S = 1.0
 
 
 def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> None:
@@ -80,7 +84,7 @@ def _make(make_node: Callable[[], Node]) -> Node:
 def _call_on_interrupt(end: Callable[[], None]) -> None:
     """Call end() from a thread at SIGINT or SIGTERM, whatever the main thread waits for.
 
-    A second signal ends the process at once.
+    A second one, more than a second later, ends the process at once.
     """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
@@ -90,8 +94,10 @@ def _call_on_interrupt(end: Callable[[], None]) -> None:
 
     def watch() -> None:
         os.read(reading, 1)
+        first = time.monotonic()
         end()
-        os.read(reading, 1)
+        while time.monotonic() < first + ONE_INTERRUPT_S:
+            os.read(reading, 1)
         os._exit(INTERRUPTED)
 
     threading.Thread(target=watch, daemon=True).start()

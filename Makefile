@@ -2,7 +2,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test oldest lint docs bench online endurance validation precision convergence pathologies bags clean
+.PHONY: help setup demo test oldest lint docs bench online endurance validation precision convergence pathologies real-data bags clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
@@ -24,6 +24,7 @@ help:
 	@echo 'make precision    compare errors of 200 simulations with their standard deviations: docs/precision.md (5 min)'
 	@echo 'make convergence  calibrate 200 random rigs with poor start values: docs/convergence.md (15 min)'
 	@echo 'make pathologies  calibrate rigs unlike the virtual rig: docs/pathologies.md (30 min)'
+	@echo 'make real-data    calibrate public data of real cameras: docs/real_data.md (downloads 4 MB, 30 min)'
 	@echo 'make bags         regenerate the bags in bags/'
 	@echo 'make clean        delete .venv, .build and caches'
 	@echo
@@ -79,6 +80,9 @@ convergence: setup
 
 pathologies: setup
 	@$(RUN) -m benchmarks.pathologies.run $(ARGS)
+
+real-data: setup
+	@$(RUN) -m benchmarks.real_data --download $(ARGS)
 
 bags: setup
 	@.venv/bin/fluoro-calib simulate --out bags $(ARGS)

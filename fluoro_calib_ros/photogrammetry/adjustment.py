@@ -83,7 +83,7 @@ class Adjustment:
     @property
     def inliers(self) -> np.ndarray:
         """True (N,) for the image points in the core of the noise distribution."""
-        return self.noise.inliers(self.q)
+        return self.noise.accepts(self.q)
 
 
 def residuals_and_q(
@@ -103,6 +103,8 @@ def total_cost(network: Network, parameters: Parameters, q: np.ndarray, noise: N
 
     Infinite where a point is behind the source. Constants of Gaussian terms are left out.
     """
+    if not np.isfinite(q).all():
+        return np.inf
     square = sum(
         a @ additional.prior @ a
         for additional, a in zip(network.additional, parameters.additional)

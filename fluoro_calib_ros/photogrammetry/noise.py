@@ -38,6 +38,8 @@ MANY_GROSS_NU = 30.0
 MIN_REDUNDANCY = 0.05
 # 0.9999 quantile of chi-square with two degrees of freedom: about four sigma of each coordinate.
 INLIER_Q = -2 * np.log(1e-4)
+# Share of the true image points that may lie beyond the limit where the tails are heavy.
+MAX_REJECTED = 1e-3
 # Iterations of the estimation of the Student-t, and relative changes at which they end. Steps of
 # the scale are cheap compared with the search for nu.
 MAX_NU_STEPS = 50
@@ -134,6 +136,23 @@ class Noise:
     def inliers(self, q: np.ndarray) -> np.ndarray:
         """True (n,) where an image point belongs to the core of the distribution."""
         return q <= INLIER_Q
+
+    @property
+    def limit(self) -> float:
+        """Normalised square beyond which an image point is taken for a gross error.
+
+        About four sigma; of heavier tails, which a Student-t has with few degrees of freedom, the
+        quantile that rejects MAX_REJECTED of the true points: P(q > x) = (1 + x/nu)^(-nu/2) for
+        D = 2.
+        """
+        if self.loss != 'student_t':
+            return float(INLIER_Q)
+        tail = self.nu * (MAX_REJECTED ** (-2 / self.nu) - 1)
+        return float(max(INLIER_Q, tail))
+
+    def accepts(self, q: np.ndarray) -> np.ndarray:
+        """True (n,) where an image point is no gross error, for this noise with its own tails."""
+        return (q <= self.limit) & (self.core_probability(q) >= 0.5)
 
     def estimate_from(self, squared: ArrayLike, unresolved: ArrayLike = 0.0) -> Noise:
         """Noise model with its scale and, for Student-t, nu and share of gross errors estimated.

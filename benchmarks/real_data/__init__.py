@@ -1,0 +1,6 @@
+"""Calibrations from public data of real cameras, out of sample, beside OpenCV and mrcal.
+
+python -m benchmarks.real_data --list                     sources and licences
+python -m benchmarks.real_data --download                 fetch them into real_data/
+python -m benchmarks.real_data --data FOLDER [--mrcal PYTHON]   docs/real_data.md from data there
+"""

@@ -7,6 +7,8 @@ import signal
 import sys
 import threading
 import time
+import traceback
+from collections import deque
 from collections.abc import Callable, Sequence
 
 import rclpy
@@ -17,7 +19,9 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from .errors import USER_ERRORS, StartError, one_line
+from .guard import guard_services
 
+MAX_FAILURES = 100  # of callbacks within a second: nothing else works
 INTERRUPTED = 130  # exit status after a second interrupt
 # Time in which further signals belong to the first one: launch and service managers signal a group
 # of processes and each of them, with SIGINT and SIGTERM.
@@ -46,12 +50,10 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
         _call_on_interrupt(end)
         node = _make(make_node)
         executor.add_node(node)
+        guard_services(node)
         getattr(node, 'bring_up', lambda: None)()
         try:
-            while rclpy.ok() and not ended.is_set():
-                executor.spin_once()
-        except ExternalShutdownException:
-            pass
+            _spin(executor, node, ended)
         finally:
             getattr(node, 'stop', lambda: None)()
             executor.shutdown()
@@ -64,6 +66,30 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
             node.destroy_node()
         rclpy.try_shutdown()
     sys.exit(code)
+
+
+def _spin(executor: SingleThreadedExecutor, node: Node, ended: threading.Event) -> None:
+    """Run the callbacks of a node until it is to end.
+
+    What a callback raises is logged, and the node goes on: a message or request of any peer must
+    not end it. Where callbacks do nothing but raise, the last exception is raised.
+    """
+    failures: deque[float] = deque(maxlen=MAX_FAILURES)
+    while rclpy.ok() and not ended.is_set():
+        try:
+            executor.spin_once()
+        except ExternalShutdownException:
+            return
+        except Exception as error:
+            if not rclpy.ok() or ended.is_set():
+                return
+            failures.append(time.monotonic())
+            if len(failures) == MAX_FAILURES and failures[-1] - failures[0] < 1.0:
+                raise
+            place = traceback.extract_tb(error.__traceback__)[-1]
+            node.get_logger().error(
+                f'a callback failed ({place.name}, line {place.lineno}): {one_line(error)}'
+            )
 
 
 def _init(args: Sequence[str] | None) -> None:

@@ -1,0 +1,70 @@
+"""Requests of any peer that a node cannot handle: it refuses them, and goes on."""
+
+import pytest
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState, GetState
+from rcl_interfaces.msg import Parameter, ParameterValue
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
+from ros_graph import BAGS
+
+MANAGED = {
+    'correction_node': {},
+    'reconstruction_node': {},
+    'image_node': {},
+    'calibration_node': {'phantom': str(BAGS / 'phantom.csv')},
+}
+OTHERS = {
+    'simulator_node': {},
+    'player_node': {'bag': str(BAGS / 'calibration'), 'loop': 'true'},
+}
+
+
+@pytest.fixture(scope='module')
+def client(module_graph):
+    """Client of a graph with all these nodes."""
+    client = module_graph.client
+    for node in (*MANAGED, *OTHERS):
+        client.expect(SetParameters, f'{node}/set_parameters')
+        client.expect(SetParametersAtomically, f'{node}/set_parameters_atomically')
+        if node in MANAGED:
+            client.expect(ChangeState, f'{node}/change_state')
+            client.expect(GetState, f'{node}/get_state')
+    for node, parameters in {**MANAGED, **OTHERS}.items():
+        module_graph.start(node, parameters, wait=False)
+    for node in (*MANAGED, *OTHERS):
+        client.wait_until_known_to(node)
+    return client
+
+
+@pytest.mark.parametrize('node', [*MANAGED, *OTHERS])
+def test_parameter_of_unknown_type_is_refused(client, node):
+    wrong = Parameter(name='fluoroscopes', value=ParameterValue(type=99))
+    for _ in range(2):  # the second answer shows that the node has survived the first
+        found = client.call(SetParameters, f'{node}/set_parameters', parameters=[wrong, wrong])
+        assert [one.successful for one in found.results] == [False, False]
+        assert '99' in found.results[0].reason
+    found = client.call(
+        SetParametersAtomically, f'{node}/set_parameters_atomically', parameters=[wrong]
+    )
+    assert not found.result.successful
+
+
+@pytest.mark.parametrize('node', MANAGED)
+def test_transition_that_does_not_fit_the_state_is_refused(client, node):
+    def change(**transition):
+        return client.call(
+            ChangeState, f'{node}/change_state', transition=Transition(**transition)
+        ).success
+
+    def state():
+        return client.call(GetState, f'{node}/get_state').current_state.id
+
+    assert state() == State.PRIMARY_STATE_ACTIVE
+    for wrong in (0, 1, 2, 3, 10, 60, 99, 250):
+        assert not change(id=wrong)
+        assert state() == State.PRIMARY_STATE_ACTIVE
+    assert not change(label='nonsense')
+    assert change(id=Transition.TRANSITION_DEACTIVATE)
+    assert not change(id=Transition.TRANSITION_DEACTIVATE)
+    assert state() == State.PRIMARY_STATE_INACTIVE
+    assert change(id=Transition.TRANSITION_ACTIVATE)

@@ -10,6 +10,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 
 import rclpy
 from rclpy._rclpy_pybind11 import RCLError
@@ -26,6 +27,7 @@ INTERRUPTED = 130  # exit status after a second interrupt
 # Time in which further signals belong to the first one: launch and service managers signal a group
 # of processes and each of them, with SIGINT and SIGTERM.
 ONE_INTERRUPT_S = 1.0
+MAX_SIGNALS = 1000
 
 
 def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> None:
@@ -120,10 +122,13 @@ def _call_on_interrupt(end: Callable[[], None]) -> None:
 
     def watch() -> None:
         os.read(reading, 1)
-        first = time.monotonic()
         end()
-        while time.monotonic() < first + ONE_INTERRUPT_S:
-            os.read(reading, 1)
+        time.sleep(ONE_INTERRUPT_S)
+        os.set_blocking(reading, False)
+        with suppress(BlockingIOError):  # no further signal has come
+            os.read(reading, MAX_SIGNALS)
+        os.set_blocking(reading, True)
+        os.read(reading, 1)
         os._exit(INTERRUPTED)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -80,7 +80,7 @@ from .runtime.parameters import (
     default_calibration_directory,
     expand_path,
 )
-from .runtime.qos import latched_qos, observations_qos
+from .runtime.qos import latched_qos, observations_qos, services_qos
 from .runtime.stream_reader import FaultHandlers
 
 COLLECT_MODES = ('still', 'request')
@@ -295,7 +295,9 @@ class CalibrationNode(StreamNode):
             (SaveCalibration, 'save_calibration', self._on_save),
             (LoadCalibration, 'load_calibration', self._on_load),
         ):
-            service = self.create_service(kind, name, callback, callback_group=group)
+            service = self.create_service(
+                kind, name, callback, qos_profile=services_qos(), callback_group=group
+            )
             self.own(service, self.destroy_service, service)
         action = ActionServer(
             self,

@@ -26,7 +26,7 @@ from ..photogrammetry import rig_orientation
 from .messages.rig_orientation import message_from_orientation
 from .runtime.lifecycle import StreamNode
 from .runtime.parameters import check_timeout
-from .runtime.qos import latched_qos
+from .runtime.qos import latched_qos, services_qos
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ class OrientationService:
         self._present: rig_orientation.RigOrientation | None = None
         self._output = node.create_publisher(RigOrientation, 'rig_orientation', latched_qos())
         self._service = node.create_service(
-            Orient, 'orient', self._on_orient, callback_group=group
+            Orient, 'orient', self._on_orient, qos_profile=services_qos(), callback_group=group
         )
 
     @property

@@ -1,11 +1,14 @@
 """Requests of any peer that a node cannot handle: it refuses them, and goes on."""
 
 import pytest
+from fluoro_calib_msgs.srv import LoadCalibration
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterValue
 from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from ros_graph import BAGS
+
+from fluoro_calib_ros.nodes.runtime.qos import services_qos
 
 MANAGED = {
     'correction_node': {},
@@ -29,6 +32,9 @@ def client(module_graph):
         if node in MANAGED:
             client.expect(ChangeState, f'{node}/change_state')
             client.expect(GetState, f'{node}/get_state')
+    client.burst = client.create_client(
+        LoadCalibration, 'load_calibration', qos_profile=services_qos()
+    )
     for node, parameters in {**MANAGED, **OTHERS}.items():
         module_graph.start(node, parameters, wait=False)
     for node in (*MANAGED, *OTHERS):
@@ -68,3 +74,10 @@ def test_transition_that_does_not_fit_the_state_is_refused(client, node):
     assert not change(id=Transition.TRANSITION_DEACTIVATE)
     assert state() == State.PRIMARY_STATE_INACTIVE
     assert change(id=Transition.TRANSITION_ACTIVATE)
+
+
+def test_every_request_of_a_burst_is_answered(client, tmp_path):
+    request = LoadCalibration.Request(directory=str(tmp_path))
+    answers = [client.burst.call_async(request) for _ in range(50)]
+    client.wait_until(lambda: all(answer.done() for answer in answers), what='50 answers')
+    assert not any(answer.result().success for answer in answers)

@@ -15,6 +15,8 @@ OBSERVATION_DEPTH = 100
 # reader gets the newest ones.
 IMAGE_DEPTH = 10
 RECORDED_LATCHED_DEPTH = 100
+# Requests that come at once and are all answered; ROS's default is 10.
+REQUEST_DEPTH = 200
 
 
 def observations_qos() -> QoSProfile:
@@ -35,6 +37,11 @@ def latched_qos() -> QoSProfile:
 def recorded_latched_qos() -> QoSProfile:
     """Profile for playing latched topics: one player replays what many publishers have latched."""
     return _reliable(RECORDED_LATCHED_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
+
+
+def services_qos() -> QoSProfile:
+    """Profile of services: a burst of requests is queued, and every one of them is answered."""
+    return _reliable(REQUEST_DEPTH)
 
 
 def qos_overrides() -> QoSOverridingOptions:

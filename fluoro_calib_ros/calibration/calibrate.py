@@ -11,6 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..distortion.base import CorrectionModel
+from ..distortion.gauge import gauge_basis
 from ..exposures.frame import validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
@@ -504,16 +505,43 @@ def _figures(
     )
 
 
-def _image_sd(run: SelfCalibration, rows: np.ndarray) -> float:
-    """Standard deviation [px] of an image coordinate of the image points rows.
+def _image_sd(run: SelfCalibration, f: int, rows: np.ndarray, model: CorrectionModel) -> float:
+    """Standard deviation [px] of an image coordinate of the image points rows of fluoroscope f.
 
     It is that of the inlier residuals, which are smaller than the noise by the root of their
-    redundancy numbers. The scale of a Student-t noise is no substitute: where the tails are heavy
-    it is smaller than the standard deviation of its core.
+    redundancy numbers, together with what the distortion of their exposures differs from the
+    model, as that of any later exposure will. The scale of a Student-t noise is no substitute:
+    where the tails are heavy it is smaller than the standard deviation of its core.
     """
     redundancy = geometric_redundancy(run.measured.network, run.after.parameters, run.after.noise)
     rows = rows[run.after.inliers[rows]]
-    return float(np.sqrt(np.sum(run.after.residuals[rows] ** 2) / np.sum(2 * redundancy[rows])))
+    noise = np.sum(run.after.residuals[rows] ** 2) / np.sum(2 * redundancy[rows])
+    variation = 0.0
+    if model.series is not None:
+        uv = run.measured.network.uv[rows]
+        own = run.correction[rows] - model.predict(uv)
+        exposure = run.measured.network.exposure[rows]
+        variation = _variance_in_exposures(own, uv, exposure, run.after.parameters.interior[f])
+    return float(np.sqrt(noise + variation))
+
+
+def _variance_in_exposures(
+    differences: np.ndarray, uv: np.ndarray, exposure: np.ndarray, interior: np.ndarray
+) -> float:
+    """Mean square of differences (n, 2) [px] without what orientations of exposures absorb.
+
+    uv (n, 2) and exposure (n,) of the image points; interior (3,).
+    """
+    square = 0.0
+    if not differences.any():
+        return square
+    for number in np.unique(exposure):
+        at = exposure == number
+        gauge = gauge_basis(uv[at], interior).reshape(2 * at.sum(), -1)
+        values = differences[at].ravel()
+        left = values - gauge @ np.linalg.lstsq(gauge, values, rcond=None)[0]
+        square += float(left @ left)
+    return square / (2 * len(uv))
 
 
 def _calibration(
@@ -541,7 +569,7 @@ def _calibration(
         interior_estimated=bool(run.measured.network.interior_free[f]),
         model=model,
         train_exposure=train_exposure,
-        image_sd=_image_sd(run, rows),
+        image_sd=_image_sd(run, f, rows, model),
         sigma0=run.after.noise.scale,
         nu=run.after.noise.nu,
         exposures=len(frames),

@@ -49,7 +49,8 @@ class FluoroscopeCalibration:
     train_exposure : (N,) ndarray of int
         Exposure of each training point of the model.
     image_sd : float
-        Standard deviation of an image coordinate of an inlier [px].
+        Standard deviation of an image coordinate of an inlier [px], with what the distortion of
+        single exposures differs.
     sigma0, nu : float
         Scale and degrees of freedom of the Student-t noise; sigma0 is a factor of sigma where that
         was given.

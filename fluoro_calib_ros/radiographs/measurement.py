@@ -19,6 +19,9 @@ from .profile import Profile, fit_profile
 NEIGHBOURS = 6  # fitted with a bead, at most
 WINDOW_MARGIN_PX = 2.0  # of background around the shadow
 STEPS = 6
+CROSSING_STEPS = (2, 4)  # before which shadows that touch are blurred together
+CROSSED = 1.35  # factor on the standard deviation where shadows cross
+FINE = 3  # points across a pixel of their grid
 MAX_STEP_PX = 0.6
 NEIGHBOUR_SD_PX = 0.3  # of a neighbour's place, which its own fit finds
 NEIGHBOUR_SD = 0.2  # of a neighbour's depth
@@ -27,7 +30,7 @@ DEPTHS = (0.05, 3.0)
 MIN_PASSED = 0.02
 NOISE_BLOCK = 16  # [px]
 PROFILE_BEADS = 150
-PROFILE_ROUNDS = 2
+PROFILE_ROUNDS = 3
 START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
 START_SCATTER = 0.1
@@ -37,6 +40,7 @@ MIN_VARIANCE = 1 / 12  # of rounding
 MAX_SHIFT_PX = 4.0  # of a centre, beyond which the fit has lost its bead
 MIN_CORRELATION = 0.08  # that is told from slow changes of the light
 LAGS = 4  # pixels over which noise is correlated
+HELD = 1e12  # weight of a term that stays zero
 TERMS = 6  # of the background: a polynomial of degree 2
 PARAMETERS = TERMS + 3  # of a bead alone, its centre and depth
 # Misfit from which pixels with large residuals count less, and the residual of half the weight.
@@ -179,6 +183,7 @@ def estimate_profile(
     alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
     for _ in range(PROFILE_ROUNDS):
         fit = _Fit(light, field, uv[alone], relative_radius[alone], profile, noise)
+        fit.plane_only = True
         fit.run(STEPS)
         place, absorbed, weight = fit.shadows()
         profile = fit_profile(place, absorbed, weight, profile)
@@ -225,6 +230,8 @@ class _Fit:
         self.measured = np.zeros(len(uv), dtype=bool)
         self.disturbed = np.zeros(len(uv), dtype=bool)
         self.inflation: float | None = None
+        self.plane_only = False
+        self.crossing: np.ndarray | None = None
         self.overlapped = np.zeros(len(uv), dtype=bool)
         largest = float(self.radius.max(initial=1.0))
         reach = profile.reach_px * largest
@@ -243,6 +250,7 @@ class _Fit:
         n = len(self.uv)
         count = min(NEIGHBOURS + 1, n)
         if count < 2:
+            self.distance = np.full(n, np.inf)
             return [(np.arange(n), np.zeros((n, 0), dtype=int))]
         distance, near = cKDTree(self.uv).query(self.uv, k=count, distance_upper_bound=together)
         other = near != np.arange(n)[:, None]
@@ -251,7 +259,8 @@ class _Fit:
         near = np.take_along_axis(np.where(other & np.isfinite(distance), near, -1), order, axis=1)
         near = near[:, : count - 1]
         distance = np.where(other, distance, np.inf)
-        self.overlapped = distance.min(axis=1) < overlap
+        self.distance = distance.min(axis=1)
+        self.overlapped = self.distance < overlap
         crowd = (near >= 0).sum(axis=1)
         groups = []
         for low, high in ((0, 0), (1, 2), (3, NEIGHBOURS)):
@@ -283,6 +292,8 @@ class _Fit:
     def run(self, steps: int) -> None:
         """Take Gauss-Newton steps; the last one gives standard deviations as well."""
         for step in range(steps):
+            if step in CROSSING_STEPS:
+                self._cross()
             moved = [self._step(rows, near, final=step == steps - 1) for rows, near in self.groups]
             if step == steps // 2:
                 self.disturbed = self.misfit > DISTURBED * self.typical()
@@ -293,6 +304,53 @@ class _Fit:
                 self.uv[kept] = uv[~lost]
                 self.depth[kept] = depth[~lost]
                 self.background[kept] = background[~lost]
+
+    def _cross(self) -> None:
+        """Note what shadows that touch have together, beyond the product of both.
+
+        The blur of the light that passes two beads is not the product of their blurred shadows.
+        The difference is computed on a finer grid, of the two nearest neighbours.
+        """
+        if self.crossing is None:
+            self.crossing = np.zeros((len(self.uv), len(self.offset)))
+        reach = 2 * (self.profile.radius_px + self.profile.blur_px)
+        for rows, near in self.groups:
+            if not near.shape[1]:
+                continue
+            first = near[:, 0]
+            touching = np.linalg.norm(self.uv[rows] - self.uv[first], axis=1) < reach
+            touching &= first >= 0
+            if touching.any():
+                chosen = rows[touching]
+                members = np.concatenate([chosen[:, None], near[touching, :2]], axis=1)
+                self.crossing[chosen] = self._crossing(chosen, members)
+
+    def _crossing(self, rows: np.ndarray, members: np.ndarray) -> np.ndarray:
+        """Differences (g, m) for windows of beads (g,) and shadows of members (g, k) or -1."""
+        half = int(np.abs(self.offset).max()) + int(np.ceil(3 * self.profile.blur_px))
+        axis = np.arange(-half * FINE, half * FINE + 1) / FINE
+        raw = np.ones((len(rows), len(axis), len(axis)), dtype=np.float32)
+        blurred = np.ones((len(rows), len(self.offset)))
+        for column in members.T:
+            there = column >= 0
+            bead = np.where(there, column, 0)
+            centre = self.uv[bead] - self.middle[rows]
+            scale = 1 / self.radius[bead]
+            depth = self.depth[bead] * there
+            squared = (axis[None, :, None] - centre[:, 1, None, None]) ** 2 + (
+                axis[None, None, :] - centre[:, 0, None, None]
+            ) ** 2
+            absorbed = self.profile.absorbed(squared * scale[:, None, None] ** 2)
+            raw *= (1 - depth[:, None, None] * absorbed).astype(np.float32)
+            away = np.linalg.norm(self.offset - centre[:, None], axis=2) * scale[:, None]
+            blurred *= 1 - depth[:, None] * self.profile.shadow(away)[0]
+        sigma = float(FINE * np.sqrt(self.profile.blur_px**2 + 1 / 12))
+        place = (self.offset + half) * FINE
+        out = np.empty_like(blurred)
+        for number, image in enumerate(raw):
+            smooth = cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
+            out[number] = smooth[place[:, 1], place[:, 0]]
+        return out - blurred
 
     def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Light (g, m) and its derivatives (g, m, TERMS + 3 + 3 k)."""
@@ -310,7 +368,8 @@ class _Fit:
         product = np.prod(passed, axis=1)
         scatter = self.profile.scatter
         plane = self._background(rows)
-        relative = scatter + (1 - scatter) * product
+        crossing = self.crossing[rows] if self.crossing is not None else 0.0
+        relative = scatter + (1 - scatter) * (product + crossing)
         by_shadow = -(1 - scatter) * plane[:, None] * product[:, None] / passed
         direction = away / np.maximum(distance, 1e-9)[..., None]
         by_place = (by_shadow * depth * -slope)[..., None] * direction
@@ -337,6 +396,8 @@ class _Fit:
         weighted = jacobian * weight[..., None]
         prior = np.zeros((len(rows), jacobian.shape[2]))
         prior[:, TERMS + 2] = DEPTH_SD**-2
+        if self.plane_only:
+            prior[:, 3:TERMS] = HELD
         for number in range(near.shape[1]):
             first = PARAMETERS + 3 * number
             # An absent neighbour has no derivatives; any prior keeps its step zero.
@@ -391,6 +452,8 @@ class _Fit:
         # The noise of one window is known to some 10 %; that of all windows helps.
         pooled = (self.misfit * pixels + typical * POOLED) / (pixels + POOLED)
         factor = np.sqrt(np.maximum(pooled, typical) * (self.inflation or 1.0))
+        # Where shadows cross, their model is less right than its noise says.
+        factor = np.where(self.distance < 2 * self.profile.radius_px, CROSSED * factor, factor)
         return Beads(
             self.uv.copy(),
             self.sigma * factor,

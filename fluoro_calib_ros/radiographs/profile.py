@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import CubicSpline
-from scipy.ndimage import gaussian_filter
 from scipy.optimize import least_squares
 
 STEP = 0.2  # of the grid on which a profile is computed [px]
@@ -51,6 +50,11 @@ class Profile:
         """Distance from the centre at which the shadow has ended [px]."""
         return self.radius_px + REACH_SIGMAS * self.blur_px
 
+    def absorbed(self, squared: np.ndarray) -> np.ndarray:
+        """Absorbed share of the light without blur at squared distances [px^2]."""
+        chord = 2 * np.sqrt(np.maximum(self.radius_px**2 - squared, 0)) / self.radius_px
+        return 1 - np.exp(-self.attenuation * chord)
+
     def shadow(self, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Absorbed share of the light at distances [px], and its derivative [1/px]."""
         position = np.minimum(distance / TABLE_STEP, self._table.shape[1] - 2)
@@ -68,14 +72,15 @@ def _tabulated(profile: Profile) -> np.ndarray:
     step = min(STEP, profile.radius_px / 4)
     axis = np.arange(int(np.ceil((profile.reach_px + 3) / step)) + 4) * step
     squared = axis[:, None] ** 2 + axis**2
-    chord = 2 * np.sqrt(np.maximum(profile.radius_px**2 - squared, 0)) / profile.radius_px
-    quarter = 1 - np.exp(-profile.attenuation * chord)
-    mirrored = np.concatenate([quarter[:0:-1], quarter])
-    mirrored = np.concatenate([mirrored[:, :0:-1], mirrored], axis=1)
-    # The blur of a square pixel has a variance of 1/12.
-    sigma = np.sqrt(profile.blur_px**2 + 1 / 12) / step
-    half = len(axis) - 1
-    blurred = gaussian_filter(mirrored, sigma, truncate=5)[half, half:]
+    quarter = profile.absorbed(squared)
+    # The blur of a square pixel has a variance of 1/12. Only the row through the centre is needed:
+    # all columns are weighted to one row, which is blurred along itself.
+    sigma = np.sqrt(profile.blur_px**2 + 1 / 12)
+    kernel = np.exp(-0.5 * (axis / sigma) ** 2)
+    row = quarter @ np.append(kernel[0], 2 * kernel[1:])
+    both_sides = np.concatenate([kernel[:0:-1], kernel])
+    blurred = np.convolve(np.concatenate([row[:0:-1], row]), both_sides / both_sides.sum() ** 2)
+    blurred = blurred[2 * len(axis) - 2 : 3 * len(axis) - 2]
     spline = CubicSpline(axis, blurred, bc_type=((1, 0.0), (1, 0.0)))
     wanted = np.arange(0, profile.reach_px + 2, TABLE_STEP)
     return np.stack([spline(wanted), spline(wanted, 1)])
@@ -101,5 +106,5 @@ def fit_profile(
 
     first = [start.radius_px, start.blur_px, start.attenuation, start.scatter]
     first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)
-    found = least_squares(residual, first, bounds=(LOW, HIGH), x_scale=first, max_nfev=25)
+    found = least_squares(residual, first, bounds=(LOW, HIGH), x_scale=first, max_nfev=12)
     return Profile(*map(float, found.x))

@@ -1,0 +1,149 @@
+"""fluoro-calib extract: images to observations, from files to a table."""
+
+from __future__ import annotations
+
+import csv
+import json
+from functools import cache
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.cli import main
+from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.files.observations import read_observations_csv
+from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.simulation.bead_images import bead_image
+
+SIZE = 400
+COUNT = 60
+
+
+@cache
+def beads() -> np.ndarray:
+    return np.random.default_rng(5).uniform(-60, 60, (COUNT, 3))
+
+
+@cache
+def picture(number: int, dtype: type = np.uint8) -> tuple[np.ndarray, np.ndarray]:
+    """An image of another renderer than that of the benchmark, and the true centres."""
+    rotation = matrix_from_vector([0.3 * number, 0.2, -0.1 * number])
+    x = beads() @ rotation.T + (0, 0, 900)
+    uv = 1600 * x[:, :2] / x[:, 2:] + (SIZE - 1) / 2
+    return bead_image(uv, (SIZE, SIZE), dtype, 2.0, 0.6, 0.01, number), uv
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    write_phantom(
+        tmp_path / 'phantom.csv', Phantom(np.arange(COUNT) + 1, beads(), np.full(60, 0.1))
+    )
+    (tmp_path / 'a').mkdir()
+    for number in (1, 2, 3):
+        cv2.imwrite(str(tmp_path / 'a' / f'image_{number:04d}.png'), picture(number)[0])
+    return tmp_path
+
+
+def extract(folder: Path, source: str, *more: str) -> None:
+    main(
+        [
+            'extract',
+            str(folder / source),
+            '--phantom',
+            str(folder / 'phantom.csv'),
+            '--fluoroscope',
+            'a',
+            '--out',
+            str(folder / 'out.csv'),
+            '--workers',
+            '1',
+            *more,
+        ]
+    )
+
+
+def test_a_folder_becomes_a_table_that_calibrate_reads(folder, capsys):
+    (folder / 'a' / 'image_0002.png').write_bytes(b'\x89PNG\r\n\x1a\nnothing')
+    cv2.imwrite(str(folder / 'a' / 'image_0007.png'), picture(1)[0][:, :300])
+    extract(folder, 'a', '--json', '--overlay', str(folder / 'overlay'))
+    printed = capsys.readouterr()
+    summary = json.loads(printed.out)
+    assert [e['exposure'] for e in summary['exposures']] == [1, 2, 3, 7]
+    assert [e['observations'] > 40 for e in summary['exposures']] == [True, False, True, False]
+    assert 'image_0002.png' in printed.err and 'PNG' in printed.err
+    assert '300 x 400 px, but the first one is 400 x 400 px' in printed.err
+    with (folder / 'out.csv').open() as file:
+        header = next(csv.reader(file))
+    assert header == ['fluoroscope', 'exposure', 'target_id', 'u', 'v', 'sigma', 'overlapped']
+    frames = read_observations_csv(folder / 'out.csv', (SIZE, SIZE))['a']
+    assert [frame.number for frame in frames] == [1, 3]
+    for frame in frames:
+        error = frame.uv - picture(frame.number)[1][frame.target_id - 1]
+        assert np.abs(error).max() < 1.0
+        assert np.median(np.abs(error)) < 0.08
+        assert frame.sigma is not None and (frame.sigma > 0).all()
+    assert sorted(path.name for path in (folder / 'overlay').iterdir())[:2] == [
+        'a_0001.png',
+        'a_0003.png',
+    ]
+
+
+def test_a_stack_is_numbered_by_its_order(folder):
+    pages = [picture(number, np.uint16)[0] for number in (2, 3)]
+    assert cv2.imwritemulti(str(folder / 'stack.tif'), pages)
+    extract(folder, 'stack.tif')
+    frames = read_observations_csv(folder / 'out.csv', (SIZE, SIZE))['a']
+    assert [frame.number for frame in frames] == [1, 2]
+    error = frames[0].uv - picture(2)[1][frames[0].target_id - 1]
+    assert np.abs(error).max() < 1.0
+
+
+@pytest.mark.parametrize(
+    ('image', 'sentence'),
+    [
+        (np.zeros((SIZE, SIZE), np.uint8), 'the image is empty'),
+        (np.zeros((1, 1), np.uint8), 'only 1 x 1 px'),
+        (bead_image([[200, 200]], (SIZE, SIZE)), 'beads'),
+    ],
+)
+def test_images_without_the_phantom_give_one_sentence(folder, capsys, image, sentence):
+    cv2.imwrite(str(folder / 'bad.png'), image)
+    (folder / 'out.csv').write_text('earlier')
+    with pytest.raises(SystemExit) as ended:
+        extract(folder, 'bad.png')
+    assert ended.value.code == 1
+    printed = capsys.readouterr().err
+    assert sentence in printed and 'bad.png' in printed and printed.count('\n') == 1
+    assert (folder / 'out.csv').read_text() == 'earlier'
+
+
+def test_a_wrong_principal_distance_gives_no_wrong_observation(folder):
+    extract(folder, 'a', '--principal-distance', '1760')
+    for frame in read_observations_csv(folder / 'out.csv', (SIZE, SIZE))['a']:
+        error = frame.uv - picture(frame.number)[1][frame.target_id - 1]
+        assert np.abs(error).max() < 1.0
+        assert len(error) > 40
+
+
+def test_images_of_one_fluoroscope_need_its_name(folder, capsys):
+    with pytest.raises(SystemExit):
+        main(
+            [
+                'calibrate',
+                str(folder / 'a'),
+                '--phantom',
+                str(folder / 'phantom.csv'),
+                '--out',
+                str(folder / 'result'),
+            ]
+        )
+    assert 'name it with --fluoroscopes NAME' in capsys.readouterr().err
+
+
+def test_diameters_of_a_phantom_are_kept(tmp_path):
+    phantom = Phantom(np.arange(4), np.eye(4, 3), np.full(4, 0.1), np.array([2.0, 2.0, 2.0, 3.0]))
+    write_phantom(tmp_path / 'phantom.csv', phantom)
+    assert np.array_equal(read_phantom(tmp_path / 'phantom.csv').diameter_mm, phantom.diameter_mm)

@@ -103,6 +103,11 @@ class CalibrationParameters(ManagedParameters):
         'folder in which calibrations are saved, and from which they are loaded at the start; '
         'empty: fluoro_calib/<namespace> in $ROS_HOME or ~/.ros',
     )
+    any_directory: bool = option(
+        False,
+        'whether save_calibration and load_calibration may name folders that are not below '
+        'calibration_directory',
+    )
     collect: str = option(
         'still',
         'when an exposure is collected: whenever the phantom stands still in a new pose, '
@@ -495,7 +500,16 @@ class CalibrationNode(StreamNode):
 
     def _directory_of(self, request: SaveCalibration.Request | LoadCalibration.Request) -> Path:
         """Return the folder of a request. Raises DataError."""
-        return expand_path(request.directory) if request.directory else self._directory
+        if not request.directory:
+            return self._directory
+        directory = self._directory / expand_path(request.directory)
+        base = self._directory.resolve()
+        if not self._settings.any_directory and not directory.resolve().is_relative_to(base):
+            raise DataError(
+                f'{directory}: this folder is not below the calibration_directory {base}; the '
+                'parameter any_directory allows it'
+            )
+        return directory
 
     def _load(
         self, directory: Path

@@ -1,7 +1,7 @@
 """Requests of any peer that a node cannot handle: it refuses them, and goes on."""
 
 import pytest
-from fluoro_calib_msgs.srv import LoadCalibration
+from fluoro_calib_msgs.srv import LoadCalibration, SaveCalibration
 from lifecycle_msgs.msg import State, Transition
 from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import Parameter, ParameterValue
@@ -20,10 +20,11 @@ OTHERS = {
     'simulator_node': {},
     'player_node': {'bag': str(BAGS / 'calibration'), 'loop': 'true'},
 }
+FOLDERS = {SaveCalibration: 'save_calibration', LoadCalibration: 'load_calibration'}
 
 
 @pytest.fixture(scope='module')
-def client(module_graph):
+def client(module_graph, tmp_path_factory):
     """Client of a graph with all these nodes."""
     client = module_graph.client
     for node in (*MANAGED, *OTHERS):
@@ -35,7 +36,12 @@ def client(module_graph):
     client.burst = client.create_client(
         LoadCalibration, 'load_calibration', qos_profile=services_qos()
     )
+    for kind, service in FOLDERS.items():
+        client.expect(kind, service)
+    client.folder = tmp_path_factory.mktemp('rig') / 'calibrations'
     for node, parameters in {**MANAGED, **OTHERS}.items():
+        if node == 'calibration_node':
+            parameters = {**parameters, 'calibration_directory': str(client.folder)}
         module_graph.start(node, parameters, wait=False)
     for node in (*MANAGED, *OTHERS):
         client.wait_until_known_to(node)
@@ -76,8 +82,23 @@ def test_transition_that_does_not_fit_the_state_is_refused(client, node):
     assert change(id=Transition.TRANSITION_ACTIVATE)
 
 
-def test_every_request_of_a_burst_is_answered(client, tmp_path):
-    request = LoadCalibration.Request(directory=str(tmp_path))
+def test_every_request_of_a_burst_is_answered(client):
+    request = LoadCalibration.Request()
     answers = [client.burst.call_async(request) for _ in range(50)]
     client.wait_until(lambda: all(answer.done() for answer in answers), what='50 answers')
     assert not any(answer.result().success for answer in answers)
+
+
+@pytest.mark.parametrize('kind', FOLDERS)
+def test_folders_elsewhere_are_refused(client, kind, tmp_path):
+    link = client.folder / 'link'
+    client.folder.mkdir(parents=True, exist_ok=True)
+    if not link.is_symlink():
+        link.symlink_to(tmp_path)
+    for place in (tmp_path / 'new', '../new', 'below/../../new', '~/new', link / 'new'):
+        answer = client.call(kind, FOLDERS[kind], directory=str(place))
+        assert not answer.success
+        assert 'is not below the calibration_directory' in answer.message
+    below = client.call(kind, FOLDERS[kind], directory='below')
+    assert 'is not below' not in below.message
+    assert not list(tmp_path.iterdir())

@@ -53,7 +53,7 @@ def test_damaged_file_is_reported_and_kept(graph, calibrated):
 def test_save_and_load(graph, calibrated, tmp_path):
     client = graph.client
     ids = ids_in(calibrated)
-    graph.calibration_node(tmp_path / 'none')
+    graph.calibration_node(tmp_path / 'none', any_directory='true')
     published = client.listen('a/calibration')
     answer = client.call(SaveCalibration, 'save_calibration')
     assert not answer.success and answer.message == 'not saved: there is no calibration to save'
@@ -94,7 +94,7 @@ def test_correction_before_and_after_a_calibration_in_mid_stream(
     )
     assert corrected == []
 
-    graph.calibration_node(calibrated)
+    graph.calibration_node(calibrated, any_directory='true')
     client.wait_for_diagnostics('correction_node', lambda s: first in [v.value for v in s.values])
     client.stream(pairs, 100.0, lambda: len(corrected))  # the calibration changes somewhere in it
     client.wait_until(

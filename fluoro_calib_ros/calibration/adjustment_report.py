@@ -78,7 +78,7 @@ class ResidualTable:
     weight : (N,) ndarray
         Robust weights, 0 to about 1.
     outlier : (N,) ndarray of bool
-        Beyond the core of the noise, about four standard deviations.
+        Beyond the core of the noise: four standard deviations, more where the tails are heavy.
     """
 
     fluoroscope: np.ndarray

@@ -560,3 +560,23 @@ def test_random_rigs_converge_to_the_right_answer(seed):
 
     result = outcome(seed)
     assert result['end'] == 'converged' and not result['wrong']
+
+
+def test_claims_hold_for_unseen_exposures_where_the_distortion_varies():
+    rng = np.random.default_rng(4)
+    frames = []
+    for frame in simulate_exposures(virtual_rig(5), 20, 5).frames['a']:
+        x, y = ((frame.uv - 511.5) / 512).T
+        terms = np.stack([x * y * y, y * x * x, x**3, y**3], axis=1)
+        bend = rng.normal(0, 0.8, (4, 2))
+        uv = np.clip(frame.uv + terms @ bend, 0, 1022)
+        frames.append(replace(frame, uv=uv))
+    phantom = virtual_rig(5).phantom
+    result = calibrate({'a': frames[::2]}, phantom)
+    calibration = result.calibrations['a']
+    assert calibration.image_sd > 1.2 * calibration.sigma0
+    table = adjust_with_calibrations({'a': frames[1::2]}, phantom, result.calibrations).residuals
+    good = ~table.outlier
+    claimed = calibration.correct(table.uv[good], exact=True).sigma
+    square = np.sum((table.residual[good] / claimed[:, None]) ** 2)
+    assert 0.6 < square / np.sum(table.redundancy[good]) < 1.6

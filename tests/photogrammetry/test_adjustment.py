@@ -1,5 +1,6 @@
 """The bundle adjustment and its precision, against dense matrices, scipy and Monte Carlo."""
 
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -43,6 +44,14 @@ def cost_at(network, result, x=None, correction=0.0):
     parameters = result.parameters if x is None else rigs.moved(network, result.parameters, x)
     _, q = residuals_and_q(network, parameters, correction, result.noise)
     return total_cost(network, parameters, q, result.noise)
+
+
+def test_cost_of_points_behind_the_source_is_infinite():
+    network, start = rigs.small_network()
+    q = np.full(len(network.uv), np.nan)
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        assert total_cost(network, start, q, Noise(gross=0.01)) == np.inf
 
 
 def standard_deviations(network, result):

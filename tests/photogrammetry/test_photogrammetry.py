@@ -422,6 +422,16 @@ def test_inliers_are_9999_of_10000_gaussian_residuals():
     ]
 
 
+@pytest.mark.parametrize('nu', [3.0, 6.0, 200.0])
+def test_few_true_image_points_are_gross_errors_whatever_the_tails(nu):
+    rng = np.random.default_rng(11)
+    q = np.sum(bivariate_t(rng, 100_000, nu, 1.0) ** 2, axis=1)
+    noise = Noise(nu=nu, gross=0.01)
+    assert np.mean(~noise.accepts(q)) < 2e-3
+    assert not noise.accepts(np.array([1e4])).any()
+    assert noise.limit >= INLIER_Q
+
+
 def test_unknown_loss_is_rejected():
     with pytest.raises(ValueError, match="student_t, huber, gaussian, not 'cauchy'"):
         Noise('cauchy')

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from ..errors import DataError
 from . import (
@@ -40,6 +41,19 @@ COMMANDS = (
 )
 
 
+class _Version(argparse.Action):
+    """Prints the versions, which are looked up only then."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
+        from ..report.versions import versions
+
+        found = versions()
+        own = found.pop('fluoro_calib_ros')
+        others = ', '.join(f'{name} {version}' for name, version in found.items())
+        print(f'fluoro_calib_ros {own} ({others})')
+        parser.exit()
+
+
 def make_parser(command: str | None = None) -> argparse.ArgumentParser:
     """Return the parser of the command line.
 
@@ -49,6 +63,7 @@ def make_parser(command: str | None = None) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.'
     )
+    parser.add_argument('--version', action=_Version, nargs=0, help='print versions and exit')
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for module in COMMANDS:
         sub = commands.add_parser(

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +31,7 @@ from .report_figures import (
 from .residuals import Residuals, residuals_of
 from .style import STYLE, png_bytes
 from .text import model_text
+from .versions import versions
 
 TEMPLATES = Path(__file__).parent / 'templates'
 VERDICTS = {
@@ -42,7 +41,6 @@ VERDICTS = {
     None: 'This calibration has not been validated.',
 }
 MAX_ROWS = 40  # of the lists of outliers and correlations
-PACKAGES = ('fluoro_calib_ros', 'numpy', 'scipy')
 
 
 @dataclass(frozen=True)
@@ -102,7 +100,7 @@ def report_html(given: ReportInput) -> str:
         rig=_rig(given),
         outliers=_outliers(given),
         correlations=given.result.get('correlations', [])[:MAX_ROWS],
-        versions=_versions(),
+        versions=versions(),
         text=_text,
     )
 
@@ -290,16 +288,6 @@ def _in_sensor(entry: Mapping[str, Any]) -> np.ndarray:
     """Return the origin of the phantom in the sensor frame of an exposure [mm]."""
     rotation = matrix_from_quaternion(np.array(entry['quaternion_wxyz'], dtype=float))
     return -rotation @ np.array(entry['position_mm'], dtype=float)
-
-
-def _versions() -> dict[str, str]:
-    out = {'Python': platform.python_version()}
-    for package in PACKAGES:
-        try:
-            out[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            out[package] = 'from source'
-    return out
 
 
 def _text(value: Any, digits: int = 3) -> str:

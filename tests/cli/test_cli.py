@@ -656,3 +656,8 @@ def test_calibrate_ends_with_verdict_and_report(rig, tmp_path, capsys):
     assert report == f'Report: {tmp_path / "new" / "report.html"}'
     text = (tmp_path / 'new' / 'report.html').read_text()
     assert found['findings'][0].split(';')[0] in html.unescape(text)
+
+
+def test_version(capsys):
+    assert run('--version') == 0
+    assert re.match(r'fluoro_calib_ros \S.* \(Python 3\.\d+\.\d+', capsys.readouterr().out)

@@ -1,0 +1,20 @@
+"""Versions of what a result was computed with."""
+
+from __future__ import annotations
+
+import platform
+from importlib import metadata
+
+PACKAGES = ('fluoro_calib_ros', 'numpy', 'scipy')
+FROM_SOURCE = 'from source'
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, this package and its numerical libraries, by name."""
+    out = {'Python': platform.python_version()}
+    for package in PACKAGES:
+        try:
+            out[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            out[package] = FROM_SOURCE
+    return out

@@ -48,7 +48,10 @@ from .state import ERROR, OK, WARN, DriftLevel, DriftState
 
 CLUSTER_STEP = 2.0  # times step_px in the charts of the clusters, which have less information
 HYSTERESIS = 0.5  # times the threshold of WARN: an alarm ends below it
-RESTART_S = 5.0  # a stamp that much before the last one starts a new stream; it is no late frame
+RESTART_S = 1.0  # a stamp that much before the newest one starts a new stream; it is no late frame
+# Exposures in a row before the newest one that start a new stream: of a bag shorter than RESTART_S
+# that is played in a loop. Late frames are fewer.
+MAX_LATE = 100
 NAN = float('nan')
 
 
@@ -134,6 +137,7 @@ class DriftWatch:
         self._tested_blocks = 0
         self._block_ns: int | None = None  # begin of the present block
         self._newest_ns = 0
+        self._late = 0  # calls with a stamp before the newest one, since that came
         self._offset_ns = 0  # added to stamps, so that time goes on where a stream begins anew
         self._observations = 0
         self._level = OK
@@ -190,7 +194,12 @@ class DriftWatch:
         if self._block_ns is None:
             self._block_ns = now
             self._newest_ns = now
-        if now < self._newest_ns - RESTART_S * 1e9:
+        if now < self._newest_ns:
+            self._late += 1
+        elif now > self._newest_ns:
+            self._late = 0
+        if now < self._newest_ns - RESTART_S * 1e9 or self._late > MAX_LATE:
+            self._late = 0
             self._offset_ns += self._newest_ns - now
             now = self._newest_ns
         self._newest_ns = max(self._newest_ns, now)

@@ -11,10 +11,10 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from ..distortion.base import CorrectionModel
-from ..distortion.gauge import gauge_basis
 from ..exposures.frame import validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.precision import Precision, geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
@@ -518,30 +518,33 @@ def _image_sd(run: SelfCalibration, f: int, rows: np.ndarray, model: CorrectionM
     noise = np.sum(run.after.residuals[rows] ** 2) / np.sum(2 * redundancy[rows])
     variation = 0.0
     if model.series is not None:
-        uv = run.measured.network.uv[rows]
-        own = run.correction[rows] - model.predict(uv)
-        exposure = run.measured.network.exposure[rows]
-        variation = _variance_in_exposures(own, uv, exposure, run.after.parameters.interior[f])
+        own = run.correction[rows] - model.predict(run.measured.network.uv[rows])
+        variation = _variance_in_exposures(run, rows, own)
     return float(np.sqrt(noise + variation))
 
 
 def _variance_in_exposures(
-    differences: np.ndarray, uv: np.ndarray, exposure: np.ndarray, interior: np.ndarray
+    run: SelfCalibration, rows: np.ndarray, differences: np.ndarray
 ) -> float:
     """Mean square of differences (n, 2) [px] without what orientations of exposures absorb.
 
-    uv (n, 2) and exposure (n,) of the image points; interior (3,).
+    rows (n,): their image points.
     """
     square = 0.0
     if not differences.any():
         return square
+    network = run.measured.network
+    _, by_exterior, _, _ = project_with_jacobian(*network.per_image_point(run.after.parameters))
+    exposure = network.exposure[rows]
     for number in np.unique(exposure):
         at = exposure == number
-        gauge = gauge_basis(uv[at], interior).reshape(2 * at.sum(), -1)
         values = differences[at].ravel()
-        left = values - gauge @ np.linalg.lstsq(gauge, values, rcond=None)[0]
+        # In units in which the six unknowns matter alike.
+        absorbed = by_exterior[rows[at]].reshape(len(values), -1)
+        absorbed = absorbed / np.linalg.norm(absorbed, axis=0)
+        left = values - absorbed @ np.linalg.lstsq(absorbed, values, rcond=None)[0]
         square += float(left @ left)
-    return square / (2 * len(uv))
+    return square / (2 * len(rows))
 
 
 def _calibration(

@@ -61,6 +61,7 @@ IMAGES_OF_A_RIG = 5
 BOUND_IMAGES = 12  # of a set, for which the bound is computed
 FALSE_PX = 1.0
 SIZE = (1024, 1024)
+KINDS = ('turntable', 'any', 'tube', 'other')  # of poses; other: of another phantom
 
 
 def settings_of(rng: np.random.Generator, hard: bool) -> RadiographSettings:
@@ -252,6 +253,8 @@ def measure_points(count: int, kind: str, report: Callable[[str], None]) -> dict
                 wrong += 1
                 report(f'{kind} {number}: WRONG')
         seconds.append(time.process_time() - start)
+        if number % 20 == 19:
+            report(f'{kind} {number + 1}: {wrong} wrong, {len(refused)} refused')
     for sentence in refused[:5] if kind != 'other' else ():
         report(sentence)
     return {
@@ -307,21 +310,23 @@ def errors_in_space(calibrations: Any, rig: VirtualRig) -> dict[str, float]:
 
 
 def write_picture(path: Path) -> None:
-    """Write a part of a hard image beside its overlay."""
-    rig = virtual_rig(FIRST_RIG + 9500)
+    """Write a part of a hard image, and of its overlay beside it."""
+    rig = virtual_rig(5)
     radiography = Radiography(rig.fluoroscopes[0], HARD)
-    pose = phantom_poses(np.random.default_rng(5), 4)[2]
-    image = radiography.image(rig.true_mm, pose, 3)
-    model = PhantomModel.of(rig.phantom.xyz_mm)
-    found = extract_beads(image, model, Lens(SIZE, 4000.0))
-    cv2.imwrite(str(path), draw_overlay(image, found))
+    image = radiography.image(rig.true_mm, phantom_poses(np.random.default_rng(3), 4)[1], 1)
+    found = extract_beads(image, PhantomModel.of(rig.phantom.xyz_mm), Lens(SIZE, 4000.0))
+    part = np.s_[200:700, 280:780]
+    left = cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)[part]
+    picture = np.hstack([left, draw_overlay(image, found)[part]])
+    cv2.imwrite(str(path), picture, [cv2.IMWRITE_PNG_COMPRESSION, 9])
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument('--images', type=int, default=0, help='images of each set')
     parser.add_argument('--sets', nargs='+', default=('clean', 'hard'), choices=('clean', 'hard'))
-    parser.add_argument('--points', type=int, default=0, help='poses, of each of three kinds')
+    parser.add_argument('--points', type=int, default=0, help='poses of each kind')
+    parser.add_argument('--kinds', nargs='+', default=KINDS, choices=KINDS)
     parser.add_argument('--calibration', type=int, default=0, help='exposures')
     parser.add_argument('--picture', type=Path)
     arguments = parser.parse_args()
@@ -333,7 +338,7 @@ def main() -> None:
     if arguments.picture:
         write_picture(arguments.picture)
     if arguments.points:
-        for kind in ('turntable', 'any', 'tube', 'other'):
+        for kind in arguments.kinds:
             tables[kind] = measure_points(arguments.points, kind, report)
             report(f'{kind}: {tables[kind]}')
     if arguments.images:

@@ -33,6 +33,8 @@ MIN_MIDDLE = 256  # size of the middle of an image that is looked at alone [px]
 MIN_SIZE = 32  # of an image [px]
 SCALES = (1.1, 1.5, 2.1, 3.0, 4.2, 6.0, 8.5)  # standard deviations of the blur [px]
 BLOB_RADIUS = 1.25  # radius of a blurred disc over the scale at which its response is largest
+# Factors on the scale: the noise of a response decreases with the scale, but beads merge.
+WIDER = (1.0, 1.4, 1.9)
 MIN_SNR = 6.0  # of a response, over the noise of the response
 MIN_SHARE = 0.3  # of the response of a typical bead
 TYPICAL = 40  # strongest blobs at each scale that choose polarity and scale
@@ -82,8 +84,13 @@ def detect_beads(image: np.ndarray, radius_px: float | None = None) -> Detection
     scale, inverted = _scale_and_polarity(grey, scales)
     light = float(grey.max()) - grey if inverted else grey
     field = field_of_view(light, scale)
-    response = _responses(light, scale)[0]
-    uv, strength = _peaks(response, field, light, scale)
+    for number, wider in enumerate(WIDER):
+        try:
+            uv, strength = _peaks(_responses(light, wider * scale)[0], field, light, wider * scale)
+            break
+        except DataError:
+            if number == len(WIDER) - 1:
+                raise
     return Detections(light, field, uv, strength, scale * BLOB_RADIUS, inverted)
 
 

@@ -37,7 +37,10 @@ MIN_BEADS = 10
 MIN_FOUND = 0.72
 MIN_EXPLAINED = 0.4
 SURE_FOUND = 0.85  # share found at which the search ends
-ALTERNATIVE = 0.25  # of the matches of the best pose that an alternative must lack
+# By how much the score of the best pose must exceed that of another one: as a share of it, and in
+# beads. What is missed by chance is less.
+MARGIN = 0.06
+MARGIN_BEADS = 8
 # Levels of the search: neighbours of a bead in the phantom, in the image, beads tried, and limits
 # of the scale by the extent of what is seen. The first finds most poses, the second those that see
 # all faces of a phantom from the edge, the third a small part of a phantom.
@@ -139,7 +142,8 @@ def match(seen: Seen, model: PhantomModel, lens: Lens, near: View | None = None)
     if best is None:
         raise DataError('no pose of the phantom fits the beads in the image')
     _check_evidence(best)
-    _check_alternatives(best, seen, model)
+    best = _unambiguous(best, seen, model)
+    _check_evidence(best)
     return best
 
 
@@ -157,8 +161,27 @@ def _check_evidence(best: Match) -> None:
         )
 
 
-def _check_alternatives(best: Match, seen: Seen, model: PhantomModel) -> None:
-    """Raise DataError where the phantom, turned by a symmetry, fits nearly as well."""
+def _unambiguous(best: Match, seen: Seen, model: PhantomModel) -> Match:
+    """Return the best of a match and what the symmetries of the phantom make of it.
+
+    Raises DataError where another one fits nearly as well.
+    """
+    matches = [best, *_alternatives(best, seen, model)]
+    first = max(matches, key=lambda one: one.score)
+    for rival in matches:
+        if rival is first or _same(rival, first):
+            continue
+        if rival.score > first.score - max(MARGIN_BEADS, MARGIN * first.score):
+            raise DataError(
+                'the pose is ambiguous: the phantom fits nearly as well in another one '
+                f'({len(rival.bead)} beads instead of {len(first.bead)}); mark it by beads that '
+                'break its symmetry'
+            )
+    return first
+
+
+def _alternatives(best: Match, seen: Seen, model: PhantomModel) -> Iterator[Match]:
+    """Yield the matches of the phantom moved by its symmetries, where they fit at all."""
     for symmetry in model.symmetries:
         other = symmetry.row[best.bead]
         known = other >= 0
@@ -171,17 +194,9 @@ def _check_alternatives(best: Match, seen: Seen, model: PhantomModel) -> None:
             RIVAL_STEPS,
             0.3,
         )
-        if scale > seen.tolerance_px:
-            continue
-        rival = settle(view, model.xyz, seen)
-        if rival is None or _same(rival, best):
-            continue
-        if rival.score > (1 - ALTERNATIVE) * best.score:
-            raise DataError(
-                'the pose is ambiguous: the phantom fits nearly as well in another one '
-                f'({len(rival.bead)} beads instead of {len(best.bead)}); mark it by beads that '
-                'break its symmetry'
-            )
+        rival = settle(view, model.xyz, seen) if scale <= seen.tolerance_px else None
+        if rival is not None:
+            yield rival
 
 
 def _same(one: Match, other: Match) -> bool:

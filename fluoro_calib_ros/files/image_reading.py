@@ -26,10 +26,12 @@ import numpy as np
 
 from ..errors import DataError
 from ..images.codec import as_grey, decode
+from ..images.declared_size import check_size
 from .access import read_bytes
 from .image_formats import IMAGE_SUFFIXES, STACK_SUFFIXES, VIDEO_CODECS, listed, suffix_of
 from .tiff import count_pages
 
+VIDEO_SIZE = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
 MAX_BATCH_BYTES = 64_000_000  # of pages that are read at once
 # Fraction of the frames by which the frame count of a video may be wrong; some containers only
 # hold an estimate.
@@ -128,6 +130,10 @@ def _open_video(path: Path) -> ImageSource:
     video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     if not video.isOpened():
         raise DataError(f'{path}: this is no video that can be read, or it is damaged')
+    try:
+        check_size(*(int(video.get(key)) for key in VIDEO_SIZE))
+    except DataError as error:
+        raise DataError(f'{path}: {error}') from None
     frame_rate = video.get(cv2.CAP_PROP_FPS)
     count = max(0, round(video.get(cv2.CAP_PROP_FRAME_COUNT)))
     if not 0 < frame_rate < 1e6:

@@ -30,6 +30,7 @@ import numpy as np
 from tifffile import TiffFile, TiffFileError, TiffWriter
 
 from ..errors import DataError
+from ..images.declared_size import check_size
 from .access import os_error_reason
 
 CLASSIC_BYTES = 4 * 10**9  # size from which a file needs 64-bit offsets, with some reserve
@@ -69,12 +70,14 @@ class StackWriter:
 def count_pages(path: str | PathLike[str]) -> int:
     """Number of pages of a TIFF file.
 
-    Raises DataError for a file that cannot be read, is no TIFF file, is cut off or is damaged.
+    Raises DataError for a file that cannot be read, is no TIFF file, is cut off or is damaged, and
+    for pages that are too large.
     """
     try:
         with TiffFile(path) as file:
             count = len(file.pages)
             complete = _ends_with_last_page(file)
+            size = (int(file.pages.first.imagewidth), int(file.pages.first.imagelength))
     except OSError as error:
         raise DataError(f'{path}: cannot be read ({os_error_reason(error)})') from None
     except (TiffFileError, struct.error, ValueError, TypeError, LookupError, OverflowError):
@@ -82,6 +85,10 @@ def count_pages(path: str | PathLike[str]) -> int:
         complete = False
     if not count or not complete:
         raise DataError(f'{path}: this is no TIFF file, or it is cut off or damaged')
+    try:
+        check_size(*size)
+    except DataError as error:
+        raise DataError(f'{path}: {error}') from None
     return count
 
 

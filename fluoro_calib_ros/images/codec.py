@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 
 from ..errors import DataError
+from .declared_size import PNG_SIGNATURE, check_declared_size
 
-PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 # Higher levels take several times as long and save a few per cent of an image with noise.
 PNG_COMPRESSION = 1
 EIGHT_BIT_SUFFIXES = ('.jpg', '.jpeg', '.bmp')
@@ -49,12 +49,13 @@ def decode(content: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
     """Grey image (h, w) of uint8 or uint16 from the bytes of an image file.
 
     The formats are PNG, JPEG, TIFF (the first page), BMP and PGM. An image whose colours are all
-    equal is grey. Raises DataError if the content is no image, is damaged or is cut off, as far
-    as its format shows it: PNG has checksums, the others an end.
+    equal is grey. Raises DataError if the content is no image, is too large, is damaged or is cut
+    off, as far as its format shows it: PNG has checksums, the others an end.
     """
     data = np.frombuffer(content, dtype=np.uint8)
     if not len(data):
         raise DataError('the image is empty, it has no data')
+    check_declared_size(data.data)
     if data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE:
         _check_png(data.data)
     if data[:2].tobytes() == JPEG_START and JPEG_END not in data[-MAX_JPEG_TRAILER:].tobytes():

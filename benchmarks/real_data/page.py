@@ -67,6 +67,17 @@ are not part of this project; `--download` fetches them.
 
 {sets}
 
+- The fisheye images (ov_cube, ov_plane) are used up to 280 px from their middle, some 35 degrees
+  off the axis. The whole image, 60 degrees off the axis, is beyond a principal distance with a
+  smooth correction: it is refused. A principal distance of 380 px is given to start with.
+- The cameras of ov_cube and ov_plane stand nearer to their targets than an X-ray source does. They
+  are refused for this reason, and calibrated by `--force`.
+- canon5d_3d was measured by hand, to half pixels. Its unit is not stated.
+- The objects of exom, canon7d_3d, canon5d_3d and aicon were surveyed by photographs of the same
+  camera. The survey is thus not independent, for any of the programs.
+- The names of the networks 2 and 3 of DBAT are interchanged; here the photographs tell the camera.
+- Every third exposure of aicon is used, to limit the time.
+
 ## Inside the calibrated area
 
 Root of the mean square of both directions [px]; the last row has the geometric mean of the ratios

@@ -142,7 +142,8 @@ def test_self_calibration_estimates_the_distortion():
 @pytest.mark.long
 def test_local_linear_is_more_accurate_than_knn():
     knn = rigs.calibrated(model='knn')
-    assert knn.fluoroscopes['a'].rmse_after.max() < NOISE_PX
+    # Its steps make heavy tails, which are not taken for gross errors.
+    assert knn.fluoroscopes['a'].rmse_after.max() < 1.2 * NOISE_PX
     assert 2.5 * field_error(rigs.calibrated()) < field_error(knn) < 1.2
 
 

@@ -36,15 +36,15 @@ PIXEL_TYPES = {'mono8': 'u1', '8UC1': 'u1', 'mono16': 'u2', '16UC1': 'u2'}
 def image_topics(source: PathLike) -> dict[str, str]:
     """Return the topics of a bag with images by fluoroscope, the part of the name before the last.
 
-    Where a fluoroscope has both, the images that are not compressed are taken. Raises DataError.
+    The suffix /compressed of image_transport does not count. Where a fluoroscope has both, the images that are not compressed are taken. Raises DataError.
     """
     out: dict[str, str] = {}
     for kind in (COMPRESSED_IMAGE, IMAGE):
         for topic, info in topics_of(source).items():
             if info.type == kind and info.count:
-                parts = [part for part in topic.split('/') if part]
-                name = parts[0] if len(parts) == 1 else fluoroscope_of_topic(topic)
-                out[name] = topic
+                base = topic.removesuffix('/compressed')
+                parts = [part for part in base.split('/') if part]
+                out[parts[0] if len(parts) == 1 else fluoroscope_of_topic(base)] = topic
     return out
 
 

@@ -25,10 +25,16 @@ import cv2
 import numpy as np
 import pytest
 
+from fluoro_calib_ros.bags.definitions import message_class, to_cdr
+from fluoro_calib_ros.bags.images import COMPRESSED_IMAGE, IMAGE
+from fluoro_calib_ros.bags.writer import BagWriter
 from fluoro_calib_ros.cli import main
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.observations import read_observations_csv
 from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
+from fluoro_calib_ros.images.codec import encode
+from fluoro_calib_ros.jobs.image_sources import contains_images, open_sources
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.bead_images import bead_image
 
@@ -120,7 +126,7 @@ def test_a_stack_is_numbered_by_its_order(folder):
     [
         (np.zeros((SIZE, SIZE), np.uint8), 'the image is empty'),
         (np.zeros((1, 1), np.uint8), 'only 1 x 1 px'),
-        (bead_image([[200, 200]], (SIZE, SIZE)), 'beads'),
+        (bead_image([[200, 200]], (SIZE, SIZE), noise=0.0), 'at least 10 are needed'),
     ],
 )
 def test_images_without_the_phantom_give_one_sentence(folder, capsys, image, sentence):
@@ -161,3 +167,42 @@ def test_diameters_of_a_phantom_are_kept(tmp_path):
     phantom = Phantom(np.arange(4), np.eye(4, 3), np.full(4, 0.1), np.array([2.0, 2.0, 2.0, 3.0]))
     write_phantom(tmp_path / 'phantom.csv', phantom)
     assert np.array_equal(read_phantom(tmp_path / 'phantom.csv').diameter_mm, phantom.diameter_mm)
+
+
+def test_images_of_a_bag_are_read(folder):
+    header = message_class('std_msgs/msg/Header')(
+        message_class('builtin_interfaces/msg/Time')(1, 0), 'a_optical'
+    )
+    wide, uv = picture(1, np.uint16)
+    rows = wide.astype('>u2').view(np.uint8).reshape(-1)
+    raw = message_class(IMAGE)(
+        header=header,
+        height=SIZE,
+        width=SIZE,
+        encoding='mono16',
+        is_bigendian=1,
+        step=2 * SIZE,
+        data=rows,
+    )
+    packed = message_class(COMPRESSED_IMAGE)(
+        header=header,
+        format='png',
+        data=np.frombuffer(encode(picture(2)[0], '.png'), np.uint8),
+    )
+    with BagWriter(folder / 'bag') as bag:
+        bag.write('/rig/a/image_raw', IMAGE, to_cdr(raw, IMAGE), 10**9)
+        bag.write(
+            '/rig/b/image_raw/compressed',
+            COMPRESSED_IMAGE,
+            to_cdr(packed, COMPRESSED_IMAGE),
+            2 * 10**9,
+        )
+    assert contains_images(folder / 'bag')
+    sources = open_sources([folder / 'bag'], 'a')
+    (found,) = sources.images()
+    assert np.array_equal(found.image, wide)
+    extract(folder, 'bag')
+    (frame,) = read_observations_csv(folder / 'out.csv', (SIZE, SIZE))['a']
+    assert np.abs(frame.uv - uv[frame.target_id - 1]).max() < 1.0
+    with pytest.raises(DataError, match="fluoroscope 'c', only of a, b"):
+        open_sources([folder / 'bag'], 'c')

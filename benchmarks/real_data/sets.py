@@ -225,7 +225,8 @@ def chessboards(folder: Path, side: str) -> DataSet:
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_MAX_ITER, 100, 1e-4)
     for number in OPENCV_NUMBERS:
         path = folder / f'opencv/opencv/samples/data/{side}{number:02d}.jpg'
-        image = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        coded = np.frombuffer(path.read_bytes(), dtype=np.uint8)
+        image = cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE)
         found, corners = cv2.findChessboardCorners(image, CHESSBOARD)
         if found:
             refined = cv2.cornerSubPix(image, corners, (5, 5), (-1, -1), stop)

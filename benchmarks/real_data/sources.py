@@ -24,9 +24,11 @@ import sys
 import urllib.request
 from dataclasses import dataclass
 from pathlib import Path
+from textwrap import fill
 
 RAW = 'https://raw.githubusercontent.com'
 TIMEOUT = 60.0  # s
+WIDTH = 120  # of lines of the list
 
 PM = 'data/riva2014/pmexports'
 ZHANG = (
@@ -161,8 +163,12 @@ def download(folder: Path) -> None:
 
 def text_of_sources() -> str:
     """Return the sources as Markdown."""
-    return '\n'.join(
+    lines = (
         f'- [{one.repository}](https://github.com/{one.repository}) ({one.licence}; '
         f'`{one.commit[:7]}`): {one.about}.'
         for one in SOURCES
+    )
+    return '\n'.join(
+        fill(line, WIDTH, subsequent_indent='  ', break_long_words=False, break_on_hyphens=False)
+        for line in lines
     )

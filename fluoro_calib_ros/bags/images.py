@@ -36,7 +36,8 @@ PIXEL_TYPES = {'mono8': 'u1', '8UC1': 'u1', 'mono16': 'u2', '16UC1': 'u2'}
 def image_topics(source: PathLike) -> dict[str, str]:
     """Return the topics of a bag with images by fluoroscope, the part of the name before the last.
 
-    The suffix /compressed of image_transport does not count. Where a fluoroscope has both, the images that are not compressed are taken. Raises DataError.
+    The suffix /compressed of image_transport does not count. Where a fluoroscope has both, the
+    images that are not compressed are taken. Raises DataError.
     """
     out: dict[str, str] = {}
     for kind in (COMPRESSED_IMAGE, IMAGE):

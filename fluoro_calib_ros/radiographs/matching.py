@@ -46,7 +46,7 @@ MARGIN_BEADS = 8
 # all faces of a phantom from the edge, the third a small part of a phantom.
 LEVELS = (
     (8, 6, 8, (0.85, 1.4)),
-    (14, 8, 6, (0.85, 1.4)),
+    (14, 8, 16, (0.85, 1.4)),
     (8, 6, 6, (0.7, 3.0)),
 )
 RIVAL_STEPS = 3

@@ -70,7 +70,7 @@ class Seen:
         """Return (n,) whether pixels (n, 2) lie in the field; NaN does not."""
         height, width = self.field.shape
         places = np.rint(np.where(np.isfinite(uv), uv, -1)).astype(int)
-        inside = ((places >= 0) & (places < (width, height))).all(axis=1)
+        inside = np.asarray(((places >= 0) & (places < (width, height))).all(axis=1))
         inside[inside] = self.field[places[inside, 1], places[inside, 0]]
         return inside
 

@@ -126,9 +126,9 @@ def estimate_noise(light: np.ndarray, field: np.ndarray) -> Noise:
         )
         return cut.swapaxes(1, 2).reshape(-1, NOISE_BLOCK**2)
 
-    used = blocks(field).all(axis=1)
+    used = np.asarray(blocks(field).all(axis=1))
     if not used.any():
-        used[:] = True
+        used = np.ones(len(used), dtype=bool)
     mean = np.median(blocks(light)[used], axis=1)
     variance = (1.4826 * np.median(np.abs(blocks(high)[used]), axis=1)) ** 2
     variance = np.maximum(variance, MIN_VARIANCE)

@@ -107,18 +107,18 @@ def fit_profile(
     edges = np.arange(0, start.reach_px + 1, 0.25)
     cell = np.digitize(distance, edges)
     total = np.bincount(cell, weights=weight, minlength=len(edges) + 1)[1:-1]
-    mean = np.bincount(cell, weights=weight * absorbed, minlength=len(edges) + 1)[1:-1]
-    place = np.bincount(cell, weights=weight * distance, minlength=len(edges) + 1)[1:-1]
+    sums = np.bincount(cell, weights=weight * absorbed, minlength=len(edges) + 1)[1:-1]
+    moments = np.bincount(cell, weights=weight * distance, minlength=len(edges) + 1)[1:-1]
     used = total > 0
-    mean = mean[used] / total[used]
-    place = place[used] / total[used]
+    mean = sums[used] / total[used]
+    place = moments[used] / total[used]
     root = np.sqrt(total[used])
 
     def residual(unknowns: np.ndarray) -> np.ndarray:
         value, _ = Profile(*unknowns[:3]).shadow(place)
         return root * ((1 - unknowns[3]) * value - mean)
 
-    first = [start.radius_px, start.blur_px, start.attenuation, start.scatter]
+    first = np.array([start.radius_px, start.blur_px, start.attenuation, start.scatter])
     first = np.clip(first, np.asarray(LOW) * 1.01 + 1e-3, np.asarray(HIGH) * 0.99)
     found = least_squares(residual, first, bounds=(LOW, HIGH), x_scale=first, max_nfev=12)
     return Profile(*map(float, found.x))

@@ -24,6 +24,8 @@ except ImportError:  # without the plugin, one process runs all tests
     LoadFileScheduling = None
 
 
+ROS = 'tests/ros'
+
 if LoadFileScheduling is not None:
 
     class OneWorkerForRos(LoadFileScheduling):
@@ -35,8 +37,14 @@ if LoadFileScheduling is not None:
 
         def _split_scope(self, nodeid: str) -> str:
             if nodeid.startswith('tests/ros/'):
-                return 'tests/ros'
+                return ROS
             return super()._split_scope(nodeid)
+
+        def _assign_work_unit(self, node) -> None:
+            """Begin with ROS, which takes longest."""
+            if ROS in self.workqueue:
+                self.workqueue.move_to_end(ROS, last=False)
+            super()._assign_work_unit(node)
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_xdist_make_scheduler(config, log):

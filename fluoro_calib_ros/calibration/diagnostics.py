@@ -108,7 +108,10 @@ def misfitting_exposures(run: SelfCalibration) -> dict[tuple[str, int], str]:
     """
     network = run.measured.network
     count = np.bincount(network.exposure, minlength=network.n_exposures)
-    fitting = np.bincount(network.exposure, run.after.inliers, network.n_exposures)
+    # By the core of the noise: the false matches of such an exposure make its tails heavy, and so
+    # the limit of gross errors wide.
+    fits = run.after.noise.inliers(run.after.q)
+    fitting = np.bincount(network.exposure, fits, network.n_exposures)
     share = fitting / count
     out = {}
     for row, frame in enumerate(run.measured.frames):

@@ -54,6 +54,9 @@ MIN_REDUNDANCY = 0.05
 INLIER_Q = -2 * np.log(1e-4)
 # Share of the true image points that may lie beyond the limit where the tails are heavy.
 MAX_REJECTED = 1e-3
+# Degrees of freedom with the heaviest tails that widen the limit, to about six sigma: heavier ones
+# are also what a wrong model or many false matches leave.
+MIN_TAIL_NU = 8.0
 # Iterations of the estimation of the Student-t, and relative changes at which they end. Steps of
 # the scale are cheap compared with the search for nu.
 MAX_NU_STEPS = 50
@@ -157,11 +160,12 @@ class Noise:
 
         About four sigma; of heavier tails, which a Student-t has with few degrees of freedom, the
         quantile that rejects MAX_REJECTED of the true points: P(q > x) = (1 + x/nu)^(-nu/2) for
-        D = 2.
+        D = 2, with nu of MIN_TAIL_NU or more.
         """
         if self.loss != 'student_t':
             return float(INLIER_Q)
-        tail = self.nu * (MAX_REJECTED ** (-2 / self.nu) - 1)
+        nu = max(self.nu, MIN_TAIL_NU)
+        tail = nu * (MAX_REJECTED ** (-2 / nu) - 1)
         return float(max(INLIER_Q, tail))
 
     def accepts(self, q: np.ndarray) -> np.ndarray:

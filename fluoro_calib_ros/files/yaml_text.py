@@ -16,9 +16,13 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import yaml
+
+BRACKETS = re.compile(r'[\[\]{}]')
+MAX_DEPTH = 100
 
 
 class _Loader(yaml.SafeLoader):
@@ -31,8 +35,18 @@ class _Loader(yaml.SafeLoader):
         return super().compose_node(parent, index)
 
 
+def _check_depth(text: str) -> None:
+    """Raise yaml.YAMLError for deep nesting, for which the parser takes quadratic time."""
+    depth = 0
+    for bracket in BRACKETS.finditer(text):
+        depth += 1 if bracket[0] in '[{' else -1
+        if depth > MAX_DEPTH:
+            raise yaml.YAMLError('nested too deeply')
+
+
 def parse_yaml(text: str) -> Any:
     """Return the value of a YAML text. Raises yaml.YAMLError, also for aliases."""
+    _check_depth(text)
     try:
         return yaml.load(text, Loader=_Loader)  # derived from the safe loader
     except RecursionError:

@@ -661,6 +661,7 @@ def test_exposures_that_are_left_out_are_reported(rig, tmp_path, capsys):
     check_result(document, ['a'], [n for n in range(1, 16) if n != 3])
 
 
+@pytest.mark.long
 def test_calibrate_ends_with_verdict_and_report(rig, tmp_path, capsys):
     arguments = (rig / 'calibration', '--phantom', rig / 'phantom.csv', '--out', tmp_path / 'new')
     assert run('calibrate', *arguments, '--fluoroscopes', 'a', '--model', 'none') == 0

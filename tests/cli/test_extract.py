@@ -38,6 +38,8 @@ from fluoro_calib_ros.jobs.image_sources import contains_images, open_sources
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.bead_images import bead_image
 
+pytestmark = pytest.mark.long
+
 SIZE = 400
 COUNT = 60
 

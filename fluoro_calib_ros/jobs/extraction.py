@@ -247,8 +247,9 @@ def run_extraction(
             results.append(result)
             if progress is not None:
                 progress(len(results), max(sources.count, len(results)))
-        shared = None if lens is None else _shared_lens(lens, results)
-        again = {number for number, result in enumerate(results) if _may_be_found(result)}
+        views = [result.view for result in results if result.view is not None]
+        shared = None if lens is None else shared_lens(lens, views)
+        again = {number for number, result in enumerate(results) if may_be_found(result.reason)}
         if shared is not None and again:
             lens = shared
             second = (s for number, s in enumerate(sources.images()) if number in again)
@@ -317,15 +318,18 @@ def _first_lens(request: ExtractionRequest, image: np.ndarray | DataError) -> Le
     """Return what is assumed of the fluoroscope of an image, None for one that cannot be read."""
     if isinstance(image, DataError):
         return None
-    size = (image.shape[1], image.shape[0])
-    if request.principal_distance_px is not None:
-        return Lens(size, request.principal_distance_px, GIVEN_SD)
-    return Lens(size, USUAL_DISTANCE * max(size), USUAL_SD)
+    return assumed_lens((image.shape[1], image.shape[0]), request.principal_distance_px)
 
 
-def _shared_lens(lens: Lens, results: Sequence[ImageResult]) -> Lens | None:
+def assumed_lens(image_size: tuple[int, int], principal_distance_px: float | None) -> Lens:
+    """Return what is assumed of a fluoroscope before its first image; None: not known."""
+    if principal_distance_px is not None:
+        return Lens(image_size, principal_distance_px, GIVEN_SD)
+    return Lens(image_size, USUAL_DISTANCE * max(image_size), USUAL_SD)
+
+
+def shared_lens(lens: Lens, views: Sequence[View]) -> Lens | None:
     """Return the lens with the distortion of the images that were solved, None for too few."""
-    views = [result.view for result in results if result.view is not None]
     if len(views) < MIN_SHARED:
         return None
     return replace(
@@ -337,9 +341,9 @@ def _shared_lens(lens: Lens, results: Sequence[ImageResult]) -> Lens | None:
     )
 
 
-def _may_be_found(result: ImageResult) -> bool:
-    """Return whether beads were seen in an image, but no pose."""
-    return result.frame is None and ('pose' in result.reason or 'phantom' in result.reason)
+def may_be_found(reason: str) -> bool:
+    """Return whether an image is refused because no pose was found for its beads."""
+    return 'pose' in reason or 'phantom' in reason
 
 
 def _all_refused(results: Sequence[ImageResult]) -> str:

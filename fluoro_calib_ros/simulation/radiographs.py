@@ -181,11 +181,11 @@ class Radiography:
         if plates:
             light *= self._plates(to_sensor, origin)
         if settings.clutter:
-            light *= _clutter(rng, light.shape, settings.clutter)
+            light *= clutter(rng, light.shape, settings.clutter)
         width, height = self.fluoroscope.image_size
         grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
-        light *= _illumination(grid, (width, height), settings)
-        return _detected(light, settings)
+        light *= illumination(grid, (width, height), settings)
+        return detected(light, settings)
 
     def _detector_mm(self, uv: np.ndarray) -> np.ndarray:
         """Points of the detector (n, 3) in the sensor frame [mm] of observed pixels (n, 2)."""
@@ -208,11 +208,11 @@ class Radiography:
         patches = low[seen, None, None] + offsets
         detector = self._detector_mm(patches.reshape(-1, 2)).reshape(len(seen), -1, 3)
         total = np.zeros((height, width), dtype=np.float32)
-        for spot in _focal_spot(self.settings.focal_spot_mm):
+        for spot in focal_spot(self.settings.focal_spot_mm):
             transmission = np.ones(
                 ((height + 2 * count) * fine, (width + 2 * count) * fine), dtype=np.float32
             )
-            path = _chords(sensor_mm[seen, None] - spot, detector - spot, radius_mm[seen, None])
+            path = chords(sensor_mm[seen, None] - spot, detector - spot, radius_mm[seen, None])
             passed = np.exp(-self.settings.bead_attenuation * path).astype(np.float32)
             passed = passed.reshape(len(seen), count * fine, count * fine)
             for (column, row), part in zip((low[seen] + count) * fine, passed):
@@ -241,7 +241,7 @@ class Radiography:
         return np.exp(-self.settings.plate_attenuation * path).astype(np.float32)
 
 
-def _focal_spot(diameter_mm: float) -> np.ndarray:
+def focal_spot(diameter_mm: float) -> np.ndarray:
     """Points (k, 3) of a uniform disc: its middle, and a ring that gives its second moment."""
     angle = np.arange(FOCAL_POINTS - 1) * 2 * np.pi / (FOCAL_POINTS - 1)
     ring = diameter_mm / 4 * np.sqrt(2 * FOCAL_POINTS / (FOCAL_POINTS - 1))
@@ -249,7 +249,7 @@ def _focal_spot(diameter_mm: float) -> np.ndarray:
     return np.concatenate([np.zeros((1, 3)), around])
 
 
-def _chords(centre: np.ndarray, ray: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def chords(centre: np.ndarray, ray: np.ndarray, radius: np.ndarray) -> np.ndarray:
     """Lengths of rays from the origin inside spheres; all arguments broadcast, the last axis 3."""
     x, y, z = np.moveaxis(ray, -1, 0)
     a, b, c = np.moveaxis(centre, -1, 0)
@@ -282,7 +282,7 @@ def _depth_in_field(
     return np.min(size * (0.5 - FIELD_MARGIN) - np.abs(from_centre), axis=-1)
 
 
-def _illumination(
+def illumination(
     uv: np.ndarray, image_size: tuple[int, int], settings: RadiographSettings
 ) -> np.ndarray:
     """Open beam (h, w) from 0 to 1 at pixels (h, w, 2): darker to the rim and to the anode."""
@@ -293,7 +293,7 @@ def _illumination(
     return (light * (LEAKAGE + (1 - LEAKAGE) * inside)).astype(np.float32)
 
 
-def _clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> np.ndarray:
+def clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> np.ndarray:
     """Transmission (h, w) of cables, bone-like shadows, screws and specks."""
     height, width = shape
     size = np.array([width, height])
@@ -334,7 +334,7 @@ def _clutter(rng: np.random.Generator, shape: tuple[int, ...], count: int) -> np
     return out
 
 
-def _detected(light: np.ndarray, settings: RadiographSettings) -> np.ndarray:
+def detected(light: np.ndarray, settings: RadiographSettings) -> np.ndarray:
     """Light (h, w) after blur and glare of the detector."""
     sharp = cv2.GaussianBlur(light, (0, 0), settings.blur_px) if settings.blur_px else light
     if not settings.glare:

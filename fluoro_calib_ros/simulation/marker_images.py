@@ -1,0 +1,412 @@
+"""Radiographs of moving markers: beads in bones that move while the light is on.
+
+Rays from several points of the focal spot, at several moments of the exposure, are traced through
+the beads, as in `radiographs`. Bones are hollow ellipsoids that move with their cluster of beads;
+discs of metal hide beads for a while, and cables, screws and specks lie in the way where it is
+asked. Only the surroundings of the beads are traced finely.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from ..photogrammetry.rotations import matrix_from_vector
+from .radiographs import (
+    DARK,
+    MARGIN_PX,
+    OPEN_BEAM,
+    RadiographSettings,
+    Radiography,
+    chords,
+    clutter,
+    detected,
+    focal_spot,
+    illumination,
+)
+from .rig import VirtualFluoroscope, VirtualRig
+
+FINE = 4  # rays across a pixel
+MOMENTS = 5  # of an exposure
+SPOT_POINTS = 3  # of the focal spot at each moment, others at the next
+BONE_STEP = 2  # pixels between rays through bones
+BONE_ATTENUATION = 0.028  # of compact bone less that of soft tissue [1/mm]
+HIDING = 0.02  # light that passes a disc of metal
+HIDING_PX = (7.0, 11.0)  # radius of such a disc
+HIDDEN_FRAMES = (3, 25)  # how long a bead is hidden
+FIRST_ID = 1001
+
+
+@dataclass(frozen=True)
+class MarkerScene:
+    """What moves in front of the fluoroscopes.
+
+    Attributes
+    ----------
+    clusters, markers : int
+        Number of rigid clusters, and of markers of each.
+    diameters_mm : tuple of float
+        Of markers, drawn at random.
+    attenuation : float
+        Linear attenuation coefficient of a marker [1/mm]; 7 is tantalum at 55 keV (NIST XCOM).
+    spread_mm : float
+        Half the size of a cluster.
+    apart_mm : float
+        Half the size of the volume in which the middles of the clusters move.
+    speed_mm : float
+        Typical way of a cluster from one image to the next.
+    hidden : float
+        Share of images in which a marker is hidden.
+    bones : bool
+        Whether each cluster is in a bone.
+    shutter : float
+        Share of the time between two images during which the light is on.
+    """
+
+    clusters: int = 5
+    markers: int = 6
+    diameters_mm: tuple[float, ...] = (0.8, 1.0)
+    attenuation: float = 7.0
+    spread_mm: float = 20.0
+    apart_mm: float = 60.0
+    speed_mm: float = 0.6
+    hidden: float = 0.05
+    bones: bool = True
+    shutter: float = 0.4
+
+
+MARKER_SETTINGS = RadiographSettings(photons=1500.0, bits=16, glare=0.08)
+HARD_MARKER_SETTINGS = RadiographSettings(
+    photons=500.0, bits=8, glare=0.15, blur_px=1.0, clutter=8, noise_blur_px=0.5
+)
+
+
+@dataclass(frozen=True)
+class MarkerImage:
+    """A radiograph of moving markers, with its truth.
+
+    Attributes
+    ----------
+    image : (h, w) ndarray of uint8 or uint16
+    uv : (n, 2) ndarray
+        True centres in the middle of the exposure [px].
+    seen : (n,) ndarray of bool
+        False for markers that are hidden or out of the field.
+    """
+
+    image: np.ndarray
+    uv: np.ndarray
+    seen: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Disc:
+    """A disc of metal that hides a marker of a fluoroscope for some images."""
+
+    fluoroscope: str
+    marker: int
+    first: float
+    last: float
+    radius_px: float
+    drift: np.ndarray  # [px] from its middle to its end
+
+
+class MovingMarkers:
+    """Rigid clusters of markers in motion.
+
+    Parameters
+    ----------
+    scene : MarkerScene
+    seed : int
+        The same seed gives the same motion.
+
+    Attributes
+    ----------
+    target_id : (n,) ndarray
+    cluster : (n,) ndarray
+        Number of the cluster of a marker.
+    local_mm : (n, 3) ndarray
+        Markers in the frame of their cluster.
+    """
+
+    def __init__(self, scene: MarkerScene, seed: int = 0) -> None:
+        self.scene = scene
+        rng = np.random.default_rng([seed, 21])
+        n = scene.clusters * scene.markers
+        self.target_id = np.arange(FIRST_ID, FIRST_ID + n)
+        self.cluster = np.repeat(np.arange(scene.clusters), scene.markers)
+        self.local_mm = _spread(rng, scene)
+        self.diameter_mm = rng.choice(scene.diameters_mm, n)
+        # Sums of three sinusoids for each coordinate and angle: (cluster, 6, 3).
+        shape = (scene.clusters, 6, 3)
+        self._amplitude = rng.uniform(0.3, 1.0, shape)
+        self._amplitude[:, :3] *= scene.apart_mm / 1.8
+        self._amplitude[:, 3:] *= 0.35
+        frequency = rng.uniform(0.5, 1.5, shape)
+        self._phase = rng.uniform(0, 2 * np.pi, shape)
+        # Scaled so that the clusters have the speed that is asked for.
+        speed = np.sqrt(0.5 * ((self._amplitude * frequency)[:, :3] ** 2).sum(axis=(1, 2)))
+        self._frequency = frequency * scene.speed_mm / np.median(speed)
+        angle = rng.uniform(-1.0, 1.0, (scene.clusters, 3))
+        self._turn = np.array([matrix_from_vector(vector) for vector in angle])
+
+    def poses(self, frame: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Rotations (3, 3) and shifts (3,) [mm] of all clusters at an image number."""
+        angle = 2 * self._frequency * frame / 2 + self._phase
+        values = (self._amplitude * np.sin(angle)).sum(axis=2)
+        return [
+            (matrix_from_vector(value[3:]) @ turn, value[:3])
+            for value, turn in zip(values, self._turn)
+        ]
+
+    def points_mm(self, frame: float) -> np.ndarray:
+        """Markers (n, 3) in the rig frame at an image number."""
+        out = np.empty_like(self.local_mm)
+        for number, (rotation, shift) in enumerate(self.poses(frame)):
+            rows = self.cluster == number
+            out[rows] = self.local_mm[rows] @ rotation.T + shift
+        return out
+
+
+def _spread(rng: np.random.Generator, scene: MarkerScene) -> np.ndarray:
+    """Markers (n, 3) of all clusters [mm], no two of a cluster close to each other."""
+    out = []
+    for _ in range(scene.clusters):
+        chosen: list[np.ndarray] = []
+        while len(chosen) < scene.markers:
+            point = rng.uniform(-1, 1, 3) * scene.spread_mm * np.array([0.5, 0.5, 1.0])
+            if all(np.linalg.norm(point - other) > 0.25 * scene.spread_mm for other in chosen):
+                chosen.append(point)
+        out += chosen
+    return np.array(out)
+
+
+class MarkerRadiography(Radiography):
+    """Takes radiographs of moving markers with one fluoroscope.
+
+    Parameters
+    ----------
+    fluoroscope : VirtualFluoroscope
+    markers : MovingMarkers
+    settings : RadiographSettings, optional
+    frames : int
+        Length of the sequence, over which markers are hidden.
+    seed : int
+    """
+
+    def __init__(
+        self,
+        fluoroscope: VirtualFluoroscope,
+        markers: MovingMarkers,
+        settings: RadiographSettings | None = None,
+        frames: int = 100,
+        seed: int = 0,
+    ) -> None:
+        super().__init__(fluoroscope, settings or MARKER_SETTINGS)
+        self.markers = markers
+        self.seed = seed
+        name = sum(fluoroscope.name.encode())
+        rng = np.random.default_rng([seed, 22, name])
+        self._discs = _discs(rng, fluoroscope.name, markers, frames)
+        width, height = fluoroscope.image_size
+        grid = np.stack(np.meshgrid(np.arange(width), np.arange(height)), axis=-1)
+        self._open = illumination(grid, (width, height), self.settings)
+        if self.settings.clutter:
+            self._open *= clutter(rng, self._open.shape, self.settings.clutter)
+        self._plane = self._rays[..., :2].astype(np.float32)
+
+    def take(self, frame: int) -> MarkerImage:
+        """Take the radiograph of an image number; the same number gives the same image."""
+        rng = np.random.default_rng([self.seed, 23, frame])
+        scene = self.markers.scene
+        moments = frame + scene.shutter * ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5)
+        points = np.array([self.markers.points_mm(moment) for moment in moments])
+        still = (np.eye(3), np.zeros(3))
+        uv = np.array([self.centres(of_moment, still) for of_moment in points])
+        true = self.centres(self.markers.points_mm(frame), still)
+        light = self._open.copy()
+        if scene.bones:
+            light *= self._bones(self.markers.poses(frame))
+        self._trace(light, points, uv)
+        hidden = self._hide(light, frame, true)
+        image = self._grey(detected(light, self.settings), rng)
+        return MarkerImage(image, true, self.in_field(true, 6.0) & ~hidden)
+
+    def _trace(self, light: np.ndarray, points: np.ndarray, uv: np.ndarray) -> None:
+        """Multiply the light (h, w) by the transmission of markers (moments, n, 3) at uv."""
+        fluoroscope = self.fluoroscope
+        sensor = (points - fluoroscope.position_mm) @ fluoroscope.rotation.T
+        radius = self.markers.diameter_mm / 2
+        reach = radius * fluoroscope.interior[2] / sensor[0, :, 2] * 1.15 + MARGIN_PX
+        low = np.floor(uv.min(axis=0) - reach[:, None]).astype(int)
+        high = np.ceil(uv.max(axis=0) + reach[:, None]).astype(int) + 1
+        low = np.maximum(low, 0)
+        high = np.minimum(high, fluoroscope.image_size)
+        spots = focal_spot(self.settings.focal_spot_mm)
+        for rows, (u0, v0), (u1, v1) in _regions(low, high):
+            column = (np.arange((u1 - u0) * FINE) + 0.5) / FINE - 0.5 + u0
+            row = (np.arange((v1 - v0) * FINE) + 0.5) / FINE - 0.5 + v0
+            grid = np.meshgrid(column.astype(np.float32), row.astype(np.float32))
+            plane = cv2.remap(self._plane, *grid, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+            detector = np.dstack([plane, np.full(grid[0].shape, self.settings.detector_mm)])
+            total = np.zeros(grid[0].shape)
+            count = 0
+            for number, of_moment in enumerate(sensor):
+                for spot in spots[1 + number % 2 :: 2][:SPOT_POINTS]:
+                    path = sum(
+                        chords(of_moment[one] - spot, detector - spot, radius[one]) for one in rows
+                    )
+                    total += np.exp(-self.markers.scene.attenuation * path)
+                    count += 1
+            passed = cv2.resize(total, (u1 - u0, v1 - v0), interpolation=cv2.INTER_AREA)
+            light[v0:v1, u0:u1] *= (passed / count).astype(np.float32)
+
+    def _bones(self, poses: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        """Transmission (h, w) of the bones around the clusters."""
+        fluoroscope = self.fluoroscope
+        ray = np.dstack(
+            [
+                self._plane[::BONE_STEP, ::BONE_STEP],
+                np.full(
+                    self._plane[::BONE_STEP, ::BONE_STEP].shape[:2], self.settings.detector_mm
+                ),
+            ]
+        )
+        ray = (ray / np.linalg.norm(ray, axis=-1, keepdims=True)).reshape(-1, 3)
+        size = self.markers.scene.spread_mm
+        path = np.zeros(len(ray), dtype=np.float32)
+        for rotation, shift in poses:
+            to_bone = (fluoroscope.rotation @ rotation).T
+            source = rotation.T @ (fluoroscope.position_mm - shift)
+            direction = (ray @ to_bone.T).astype(np.float32)
+            for factor, sign in ((1.0, 1.0), (0.78, -1.0)):
+                axes = factor * size * np.array([0.75, 0.75, 2.2])
+                path += sign * _ellipsoid_path(source / axes, direction / axes)
+        shape = self._plane[::BONE_STEP, ::BONE_STEP].shape[:2]
+        passed = np.exp(-BONE_ATTENUATION * path).astype(np.float32).reshape(shape)
+        height, width = self._plane.shape[:2]
+        # The coarse pixels are those at multiples of the step, so they are no area means.
+        place = np.meshgrid(
+            np.arange(width, dtype=np.float32) / BONE_STEP,
+            np.arange(height, dtype=np.float32) / BONE_STEP,
+        )
+        return cv2.remap(passed, *place, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+
+    def _hide(self, light: np.ndarray, frame: int, true: np.ndarray) -> np.ndarray:
+        """Draw the discs of metal of an image; returns (n,) which markers they hide."""
+        hidden = np.zeros(len(true), dtype=bool)
+        for disc in self._discs:
+            if not disc.first <= frame <= disc.last:
+                continue
+            middle = 0.5 * (disc.first + disc.last)
+            part = (frame - middle) / max(disc.last - middle, 1.0)
+            centre = true[disc.marker] + part * disc.drift
+            mask = np.zeros(light.shape, dtype=np.uint8)
+            place = np.round(centre * 8).astype(int)
+            cv2.circle(mask, tuple(map(int, place)), round(disc.radius_px * 8), 255, -1, 16, 3)
+            light *= 1 - (1 - HIDING) * (mask / np.float32(255))
+            hidden |= np.linalg.norm(true - centre, axis=1) < disc.radius_px + 2.5
+        return hidden
+
+    def _grey(self, light: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+        """Grey values (h, w) of light from 0 to 1; so many photons have Gaussian noise."""
+        settings = self.settings
+        expected = np.maximum(light, 0).astype(np.float32) * np.float32(settings.photons)
+        noise = rng.standard_normal(expected.shape, dtype=np.float32) * np.sqrt(expected)
+        if settings.noise_blur_px:
+            noise = cv2.GaussianBlur(noise, (0, 0), settings.noise_blur_px)
+        largest = 2**settings.bits - 1
+        counted = (expected + noise) / settings.photons
+        grey = largest * (DARK + (OPEN_BEAM - DARK) * counted)
+        if settings.inverted:
+            grey = largest - grey
+        dtype = np.uint8 if settings.bits == 8 else np.uint16
+        return np.clip(np.rint(grey), 0, largest).astype(dtype)
+
+
+def _regions(
+    low: np.ndarray, high: np.ndarray
+) -> Iterator[tuple[list[int], tuple[int, int], tuple[int, int]]]:
+    """Yield rows and corners of boxes low (n, 2) to high (n, 2), those that touch as one."""
+    boxes = [
+        ([number], a.copy(), b.copy())
+        for number, (a, b) in enumerate(zip(low, high))
+        if (b > a).all()
+    ]
+    merged = True
+    while merged:
+        merged = False
+        for one in range(len(boxes)):
+            for other in range(one + 1, len(boxes)):
+                _, a0, a1 = boxes[one]
+                rows, b0, b1 = boxes[other]
+                if (a0 < b1).all() and (b0 < a1).all():
+                    both = boxes[one][0] + rows
+                    boxes[one] = (both, np.minimum(a0, b0), np.maximum(a1, b1))
+                    del boxes[other]
+                    merged = True
+                    break
+            if merged:
+                break
+    for rows, a, b in boxes:
+        yield rows, (int(a[0]), int(a[1])), (int(b[0]), int(b[1]))
+
+
+def _ellipsoid_path(source: np.ndarray, direction: np.ndarray) -> np.ndarray:
+    """Lengths (n,) of rays in an ellipsoid, scaled to the unit sphere; directions (n, 3)."""
+    a = (direction * direction).sum(axis=1)
+    b = direction @ source.astype(np.float32)
+    c = np.float32(source @ source - 1)
+    return 2 * np.sqrt(np.maximum(b * b - a * c, 0)) / a
+
+
+def _discs(
+    rng: np.random.Generator, fluoroscope: str, markers: MovingMarkers, frames: int
+) -> list[_Disc]:
+    """Draw when markers are hidden, after the first images."""
+    out = []
+    mean = 0.5 * sum(HIDDEN_FRAMES)
+    count = rng.poisson(markers.scene.hidden * frames * len(markers.target_id) / mean)
+    for _ in range(count):
+        length = rng.integers(*HIDDEN_FRAMES)
+        first = rng.uniform(3, max(frames, 4))
+        angle = rng.uniform(0, 2 * np.pi)
+        radius = rng.uniform(*HIDING_PX)
+        drift = radius * np.array([np.cos(angle), np.sin(angle)])
+        marker = int(rng.integers(len(markers.target_id)))
+        out.append(_Disc(fluoroscope, marker, first, first + length, radius, drift))
+    return out
+
+
+@dataclass(frozen=True)
+class MarkerSequence:
+    """Radiographs of moving markers with all fluoroscopes of a rig, taken one after the other.
+
+    Attributes
+    ----------
+    rig : VirtualRig
+    markers : MovingMarkers
+    settings : RadiographSettings
+    frames : int
+    seed : int
+    """
+
+    rig: VirtualRig
+    markers: MovingMarkers
+    settings: RadiographSettings = field(default_factory=lambda: MARKER_SETTINGS)
+    frames: int = 100
+    seed: int = 0
+
+    def __iter__(self) -> Iterator[Mapping[str, MarkerImage]]:
+        """Yield the images of each moment, by fluoroscope."""
+        taken = {
+            fluoroscope.name: MarkerRadiography(
+                fluoroscope, self.markers, self.settings, self.frames, self.seed
+            )
+            for fluoroscope in self.rig.fluoroscopes
+        }
+        for frame in range(1, self.frames + 1):
+            yield {name: radiography.take(frame) for name, radiography in taken.items()}

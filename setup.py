@@ -51,7 +51,11 @@ setup(
         'jinja2',
         'tomli; python_version < "3.11"',
     ],
-    extras_require={'c3d': ['ezc3d'], 'test': ['pytest', 'pytest-timeout', 'pytest-xdist']},
+    extras_require={
+        'c3d': ['ezc3d'],
+        'watch': ['textual'],
+        'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],
+    },
     zip_safe=False,
     url='https://arxiv.org/abs/1810.00138',
     author='fluoro_calib_ros maintainers',

@@ -33,6 +33,7 @@ _REMEDIES = {
         'ROS 2 is not installed or not sourced: source /opt/ros/<distribution>/setup.bash, or run '
         '`make setup` and use .venv'
     ),
+    'textual': 'the dashboard needs it: pip install textual',
 }
 
 
@@ -69,6 +70,11 @@ def recorder_node() -> None:
 def simulator_node() -> None:
     """Run the simulator."""
     _run('nodes.simulator_node')
+
+
+def watch() -> None:
+    """Run the dashboard."""
+    _run('nodes.dashboard.watch')
 
 
 def demo() -> None:

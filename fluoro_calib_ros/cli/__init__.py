@@ -35,6 +35,7 @@ from . import (
     report,
     simulate,
     validate,
+    watch,
 )
 
 # A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, where
@@ -52,6 +53,7 @@ COMMANDS = (
     reconstruct,
     convert,
     bag,
+    watch,
 )
 
 

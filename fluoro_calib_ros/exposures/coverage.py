@@ -22,6 +22,19 @@ from scipy.ndimage import binary_dilation
 
 # Across the image: at 1024 px a cell is 32 px, about the spacing of the points of 15 exposures.
 CELLS = 32
+# Areas of the image, in rows of three from the top left.
+AREAS = (
+    'in the upper left corner',
+    'at the upper edge',
+    'in the upper right corner',
+    'at the left edge',
+    'in the centre',
+    'at the right edge',
+    'in the lower left corner',
+    'at the lower edge',
+    'in the lower right corner',
+)
+SUFFICIENT_OF_AREA = 0.85  # covered fraction above which an area is not named as missing
 
 
 class Coverage:
@@ -49,3 +62,15 @@ class Coverage:
     def fraction(self) -> float:
         """Covered fraction of the image, 0 to 1."""
         return float(np.mean(self.covered))
+
+    @property
+    def missing_areas(self) -> tuple[str, ...]:
+        """Areas of the image that are not sufficiently covered, the emptiest first, in words."""
+        thirds = np.linspace(0, CELLS, 4).astype(int)
+        covered = np.add.reduceat(
+            np.add.reduceat(self.covered.astype(float), thirds[:-1], 0), thirds[:-1], 1
+        )
+        size = np.diff(thirds)
+        fractions = (covered / np.outer(size, size)).ravel()
+        order = np.argsort(fractions, kind='stable')
+        return tuple(AREAS[i] for i in order if fractions[i] < SUFFICIENT_OF_AREA)

@@ -43,6 +43,7 @@ from rclpy.parameter import Parameter
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.task import Future
+from sensor_msgs.msg import Image
 
 from ..calibration import result as calibration_result
 from ..calibration.options import CalibrationOptions
@@ -57,6 +58,7 @@ from ..exposures.phantom import Phantom
 from ..files.calibration import SUFFIX, load_calibrations
 from ..files.calibration_request import PHANTOM as PHANTOM_FILE
 from ..files.phantom import read_phantom
+from ..images.coverage_picture import coverage_picture
 from ..jobs.calibration import CalibrationOutcome, Rig
 from ..jobs.result_folder import (
     check_result_folder,
@@ -69,9 +71,10 @@ from ..jobs.worker_process import run_in_worker_process
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..validation.check import Validation
-from .exposure_input import CollectOptions, ExposureInput
+from .exposure_input import Collected, CollectOptions, ExposureInput
 from .messages.calibration_status import FluoroscopeProgress, message_from_progress
 from .messages.fluoroscope_calibration import message_from_calibration
+from .messages.image import colour_message
 from .messages.self_calibration import (
     Request,
     Result,
@@ -287,6 +290,7 @@ class CalibrationNode(StreamNode):
         self._calibration_outputs = self._create_publishers(
             FluoroscopeCalibration, 'calibration', latched_qos()
         )
+        self._coverage_outputs = self._create_publishers(Image, 'coverage', latched_qos())
         # Services that await must not keep others from being answered.
         services = ReentrantCallbackGroup()
         self._orientation = OrientationService(
@@ -757,15 +761,31 @@ class CalibrationNode(StreamNode):
         incompatible = self.incompatible_publishers()
         statuses = []
         for fluoroscope in self._fluoroscopes.values():
-            progress = self._progress_of(fluoroscope)
+            collected = self._exposures.collected(fluoroscope.name)
+            progress = self._progress_of(fluoroscope, collected)
             self._status_outputs[fluoroscope.name].publish(message_from_progress(progress, stamp))
+            self._publish_coverage(progress, collected)
             fault = incompatible.get(f'{fluoroscope.name}/{OBSERVATIONS}', '')
-            statuses.append(self._diagnose(fluoroscope, progress, fault))
+            statuses.append(self._diagnose(fluoroscope, progress, collected, fault))
         return statuses
 
-    def _progress_of(self, fluoroscope: _Fluoroscope) -> FluoroscopeProgress:
+    def _publish_coverage(self, progress: FluoroscopeProgress, collected: Collected) -> None:
+        """Publish a picture of what is covered, while somebody looks at it."""
+        name = progress.fluoroscope
+        output = self._coverage_outputs[name]
+        if collected.covered is None or not output.get_subscription_count():
+            return
+        lines = (
+            f'{name}: {progress.exposures} exposures, {100 * progress.coverage:.0f} % covered',
+            collected.readiness.advice,
+        )
+        size = collected.image_size or (1, 1)
+        picture = coverage_picture(collected.covered, size, lines)
+        stamp = self.get_clock().now().to_msg()
+        output.publish(colour_message(picture, stamp, f'{name}_optical'))
+
+    def _progress_of(self, fluoroscope: _Fluoroscope, collected: Collected) -> FluoroscopeProgress:
         name = fluoroscope.name
-        collected = self._exposures.collected(name)
         return FluoroscopeProgress(
             fluoroscope=name,
             frames_received=collected.received,
@@ -781,7 +801,11 @@ class CalibrationNode(StreamNode):
         )
 
     def _diagnose(
-        self, fluoroscope: _Fluoroscope, progress: FluoroscopeProgress, incompatible: str
+        self,
+        fluoroscope: _Fluoroscope,
+        progress: FluoroscopeProgress,
+        collected: Collected,
+        incompatible: str,
     ) -> Status:
         """Return the diagnostics of a fluoroscope.
 
@@ -793,6 +817,8 @@ class CalibrationNode(StreamNode):
             {
                 'exposures': progress.exposures,
                 'coverage': f'{progress.coverage:.2f}',
+                'ready': collected.readiness.ready,
+                'next pose': collected.readiness.advice,
                 'frames received': progress.frames_received,
                 'frames rejected': progress.frames_rejected,
                 'frames unpaired': progress.frames_unpaired,

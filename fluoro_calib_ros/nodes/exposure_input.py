@@ -31,6 +31,7 @@ from ..exposures.collector import ExposureCollector, StillOptions
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.pairing import CompletePairer, PairingOptions
 from ..exposures.phantom import Phantom
+from ..exposures.readiness import Readiness, readiness
 from .messages.target_observations import ObservedFrame, frame_from_observed
 from .runtime.logging import RateLimitedLogger
 from .runtime.refusals import RefusalLog
@@ -65,6 +66,10 @@ class Collected:
         Collected exposures, and the image points in them.
     coverage : float
         Covered part of the image, 0 to 1.
+    covered : ndarray or None
+        Whether cells (rows, columns) of the image are covered; None before the first exposure.
+    image_size : tuple of int or None
+    readiness : Readiness
     """
 
     received: int
@@ -73,6 +78,9 @@ class Collected:
     exposures: int
     observations: int
     coverage: float
+    covered: np.ndarray | None
+    image_size: tuple[int, int] | None
+    readiness: Readiness
 
 
 class ObservationStream:
@@ -172,6 +180,9 @@ class ExposureInput:
                 len(exposures),
                 sum(len(pair[name].target_id) for pair in exposures),
                 coverage.fraction if coverage else 0.0,
+                coverage.covered if coverage else None,
+                stream.image_size,
+                readiness(len(exposures), coverage),
             )
 
     def disagreement(self) -> str:
@@ -275,4 +286,10 @@ class ExposureInput:
             f'{100 * coverage.fraction:.0f} % of the image covered'
             for name, coverage in self._collector.coverage.items()
         )
-        self._logger.info(f'exposure {len(self._collector.exposures)} collected ({counts})')
+        exposures = len(self._collector.exposures)
+        self._logger.info(f'exposure {exposures} collected ({counts})')
+        advice = [
+            f'{name}: {readiness(exposures, coverage).advice}'
+            for name, coverage in self._collector.coverage.items()
+        ]
+        self._logger.info(f'next pose: {"; ".join(advice)}')

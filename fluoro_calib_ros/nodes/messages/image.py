@@ -20,6 +20,7 @@ from array import array
 
 import cv2
 import numpy as np
+from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
@@ -136,6 +137,20 @@ class ImageConverter:
             f'fluoroscope {self._fluoroscope}, image of {stamp.sec}.{stamp.nanosec:09d} s: '
             f'{reason}',
         )
+
+
+def colour_message(image: np.ndarray, stamp: Time, frame_id: str) -> Image:
+    """Return the Image of a colour picture (h, w, 3) of uint8, RGB."""
+    message = Image(
+        height=image.shape[0],
+        width=image.shape[1],
+        encoding='rgb8',
+        step=3 * image.shape[1],
+        data=array('B', np.ascontiguousarray(image).tobytes()),
+    )
+    message.header.stamp = stamp
+    message.header.frame_id = frame_id
+    return message
 
 
 def compressed_message(

@@ -143,6 +143,7 @@ class StreamNode(ManagedNode):
         self.limited_logger = RateLimitedLogger(self.get_logger())
         self.readers: list[StreamReader] = []
         self._resources = ExitStack()
+        self._readiness = ''  # what was logged last
 
     def create_outputs(self) -> None:
         """Make what exists while the node is configured, by create_output() and own()."""
@@ -225,7 +226,12 @@ class StreamNode(ManagedNode):
         self.create_outputs()
         diagnostics = DiagnosticsPublisher(self)
         self.own(diagnostics, diagnostics.close)
-        timer = self.create_timer(1.0, lambda: diagnostics.publish(self.diagnose()))
+
+        def report() -> None:
+            diagnostics.publish(self.diagnose())
+            self._log_readiness()
+
+        timer = self.create_timer(1.0, report)
         self.own(timer, self.destroy_timer, timer)
 
     def activate(self) -> None:
@@ -233,6 +239,25 @@ class StreamNode(ManagedNode):
         self.create_readers()
         for reader in self.readers:
             reader.start()
+        self._readiness = ''
+
+    def _log_readiness(self) -> None:
+        """Log that the node is ready and for whom it waits, whenever that has changed."""
+        found: dict[str, bool] = {}
+        for reader in self.readers:
+            for topic, published in reader.topics().items():
+                # Of raw and compressed images, one suffices.
+                topic = topic.removesuffix('/compressed')
+                found[topic] = found.get(topic, False) or published
+        if not found:
+            return
+        missing = [topic for topic, published in found.items() if not published]
+        state = f'receiving {", ".join(found)}'
+        if missing:
+            state = f'waiting for a publisher of {", ".join(missing)}'
+        if state != self._readiness:
+            self._readiness = state
+            self.get_logger().info(f'ready: {state}')
 
     def deactivate(self) -> None:
         """Stop the stream readers."""

@@ -35,6 +35,8 @@ from rclpy.signals import SignalHandlerOptions
 
 from .errors import USER_ERRORS, StartError, one_line
 from .guard import guard_services
+from .node_help import asks_for_help, help_text
+from .parameters import unknown_parameters
 
 MAX_FAILURES = 100  # of callbacks within a second: nothing else works
 INTERRUPTED = 130  # exit status after a second interrupt
@@ -52,6 +54,9 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
     method stop(), which ends everything that its callbacks wait for. The callbacks end before the
     context does: rclpy's own signal handlers would shut it down while they run.
     """
+    if asks_for_help(sys.argv[1:] if args is None else args):
+        print(help_text(sys.modules[make_node.__module__]))
+        sys.exit(0)
     ended = threading.Event()
     node = None
     code = 0
@@ -66,6 +71,8 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
         _call_on_interrupt(end)
         node = _make(make_node)
         executor.add_node(node)
+        for sentence in unknown_parameters(node):
+            node.get_logger().warning(sentence)
         guard_services(node)
         getattr(node, 'bring_up', lambda: None)()
         try:

@@ -21,6 +21,7 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -42,6 +43,9 @@ MAX_TIMEOUT_S = 86400.0  # longest time that a request may ask a node to wait
 MAX_INTEGER = 2**63 - 1
 # A fluoroscope's name is part of file names and topics.
 FLUOROSCOPE_NAME = re.compile('[A-Za-z_][A-Za-z0-9_]{0,99}')
+
+# Names that ROS declares itself, in part only when they are needed.
+_OF_ROS = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
 
 T = TypeVar('T')
 
@@ -238,6 +242,21 @@ def parameters_of(groups: Iterable[ParameterGroup[Any]]) -> dict[str, Option]:
 def settable_parameters(groups: Iterable[ParameterGroup[Any]]) -> frozenset[str]:
     """Return the names of the parameters of a node that may change while it runs."""
     return frozenset(name for group in groups for name in group.settable)
+
+
+def unknown_parameters(node: Node) -> list[str]:
+    """Return a sentence for every given parameter that a node does not have.
+
+    ROS ignores them: a mistyped name would change nothing, and nobody would be told.
+    """
+    sentences = []
+    for name in node._parameter_overrides:  # rclpy has no public access to them
+        if node.has_parameter(name) or name.startswith(_OF_ROS):
+            continue
+        close = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
+        hint = f'; did you mean {close[0]}?' if close else '; --help lists the parameters'
+        sentences.append(f'there is no parameter {name}, it has no effect{hint}')
+    return sentences
 
 
 def check_fluoroscopes(names: tuple[str, ...], minimum: int = 1) -> None:

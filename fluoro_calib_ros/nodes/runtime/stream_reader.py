@@ -137,6 +137,13 @@ class StreamReader:
         decode = decode or (lambda data: deserialize_message(data, kind))
         self._routes.append((topic, subscription, decode, callback))
 
+    def topics(self) -> dict[str, bool]:
+        """Return the subscribed topics by relative name, and whether each has a publisher."""
+        return {
+            topic: bool(self._node.count_publishers(subscription.topic_name))
+            for topic, subscription, *_ in self._routes
+        }
+
     def accept_best_effort(self) -> list[str]:
         """Subscribe best effort to topics that are only published so; returns them.
 

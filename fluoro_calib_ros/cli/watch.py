@@ -1,0 +1,44 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""fluoro-calib watch."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+
+NAME = 'watch'
+HELP = 'Watch and run a live session in the terminal: nodes, exposures, calibration (needs ROS 2).'
+EXAMPLE = 'fluoro-calib watch'
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.add_argument(
+        '--namespace', default='', metavar='NS', help='namespace of the rig (default: none)'
+    )
+    parser.add_argument(
+        '--once', action='store_true', help='print the state once and end, for logs and scripts'
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Replace this process by the dashboard, which has the terminal to itself."""
+    words = ['--once'] if arguments.once else []
+    if arguments.namespace:
+        words += ['--ros-args', '-r', f'__ns:=/{arguments.namespace.strip("/")}']
+    code = 'from fluoro_calib_ros.entry_points import watch; watch()'
+    os.execv(sys.executable, [sys.executable, '-c', code, *words])

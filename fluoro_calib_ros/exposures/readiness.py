@@ -1,0 +1,59 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether the collected exposures suffice for a calibration, and what the next one should show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from .coverage import Coverage
+
+RECOMMENDED_EXPOSURES = 15  # docs/usage.md; accuracy against their number: docs/accuracy.md
+RECOMMENDED_COVERAGE = 0.9
+MAX_AREAS = 2  # named at once
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """What is still missing before a calibration is worthwhile.
+
+    Attributes
+    ----------
+    ready : bool
+        Whether there are enough exposures and enough of the image is covered.
+    advice : str
+        What the next pose should show, or that it is time to calibrate.
+    """
+
+    ready: bool
+    advice: str
+
+
+def readiness(exposures: int, coverage: Coverage | None) -> Readiness:
+    """Return what is missing to a calibration of one fluoroscope.
+
+    exposures: number of collected ones; coverage: None before the first one.
+    """
+    if coverage is None or not exposures:
+        return Readiness(False, 'show the phantom and keep it still')
+    missing = coverage.missing_areas[:MAX_AREAS]
+    covered = coverage.fraction >= RECOMMENDED_COVERAGE
+    if exposures >= RECOMMENDED_EXPOSURES and covered:
+        return Readiness(True, 'ready to calibrate')
+    further = RECOMMENDED_EXPOSURES - exposures
+    count = f'{further} more, ' if further > 0 else ''
+    if not missing:
+        return Readiness(False, f'{count}with the phantom turned and tilted')
+    return Readiness(False, f'{count}with beads {" and ".join(missing)} of the image')

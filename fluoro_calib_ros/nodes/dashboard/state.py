@@ -1,0 +1,166 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the dashboard shows, without ROS and without a terminal."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+from typing import Protocol
+
+LEVELS = ('ok', 'warn', 'error', 'silent')  # of a node or a function; silent: nothing is heard
+# Keys by which a user asks for something, and what the dashboard then calls.
+CAPTURE = 'capture'
+CALIBRATE = 'calibrate'
+CALIBRATE_FAST = 'calibrate_fast'
+CANCEL = 'cancel'
+ORIENT = 'orient'
+RESET = 'reset'
+REQUESTS = (CAPTURE, CALIBRATE, CALIBRATE_FAST, CANCEL, ORIENT, RESET)
+
+RATE_WINDOW_S = 5.0
+
+
+@dataclass(frozen=True)
+class FluoroscopeState:
+    """One fluoroscope. NaN and '' stand for what is not known yet.
+
+    Attributes
+    ----------
+    name : str
+    state : str
+        'collecting', 'calibrating', 'calibrated'.
+    frames_hz, corrected_hz : float
+        Frames that arrive, and frames that are corrected, a second.
+    latency_p50_ms, latency_p99_ms : float
+        From the arrival of a frame to its correction.
+    rejected : int
+        Frames refused because their content was wrong.
+    exposures : int
+    coverage : float
+        Covered part of the image, 0 to 1.
+    next_pose : str
+        What the next exposure should show.
+    ready : bool
+        Whether the exposures suffice.
+    iteration : int
+        Round of the running or last calibration.
+    rmse_px : tuple of float
+        Of that round, in u and v.
+    calibration_id : str
+    age_s : float
+        Of the calibration.
+    """
+
+    name: str
+    state: str = ''
+    frames_hz: float = math.nan
+    corrected_hz: float = math.nan
+    latency_p50_ms: float = math.nan
+    latency_p99_ms: float = math.nan
+    rejected: int = 0
+    exposures: int = 0
+    coverage: float = 0.0
+    next_pose: str = ''
+    ready: bool = False
+    iteration: int = 0
+    rmse_px: tuple[float, float] = (math.nan, math.nan)
+    calibration_id: str = ''
+    age_s: float = math.nan
+
+
+@dataclass(frozen=True)
+class NodeState:
+    """One node: its worst level and the message that belongs to it."""
+
+    name: str
+    level: str
+    message: str
+
+
+@dataclass(frozen=True)
+class SessionState:
+    """The whole session.
+
+    Attributes
+    ----------
+    namespace : str
+    fluoroscopes : tuple of FluoroscopeState
+    nodes : tuple of NodeState
+    points_hz : float
+        Exposures reconstructed a second.
+    points_latency_ms : tuple of float
+        Median and 99th percentile.
+    orientation : str
+        Source of the orientation of the rig, '' without one.
+    drift_level, drift : str
+        Of the drift watch.
+    verdict : str
+        Of the last calibration of this session that was validated.
+    findings : tuple of str
+    job : str
+        What runs at the moment, '' if nothing does.
+    log : tuple of str
+        What was asked for, and the answers; the newest last.
+    """
+
+    namespace: str = '/'
+    fluoroscopes: tuple[FluoroscopeState, ...] = ()
+    nodes: tuple[NodeState, ...] = ()
+    points_hz: float = math.nan
+    points_latency_ms: tuple[float, float] = (math.nan, math.nan)
+    orientation: str = ''
+    drift_level: str = ''
+    drift: str = ''
+    verdict: str = ''
+    findings: tuple[str, ...] = ()
+    job: str = ''
+    log: tuple[str, ...] = ()
+
+
+class Session(Protocol):
+    """What the view needs: the present state, and somebody who carries out requests."""
+
+    def state(self) -> SessionState:
+        """Return the present state."""
+        ...
+
+    def request(self, action: str) -> None:
+        """Start one of REQUESTS; the answer comes into the log."""
+        ...
+
+
+@dataclass
+class RateMeter:
+    """Events a second, from a counter that is read now and then."""
+
+    _readings: deque[tuple[float, int]] = field(default_factory=lambda: deque(maxlen=100))
+
+    def add(self, seconds: float, count: int) -> None:
+        """Add a reading; a counter that was reset begins anew."""
+        if self._readings and count < self._readings[-1][1]:
+            self._readings.clear()
+        self._readings.append((seconds, count))
+        while seconds - self._readings[0][0] > RATE_WINDOW_S:
+            self._readings.popleft()
+
+    @property
+    def hz(self) -> float:
+        """The mean rate of the last seconds, NaN before two readings."""
+        if len(self._readings) < 2:
+            return math.nan
+        (first_s, first), (last_s, last) = self._readings[0], self._readings[-1]
+        return (last - first) / (last_s - first_s) if last_s > first_s else math.nan

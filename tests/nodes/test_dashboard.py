@@ -1,0 +1,132 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The view of the dashboard, on plain states."""
+
+import asyncio
+from dataclasses import replace
+
+import pytest
+from rich.console import Console
+
+from fluoro_calib_ros.nodes.dashboard.state import (
+    FluoroscopeState,
+    NodeState,
+    RateMeter,
+    SessionState,
+)
+
+pytest.importorskip('textual')
+from textual.widgets import Static
+
+from fluoro_calib_ros.nodes.dashboard.view import Dashboard, session_text
+
+STATE = SessionState(
+    fluoroscopes=(
+        FluoroscopeState('a', 'collecting', 59.9, exposures=9, coverage=0.75, next_pose='6 more'),
+        FluoroscopeState('b', 'calibrating', rejected=3, iteration=4, rmse_px=(0.21, 0.22)),
+    ),
+    nodes=(NodeState('calibration_node', 'ok', 'collecting exposures'),),
+)
+
+
+class Recorded:
+    """A session that shows a state and records what is asked."""
+
+    def __init__(self, state=STATE):
+        self.shown = state
+        self.asked = []
+
+    def state(self):
+        return self.shown
+
+    def request(self, action):
+        self.asked.append(action)
+
+
+def text_of(renderable):
+    console = Console(width=120, record=True, file=open('/dev/null', 'w'))  # noqa: SIM115
+    console.print(renderable)
+    return console.export_text()
+
+
+def run(session, scenario):
+    async def main():
+        app = Dashboard(session)
+        async with app.run_test(size=(100, 36)) as pilot:
+            await scenario(app, pilot)
+
+    asyncio.run(main())
+
+
+def test_text_holds_every_part_of_the_state():
+    text = text_of(session_text(STATE))
+    for part in ('59.9 a second', '75 %', '6 more', '3 refused', 'round 4  RMSE 0.210 0.220 px'):
+        assert part in text
+    assert 'no calibration of this session yet' in text and 'none yet' in text
+
+
+def test_findings_follow_the_verdict():
+    state = replace(STATE, verdict='fail', findings=('the residuals have a trend',))
+    text = text_of(session_text(state))
+    assert text.index('fail') < text.index('the residuals have a trend')
+
+
+def test_without_nodes_it_says_for_what_it_waits():
+    assert 'waiting for a calibration node' in text_of(session_text(SessionState()))
+
+
+def test_keys_ask_the_session():
+    session = Recorded()
+
+    async def scenario(_, pilot):
+        await pilot.press('p', 'c', 'f', 'o', 'x')
+
+    run(session, scenario)
+    assert session.asked == ['capture', 'calibrate', 'calibrate_fast', 'orient', 'cancel']
+
+
+def test_reset_needs_a_second_key():
+    session = Recorded()
+
+    async def scenario(app, pilot):
+        await pilot.press('r')
+        assert not session.asked
+        assert 'press r again' in str(app.query_one('#log', Static).render())
+        await pilot.press('r')
+
+    run(session, scenario)
+    assert session.asked == ['reset']
+
+
+def test_the_view_follows_the_state():
+    session = Recorded()
+
+    async def scenario(app, pilot):
+        session.shown = replace(STATE, log=('12:00:00  calibrate: a, b calibrated in 3.0 s',))
+        app.show()
+        await pilot.pause()
+        assert 'calibrated in 3.0 s' in str(app.query_one('#log', Static).render())
+
+    run(session, scenario)
+
+
+def test_rate_is_that_of_the_last_seconds_and_survives_a_restart():
+    meter = RateMeter()
+    for second in range(10):
+        meter.add(second, 100 if second < 4 else 100 + 60 * (second - 3))
+    assert meter.hz == pytest.approx(60.0)
+    meter.add(10, 0)
+    meter.add(11, 30)
+    assert meter.hz == pytest.approx(30.0)

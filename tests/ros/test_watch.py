@@ -1,0 +1,73 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The dashboard's client and the calibration node: a session without the command ros2."""
+
+import numpy as np
+from ros_graph import NAMES, standing
+from sensor_msgs.msg import Image
+
+from fluoro_calib_ros.nodes.dashboard.client import SessionClient
+from fluoro_calib_ros.nodes.runtime.qos import latched_qos
+
+
+def test_session_is_run_from_the_dashboard(graph, exposures, tmp_path, monkeypatch):
+    """It shows the exposures and what is missing, and captures, resets and calibrates."""
+    node = graph.calibration_node(tmp_path / 'out', collect='request', phantm='mistyped')
+    client = graph.client
+    assert 'there is no parameter phantm, it has no effect; did you mean phantom?' in node.log
+    watch = SessionClient(graph.namespace)
+    client._spinner.add_node(watch)
+    pictures = []
+    client.create_subscription(Image, 'a/coverage', pictures.append, latched_qos())
+
+    def fluoroscope():
+        return next((f for f in watch.state().fluoroscopes if f.name == 'a' and f.state), None)
+
+    try:
+        client.wait_until(fluoroscope, what='the status of fluoroscope a')
+        assert fluoroscope().exposures == 0 and not fluoroscope().ready
+        assert fluoroscope().next_pose == 'show the phantom and keep it still'
+        watch.request('calibrate_fast')
+        client.wait_until(
+            lambda: any('calibrate failed' in line for line in watch.state().log),
+            what='the refusal of a calibration without exposures',
+        )
+        assert not watch.state().job
+
+        streams = [standing(exposures[name][0], 10**6) for name in NAMES]
+        client.stream(zip(*streams), rate=30.0)
+        watch.request('capture')
+        client.wait_until(lambda: fluoroscope().exposures == 1, what='the captured exposure')
+        client.wait_until(lambda: '14 more, with beads' in fluoroscope().next_pose)
+        client.wait_until(lambda: pictures, what='a picture of the coverage')
+        picture = pictures[-1]
+        colours = np.frombuffer(picture.data, np.uint8).reshape(picture.height, picture.width, 3)
+        green = (colours[: picture.width] == (60, 150, 70)).all(axis=2).mean()
+        assert abs(green - fluoroscope().coverage) < 0.05
+        client.wait_until(
+            lambda: 'ready: receiving a/target_observations, b/target_observations' in node.log,
+            what='the line that the node is ready',
+        )
+        watch.request('reset')
+        client.wait_until(lambda: fluoroscope().exposures == 0, what='the reset')
+        client.end_stream()
+        (state,) = watch.state().nodes
+        assert state.name == 'calibration_node'
+
+        assert node.end() == 0
+        client.wait_until(lambda: watch.state().nodes[0].level == 'silent')
+    finally:
+        client._spinner.remove_node(watch)
+        watch.destroy_node()

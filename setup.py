@@ -68,6 +68,7 @@ setup(
     entry_points={
         'console_scripts': [
             'calibration_node = fluoro_calib_ros.entry_points:calibration_node',
+            'extraction_node = fluoro_calib_ros.entry_points:extraction_node',
             'correction_node = fluoro_calib_ros.entry_points:correction_node',
             'reconstruction_node = fluoro_calib_ros.entry_points:reconstruction_node',
             'image_node = fluoro_calib_ros.entry_points:image_node',

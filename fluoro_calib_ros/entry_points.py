@@ -42,6 +42,11 @@ def calibration_node() -> None:
     _run('nodes.calibration_node')
 
 
+def extraction_node() -> None:
+    """Run the extraction node."""
+    _run('nodes.extraction_node')
+
+
 def correction_node() -> None:
     """Run the correction node."""
     _run('nodes.correction_node')

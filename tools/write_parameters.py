@@ -33,7 +33,13 @@ from fluoro_calib_ros.options import Option
 ROOT = Path(__file__).parents[1]
 CONFIG = ROOT / 'config' / 'fluoro_calib.yaml'
 DOCS = ROOT / 'docs' / 'nodes.md'
-CONFIGURED = ('calibration_node', 'correction_node', 'reconstruction_node', 'image_node')
+CONFIGURED = (
+    'extraction_node',
+    'calibration_node',
+    'correction_node',
+    'reconstruction_node',
+    'image_node',
+)
 NODES = (*CONFIGURED, 'player_node', 'recorder_node', 'simulator_node')
 WIDTH = 99
 HEAD = """\

@@ -100,7 +100,7 @@ def _work(
     or ('error', exception) at the end.
     """
     os.nice(NICE)
-    threading.Thread(target=_end_with, args=(parent,), daemon=True).start()
+    threading.Thread(target=end_with_parent, args=(parent,), daemon=True).start()
     try:
         outcome = run_calibration(
             request,
@@ -115,7 +115,7 @@ def _work(
         sender.send(('error', RuntimeError(repr(error))))
 
 
-def _end_with(parent: int) -> None:
+def end_with_parent(parent: int) -> None:
     """End this process once its parent has died, which cannot terminate it any more."""
     while os.getppid() == parent:
         time.sleep(PARENT_POLL_S)

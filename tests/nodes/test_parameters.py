@@ -161,7 +161,8 @@ def test_shipped_rviz_and_aggregator_configurations_name_our_topics_and_nodes():
     )
     groups = yaml.safe_load((config / 'diagnostics.yaml').read_text())['/**']['ros__parameters']
     nodes = {name for g in groups.values() if isinstance(g, dict) for name in g['contains']}
-    assert nodes == {f'{n}_node' for n in ('calibration', 'correction', 'reconstruction', 'image')}
+    kinds = ('extraction', 'calibration', 'correction', 'reconstruction', 'image')
+    assert nodes == {f'{kind}_node' for kind in kinds}
 
 
 # ---- setting them while the node runs

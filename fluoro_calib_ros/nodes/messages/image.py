@@ -55,25 +55,30 @@ class ImageConverter:
         """
         frame_id = message.header.frame_id
         if frame_id != calibration.frame_id and frame_id and calibration.frame_id:
-            raise self._refused(
+            raise self.refusal(
                 'frame id',
                 message,
                 f'the frame id is {frame_id}, but the calibration is of {calibration.frame_id}',
             )
-        if isinstance(message, CompressedImage):
-            image = self._decompress(message)
-            encoding = ENCODINGS[image.dtype]
-        else:
-            image = self._view(message)
-            encoding = message.encoding
+        image, encoding = self.decoded(message)
         if image.shape[::-1] != tuple(calibration.image_size):
-            raise self._refused(
+            raise self.refusal(
                 'image size',
                 message,
                 f'the image is {image.shape[1]} x {image.shape[0]} px, but the '
                 f'calibration is for {calibration.image_size[0]} x {calibration.image_size[1]} px',
             )
         return image, encoding
+
+    def decoded(self, message: Image | CompressedImage) -> tuple[np.ndarray, str]:
+        """Return the grey image (h, w) uint8 or uint16 of a message, and its encoding.
+
+        The array is the memory of an Image where its byte order allows. Raises Refused.
+        """
+        if isinstance(message, CompressedImage):
+            image = self._decompress(message)
+            return image, ENCODINGS[image.dtype]
+        return self._view(message), message.encoding
 
     def prepare_output(
         self, header: Header, encoding: str, shape: tuple[int, ...]
@@ -98,7 +103,7 @@ class ImageConverter:
     def _view(self, message: Image) -> np.ndarray:
         pixel_type = PIXEL_TYPES.get(message.encoding)
         if pixel_type is None:
-            raise self._refused(
+            raise self.refusal(
                 'encoding', message, f'its encoding {message.encoding!r} is not mono8 or mono16'
             )
         dtype = np.dtype(pixel_type)
@@ -109,7 +114,7 @@ class ImageConverter:
         row_size = width * dtype.itemsize
         min_size = (height - 1) * step + row_size
         if not width or not height or step < row_size or not min_size <= size <= height * step:
-            raise self._refused(
+            raise self.refusal(
                 'image size',
                 message,
                 f'{size} bytes in rows of {step} are not an image of {width} x '
@@ -126,11 +131,12 @@ class ImageConverter:
             return decode(message.data)
         except DataError as error:
             kind = 'encoding' if 'colour' in str(error) or 'pixels of' in str(error) else 'damaged'
-            raise self._refused(
+            raise self.refusal(
                 kind, message, f'{message.format or "no format"}: {error}'
             ) from None
 
-    def _refused(self, kind: str, message: Image | CompressedImage, reason: str) -> Refused:
+    def refusal(self, kind: str, message: Image | CompressedImage, reason: str) -> Refused:
+        """Return the error that names an image and says why it is refused."""
         stamp = message.header.stamp
         return Refused(
             kind,

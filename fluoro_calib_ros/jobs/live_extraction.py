@@ -1,0 +1,165 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Extraction of a stream: image after image of one fluoroscope, each helped by those before."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Protocol
+
+import numpy as np
+
+from ..errors import DataError
+from ..exposures.phantom import Phantom
+from ..radiographs.extraction import Extraction, extract_beads
+from ..radiographs.matching import PhantomModel
+from ..radiographs.overlay import draw_overlay
+from ..radiographs.view import Lens, View
+from .extraction import assumed_lens, may_be_found, shared_lens
+
+VIEWS = 30  # solved images whose distortion helps where a pose is not found
+FOLLOWED_TURN = np.deg2rad(15.0)  # to the pose of the image before: nearer ones were followed
+
+
+@dataclass(frozen=True)
+class LiveObservations:
+    """What was found in one image of a stream.
+
+    Attributes
+    ----------
+    target_id : (n,) ndarray of int
+    uv : (n, 2) ndarray
+        Centres [px].
+    sigma : (n,) ndarray
+        Standard deviation of a coordinate [px].
+    overlapped : (n,) ndarray of bool
+    reason : str
+        Why there are no observations; '' where there are.
+    note : str
+        What should be known of the observations, such as ids that may have been exchanged.
+    expected : int
+        Targets that should be visible.
+    found, explained : float
+        Shares of the expected targets that are found, and of what is found that is expected.
+    followed : bool
+        Whether the image before gave the start.
+    picture : (h, w, 3) ndarray or None
+        Overlay of uint8, blue, green, red, if it was asked for.
+    seconds : float
+    """
+
+    target_id: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    uv: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
+    sigma: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    overlapped: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    reason: str = ''
+    note: str = ''
+    expected: int = 0
+    found: float = 0.0
+    explained: float = 0.0
+    followed: bool = False
+    picture: np.ndarray | None = None
+    seconds: float = 0.0
+
+
+class LiveExtractor(Protocol):
+    """Extracts the targets of one fluoroscope, image after image."""
+
+    def extract(self, image: np.ndarray, overlay: bool = False) -> LiveObservations:
+        """Return what is found in an image (h, w) of uint8 or uint16; never raises DataError."""
+
+
+# Makes the extractor of a fluoroscope, in the process in which it is to run.
+MakeExtractor = Callable[[], LiveExtractor]
+
+
+@dataclass(frozen=True)
+class PhantomSettings:
+    """What a PhantomFollower is made of: phantom, and principal distance [px] or None."""
+
+    phantom: Phantom
+    principal_distance_px: float | None = None
+
+    def __call__(self) -> PhantomFollower:
+        """Return a new PhantomFollower."""
+        return PhantomFollower(self)
+
+
+class PhantomFollower:
+    """Extracts the beads of a phantom: from the pose of the image before, else from nothing.
+
+    The observations are those of `run_extraction`: both extract an image by the same function.
+    """
+
+    def __init__(self, settings: PhantomSettings) -> None:
+        phantom = settings.phantom
+        self._target_id = phantom.target_id
+        self._model = PhantomModel.of(phantom.xyz_mm, phantom.diameter_mm)
+        self._distance = settings.principal_distance_px
+        self._lens: Lens | None = None
+        self._views: deque[View] = deque(maxlen=VIEWS)
+
+    def extract(self, image: np.ndarray, overlay: bool = False) -> LiveObservations:
+        """Return what is found in an image (h, w) of uint8 or uint16."""
+        start = time.perf_counter()
+        near = self._views[-1] if self._views else None
+        extraction: Extraction | None = None
+        try:
+            extraction = self._extraction(image, near)
+            result = self._observed(extraction, near)
+            self._views.append(extraction.view)
+        except DataError as error:
+            result = LiveObservations(reason=str(error))
+        picture = draw_overlay(image, extraction, result.reason) if overlay else None
+        return replace(result, picture=picture, seconds=time.perf_counter() - start)
+
+    def _extraction(self, image: np.ndarray, near: View | None) -> Extraction:
+        """Extract the beads, if need be with the distortion of the images before.
+
+        Raises DataError.
+        """
+        size = (image.shape[1], image.shape[0])
+        if self._lens is None or self._lens.image_size != size:
+            self._lens = assumed_lens(size, self._distance)
+            self._views.clear()
+            near = None
+        try:
+            return extract_beads(image, self._model, self._lens, near)
+        except DataError as error:
+            shared = shared_lens(self._lens, list(self._views))
+            if shared is None or not may_be_found(str(error)):
+                raise
+            return extract_beads(image, self._model, shared)
+
+    def _observed(self, extraction: Extraction, near: View | None) -> LiveObservations:
+        return LiveObservations(
+            self._target_id[extraction.bead],
+            extraction.uv,
+            extraction.sigma,
+            extraction.overlapped,
+            expected=extraction.match.expected,
+            found=extraction.match.found,
+            explained=extraction.match.explained,
+            followed=near is not None and _turn(near, extraction.view) < FOLLOWED_TURN,
+        )
+
+
+def _turn(one: View, other: View) -> float:
+    """Angle between the attitudes of two views [rad]."""
+    cosine = (np.trace(one.rotation.T @ other.rotation) - 1) / 2
+    return float(np.arccos(np.clip(cosine, -1, 1)))

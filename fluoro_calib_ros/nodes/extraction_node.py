@@ -1,0 +1,401 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Node that finds the beads of the phantom, or markers, in the images of the fluoroscopes, live.
+
+One thread receives the images and numbers them; each fluoroscope has a thread and a process of its
+own that extracts. Where images come faster than they are extracted, whole exposures are shed.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from array import array
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from fluoro_calib_msgs.msg import TargetObservations
+from rclpy.publisher import Publisher
+from sensor_msgs.msg import CompressedImage, Image
+from std_msgs.msg import Header
+
+from ..errors import DataError
+from ..exposures.frame import Frame
+from ..exposures.numbering import ExposureNumbers
+from ..exposures.pairing import PairingOptions
+from ..jobs.extraction_process import ExtractionProcess
+from ..jobs.live_extraction import LiveObservations, MakeExtractor, PhantomSettings
+from ..jobs.sources import read_survey
+from ..options import option
+from .image_node import INPUTS
+from .messages.fields import NS_PER_S
+from .messages.image import IMAGE_REFUSALS, ImageConverter, use_single_thread
+from .messages.target_observations import message_from_frame
+from .runtime.diagnostics import OK, WARN, LatencyWindow, Status
+from .runtime.errors import StartError
+from .runtime.exposure_queue import ExposureQueue
+from .runtime.lifecycle import StreamNode
+from .runtime.logging import RateLimitedLogger
+from .runtime.main import run
+from .runtime.parameters import ManagedParameters, ParameterGroup, expand_path
+from .runtime.qos import images_qos, observations_qos
+from .runtime.refusals import RefusalLog, Refused
+from .runtime.stall import StallDetector
+from .runtime.stream_reader import FaultHandlers
+
+OVERLAY = 'image_overlay'
+MODES = ('phantom',)
+
+
+@dataclass(frozen=True)
+class ExtractionParameters(ManagedParameters):
+    """Parameters of the extraction node."""
+
+    mode: str = option('phantom', 'what is looked for in the images', choices=MODES)
+    phantom: str = option(
+        '',
+        'file phantom.csv with the surveyed coordinates of the beads, and with a column diameter '
+        'where their sizes differ',
+        unit='mm',
+    )
+    principal_distance: float = option(
+        0.0,
+        'principal distance, to some 10 %; 0: four times the width of the image, to 25 %',
+        minimum=0.0,
+        maximum=1e7,
+        unit='px',
+    )
+    inputs: str = option(
+        'both', 'topics to subscribe to; of a camera that offers both, choose one', choices=INPUTS
+    )
+    queue_size: int = option(
+        32,
+        'images of a fluoroscope that may wait; of more, the oldest exposure is shed; 1 for the '
+        'least delay',
+        minimum=1,
+        maximum=10000,
+    )
+
+
+_NODE = ParameterGroup(ExtractionParameters)
+_PAIRING = ParameterGroup(PairingOptions, {'tolerance_s': 'pair_tolerance'})
+PARAMETERS = (_NODE, _PAIRING)
+
+
+@dataclass(frozen=True)
+class _Task:
+    """An image that waits: its number, message, and when it has arrived [ns, system clock]."""
+
+    number: int
+    message: Image | CompressedImage
+    received_ns: int
+
+
+class _ImageStream:
+    """State of one fluoroscope."""
+
+    def __init__(self, name: str, logger: RateLimitedLogger) -> None:
+        self.name = name
+        self.received = 0
+        self.extracted = 0
+        self.followed = 0
+        self.without = 0  # images without observations
+        self.shed = 0
+        self.last: LiveObservations | None = None
+        self.first: tuple[tuple[int, int], str] | None = None  # image size and frame id
+        self.converter = ImageConverter(name)
+        self.refusals = RefusalLog('image', logger)
+        self.stall = StallDetector()
+        self.latencies = LatencyWindow()
+        self.seconds = 0.0  # that images took
+        # Of the last diagnostics: time, images that were processed, images that were shed.
+        self._before = (time.monotonic(), 0, 0)
+        self.rate_hz = 0.0
+        self.shed_now = 0
+
+    def measure(self) -> None:
+        """Determine the rate, and what was shed, since the last call."""
+        now = time.monotonic()
+        then, processed, shed = self._before
+        count = self.extracted + self.without
+        self.rate_hz = (count - processed) / max(now - then, 1e-3)
+        self.shed_now = self.shed - shed
+        self._before = (now, count, self.shed)
+
+    def decoded(self, message: Image | CompressedImage) -> np.ndarray:
+        """Return the image (h, w) of a message. Raises Refused where the stream has changed."""
+        frame_id = message.header.frame_id
+        if self.first is not None and frame_id != self.first[1]:
+            raise self.converter.refusal(
+                'frame id',
+                message,
+                f'the frame id is {frame_id!r}, but that of the first image is {self.first[1]!r}',
+            )
+        image, _ = self.converter.decoded(message)
+        size = (image.shape[1], image.shape[0])
+        if self.first is None:
+            self.first = size, frame_id
+        elif size != self.first[0]:
+            expected = self.first[0]
+            raise self.converter.refusal(
+                'image size',
+                message,
+                f'the image is {size[0]} x {size[1]} px, but the first one is '
+                f'{expected[0]} x {expected[1]} px',
+            )
+        return image
+
+
+class ExtractionNode(StreamNode):
+    """Publishes the targets that it finds in images."""
+
+    def __init__(self) -> None:
+        super().__init__('extraction_node')
+        self._settings = _NODE.declare(self)
+        self._tolerance_ns = _PAIRING.declare(self).tolerance_ns
+        self.autostart = self._settings.autostart
+        self.names = self._settings.fluoroscopes
+        self._inputs = INPUTS[self._settings.inputs]
+        self._make = self._extractor()
+        self._threads: list[threading.Thread] = []
+        self._processes: list[ExtractionProcess] = []
+        self._queue: ExposureQueue[_Task] = ExposureQueue(self.names, self._settings.queue_size)
+        use_single_thread()
+        self.reset()
+
+    def _extractor(self) -> MakeExtractor:
+        """Return what makes the extractor of a fluoroscope. Raises StartError."""
+        if not self._settings.phantom:
+            raise StartError('parameter phantom is not set: it names the file phantom.csv')
+        try:
+            survey = read_survey(expand_path(self._settings.phantom))
+        except DataError as error:
+            raise StartError(str(error)) from None
+        for note in survey.notes:
+            self.get_logger().warning(note)
+        return PhantomSettings(survey.phantom, self._settings.principal_distance or None)
+
+    # -- lifecycle
+
+    def reset(self) -> None:
+        """Start counting from zero."""
+        self.streams = {name: _ImageStream(name, self.limited_logger) for name in self.names}
+        self._numbers = ExposureNumbers(self.names, self._tolerance_ns)
+
+    def create_outputs(self) -> None:
+        """Make the outputs."""
+        self._observations: dict[str, Publisher] = {}
+        self._overlays: dict[str, Publisher] = {}
+        for name in self.names:
+            self._observations[name] = self.create_output(
+                TargetObservations, f'{name}/target_observations', observations_qos()
+            )
+            self._overlays[name] = self.create_output(Image, f'{name}/{OVERLAY}', images_qos())
+
+    def create_readers(self) -> None:
+        """Receive the images of all fluoroscopes in one thread, and number them."""
+        reader = self.create_reader(
+            FaultHandlers(
+                self._on_undecodable,
+                lambda topic, error: self._stream_of(topic).refusals.fail(topic, error),
+                self.fail,
+            )
+        )
+        for name in self.names:
+            for kind, topic in self._inputs:
+                reader.subscribe(
+                    kind, f'{name}/{topic}', partial(self._on_image, name), images_qos()
+                )
+
+    def activate(self) -> None:
+        """Start the processes that extract, then the stream reader."""
+        self._queue = ExposureQueue(self.names, self._settings.queue_size)
+        for name in self.names:
+            process = ExtractionProcess(self._make)
+            process.start()
+            thread = threading.Thread(
+                target=self._serve, args=(name, self._queue, process), name=name, daemon=True
+            )
+            thread.start()
+            self._processes.append(process)
+            self._threads.append(thread)
+        super().activate()
+
+    def deactivate(self) -> None:
+        """Stop receiving and extracting; what is waiting is lost."""
+        super().deactivate()
+        self._queue.close()
+        for process in self._processes:
+            process.close()
+        for thread in self._threads:
+            thread.join()
+        self._processes = []
+        self._threads = []
+
+    # -- the thread of the stream reader
+
+    def _stream_of(self, topic: str) -> _ImageStream:
+        return self.streams[topic.partition('/')[0]]
+
+    def _on_undecodable(self, topic: str) -> None:
+        stream = self._stream_of(topic)
+        stream.received += 1
+        stream.refusals.refuse_undecodable(topic)
+
+    def _on_image(
+        self, name: str, message: Image | CompressedImage, info: Mapping[str, int]
+    ) -> None:
+        """Number an image and let it wait for the thread of its fluoroscope."""
+        self.streams[name].received += 1
+        stamp = message.header.stamp
+        number = self._numbers.number(name, NS_PER_S * stamp.sec + stamp.nanosec)
+        task = _Task(number, message, info['received_timestamp'])
+        for loser in self._queue.put(name, number, task):
+            self.streams[loser].shed += 1
+
+    # -- the threads of the fluoroscopes
+
+    def _serve(self, name: str, queue: ExposureQueue[_Task], process: ExtractionProcess) -> None:
+        """Extract the images of a fluoroscope until the queue is closed."""
+        stream = self.streams[name]
+        while (task := queue.get(name)) is not None:
+            try:
+                self._extract(stream, task, process)
+            except Refused as error:
+                stream.refusals.refuse(error)
+            except Exception as error:  # this image is lost, the next ones are not
+                if queue.closed:
+                    return  # the process has been ended
+                stream.refusals.fail(f'{name}/{self._inputs[0][1]}', error)
+
+    def _extract(self, stream: _ImageStream, task: _Task, process: ExtractionProcess) -> None:
+        """Extract an image and publish its observations. Raises Refused and RuntimeError."""
+        message = task.message
+        image = stream.decoded(message)
+        overlay = self._overlays[stream.name]
+        found = process.extract(image, bool(overlay.get_subscription_count()))
+        if not found.reason:
+            self._publish(stream, task, found, (image.shape[1], image.shape[0]))
+        else:
+            stream.without += 1
+            stream.refusals.note(
+                str(stream.converter.refusal('', message, f'no observations: {found.reason}'))
+            )
+        if found.note:
+            stream.refusals.note(str(stream.converter.refusal('', message, found.note)))
+        stream.last = found
+        stream.seconds += found.seconds
+        if found.picture is not None:
+            overlay.publish(_picture_message(message.header, found.picture))
+
+    def _publish(
+        self,
+        stream: _ImageStream,
+        task: _Task,
+        found: LiveObservations,
+        image_size: tuple[int, int],
+    ) -> None:
+        header = task.message.header
+        frame = Frame(
+            stream.name,
+            task.number,
+            found.target_id,
+            found.uv,
+            image_size,
+            found.sigma,
+            NS_PER_S * header.stamp.sec + header.stamp.nanosec,
+            header.frame_id,
+        )
+        self._observations[stream.name].publish(message_from_frame(frame))
+        stream.extracted += 1
+        stream.followed += found.followed
+        stream.latencies.add(time.time_ns() - task.received_ns)
+
+    # -- diagnostics
+
+    def diagnose(self) -> list[Status]:
+        """Return the status of every fluoroscope."""
+        incompatible = self.incompatible_publishers()
+        statuses = []
+        for name, stream in self.streams.items():
+            stream.measure()
+            statuses.append(
+                Status(name, *self._verdict(stream, incompatible), self._values(stream))
+            )
+        return statuses
+
+    def _values(self, stream: _ImageStream) -> dict[str, object]:
+        last = stream.last or LiveObservations()
+        processed = stream.extracted + stream.without
+        return {
+            'images received': stream.received,
+            'images extracted': stream.extracted,
+            'images followed': stream.followed,
+            'images without observations': stream.without,
+            'images waiting': self._queue.waiting(stream.name),
+            'images shed': stream.shed,
+            **stream.refusals.values(IMAGE_REFUSALS),
+            'last fault': stream.refusals.last_fault,
+            'targets': len(last.target_id),
+            'targets expected': last.expected,
+            'found [%]': f'{100 * last.found:.1f}',
+            'explained [%]': f'{100 * last.explained:.1f}',
+            'overlapped': int(last.overlapped.sum()),
+            'refusal of the last image': last.reason,
+            'rate [Hz]': f'{stream.rate_hz:.1f}',
+            'time of an image [ms]': f'{1e3 * stream.seconds / max(processed, 1):.0f}',
+            **stream.latencies.values(),
+        }
+
+    def _verdict(self, stream: _ImageStream, incompatible: Mapping[str, str]) -> tuple[bytes, str]:
+        """Return level and message of the diagnostics of a fluoroscope."""
+        failure = stream.refusals.failure_status()
+        if failure:
+            return failure
+        topics = [f'{stream.name}/{topic}' for _, topic in self._inputs]
+        for topic in topics:
+            if topic in incompatible:
+                return WARN, incompatible[topic]
+        if not self.readers:
+            return WARN, 'the node is not active'
+        if not any(map(self.has_publisher, topics)):
+            return WARN, 'no publisher of images'
+        stalled = stream.stall.message(stream.received)
+        if stalled:
+            return WARN, stalled
+        if stream.shed_now:
+            return WARN, f'images come faster than they are extracted: {stream.shed} were shed'
+        if stream.last is not None and stream.last.reason:
+            return WARN, f'no observations in the last image: {stream.last.reason}'
+        return stream.refusals.refusal_status() or (OK, 'extracting')
+
+
+def _picture_message(header: Header, picture: np.ndarray) -> Image:
+    """Return the Image of a picture (h, w, 3) of blue, green and red."""
+    height, width = picture.shape[:2]
+    message = Image(header=header, height=height, width=width, encoding='bgr8', step=3 * width)
+    message.data = array('B', picture.tobytes())
+    return message
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node."""
+    run(ExtractionNode, args)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,93 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Images that wait to be processed, exposure by exposure."""
+
+from __future__ import annotations
+
+import threading
+from collections import OrderedDict, deque
+from collections.abc import Iterable
+from typing import Generic, TypeVar
+
+T = TypeVar('T')
+
+REMEMBERED = 1000  # numbers of exposures that were begun or shed
+
+
+class ExposureQueue(Generic[T]):
+    """Items of each fluoroscope that wait for its thread, at most `size` of them.
+
+    Where more would wait, the oldest exposure that no thread has begun is shed with the items of
+    all fluoroscopes: views of different exposures are of no use to a reconstruction.
+    """
+
+    def __init__(self, fluoroscopes: Iterable[str], size: int) -> None:
+        self._size = size
+        self._waiting: dict[str, OrderedDict[int, T]] = {n: OrderedDict() for n in fluoroscopes}
+        self._begun: deque[int] = deque(maxlen=REMEMBERED)
+        self._shed: deque[int] = deque(maxlen=REMEMBERED)
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def put(self, fluoroscope: str, number: int, item: T) -> list[str]:
+        """Add an item; returns the fluoroscopes that have lost one."""
+        with self._changed:
+            waiting = self._waiting[fluoroscope]
+            if number in self._shed:
+                return [fluoroscope]
+            lost = [fluoroscope] if number in waiting else []  # a number that is used again
+            waiting[number] = item
+            if len(waiting) > self._size:
+                lost += self._shed_one(waiting)
+            self._changed.notify_all()
+            return lost
+
+    def get(self, fluoroscope: str) -> T | None:
+        """Wait for the next item of a fluoroscope; None once the queue is closed."""
+        waiting = self._waiting[fluoroscope]
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or waiting)
+            if self._closed:
+                return None
+            number, item = waiting.popitem(last=False)
+            self._begun.append(number)
+            return item
+
+    @property
+    def closed(self) -> bool:
+        """Whether the queue is closed."""
+        return self._closed
+
+    def waiting(self, fluoroscope: str) -> int:
+        """Return how many items of a fluoroscope wait."""
+        return len(self._waiting[fluoroscope])
+
+    def close(self) -> None:
+        """End all waits; what is waiting is lost."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+    def _shed_one(self, full: OrderedDict[int, T]) -> list[str]:
+        """Remove an exposure; returns the fluoroscopes that have lost an item."""
+        fresh = [number for number in full if number not in self._begun]
+        if not fresh:
+            full.popitem(last=False)
+            return [name for name, items in self._waiting.items() if items is full]
+        self._shed.append(fresh[0])
+        lost = [name for name, items in self._waiting.items() if fresh[0] in items]
+        for name in lost:
+            del self._waiting[name][fresh[0]]
+        return lost

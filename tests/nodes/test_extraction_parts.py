@@ -1,0 +1,122 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""What the extraction node is made of: numbers of images, the queue, the process."""
+
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.exposures.numbering import ExposureNumbers
+from fluoro_calib_ros.jobs.extraction_process import ExtractionProcess
+from fluoro_calib_ros.jobs.live_extraction import LiveObservations
+from fluoro_calib_ros.nodes.runtime.exposure_queue import ExposureQueue
+
+MS = 1_000_000
+
+
+def test_images_of_an_exposure_have_the_same_number_whatever_is_lost():
+    numbers = ExposureNumbers('ab', 2 * MS)
+    start = 10**18
+    came = [('a', 0), ('b', 1), ('a', 100), ('a', 200), ('b', 201), ('b', 299), ('a', 300)]
+    found = [(name, numbers.number(name, start + ms * MS)) for name, ms in came]
+    assert found == [('a', 1), ('b', 1), ('a', 2), ('a', 3), ('b', 3), ('b', 4), ('a', 4)]
+
+
+def test_a_repeated_recording_is_numbered_on():
+    numbers = ExposureNumbers('ab', MS)
+    found = [numbers.number(name, 5 * MS * i) for _ in range(2) for i in (1, 2) for name in 'ab']
+    assert found == [1, 1, 2, 2, 3, 3, 4, 4]
+
+
+def test_images_without_a_stamp_are_counted_by_fluoroscope():
+    numbers = ExposureNumbers('ab', MS)
+    assert [numbers.number(name, 0) for name in 'aabab'] == [1, 2, 1, 3, 2]
+
+
+def test_a_full_queue_sheds_the_oldest_exposure_that_is_not_begun():
+    queue = ExposureQueue('ab', 2)
+    lost = [queue.put(name, number, (name, number)) for number in (1, 2) for name in 'ab']
+    assert lost == [[]] * 4
+    assert queue.get('a') == ('a', 1)
+    assert queue.put('a', 3, ('a', 3)) == []
+    assert queue.put('b', 3, ('b', 3)) == ['a', 'b']  # exposure 2: its partner has begun 1
+    assert queue.put('a', 2, ('a', 2)) == ['a']  # too late
+    assert [queue.get('b'), queue.get('b'), queue.get('a')] == [('b', 1), ('b', 3), ('a', 3)]
+    assert queue.waiting('a') == queue.waiting('b') == 0
+
+
+def test_a_queue_whose_exposures_are_all_begun_sheds_the_oldest_item():
+    queue = ExposureQueue('ab', 1)
+    for number in (1, 2):
+        queue.put('a', number, number)
+        queue.get('a')
+    assert queue.put('b', 1, 1) == [] and queue.put('b', 2, 2) == ['b']
+    assert queue.get('b') == 2
+
+
+def test_closing_a_queue_ends_the_wait():
+    queue = ExposureQueue('a', 1)
+    found = []
+    waiting = threading.Thread(target=lambda: found.append(queue.get('a')))
+    waiting.start()
+    queue.close()
+    waiting.join(10)
+    assert found == [None]
+
+
+class Fragile:
+    """Extractor that counts images, and fails as the first pixel says."""
+
+    def __init__(self):
+        self.count = 0
+
+    def extract(self, image, overlay=False):
+        self.count += 1
+        if image[0, 0] == 1:
+            raise ZeroDivisionError('one')
+        if image[0, 0] == 2:
+            raise SystemExit(3)
+        if image[0, 0] == 3:
+            time.sleep(600)  # until it is ended
+        return LiveObservations(expected=self.count)
+
+
+def test_a_failure_loses_one_image_and_closing_ends_the_one_in_work():
+    process = ExtractionProcess(Fragile)
+
+    def extract(value):
+        return process.extract(np.full((2, 2), value, np.uint8)).expected
+
+    assert extract(0) == 1
+    with pytest.raises(RuntimeError, match='one'):
+        extract(1)
+    assert extract(0) == 3
+    with pytest.raises(RuntimeError, match='ended with status 3'):
+        extract(2)
+    assert extract(0) == 1  # a new process
+    errors = []
+
+    def last():
+        with pytest.raises(RuntimeError) as error:
+            extract(3)
+        errors.append(str(error.value))
+
+    thread = threading.Thread(target=last)
+    thread.start()
+    process.close()
+    thread.join(10)
+    assert len(errors) == 1

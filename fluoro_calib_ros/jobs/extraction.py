@@ -36,6 +36,7 @@ from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..files.access import check_safe_name, make_folder
 from ..files.atomic import write_bytes
+from ..radiographs.assumptions import assumed_lens, may_be_found, shared_lens
 from ..radiographs.extraction import Extraction, extract_beads
 from ..radiographs.matching import PhantomModel
 from ..radiographs.overlay import draw_overlay
@@ -43,14 +44,6 @@ from ..radiographs.view import Lens, View
 from .image_sources import SourceImage, fluoroscope_folders, is_image_bag, open_sources
 from .sources import Recording, Survey
 
-# Without a principal distance: that of image intensifiers and of biplane laboratories, which are
-# three to five times as far from the source as they are wide.
-USUAL_DISTANCE = 4.0
-USUAL_SD = 0.25
-GIVEN_SD = 0.08
-SHARED_SD = 0.03  # of the principal distance, once other images of the fluoroscope are known
-SHARED_CERTAINTY = 0.3
-MIN_SHARED = 3  # images whose distortion helps with the others
 QUEUED = 3  # images that wait for each process
 
 Progress = Callable[[int, int], None]
@@ -319,31 +312,6 @@ def _first_lens(request: ExtractionRequest, image: np.ndarray | DataError) -> Le
     if isinstance(image, DataError):
         return None
     return assumed_lens((image.shape[1], image.shape[0]), request.principal_distance_px)
-
-
-def assumed_lens(image_size: tuple[int, int], principal_distance_px: float | None) -> Lens:
-    """Return what is assumed of a fluoroscope before its first image; None: not known."""
-    if principal_distance_px is not None:
-        return Lens(image_size, principal_distance_px, GIVEN_SD)
-    return Lens(image_size, USUAL_DISTANCE * max(image_size), USUAL_SD)
-
-
-def shared_lens(lens: Lens, views: Sequence[View]) -> Lens | None:
-    """Return the lens with the distortion of the images that were solved, None for too few."""
-    if len(views) < MIN_SHARED:
-        return None
-    return replace(
-        lens,
-        principal_distance_px=float(np.median([view.principal_distance_px for view in views])),
-        principal_distance_sd=SHARED_SD,
-        coefficients=np.median([view.coefficients for view in views], axis=0),
-        certainty=SHARED_CERTAINTY,
-    )
-
-
-def may_be_found(reason: str) -> bool:
-    """Return whether an image is refused because no pose was found for its beads."""
-    return 'pose' in reason or 'phantom' in reason
 
 
 def _all_refused(results: Sequence[ImageResult]) -> str:

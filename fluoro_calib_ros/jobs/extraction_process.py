@@ -29,7 +29,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from .live_extraction import LiveObservations, MakeExtractor
-from .worker_process import end_with_parent
+from .parent_watch import end_with_parent
 
 NICE = 5  # lower priority than the live nodes, higher than a calibration
 

@@ -26,11 +26,11 @@ import numpy as np
 
 from ..errors import DataError
 from ..exposures.phantom import Phantom
+from ..radiographs.assumptions import assumed_lens, may_be_found, shared_lens
 from ..radiographs.extraction import Extraction, extract_beads
 from ..radiographs.matching import PhantomModel
 from ..radiographs.overlay import draw_overlay
 from ..radiographs.view import Lens, View
-from .extraction import assumed_lens, may_be_found, shared_lens
 
 VIEWS = 30  # solved images whose distortion helps where a pose is not found
 FOLLOWED_TURN = np.deg2rad(15.0)  # to the pose of the image before: nearer ones were followed

@@ -20,15 +20,14 @@ import multiprocessing
 import os
 import signal
 import threading
-import time
 from multiprocessing.connection import Connection
 
 from ..calibration.request import CalibrationRequest
 from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run_calibration
+from .parent_watch import end_with_parent
 
 POLL_S = 0.05  # interval at which the caller may cancel [s]
 NICE = 10  # lower priority than the live nodes
-PARENT_POLL_S = 0.5  # interval at which the worker looks whether its caller is alive [s]
 
 
 def run_in_worker_process(
@@ -113,10 +112,3 @@ def _work(
         sender.send(('error', error))
     except Exception as error:
         sender.send(('error', RuntimeError(repr(error))))
-
-
-def end_with_parent(parent: int) -> None:
-    """End this process once its parent has died, which cannot terminate it any more."""
-    while os.getppid() == parent:
-        time.sleep(PARENT_POLL_S)
-    os._exit(1)

@@ -72,16 +72,21 @@ class Detections:
     inverted: bool
 
 
-def detect_beads(image: np.ndarray, radius_px: float | None = None) -> Detections:
+def detect_beads(
+    image: np.ndarray, radius_px: float | None = None, inverted: bool | None = None
+) -> Detections:
     """Find the beads of an image (h, w) of uint8 or uint16.
 
-    radius_px is the radius of a bead, estimated by default. Raises DataError, in one sentence,
-    for an image without beads.
+    radius_px is the radius of a bead, and inverted whether beads are bright; both are estimated by
+    default. Raises DataError, in one sentence, for an image without beads.
     """
     _check(image)
     grey = image.astype(np.float32)
     scales = SCALES if radius_px is None else (max(radius_px / BLOB_RADIUS, 1.0),)
-    scale, inverted = _scale_and_polarity(grey, scales)
+    if len(scales) == 1 and inverted is not None:
+        scale = scales[0]
+    else:
+        scale, inverted = _scale_and_polarity(grey, scales)
     light = float(grey.max()) - grey if inverted else grey
     field = field_of_view(light, scale)
     for number, wider in enumerate(WIDER):

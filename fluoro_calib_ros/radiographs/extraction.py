@@ -23,9 +23,18 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from .detection import Detections, detect_beads
+from .following import follow
 from .growth import Match, Seen, smoothed
 from .matching import PhantomModel, match
-from .measurement import Beads, estimate_noise, estimate_profile, measure_beads
+from .measurement import (
+    FIRST_STEPS,
+    STEPS,
+    Beads,
+    Noise,
+    estimate_noise,
+    estimate_profile,
+    measure_beads,
+)
 from .profile import Profile
 from .view import Lens, View, fit_view
 
@@ -77,10 +86,49 @@ class Extraction:
     detections: Detections
     match: Match
     profile: Profile
+    noise: Noise
+
+    @property
+    def nearby(self) -> Nearby:
+        """What an exposure nearby begins with."""
+        found = self.detections
+        return Nearby(
+            self.view,
+            self.match.scale_px,
+            self.profile,
+            self.noise,
+            found.radius_px,
+            found.inverted,
+        )
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """What is taken over from an exposure nearby, such as the previous one of a video.
+
+    Attributes
+    ----------
+    view : View
+    scale_px : float
+        Robust standard deviation of its residuals [px].
+    profile : Profile
+    noise : Noise
+    radius_px : float
+        Of a bead.
+    inverted : bool
+        Beads are bright.
+    """
+
+    view: View
+    scale_px: float
+    profile: Profile
+    noise: Noise
+    radius_px: float
+    inverted: bool
 
 
 def extract_beads(
-    image: np.ndarray, model: PhantomModel, lens: Lens, near: View | None = None
+    image: np.ndarray, model: PhantomModel, lens: Lens, near: Nearby | None = None
 ) -> Extraction:
     """Extract the beads of a phantom from a radiograph.
 
@@ -89,8 +137,9 @@ def extract_beads(
     image : (h, w) ndarray of uint8 or uint16
     model : PhantomModel
     lens : Lens
-    near : View, optional
-        A pose nearby, which is tried first.
+    near : Nearby, optional
+        The exposure before. Where the phantom has moved little since then, this is several times
+        faster; elsewhere its pose is searched for as without it.
 
     Returns
     -------
@@ -101,22 +150,56 @@ def extract_beads(
     DataError
         Where there is no phantom in the image, or its pose is not sure, with the reason.
     """
+    if near is not None:
+        followed = _followed(image, model, near)
+        if followed is not None:
+            return followed
     detections = detect_beads(image)
     seen = Seen.of(detections.uv, detections.field, detections.radius_px)
-    found = match(seen, model, lens, near)
-    return _measured(detections, seen, found, model)
+    found = match(seen, model, lens)
+    noise = estimate_noise(detections.light, detections.field)
+    return _measured(detections, seen, found, model, _Imaging(noise))
 
 
-def _measured(detections: Detections, seen: Seen, found: Match, model: PhantomModel) -> Extraction:
-    """Measure all predicted beads, twice: the second time from a better prediction."""
+def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extraction | None:
+    """Return the extraction from an exposure nearby, None where it does not lead to the pose."""
+    try:
+        detections = detect_beads(image, near.radius_px, near.inverted)
+        seen = Seen.of(detections.uv, detections.field, detections.radius_px)
+        found = follow(seen, model, near.view, near.scale_px)
+        if found is None:
+            return None
+        imaging = _Imaging(near.noise, near.profile)
+        return _measured(detections, seen, found, model, imaging, (STEPS,))
+    except DataError:
+        return None
+
+
+@dataclass(frozen=True)
+class _Imaging:
+    """What is known of noise and shadows before beads are measured."""
+
+    noise: Noise
+    profile: Profile | None = None
+
+
+def _measured(
+    detections: Detections,
+    seen: Seen,
+    found: Match,
+    model: PhantomModel,
+    imaging: _Imaging,
+    passes: tuple[int, ...] = (FIRST_STEPS, STEPS),
+) -> Extraction:
+    """Measure all predicted beads, by default twice: the second time from a better prediction."""
     view = found.view
     predicted = found.predicted
     bead = found.bead
     uv = seen.uv[found.detection]
     light = detections.light
-    noise = estimate_noise(light, detections.field)
-    profile: Profile | None = None
-    for _ in range(2):
+    noise = imaging.noise
+    profile = imaging.profile
+    for steps in passes:
         rows = np.flatnonzero(seen.in_field(predicted))
         start = _starts(predicted, rows, bead, uv, seen)
         radius = _relative_radius(view, model)
@@ -125,7 +208,7 @@ def _measured(detections: Detections, seen: Seen, found: Match, model: PhantomMo
             profile = estimate_profile(
                 light, detections.field, start[known], radius[rows[known]], seen.radius_px
             )
-        beads = measure_beads(light, detections.field, start, radius[rows], profile, noise)
+        beads = measure_beads(light, detections.field, start, radius[rows], profile, noise, steps)
         reasons = _reasons(beads, predicted[rows])
         good = np.array([not reason for reason in reasons], dtype=bool)
         if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(found.bead)):
@@ -137,7 +220,8 @@ def _measured(detections: Detections, seen: Seen, found: Match, model: PhantomMo
         uv = beads.uv[good]
         view, _ = fit_view(view, model.xyz[bead], uv, 3)
         predicted = view.project(model.xyz) + smoothed(view, model.xyz, bead, uv)
-    return _checked(detections, found, view, (rows, beads, reasons, predicted), profile)
+    measured = (rows, beads, reasons, predicted)
+    return _checked(detections, found, view, measured, _Imaging(noise, profile))
 
 
 def _checked(
@@ -145,7 +229,7 @@ def _checked(
     found: Match,
     view: View,
     measured: tuple[np.ndarray, Beads, list[str], np.ndarray],
-    profile: Profile | None,
+    imaging: _Imaging,
 ) -> Extraction:
     """Leave out beads that are not where their neighbours say."""
     rows, beads, reasons, predicted = measured
@@ -162,7 +246,7 @@ def _checked(
         Refusal(int(rows[number]), predicted[rows[number]], reasons[number])
         for number in np.flatnonzero(~good)
     )
-    assert profile is not None
+    assert imaging.profile is not None
     return Extraction(
         rows[good],
         beads.uv[good],
@@ -172,7 +256,8 @@ def _checked(
         view,
         detections,
         found,
-        profile,
+        imaging.profile,
+        imaging.noise,
     )
 
 

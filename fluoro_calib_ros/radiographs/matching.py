@@ -36,7 +36,9 @@ from .view import Lens, View, fit_view
 MIN_BEADS = 10
 MIN_FOUND = 0.72
 MIN_EXPLAINED = 0.4
-SURE_FOUND = 0.85  # share found at which the search ends
+# Shares found and explained at which the search ends. Where many beads overlap, fewer are found,
+# but nothing else is seen.
+SURE = ((0.85, 0.4), (0.75, 0.95))
 # By how much the score of the best pose must exceed that of another one: as a share of it, and in
 # beads. What is missed by chance is less.
 MARGIN = 0.06
@@ -109,7 +111,7 @@ class PhantomModel:
         return cls(xyz, diameter_mm, triples, tuple(_symmetries(xyz)))
 
 
-def match(seen: Seen, model: PhantomModel, lens: Lens, near: View | None = None) -> Match:
+def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
     """Match what was found in an image with a phantom.
 
     Parameters
@@ -117,8 +119,6 @@ def match(seen: Seen, model: PhantomModel, lens: Lens, near: View | None = None)
     seen : Seen
     model : PhantomModel
     lens : Lens
-    near : View, optional
-        A pose nearby, which is tried first.
 
     Returns
     -------
@@ -134,10 +134,10 @@ def match(seen: Seen, model: PhantomModel, lens: Lens, near: View | None = None)
             f'only {len(seen.uv)} beads are found in the image, at least {MIN_BEADS} are needed'
         )
     best: Match | None = None
-    for candidate in _candidates(seen, model, lens, near):
+    for candidate in _candidates(seen, model, lens):
         if best is None or candidate.score > best.score:
             best = candidate
-        if best.found >= SURE_FOUND and best.explained >= MIN_EXPLAINED:
+        if is_sure(best):
             break
     if best is None:
         raise DataError('no pose of the phantom fits the beads in the image')
@@ -145,6 +145,11 @@ def match(seen: Seen, model: PhantomModel, lens: Lens, near: View | None = None)
     best = _unambiguous(best, seen, model)
     _check_evidence(best)
     return best
+
+
+def is_sure(best: Match) -> bool:
+    """Return whether a better match need not be searched for."""
+    return any(best.found >= found and best.explained >= explained for found, explained in SURE)
 
 
 def _check_evidence(best: Match) -> None:
@@ -207,12 +212,8 @@ def _same(one: Match, other: Match) -> bool:
     return same > 0.5 * min(len(a), len(b))
 
 
-def _candidates(seen: Seen, model: PhantomModel, lens: Lens, near: View | None) -> Iterator[Match]:
+def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     """Yield matches of poses, the likeliest first."""
-    if near is not None:
-        found = settle(near, model.xyz, seen)
-        if found is not None:
-            yield found
     beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
     beads[~seen.field] = 2
     order = _seeds(seen)

@@ -32,8 +32,10 @@ from .profile import Profile, fit_profile
 
 NEIGHBOURS = 6  # fitted with a bead, at most
 WINDOW_MARGIN_PX = 2.0  # of background around the shadow
-STEPS = 6
-CROSSING_STEPS = (2, 4)  # before which shadows that touch are blurred together
+STEPS = 5
+FIRST_STEPS = 4  # that only have to tell beads from other things
+PROFILE_STEPS = 3
+CROSSING_STEPS = (2, 3)  # before which shadows that touch are blurred together
 CROSSED = 1.35  # factor on the standard deviation where shadows cross
 FINE = 3  # points across a pixel of their grid
 MAX_STEP_PX = 0.6
@@ -198,7 +200,7 @@ def estimate_profile(
     for _ in range(PROFILE_ROUNDS):
         fit = _Fit(light, field, uv[alone], relative_radius[alone], profile, noise)
         fit.plane_only = True
-        fit.run(STEPS)
+        fit.run(PROFILE_STEPS)
         place, absorbed, weight = fit.shadows()
         profile = fit_profile(place, absorbed, weight, profile)
     return profile
@@ -211,13 +213,14 @@ def measure_beads(
     relative_radius: np.ndarray,
     profile: Profile,
     noise: Noise,
+    steps: int = STEPS,
 ) -> Beads:
-    """Measure all beads near pixels uv (n, 2) at once.
+    """Measure all beads near pixels uv (n, 2) at once, in so many Gauss-Newton steps.
 
     The other arguments are those of `estimate_profile` and what was estimated.
     """
     fit = _Fit(light, field, uv, relative_radius, profile, noise)
-    fit.run(STEPS)
+    fit.run(steps)
     return fit.result()
 
 
@@ -254,7 +257,7 @@ class _Fit:
         axis = np.arange(-half, half + 1)
         grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         self.offset = grid[np.hypot(*grid.T) <= window]
-        x, y = (self.offset / window).T
+        x, y = (self.offset / window).T.astype(np.float32)
         self.basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
         self.groups = self._groups(window + reach, 2 * profile.reach_px * 0.85)
         self._read(light, field)
@@ -292,7 +295,7 @@ class _Fit:
         column = np.clip(places[..., 0], 0, width - 1)
         row = np.clip(places[..., 1], 0, height - 1)
         self.valid = inside & field[row, column]
-        self.grey = light[row, column].astype(float)
+        self.grey = light[row, column].astype(np.float32)
         self.usable = self.valid.mean(axis=1) >= MIN_PIXELS
         self.background = np.zeros((len(self.uv), TERMS))
         ordered = np.sort(np.where(self.valid, self.grey, 0.0), axis=1)
@@ -300,8 +303,9 @@ class _Fit:
 
     def _background(self, rows: np.ndarray) -> np.ndarray:
         """Light (g, m) in windows without beads."""
-        plane = self.background[rows] @ self.basis.T
-        return np.maximum(plane, 1e-3 * np.abs(self.background[rows, :1]) + 1e-6)
+        background = self.background[rows].astype(np.float32)
+        plane = background @ self.basis.T
+        return np.maximum(plane, 1e-3 * np.abs(background[:, :1]) + 1e-6)
 
     def run(self, steps: int) -> None:
         """Take Gauss-Newton steps; the last one gives standard deviations as well."""
@@ -326,7 +330,7 @@ class _Fit:
         The difference is computed on a finer grid, of the two nearest neighbours.
         """
         if self.crossing is None:
-            self.crossing = np.zeros((len(self.uv), len(self.offset)))
+            self.crossing = np.zeros((len(self.uv), len(self.offset)), dtype=np.float32)
         reach = 2 * (self.profile.radius_px + self.profile.blur_px)
         for rows, near in self.groups:
             if not near.shape[1]:
@@ -367,32 +371,32 @@ class _Fit:
         return out - blurred
 
     def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Light (g, m) and its derivatives (g, m, TERMS + 3 + 3 k)."""
+        """Light (g, m) and its derivatives (g, TERMS + 3 + 3 k, m), of single precision."""
         everyone = np.concatenate([rows[:, None], near], axis=1)
         there = everyone >= 0
-        scale = 1 / self.radius[everyone]
-        place = self.middle[rows, None, None] + self.offset
-        away = place - self.uv[everyone][:, :, None]
-        distance = np.sqrt(np.sum(away * away, axis=3))
-        shadow, slope = self.profile.shadow(distance * scale[..., None])
-        shadow = shadow * there[..., None]
-        slope = slope * (there * scale)[..., None]
-        depth = self.depth[everyone][..., None]
-        passed = np.maximum(1 - depth * shadow, MIN_PASSED)
+        scale = (1 / self.radius[everyone]).astype(np.float32)[..., None]
+        centre = (self.middle[rows, None] - self.uv[everyone]).astype(np.float32)
+        x = centre[..., :1] + self.offset[:, 0].astype(np.float32)
+        y = centre[..., 1:] + self.offset[:, 1].astype(np.float32)
+        distance = np.sqrt(x * x + y * y)
+        shadow, slope = self.profile.shadow(distance * scale)
+        shadow *= there[..., None]
+        slope *= there[..., None] * scale / np.maximum(distance, 1e-6)
+        depth = self.depth[everyone].astype(np.float32)[..., None]
+        passed = np.maximum(1 - depth * shadow, np.float32(MIN_PASSED))
         product = np.prod(passed, axis=1)
-        scatter = self.profile.scatter
+        transmitted = np.float32(1 - self.profile.scatter)
         plane = self._background(rows)
-        crossing = self.crossing[rows] if self.crossing is not None else 0.0
-        relative = scatter + (1 - scatter) * (product + crossing)
-        by_shadow = -(1 - scatter) * plane[:, None] * product[:, None] / passed
-        direction = away / np.maximum(distance, 1e-9)[..., None]
-        by_place = (by_shadow * depth * -slope)[..., None] * direction
+        crossing = self.crossing[rows] if self.crossing is not None else np.float32(0)
+        relative = np.float32(self.profile.scatter) + transmitted * (product + crossing)
+        by_shadow = (-transmitted * plane * product)[:, None] / passed
+        by_distance = -by_shadow * depth * slope
         g, k, m = distance.shape
-        jacobian = np.empty((g, m, TERMS + 3 * k))
-        jacobian[:, :, :TERMS] = relative[..., None] * self.basis
-        jacobian[:, :, TERMS::3] = np.swapaxes(by_place[..., 0], 1, 2)
-        jacobian[:, :, TERMS + 1 :: 3] = np.swapaxes(by_place[..., 1], 1, 2)
-        jacobian[:, :, TERMS + 2 :: 3] = np.swapaxes(by_shadow * shadow, 1, 2)
+        jacobian = np.empty((g, TERMS + 3 * k, m), dtype=np.float32)
+        np.multiply(relative[:, None], self.basis.T, out=jacobian[:, :TERMS])
+        np.multiply(by_distance, x, out=jacobian[:, TERMS::3])
+        np.multiply(by_distance, y, out=jacobian[:, TERMS + 1 :: 3])
+        np.multiply(by_shadow, shadow, out=jacobian[:, TERMS + 2 :: 3])
         return plane * relative, jacobian
 
     def _step(
@@ -405,22 +409,15 @@ class _Fit:
         squared = residual * residual * weight
         freedom = np.maximum(self.valid[rows].sum(axis=1) - PARAMETERS, 1)
         self.misfit[rows] = squared.sum(axis=1) / freedom
-        robust = self.disturbed[rows, None] * squared / (ROBUST**2 * self.typical())
-        weight = weight / (1 + robust)
-        weighted = jacobian * weight[..., None]
-        prior = np.zeros((len(rows), jacobian.shape[2]))
-        prior[:, TERMS + 2] = DEPTH_SD**-2
-        if self.plane_only:
-            prior[:, 3:TERMS] = HELD
-        for number in range(near.shape[1]):
-            first = PARAMETERS + 3 * number
-            # An absent neighbour has no derivatives; any prior keeps its step zero.
-            prior[:, first : first + 2] = NEIGHBOUR_SD_PX**-2
-            prior[:, first + 2] = NEIGHBOUR_SD**-2
-        normal = np.swapaxes(weighted, 1, 2) @ jacobian
+        if self.disturbed[rows].any():
+            robust = self.disturbed[rows, None] * squared / (ROBUST**2 * self.typical())
+            weight = weight / (1 + robust)
+        weighted = jacobian * weight.astype(np.float32)[:, None]
+        prior = self._prior(len(rows), near.shape[1])
+        normal = (weighted @ np.swapaxes(jacobian, 1, 2)).astype(float)
         diagonal = np.arange(normal.shape[1])
         normal[:, diagonal, diagonal] += prior + 1e-9 * normal[:, diagonal, diagonal] + 1e-12
-        right = (np.swapaxes(weighted, 1, 2) @ residual[..., None])[..., 0]
+        right = (weighted @ residual.astype(np.float32)[..., None])[..., 0].astype(float)
         right[:, TERMS + 2] -= prior[:, TERMS + 2] * (self.depth[rows] - 1)
         step = np.linalg.solve(normal, right[..., None])[..., 0]
         move = np.clip(step[:, TERMS : TERMS + 2], -MAX_STEP_PX, MAX_STEP_PX)
@@ -432,6 +429,19 @@ class _Fit:
             np.clip(self.depth[rows] + np.where(usable, step[:, TERMS + 2], 0), *DEPTHS),
             self.background[rows] + np.where(usable[:, None], step[:, :TERMS], 0),
         )
+
+    def _prior(self, count: int, neighbours: int) -> np.ndarray:
+        """Weights (count, TERMS + 3 + 3 neighbours) of what is expected of the unknowns."""
+        prior = np.zeros((count, PARAMETERS + 3 * neighbours))
+        prior[:, TERMS + 2] = DEPTH_SD**-2
+        if self.plane_only:
+            prior[:, 3:TERMS] = HELD
+        for number in range(neighbours):
+            first = PARAMETERS + 3 * number
+            # An absent neighbour has no derivatives; any prior keeps its step zero.
+            prior[:, first : first + 2] = NEIGHBOUR_SD_PX**-2
+            prior[:, first + 2] = NEIGHBOUR_SD**-2
+        return prior
 
     def typical(self) -> float:
         """Median misfit of the beads whose fit goes on."""
@@ -446,8 +456,8 @@ class _Fit:
         self.measured[rows] = self.usable[rows] & np.isfinite(variance)
         if len(weighted) and self.inflation is None:
             # The influence of each pixel on a centre: noise of neighbouring pixels adds up.
-            influence = np.linalg.solve(normal, np.swapaxes(weighted, 1, 2))[:, TERMS]
-            self.inflation = _inflation(influence[: min(20, len(rows))], self.offset, self.noise)
+            influence = np.linalg.solve(normal[:20], weighted[:20])[:, TERMS]
+            self.inflation = _inflation(influence, self.offset, self.noise)
 
     def shadows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distances [px] of pixels from beads, absorbed shares there, and weights (n,)."""

@@ -71,13 +71,15 @@ class Profile:
 
     def shadow(self, distance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Absorbed share of the light at distances [px], and its derivative [1/px]."""
-        position = np.minimum(distance / TABLE_STEP, self._table.shape[1] - 2)
+        value, slope = self._table.astype(distance.dtype)
+        position = np.minimum(
+            distance * distance.dtype.type(1 / TABLE_STEP), distance.dtype.type(len(value) - 2)
+        )
         index = position.astype(np.intp)
-        part = position - index
-        value, slope = self._table
+        part = position - index.astype(distance.dtype)
         return (
-            value[index] + part * (value[index + 1] - value[index]),
-            slope[index] + part * (slope[index + 1] - slope[index]),
+            value.take(index) + part * np.diff(value).take(index),
+            slope.take(index) + part * np.diff(slope).take(index),
         )
 
 

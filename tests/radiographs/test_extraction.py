@@ -28,6 +28,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.radiographs.detection import detect_beads
 from fluoro_calib_ros.radiographs.extraction import Extraction, extract_beads
+from fluoro_calib_ros.radiographs.following import follow
 from fluoro_calib_ros.radiographs.growth import Seen
 from fluoro_calib_ros.radiographs.matching import PhantomModel, match
 from fluoro_calib_ros.radiographs.measurement import estimate_noise, measure_beads
@@ -203,15 +204,39 @@ def test_another_phantom_is_refused():
         match(seen, PhantomModel.of(small_phantom(2)), LENS)
 
 
-def test_a_pose_nearby_is_followed():
-    seen = seen_of(small_phantom(1))
-    model = PhantomModel.of(small_phantom(1))
+@pytest.mark.parametrize('shift_mm', [0.3, 12.0])
+def test_a_pose_nearby_is_followed(shift_mm):
+    xyz = small_phantom(1)
+    seen = seen_of(xyz)
+    model = PhantomModel.of(xyz)
     found = match(seen, model, LENS)
     turn = matrix_from_vector([0.003, -0.002, 0.004])
-    moved = replace(found.view, rotation=turn @ found.view.rotation)
-    followed = match(seen, model, LENS, near=moved)
-    assert np.array_equal(followed.bead, found.bead)
-    assert np.array_equal(followed.detection, found.detection)
+    moved = replace(
+        found.view,
+        rotation=turn @ found.view.rotation,
+        position=found.view.position + shift_mm * found.view.rotation[0],
+    )
+    followed = follow(seen, model, moved, 0.1)
+    assert np.array_equal(np.sort(followed.bead), np.sort(found.bead))
+    assert np.allclose(followed.view.position, found.view.position, atol=0.1)
+
+
+def test_another_phantom_is_not_followed():
+    found = match(seen_of(small_phantom(1)), PhantomModel.of(small_phantom(1)), LENS)
+    assert (
+        follow(seen_of(small_phantom(2)), PhantomModel.of(small_phantom(1)), found.view, 1) is None
+    )
+
+
+def test_an_image_followed_has_the_observations_of_one_searched():
+    image, true, _ = radiograph()
+    first = extraction()
+    followed = extract_beads(image, model(), LENS, first.nearby)
+    both = np.intersect1d(first.bead, followed.bead)
+    assert len(both) > 0.98 * len(first.bead)
+    searched, error = (np.abs(one.uv - true[one.bead]) for one in (first, followed))
+    assert error.max() < 1.0
+    assert np.median(error) < 1.05 * np.median(searched)
 
 
 def test_a_survey_with_wrong_beads_gives_no_wrong_observation():

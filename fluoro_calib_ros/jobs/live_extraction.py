@@ -27,13 +27,12 @@ import numpy as np
 from ..errors import DataError
 from ..exposures.phantom import Phantom
 from ..radiographs.assumptions import assumed_lens, may_be_found, shared_lens
-from ..radiographs.extraction import Extraction, extract_beads
+from ..radiographs.extraction import Extraction, Nearby, extract_beads
 from ..radiographs.matching import PhantomModel
 from ..radiographs.overlay import draw_overlay
 from ..radiographs.view import Lens, View
 
 VIEWS = 30  # solved images whose distortion helps where a pose is not found
-FOLLOWED_TURN = np.deg2rad(15.0)  # to the pose of the image before: nearer ones were followed
 
 
 @dataclass(frozen=True)
@@ -113,22 +112,23 @@ class PhantomFollower:
         self._distance = settings.principal_distance_px
         self._lens: Lens | None = None
         self._views: deque[View] = deque(maxlen=VIEWS)
+        self._near: Nearby | None = None
 
     def extract(self, image: np.ndarray, overlay: bool = False) -> LiveObservations:
         """Return what is found in an image (h, w) of uint8 or uint16."""
         start = time.perf_counter()
-        near = self._views[-1] if self._views else None
         extraction: Extraction | None = None
         try:
-            extraction = self._extraction(image, near)
-            result = self._observed(extraction, near)
+            extraction = self._extraction(image)
+            result = self._observed(extraction)
+            self._near = extraction.nearby
             self._views.append(extraction.view)
         except DataError as error:
             result = LiveObservations(reason=str(error))
         picture = draw_overlay(image, extraction, result.reason) if overlay else None
         return replace(result, picture=picture, seconds=time.perf_counter() - start)
 
-    def _extraction(self, image: np.ndarray, near: View | None) -> Extraction:
+    def _extraction(self, image: np.ndarray) -> Extraction:
         """Extract the beads, if need be with the distortion of the images before.
 
         Raises DataError.
@@ -137,16 +137,16 @@ class PhantomFollower:
         if self._lens is None or self._lens.image_size != size:
             self._lens = assumed_lens(size, self._distance)
             self._views.clear()
-            near = None
+            self._near = None
         try:
-            return extract_beads(image, self._model, self._lens, near)
+            return extract_beads(image, self._model, self._lens, self._near)
         except DataError as error:
             shared = shared_lens(self._lens, list(self._views))
             if shared is None or not may_be_found(str(error)):
                 raise
             return extract_beads(image, self._model, shared)
 
-    def _observed(self, extraction: Extraction, near: View | None) -> LiveObservations:
+    def _observed(self, extraction: Extraction) -> LiveObservations:
         return LiveObservations(
             self._target_id[extraction.bead],
             extraction.uv,
@@ -155,11 +155,5 @@ class PhantomFollower:
             expected=extraction.match.expected,
             found=extraction.match.found,
             explained=extraction.match.explained,
-            followed=near is not None and _turn(near, extraction.view) < FOLLOWED_TURN,
+            followed=extraction.followed,
         )
-
-
-def _turn(one: View, other: View) -> float:
-    """Angle between the attitudes of two views [rad]."""
-    cosine = (np.trace(one.rotation.T @ other.rotation) - 1) / 2
-    return float(np.arccos(np.clip(cosine, -1, 1)))

@@ -16,7 +16,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -75,6 +75,9 @@ class Extraction:
     detections : Detections
     match : Match
     profile : Profile
+    noise : Noise
+    followed : bool
+        The pose comes from the exposure before, not from a search.
     """
 
     bead: np.ndarray
@@ -87,6 +90,7 @@ class Extraction:
     match: Match
     profile: Profile
     noise: Noise
+    followed: bool = False
 
     @property
     def nearby(self) -> Nearby:
@@ -165,14 +169,17 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
     """Return the extraction from an exposure nearby, None where it does not lead to the pose."""
     try:
         detections = detect_beads(image, near.radius_px, near.inverted)
+        if image.shape != near.view.lens.image_size[::-1]:
+            return None
         seen = Seen.of(detections.uv, detections.field, detections.radius_px)
         found = follow(seen, model, near.view, near.scale_px)
         if found is None:
             return None
         imaging = _Imaging(near.noise, near.profile)
-        return _measured(detections, seen, found, model, imaging, (STEPS,))
+        followed = _measured(detections, seen, found, model, imaging, (STEPS,))
     except DataError:
         return None
+    return replace(followed, followed=True)
 
 
 @dataclass(frozen=True)

@@ -72,8 +72,8 @@ class ExtractionProcess:
             signal.pthread_sigmask(signal.SIG_SETMASK, masked)
             other.close()
 
-    def extract(self, image: np.ndarray, overlay: bool = False) -> LiveObservations:
-        """Return what is found in an image (h, w).
+    def extract(self, image: np.ndarray, number: int, overlay: bool = False) -> LiveObservations:
+        """Return what is found in the image (h, w) of an exposure.
 
         Raises RuntimeError where the extractor or its process fails.
         """
@@ -82,7 +82,7 @@ class ExtractionProcess:
         if connection is None:
             raise RuntimeError('the extraction was ended')
         try:
-            connection.send((image, overlay))
+            connection.send((image, number, overlay))
             answer = connection.recv()
         except (EOFError, OSError):
             status = self._end(END_S)
@@ -118,8 +118,8 @@ def _work(connection: Connection, make: MakeExtractor, parent: int) -> None:
     with suppress(EOFError, OSError), threadpool_limits(1):
         extractor = make()
         while True:
-            image, overlay = connection.recv()
+            image, number, overlay = connection.recv()
             try:
-                connection.send(extractor.extract(image, overlay))
+                connection.send(extractor.extract(image, number, overlay))
             except Exception as error:  # a bug: this image is lost, the next one is not
                 connection.send(RuntimeError(repr(error)))

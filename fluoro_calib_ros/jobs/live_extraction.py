@@ -79,8 +79,11 @@ class LiveObservations:
 class LiveExtractor(Protocol):
     """Extracts the targets of one fluoroscope, image after image."""
 
-    def extract(self, image: np.ndarray, overlay: bool = False) -> LiveObservations:
-        """Return what is found in an image (h, w) of uint8 or uint16; never raises DataError."""
+    def extract(self, image: np.ndarray, number: int, overlay: bool = False) -> LiveObservations:
+        """Return what is found in an image (h, w) of uint8 or uint16; never raises DataError.
+
+        number is that of its exposure: it grows, and tells how many images are left out.
+        """
 
 
 # Makes the extractor of a fluoroscope, in the process in which it is to run.
@@ -114,8 +117,8 @@ class PhantomFollower:
         self._views: deque[View] = deque(maxlen=VIEWS)
         self._near: Nearby | None = None
 
-    def extract(self, image: np.ndarray, overlay: bool = False) -> LiveObservations:
-        """Return what is found in an image (h, w) of uint8 or uint16."""
+    def extract(self, image: np.ndarray, number: int, overlay: bool = False) -> LiveObservations:
+        """Return what is found in an image (h, w) of uint8 or uint16, whatever its number."""
         start = time.perf_counter()
         extraction: Extraction | None = None
         try:

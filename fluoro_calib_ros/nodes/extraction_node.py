@@ -287,7 +287,7 @@ class ExtractionNode(StreamNode):
         message = task.message
         image = stream.decoded(message)
         overlay = self._overlays[stream.name]
-        found = process.extract(image, bool(overlay.get_subscription_count()))
+        found = process.extract(image, task.number, bool(overlay.get_subscription_count()))
         if not found.reason:
             self._publish(stream, task, found, (image.shape[1], image.shape[0]))
         else:

@@ -84,7 +84,7 @@ class Fragile:
     def __init__(self):
         self.count = 0
 
-    def extract(self, image, overlay=False):
+    def extract(self, image, number, overlay=False):
         self.count += 1
         if image[0, 0] == 1:
             raise ZeroDivisionError('one')
@@ -99,7 +99,7 @@ def test_a_failure_loses_one_image_and_closing_ends_the_one_in_work():
     process = ExtractionProcess(Fragile)
 
     def extract(value):
-        return process.extract(np.full((2, 2), value, np.uint8)).expected
+        return process.extract(np.full((2, 2), value, np.uint8), 1).expected
 
     assert extract(0) == 1
     with pytest.raises(RuntimeError, match='one'):

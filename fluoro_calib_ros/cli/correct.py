@@ -43,8 +43,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='SOURCE',
         help='CSV file with columns u, v [px] and optionally fluoroscope, sigma; image points of '
         'another program (docs/formats.md); or a grey image '
-        '(png, tif, jpg, bmp, pgm), a folder of images, or a video (avi, mkv, mp4) such as '
-        'recording.avi',
+        '(png, tif, jpg, bmp, pgm), a folder of images, or a video (avi, mkv, mp4), or a '
+        'recording (cine, dcm) such as trial.cine',
     )
     add_calibration(parser)
     parser.add_argument(
@@ -72,8 +72,7 @@ def run(arguments: argparse.Namespace) -> None:
     """Correct image points or images. Raises DataError."""
     from ..files.folder import check_output_file
     from ..files.image_formats import (
-        IMAGE_SUFFIXES,
-        VIDEO_CODECS,
+        READ_SUFFIXES,
         is_image_source,
         listed,
         suffix_of,
@@ -89,7 +88,7 @@ def run(arguments: argparse.Namespace) -> None:
     elif suffix_of(arguments.source) in POINTS_SUFFIXES or not arguments.source.exists():
         _correct_points(arguments, calibrations)  # reports a missing file
     else:
-        known = listed(('.csv', *IMAGE_SUFFIXES, *VIDEO_CODECS))
+        known = listed(('.csv', *READ_SUFFIXES))
         raise DataError(
             f'{arguments.source}: files with the ending {suffix_of(arguments.source)} cannot be '
             f'read, only {known} and folders of images'

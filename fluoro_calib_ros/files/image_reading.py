@@ -28,7 +28,18 @@ from ..errors import DataError
 from ..images.codec import as_grey, decode
 from ..images.declared_size import check_size
 from .access import read_bytes
-from .image_formats import IMAGE_SUFFIXES, STACK_SUFFIXES, VIDEO_CODECS, listed, suffix_of
+from .cine import read_cine_header, read_cine_images
+from .dicom import read_dicom_header, read_dicom_images
+from .image_formats import (
+    CINE_SUFFIXES,
+    DICOM_SUFFIXES,
+    IMAGE_SUFFIXES,
+    READ_SUFFIXES,
+    STACK_SUFFIXES,
+    VIDEO_CODECS,
+    listed,
+    suffix_of,
+)
 from .tiff import count_pages
 
 VIDEO_SIZE = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
@@ -69,16 +80,31 @@ def open_images(path: Path) -> ImageSource:
     suffix = suffix_of(path)
     if suffix in VIDEO_CODECS:
         return _open_video(path)
+    if suffix in CINE_SUFFIXES:
+        header = read_cine_header(path)
+        images = read_cine_images(path, header)
+        return ImageSource('video', len(header.offsets), images, header.frame_rate)
+    if suffix in DICOM_SUFFIXES:
+        return _open_dicom(path)
     if suffix not in IMAGE_SUFFIXES:
         raise DataError(
-            f'{path}: the ending {suffix or "(none)"} is none of an image '
-            f'({listed(IMAGE_SUFFIXES)}) or a video ({listed(VIDEO_CODECS)})'
+            f'{path}: the ending {suffix or "(none)"} is none of an image or a video '
+            f'({listed(READ_SUFFIXES)})'
         )
     pages = count_pages(path) if suffix in STACK_SUFFIXES else 1
     if pages > 1:
         check_name(path)
         return ImageSource('stack', pages, _read_pages(path, pages))
     return ImageSource('image', 1, _read_image(path))
+
+
+def _open_dicom(path: Path) -> ImageSource:
+    header = read_dicom_header(path)
+    images = read_dicom_images(path, header)
+    if header.count == 1:
+        return ImageSource('image', 1, images)
+    kind = 'stack' if header.frame_rate is None else 'video'
+    return ImageSource(kind, header.count, images, header.frame_rate)
 
 
 def check_name(path: Path) -> None:

@@ -27,7 +27,7 @@ import numpy as np
 from ..bags.images import image_topics, images_of_topic
 from ..bags.reader import topics_of
 from ..errors import DataError
-from ..files.image_formats import IMAGE_SUFFIXES, VIDEO_CODECS, listed, suffix_of
+from ..files.image_formats import EXPOSURE_SUFFIXES, READ_SUFFIXES, listed, suffix_of
 from ..files.image_reading import open_images
 
 BAG_SUFFIXES = ('.mcap', '.db3')
@@ -108,16 +108,16 @@ def fluoroscope_folders(source: Path) -> dict[str, Path]:
     return {
         path.name: path
         for path in sorted(source.iterdir())
-        if path.is_dir() and any(suffix_of(file) in IMAGE_SUFFIXES for file in path.iterdir())
+        if path.is_dir() and any(suffix_of(file) in EXPOSURE_SUFFIXES for file in path.iterdir())
     }
 
 
 def contains_images(source: Path) -> bool:
     """Return whether a source is an image, a folder of images, a video, or a bag of images."""
-    if suffix_of(source) in (*IMAGE_SUFFIXES, *VIDEO_CODECS) and not source.is_dir():
+    if suffix_of(source) in READ_SUFFIXES and not source.is_dir():
         return True
     if source.is_dir() and not (source / 'metadata.yaml').exists():
-        direct = any(suffix_of(path) in IMAGE_SUFFIXES for path in source.iterdir())
+        direct = any(suffix_of(path) in EXPOSURE_SUFFIXES for path in source.iterdir())
         return direct or bool(fluoroscope_folders(source))
     if source.is_dir() or suffix_of(source) in BAG_SUFFIXES:
         observations = 'fluoro_calib_msgs/msg/TargetObservations'
@@ -131,9 +131,11 @@ def contains_images(source: Path) -> bool:
 
 def _images_in(folder: Path) -> list[Path]:
     """Return the images of a folder in the order of their names. Raises DataError for none."""
-    found = [path for path in folder.iterdir() if suffix_of(path) in IMAGE_SUFFIXES]
+    found = [path for path in folder.iterdir() if suffix_of(path) in EXPOSURE_SUFFIXES]
     if not found:
-        raise DataError(f'{folder}: there are no images in this folder ({listed(IMAGE_SUFFIXES)})')
+        raise DataError(
+            f'{folder}: there are no images in this folder ({listed(EXPOSURE_SUFFIXES)})'
+        )
     return sorted(found, key=lambda path: (_number(path) is None, _number(path) or 0, path.name))
 
 

@@ -53,6 +53,7 @@ setup(
     ],
     extras_require={
         'c3d': ['ezc3d'],
+        'cluster': ['distributed'],
         'dicom': ['pydicom>=3'],
         'watch': ['textual'],
         'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],

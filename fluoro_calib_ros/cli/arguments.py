@@ -201,6 +201,16 @@ def add_fluoroscopes(parser: argparse.ArgumentParser, use: str = 'use') -> None:
     )
 
 
+def add_scheduler(parser: argparse._ActionsContainer) -> None:
+    """Add --scheduler, the address of a Dask cluster for images."""
+    parser.add_argument(
+        '--scheduler',
+        metavar='tcp://HOST:PORT',
+        help='Dask scheduler whose workers extract the images, in place of processes of this '
+        'machine (needs: pip install fluoro_calib_ros[cluster])',
+    )
+
+
 def add_phantom(parser: argparse.ArgumentParser, **changes: Any) -> None:
     """Add --phantom; changes replace keyword arguments of `add_argument`."""
     settings: dict[str, Any] = {

@@ -28,6 +28,7 @@ from .arguments import (
     add_collect,
     add_option,
     add_phantom,
+    add_scheduler,
     add_source,
     bag_selection,
     file_settings,
@@ -67,6 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_bag_options(parser)
     add_phantom(parser)
+    add_scheduler(parser)
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
     )
@@ -307,5 +309,6 @@ def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
             survey,
             arguments.fluoroscopes,
             arguments.principal_distance,
+            arguments.scheduler,
             bar,
         )

@@ -20,7 +20,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .arguments import add_phantom, file_settings, number_in
+from .arguments import add_phantom, add_scheduler, file_settings, number_in
 from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
@@ -74,6 +74,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='N',
         help='processes (default: as many as there are cores)',
     )
+    add_scheduler(parser)
     add_file_options(parser)
 
 
@@ -96,6 +97,7 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.principal_distance,
         arguments.overlay,
         arguments.workers,
+        arguments.scheduler,
     )
     with ProgressBar('extract') as bar:
         outcome = run_extraction(request, bar)
@@ -122,6 +124,7 @@ def _document(out: Path, outcome: ExtractionOutcome) -> dict[str, Any]:
                 'expected': result.expected,
                 'found': result.found,
                 'explained': result.explained,
+                'followed': result.followed,
                 'reason': result.reason,
                 'seconds': result.seconds,
             }

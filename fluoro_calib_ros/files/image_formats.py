@@ -32,6 +32,8 @@ SUPPORTS_16_BIT_VIDEOS = tuple(map(int, cv2.__version__.split('.')[:2])) >= (4, 
 # Codec by which videos are written. Players know MP4 with lossy codecs only.
 VIDEO_CODECS = {'.avi': LOSSLESS_CODEC, '.mkv': LOSSLESS_CODEC, '.mp4': 'mp4v'}
 
+# Files whose images follow each other in time.
+VIDEO_SUFFIXES = (*VIDEO_CODECS, *CINE_SUFFIXES, *DICOM_SUFFIXES)
 # Files with one image or more of which a folder may hold one for each exposure.
 EXPOSURE_SUFFIXES = (*IMAGE_SUFFIXES, *DICOM_SUFFIXES)
 READ_SUFFIXES = (*IMAGE_SUFFIXES, *VIDEO_CODECS, *CINE_SUFFIXES, *DICOM_SUFFIXES)

@@ -16,19 +16,15 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from itertools import groupby
 from pathlib import Path
 
 import cv2
 import numpy as np
-from threadpoolctl import threadpool_limits
 
 from ..bags.images import image_topics
 from ..errors import DataError
@@ -37,14 +33,21 @@ from ..exposures.phantom import Phantom
 from ..files.access import check_safe_name, make_folder
 from ..files.atomic import write_bytes
 from ..radiographs.assumptions import assumed_lens, may_be_found, shared_lens
-from ..radiographs.extraction import Extraction, extract_beads
+from ..radiographs.extraction import Extraction, Nearby, extract_beads
 from ..radiographs.matching import PhantomModel
 from ..radiographs.overlay import draw_overlay
 from ..radiographs.view import Lens, View
-from .image_sources import SourceImage, fluoroscope_folders, is_image_bag, open_sources
+from .image_sources import (
+    ImageSources,
+    SourceImage,
+    fluoroscope_folders,
+    is_image_bag,
+    open_sources,
+)
+from .scheduling import Workers, open_workers
 from .sources import Recording, Survey
 
-QUEUED = 3  # images that wait for each process
+FOLLOWED = 12  # images of a video after which the pose is searched for anew
 
 Progress = Callable[[int, int], None]
 
@@ -67,7 +70,11 @@ class ImageResult:
     found, explained : float
         Shares of the expected beads that are found, and of what is found that is expected.
     view : View or None
+    followed : bool
+        The pose comes from the image before.
     seconds : float
+    picture : bytes or None
+        Overlay as PNG, if it was asked for.
     """
 
     exposure: int
@@ -79,7 +86,9 @@ class ImageResult:
     found: float = 0.0
     explained: float = 0.0
     view: View | None = None
+    followed: bool = False
     seconds: float = 0.0
+    picture: bytes | None = None
 
 
 @dataclass(frozen=True)
@@ -98,6 +107,8 @@ class ExtractionRequest:
         Folder for pictures of what was found.
     workers : int
         Processes; 0: as many as there are cores.
+    scheduler : str or None
+        Address of a Dask scheduler whose workers extract, in place of processes.
     """
 
     sources: Sequence[Path]
@@ -106,6 +117,7 @@ class ExtractionRequest:
     principal_distance_px: float | None = None
     overlay: Path | None = None
     workers: int = 0
+    scheduler: str | None = None
 
 
 @dataclass(frozen=True)
@@ -128,73 +140,82 @@ class ExtractionOutcome:
 
 @dataclass(frozen=True)
 class _Task:
-    """An image for a worker."""
+    """Images for a worker: one, or some of a video."""
 
-    source: SourceImage
+    images: tuple[SourceImage, ...]
     fluoroscope: str
     lens: Lens
-    overlay: Path | None
+    overlay: bool
 
 
-class _Worker:
-    """What a process keeps between images: the phantom, prepared for matching."""
+@lru_cache(maxsize=4)
+def _model_of(beads: bytes, diameters: bytes | None) -> PhantomModel:
+    """Return a phantom, prepared for matching; a worker keeps it between tasks."""
+    diameter_mm = None if diameters is None else np.frombuffer(diameters)
+    return PhantomModel.of(np.frombuffer(beads).reshape(-1, 3), diameter_mm)
 
-    phantom: Phantom
-    model: PhantomModel
 
-    @classmethod
-    def prepare(cls, phantom: Phantom) -> None:
-        cv2.setNumThreads(1)
-        cls.phantom = phantom
-        cls.model = PhantomModel.of(phantom.xyz_mm, phantom.diameter_mm)
-
-    @classmethod
-    def run(cls, task: _Task) -> ImageResult:
+def _extract(phantom: Phantom, task: _Task) -> list[ImageResult]:
+    """Extract the images of a task, each from the pose of the one before, where that leads."""
+    diameters = None if phantom.diameter_mm is None else phantom.diameter_mm.tobytes()
+    model = _model_of(phantom.xyz_mm.tobytes(), diameters)
+    near: Nearby | None = None
+    results = []
+    for source in task.images:
         start = time.perf_counter()
-        source = task.source
-        image = source.image
         result = ImageResult(source.exposure, source.place)
+        image = source.image
         if isinstance(image, DataError):
-            return replace(result, reason=_without_place(str(image), source.place))
+            results.append(replace(result, reason=_without_place(str(image), source.place)))
+            continue
         extraction: Extraction | None = None
         try:
-            size = image.shape[::-1]
-            if size != task.lens.image_size:
-                expected = task.lens.image_size
-                raise DataError(
-                    f'the image is {size[0]} x {size[1]} px, but the first one is '
-                    f'{expected[0]} x {expected[1]} px'
-                )
-            with threadpool_limits(1):
-                extraction = extract_beads(image, cls.model, task.lens)
-            result = cls._observed(result, extraction, task)
+            _check_size(image, task.lens)
+            extraction = extract_beads(image, model, task.lens, near)
+            near = extraction.nearby
+            result = _observed(result, extraction, phantom, task)
         except DataError as error:
             result = replace(result, reason=str(error))
-        if task.overlay is not None:
+        if task.overlay:
             picture = draw_overlay(image, extraction, result.reason)
-            name = f'{task.fluoroscope}_{source.exposure:04d}.png'
-            write_bytes(task.overlay / name, cv2.imencode('.png', picture)[1].tobytes())
-        return replace(result, seconds=time.perf_counter() - start)
+            result = replace(result, picture=cv2.imencode('.png', picture)[1].tobytes())
+        results.append(replace(result, seconds=time.perf_counter() - start))
+    return results
 
-    @classmethod
-    def _observed(cls, result: ImageResult, extraction: Extraction, task: _Task) -> ImageResult:
-        frame = Frame(
-            task.fluoroscope,
-            result.exposure,
-            cls.phantom.target_id[extraction.bead],
-            extraction.uv,
-            task.lens.image_size,
-            extraction.sigma,
+
+def _check_size(image: np.ndarray, lens: Lens) -> None:
+    """Raise DataError for an image of another size than the first one."""
+    size = image.shape[::-1]
+    if size != lens.image_size:
+        expected = lens.image_size
+        raise DataError(
+            f'the image is {size[0]} x {size[1]} px, but the first one is '
+            f'{expected[0]} x {expected[1]} px'
         )
-        return replace(
-            result,
-            frame=frame,
-            overlapped=extraction.overlapped,
-            expected=extraction.match.expected,
-            found=extraction.match.found,
-            explained=extraction.match.explained,
-            view=extraction.view,
-        )
+
+
+def _observed(
+    result: ImageResult, extraction: Extraction, phantom: Phantom, task: _Task
+) -> ImageResult:
+    """Return a result with observations."""
+    frame = Frame(
+        task.fluoroscope,
+        result.exposure,
+        phantom.target_id[extraction.bead],
+        extraction.uv,
+        task.lens.image_size,
+        extraction.sigma,
+    )
+    return replace(
+        result,
+        frame=frame,
+        overlapped=extraction.overlapped,
+        expected=extraction.match.expected,
+        found=extraction.match.found,
+        explained=extraction.match.explained,
+        view=extraction.view,
+        followed=extraction.followed,
+    )
 
 
 def run_extraction(
@@ -223,36 +244,87 @@ def run_extraction(
     sources = open_sources(request.sources, request.fluoroscope)
     if request.overlay is not None:
         make_folder(request.overlay)
-    lens: Lens | None = None
-
-    def tasks(chosen: Iterable[SourceImage]) -> Iterator[_Task]:
-        nonlocal lens
-        for source in chosen:
-            if lens is None:
-                lens = _first_lens(request, source.image)
-            usable = lens or Lens((1, 1), 1.0)  # for an image that cannot be read
-            yield _Task(source, request.fluoroscope, usable, request.overlay)
-
-    results: list[ImageResult] = []
-    workers = min(request.workers or os.cpu_count() or 1, max(sources.count, 1))
-    with _Pool(request.phantom, workers) as pool:
-        for result in pool.map(tasks(sources.images())):
-            results.append(result)
-            if progress is not None:
-                progress(len(results), max(sources.count, len(results)))
-        views = [result.view for result in results if result.view is not None]
-        shared = None if lens is None else shared_lens(lens, views)
-        again = {number for number, result in enumerate(results) if may_be_found(result.reason)}
-        if shared is not None and again:
-            lens = shared
-            second = (s for number, s in enumerate(sources.images()) if number in again)
-            for number, result in zip(sorted(again), pool.map(tasks(second))):
-                if result.frame is not None:
-                    results[number] = result
+    with open_workers(request.workers, request.scheduler, sources.count) as workers:
+        results = _first_pass(request, sources, workers, progress)
+        _second_pass(request, sources, workers, results)
     if not any(result.frame is not None for result in results):
         raise DataError(_all_refused(results))
     results.sort(key=lambda result: result.exposure)
     return ExtractionOutcome(request.fluoroscope, tuple(results))
+
+
+def _first_pass(
+    request: ExtractionRequest,
+    sources: ImageSources,
+    workers: Workers,
+    progress: Progress | None,
+) -> list[ImageResult]:
+    """Extract all images, those of a video from the pose of the one before."""
+    lens: Lens | None = None
+
+    def tasks() -> Iterator[_Task]:
+        nonlocal lens
+        for images in _groups(sources.images()):
+            for image in images:
+                lens = lens or _first_lens(request, image.image)
+            yield _task(request, images, lens)
+
+    results: list[ImageResult] = []
+    for done in workers.map(partial(_extract, request.phantom), tasks()):
+        for result in done:
+            results.append(_with_picture_written(request, result))
+            if progress is not None:
+                progress(len(results), max(sources.count, len(results)))
+    return results
+
+
+def _second_pass(
+    request: ExtractionRequest,
+    sources: ImageSources,
+    workers: Workers,
+    results: list[ImageResult],
+) -> None:
+    """Extract refused images with the distortion of the others; replaces the results."""
+    again = {number for number, result in enumerate(results) if may_be_found(result.reason)}
+    views = [result.view for result in results if result.view is not None]
+    lens = shared_lens(views[0].lens, views) if views else None
+    if lens is None or not again:
+        return
+    images = (image for number, image in enumerate(sources.images()) if number in again)
+    tasks = (_task(request, (image,), lens) for image in images)
+    done = workers.map(partial(_extract, request.phantom), tasks)
+    for number, (result,) in zip(sorted(again), done):
+        if result.frame is not None:
+            results[number] = _with_picture_written(request, result)
+
+
+def _groups(images: Iterable[SourceImage]) -> Iterator[tuple[SourceImage, ...]]:
+    """Yield images that one worker extracts: one alone, or some of a video."""
+    for _, group in groupby(enumerate(images), lambda item: _group(*item)):
+        yield tuple(image for _, image in group)
+
+
+def _group(number: int, image: SourceImage) -> tuple[int, int]:
+    """Return a key that is equal for the images of a group."""
+    if image.frame is None:
+        return number, -1
+    return number - image.frame, image.frame // FOLLOWED
+
+
+def _task(request: ExtractionRequest, images: tuple[SourceImage, ...], lens: Lens | None) -> _Task:
+    # Without a lens none of the images can be read, so that it is not used.
+    lens = lens or Lens((1, 1), 1.0)
+    return _Task(images, request.fluoroscope, lens, request.overlay is not None)
+
+
+def _with_picture_written(request: ExtractionRequest, result: ImageResult) -> ImageResult:
+    """Write the picture of a result; return the result without it."""
+    if result.picture is None or request.overlay is None:
+        return result
+    write_bytes(
+        request.overlay / f'{request.fluoroscope}_{result.exposure:04d}.png', result.picture
+    )
+    return replace(result, picture=None)
 
 
 def recording_of_images(
@@ -260,6 +332,7 @@ def recording_of_images(
     survey: Survey,
     fluoroscopes: Sequence[str] | None = None,
     principal_distance_px: float | None = None,
+    scheduler: str | None = None,
     progress: Progress | None = None,
 ) -> Recording:
     """Extract the beads of all images of a rig.
@@ -273,6 +346,8 @@ def recording_of_images(
     fluoroscopes : sequence of str, optional
         Names of those to read; needed for the images of a single one.
     principal_distance_px : float, optional
+    scheduler : str, optional
+        Address of a Dask scheduler.
     progress : callable, optional
 
     Returns
@@ -299,7 +374,11 @@ def recording_of_images(
             raise DataError(f'{source}: there is no fluoroscope {name!r}, only {", ".join(known)}')
         check_safe_name(name, source)
         request = ExtractionRequest(
-            [folders.get(name, source)], survey.phantom, name, principal_distance_px
+            [folders.get(name, source)],
+            survey.phantom,
+            name,
+            principal_distance_px,
+            scheduler=scheduler,
         )
         outcome = run_extraction(request, progress)
         frames[name] = outcome.frames
@@ -325,46 +404,3 @@ def _all_refused(results: Sequence[ImageResult]) -> str:
 def _without_place(text: str, place: str) -> str:
     """Return the text of an error without the place that it begins with."""
     return text.removeprefix(f'{place}: ')
-
-
-class _Pool:
-    """Processes that extract images in order; none for a single one."""
-
-    def __init__(self, phantom: Phantom, workers: int) -> None:
-        self._workers = workers
-        self._executor: ProcessPoolExecutor | None = None
-        if workers > 1:
-            self._executor = ProcessPoolExecutor(
-                workers,
-                multiprocessing.get_context('spawn'),
-                initializer=_Worker.prepare,
-                initargs=(phantom,),
-            )
-        else:
-            _Worker.prepare(phantom)
-
-    def __enter__(self) -> _Pool:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        if self._executor is not None:
-            self._executor.shutdown(wait=True, cancel_futures=True)
-
-    def map(self, tasks: Iterator[_Task]) -> Iterator[ImageResult]:
-        """Yield the results of tasks in their order; only a few images are in memory."""
-        if self._executor is None:
-            yield from map(_Worker.run, tasks)
-            return
-        waiting: deque[Future[ImageResult]] = deque()
-        try:
-            for task in tasks:
-                waiting.append(self._executor.submit(_Worker.run, task))
-                if len(waiting) >= QUEUED * self._workers:
-                    yield waiting.popleft().result()
-            while waiting:
-                yield waiting.popleft().result()
-        except BrokenProcessPool:
-            raise DataError(
-                'a process that extracts beads was ended from outside, perhaps for want of '
-                'memory; start again with fewer processes (--workers)'
-            ) from None

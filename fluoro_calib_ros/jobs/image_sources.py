@@ -27,7 +27,13 @@ import numpy as np
 from ..bags.images import image_topics, images_of_topic
 from ..bags.reader import topics_of
 from ..errors import DataError
-from ..files.image_formats import EXPOSURE_SUFFIXES, READ_SUFFIXES, listed, suffix_of
+from ..files.image_formats import (
+    EXPOSURE_SUFFIXES,
+    READ_SUFFIXES,
+    VIDEO_SUFFIXES,
+    listed,
+    suffix_of,
+)
 from ..files.image_reading import open_images
 
 BAG_SUFFIXES = ('.mcap', '.db3')
@@ -44,11 +50,14 @@ class SourceImage:
         File, page or message, in words.
     image : (h, w) ndarray or DataError
         The error says why it cannot be read.
+    frame : int or None
+        Place in its video; None for an image that is of no video.
     """
 
     exposure: int
     place: str
     image: np.ndarray | DataError
+    frame: int | None = None
 
 
 @dataclass(frozen=True)
@@ -85,10 +94,11 @@ def open_sources(sources: Sequence[Path], fluoroscope: str = '') -> ImageSources
 
     def images() -> Iterator[SourceImage]:
         exposure = 0
-        for (_, read), number in zip(readers, numbers):
-            for place, image in read():
+        for path, (_, read), number in zip(files, readers, numbers):
+            video = suffix_of(path) in VIDEO_SUFFIXES
+            for frame, (place, image) in enumerate(read()):
                 exposure = number if numbered and number is not None else exposure + 1
-                yield SourceImage(exposure, place, image)
+                yield SourceImage(exposure, place, image, frame if video else None)
 
     return ImageSources(sum(count for count, _ in readers), images)
 

@@ -1,0 +1,114 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Images on a Dask cluster: the same results, also where a worker dies in mid-run."""
+
+from __future__ import annotations
+
+import os
+import signal
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.jobs import scheduling
+from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
+from fluoro_calib_ros.jobs.scheduling import LocalWorkers, open_workers
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.simulation.bead_images import bead_image
+
+SIZE = 400
+COUNT = 60
+IMAGES = 10
+
+
+def phantom() -> Phantom:
+    xyz = np.random.default_rng(5).uniform(-60, 60, (COUNT, 3))
+    return Phantom(np.arange(COUNT) + 1, xyz, np.full(COUNT, 0.1))
+
+
+def picture(number: int) -> np.ndarray:
+    x = phantom().xyz_mm @ matrix_from_vector([0.3 * number, 0.2, -0.1 * number]).T
+    uv = 1600 * x[:, :2] / (x[:, 2:] + 900) + (SIZE - 1) / 2
+    return bead_image(uv, (SIZE, SIZE), np.uint8, 2.0, 0.6, 0.01, number)
+
+
+@pytest.fixture(scope='module')
+def images(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp('images')
+    for number in range(1, IMAGES + 1):
+        cv2.imwrite(str(folder / f'image_{number:02d}.png'), picture(number))
+    (folder / 'image_03.png').write_bytes(b'\x89PNG\r\n\x1a\nnothing')
+    return folder
+
+
+def request(images: Path, **settings) -> ExtractionRequest:
+    return ExtractionRequest([images], phantom(), 'a', **settings)
+
+
+@pytest.mark.long
+def test_a_killed_worker_of_a_cluster_loses_no_image(images):
+    from distributed import Client, LocalCluster
+
+    expected = run_extraction(request(images, workers=1))
+    killed = []
+    with (
+        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+
+        def kill_one(done: int, total: int) -> None:
+            if done == 2:
+                killed.append(next(iter(client.run(os.getpid).values())))
+                os.kill(killed[0], signal.SIGKILL)
+
+        found = run_extraction(request(images, scheduler=cluster.scheduler_address), kill_one)
+    assert killed
+    assert [r.exposure for r in found.results] == list(range(1, IMAGES + 1))
+    assert [r.reason for r in found.refused] == [r.reason for r in expected.refused]
+    for one, other in zip(found.frames, expected.frames):
+        assert np.array_equal(one.target_id, other.target_id)
+        assert np.array_equal(one.uv, other.uv)
+
+
+def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
+    monkeypatch.setattr(scheduling, 'CONNECT_S', 0.5)
+    with pytest.raises(DataError, match=r'no Dask scheduler at tcp://127\.0\.0\.1:9'):
+        open_workers(scheduler='tcp://127.0.0.1:9')
+    with pytest.raises(DataError, match='no Dask scheduler at nonsense'):
+        open_workers(scheduler='nonsense')
+
+
+def test_results_keep_the_order_of_their_tasks_and_few_tasks_are_in_memory():
+    taken = []
+
+    def tasks():
+        for number in range(40):
+            taken.append(number)
+            yield number
+
+    with LocalWorkers(2) as workers:
+        results = workers.map(abs, tasks())
+        first = next(results)
+        assert len(taken) < 10
+        assert [first, *results] == list(range(40))
+
+
+def test_a_worker_that_dies_is_told():
+    with LocalWorkers(2) as workers, pytest.raises(DataError, match='worker process was ended'):
+        list(workers.map(os._exit, [1, 1]))

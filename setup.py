@@ -55,6 +55,7 @@ setup(
         'c3d': ['ezc3d'],
         'cluster': ['distributed'],
         'dicom': ['pydicom>=3'],
+        'completion': ['shtab'],
         'watch': ['textual'],
         'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],
     },

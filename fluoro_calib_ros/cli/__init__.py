@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import sys
 from collections.abc import Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError
 from . import (
@@ -37,6 +37,12 @@ from . import (
     validate,
     watch,
 )
+from .completion import SHELLS
+from .output import print_note, styled
+from .rig import add_rig, find_rig
+
+if TYPE_CHECKING:
+    from ..files.rig_file import RigFile
 
 # A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, where
 # arguments depend on each other, check(arguments, error).
@@ -70,16 +76,38 @@ class _Version(argparse.Action):
         parser.exit()
 
 
-def make_parser(command: str | None = None) -> argparse.ArgumentParser:
+class _Completion(argparse.Action):
+    """Prints the script for a shell, and ends."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: Any,
+        option_string: str | None = None,
+    ) -> None:
+        from .completion import completion_script
+
+        print(completion_script(make_parser(), values))
+        parser.exit()
+
+
+def make_parser(command: str | None = None, rig: RigFile | None = None) -> argparse.ArgumentParser:
     """Return the parser of the command line.
 
     Only the arguments of `command` are added, by default those of all commands: each command
-    imports the modules that declare its options.
+    imports the modules that declare its options. rig: gives defaults of the arguments.
     """
     parser = argparse.ArgumentParser(
         prog='fluoro-calib', description='Self-calibration of X-ray fluoroscopes.'
     )
     parser.add_argument('--version', action=_Version, nargs=0, help='print versions and exit')
+    parser.add_argument(
+        '--print-completion',
+        action=_Completion,
+        choices=SHELLS,
+        help='print a script that completes the command line in a shell, and exit',
+    )
     commands = parser.add_subparsers(dest='command', required=True, metavar='COMMAND')
     for module in COMMANDS:
         sub = commands.add_parser(
@@ -94,6 +122,7 @@ def make_parser(command: str | None = None) -> argparse.ArgumentParser:
                 '--json', action='store_true', help='print the result as JSON on standard output'
             )
             module.add_arguments(sub)
+            add_rig(sub, module.NAME, rig)
     return parser
 
 
@@ -103,14 +132,19 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Exit status 0: done, 1: failed for a reason in the data, 2: wrong usage.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
-    parser = make_parser(next((word for word in words if not word.startswith('-')), ''))
-    options = parser.parse_args(words)
-    if hasattr(options.module, 'check'):
-        options.module.check(options, parser.error)
+    command = next((word for word in words if not word.startswith('-')), '')
     try:
+        rig = find_rig(words, command)
+        parser = make_parser(command, rig)
+        options = parser.parse_args(words)
+        if hasattr(options.module, 'check'):
+            options.module.check(options, parser.error)
+        if rig is not None:
+            print_note(f'defaults of {rig.path}')
         options.module.run(options)
     except (DataError, OSError) as error:
-        print(f'fluoro-calib {options.command}: {error}', file=sys.stderr)
+        program = styled(f'fluoro-calib {command}'.rstrip() + ':', 'red', sys.stderr)
+        print(f'{program} {error}', file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)

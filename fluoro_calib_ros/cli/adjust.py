@@ -40,12 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     from ..calibration.options import CalibrationOptions
 
-    add_source(
+    source = add_source(
         parser,
         'image size of a file that does not contain it [px] (default: that of the calibration)',
     )
+    add_phantom(source)
     add_bag_options(parser)
-    add_phantom(parser)
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
     )

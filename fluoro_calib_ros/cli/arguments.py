@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ..exchange.content import FileSettings
     from ..jobs.sources import BagSelection
 
+Parser = argparse.ArgumentParser | argparse._ArgumentGroup
 UNITS = ('mm', 'cm', 'm')
 
 
@@ -79,9 +80,7 @@ def names(text: str) -> list[str]:
     return text.split(',')
 
 
-def add_option(
-    parser: argparse.ArgumentParser | argparse._ArgumentGroup, option: Option, **changes: Any
-) -> None:
+def add_option(parser: Parser, option: Option, **changes: Any) -> None:
     """Add the argument of a declared option: --name with its choices, default and description.
 
     changes replace keyword arguments of `add_argument`.
@@ -112,8 +111,13 @@ def _text(default: Any) -> str:
     return ','.join(f'{v:g}' for v in default) if isinstance(default, tuple) else str(default)
 
 
-def add_source(parser: argparse.ArgumentParser, image_size_help: str, more: str = '') -> None:
-    """Add SOURCE, --image-size and --fluoroscopes; more: what else SOURCE may be."""
+def add_source(
+    parser: argparse.ArgumentParser, image_size_help: str, more: str = ''
+) -> argparse._ArgumentGroup:
+    """Add SOURCE, --image-size and --fluoroscopes; more: what else SOURCE may be.
+
+    Returns the group of what is read.
+    """
     parser.add_argument(
         'source',
         type=Path,
@@ -121,9 +125,11 @@ def add_source(parser: argparse.ArgumentParser, image_size_help: str, more: str 
         help='bag (file or folder), CSV file fluoroscope,exposure,target_id,u,v[,sigma], or image '
         'points of another program: XMALab 2-D points or project, .pho (docs/formats.md)' + more,
     )
-    parser.add_argument('--image-size', type=image_size, metavar='WxH', help=image_size_help)
-    add_fluoroscopes(parser)
+    group = parser.add_argument_group('input')
+    group.add_argument('--image-size', type=image_size, metavar='WxH', help=image_size_help)
+    add_fluoroscopes(group)
     add_file_options(parser)
+    return group
 
 
 def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> None:
@@ -191,7 +197,7 @@ def file_settings(arguments: argparse.Namespace, **changes: Any) -> FileSettings
     return FileSettings(**settings)
 
 
-def add_fluoroscopes(parser: argparse.ArgumentParser, use: str = 'use') -> None:
+def add_fluoroscopes(parser: Parser, use: str = 'use') -> None:
     """Add --fluoroscopes."""
     parser.add_argument(
         '--fluoroscopes',
@@ -211,7 +217,7 @@ def add_scheduler(parser: argparse._ActionsContainer) -> None:
     )
 
 
-def add_phantom(parser: argparse.ArgumentParser, **changes: Any) -> None:
+def add_phantom(parser: Parser, **changes: Any) -> None:
     """Add --phantom; changes replace keyword arguments of `add_argument`."""
     settings: dict[str, Any] = {
         'required': True,
@@ -223,7 +229,7 @@ def add_phantom(parser: argparse.ArgumentParser, **changes: Any) -> None:
     parser.add_argument('--phantom', **settings)
 
 
-def add_calibration(parser: argparse.ArgumentParser) -> None:
+def add_calibration(parser: Parser) -> None:
     """Add --calibration."""
     parser.add_argument(
         '--calibration',
@@ -234,7 +240,29 @@ def add_calibration(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def add_collect(parser: argparse.ArgumentParser, source: str = 'a bag') -> None:
+def add_result_folder(parser: argparse.ArgumentParser) -> None:
+    """Add DIR, which --calibration and a rig.toml give as well; see `result_folder`."""
+    parser.add_argument(
+        'directory',
+        type=Path,
+        nargs='?',
+        metavar='DIR',
+        help='result folder of calibrate',
+    )
+    parser.add_argument(
+        '--calibration', type=Path, metavar='DIR', help='the same, as other commands name it'
+    )
+
+
+def result_folder(arguments: argparse.Namespace, error: Callable[[str], None]) -> Path:
+    """Return the folder of `add_result_folder`; call error with a sentence where there is none."""
+    if arguments.directory is None and arguments.calibration is None:
+        error('the following arguments are required: DIR')
+    folder: Path = arguments.directory or arguments.calibration
+    return folder
+
+
+def add_collect(parser: Parser, source: str = 'a bag') -> None:
     """Add --collect."""
     from ..exposures.collector import COLLECT_MODES
 

@@ -46,12 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     recover = _add_action(
         actions, 'recover', 'Write all intact messages of a damaged or cut-off bag to a new one.'
     )
-    recover.add_argument('source', type=Path, metavar='IN', help='bag (file or folder)')
+    recover.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
     recover.add_argument(
         '--out', required=True, type=Path, metavar='FOLDER', help='new bag, which must not exist'
     )
     info = _add_action(actions, 'info', 'Say what is in a bag and what is wrong with it.')
-    info.add_argument('source', type=Path, metavar='BAG', help='bag (file or folder)')
+    info.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
 
     record = _add_action(
         actions, 'record', 'Record topics into a new bag until interrupted (needs ROS 2).'
@@ -67,7 +67,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     play = _add_action(
         actions, 'play', 'Publish the messages of a bag as they were recorded (needs ROS 2).'
     )
-    play.add_argument('source', type=Path, metavar='BAG', help='bag (file or folder)')
+    play.add_argument('source', type=Path, metavar='SOURCE', help='bag (file or folder)')
     play.add_argument('--topics', type=names, metavar='T,T', help='topics to play (default: all)')
     play.add_argument(
         '--rate',

@@ -42,6 +42,7 @@ from .output import (
     print_round,
     print_step,
     print_unpaired,
+    styled_verdict,
 )
 
 if TYPE_CHECKING:
@@ -53,45 +54,71 @@ if TYPE_CHECKING:
 NAME = 'calibrate'
 HELP = 'Self-calibrate the fluoroscopes of a bag, file of image points or folder of radiographs.'
 EXAMPLE = 'fluoro-calib calibrate bags/calibration --phantom bags/phantom.csv --out result'
+OF_MODEL = ('model', 'k')
 INTERNAL = ('tolerance',)  # options that the command does not offer
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from ..calibration.options import CalibrationOptions
-
-    add_source(
+    source = add_source(
         parser,
         'image size of a file that does not contain it [px]',
         '; or radiographs: a folder with a folder of images for each fluoroscope, a bag with '
         'images',
     )
+    add_phantom(source)
+    add_collect(source)
+    add_scheduler(source)
     add_bag_options(parser)
-    add_phantom(parser)
-    add_scheduler(parser)
-    parser.add_argument(
+    _add_adjustment(parser)
+    result = parser.add_argument_group('result')
+    result.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
     )
+    result.add_argument(
+        '--force',
+        action='store_true',
+        help='calibrate even if the input or the result cannot be right, for example with another '
+        'phantom; the reasons are written to result.json',
+    )
+    result.add_argument(
+        '--fast',
+        action='store_true',
+        help='write neither the verdict (see validate) nor the report; they take two to '
+        'three times as long as the calibration',
+    )
+    result.add_argument(
+        '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
+    )
+
+
+def _add_adjustment(parser: argparse.ArgumentParser) -> None:
+    """Add the options of correction model and adjustment."""
+    from ..calibration.options import CalibrationOptions
+
+    model = parser.add_argument_group('correction model')
+    adjustment = parser.add_argument_group('adjustment')
     for name, option in declared(CalibrationOptions).items():
         if name == 'model':
-            _add_model(parser, option)
+            _add_model(model, option)
         elif name not in INTERNAL:
-            add_option(parser, option, **_METAVARS.get(name, {}))
-    together = parser.add_mutually_exclusive_group()
+            group = model if name in OF_MODEL else adjustment
+            add_option(group, option, **_METAVARS.get(name, {}))
+    together = adjustment.add_mutually_exclusive_group()
     together.add_argument(
         '--joint', action='store_true', help='all fluoroscopes in one adjustment'
     )
     together.add_argument(
         '--separate', action='store_true', help='one fluoroscope after the other (the default)'
     )
-    parser.add_argument(
+    adjustment.add_argument(
         '--principal-distance',
         type=number_in(1, 1e7),
         metavar='PX',
         help='start value, or with --interior fixed the held value '
         '(default: from the observations)',
     )
-    parser.add_argument(
+    adjustment.add_argument(
         '--known-orientation',
         type=Path,
         action='append',
@@ -101,25 +128,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         'MayaCam 2; repeatable: only the distortion is estimated; the phantom is then given in '
         'the frame of the lab, in motion with a column exposure',
     )
-    add_collect(parser)
-    parser.add_argument(
-        '--force',
-        action='store_true',
-        help='calibrate even if the input or the result cannot be right, for example with another '
-        'phantom; the reasons are written to result.json',
-    )
-    parser.add_argument(
-        '--fast',
-        action='store_true',
-        help='write neither the verdict (see validate) nor the report; they take two to '
-        'three times as long as the calibration',
-    )
-    parser.add_argument(
-        '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
-    )
 
 
-def _add_model(parser: argparse.ArgumentParser, option: Option) -> None:
+def _add_model(parser: argparse._ArgumentGroup, option: Option) -> None:
     """Add --model: the name of a model, or the user's own regressor."""
 
     def convert(text: str) -> Any:
@@ -275,9 +286,21 @@ def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
     if outcome.validation is not None:
         report = _report(arguments.out)
         document |= {'validation': validation_document(outcome.validation), 'report': report}
-        lines += ['', verdict_line(outcome.validation)]
+        verdict = outcome.validation.verdict
+        lines += ['', styled_verdict(verdict_line(outcome.validation), verdict)]
         lines += [f'Report: {report}'] if report else []
-    print_result(arguments, document, '\n'.join(lines))
+    print_result(arguments, document, '\n'.join(lines), _next_step(arguments, outcome))
+
+
+def _next_step(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> tuple[object, ...]:
+    """Return the command that follows: it uses the calibration, or says what is wrong with it."""
+    if outcome.validation is None:
+        return 'validate', arguments.out
+    if outcome.validation.verdict == 'fail':
+        return ()  # the verdict says what to do
+    if outcome.orientation is None:
+        return 'correct', 'POINTS.csv', '--calibration', arguments.out, '--out', 'corrected.csv'
+    return 'reconstruct', 'MEASURED', '--calibration', arguments.out, '--out', 'points.csv'
 
 
 def _report(directory: Path) -> str | None:

@@ -55,7 +55,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='file to write, whose suffix determines the format; a folder for a folder of images',
     )
     parser.add_argument(
+        '--fluoroscopes',
         '--fluoroscope',
+        dest='fluoroscope',
         metavar='NAME',
         help='fluoroscope of the source, if several are calibrated',
     )

@@ -54,10 +54,10 @@ def exposure_numbers(text: str) -> set[int]:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
+    source = add_source(parser, 'image size of a file [px] (default: that of the calibration)')
     add_bag_options(parser)
     add_calibration(parser)
-    add_phantom(parser)
+    add_phantom(source)
     parser.add_argument(
         '--frame-id',
         default='rig',
@@ -117,4 +117,5 @@ def run(arguments: argparse.Namespace) -> None:
             'their survey (RMS)'
         )
     lines.append(f'written to {path}')
-    print_result(arguments, document, '\n'.join(lines))
+    reconstruct = ('reconstruct', 'MEASURED', '--calibration', arguments.calibration)
+    print_result(arguments, document, '\n'.join(lines), (*reconstruct, '--out', 'points.csv'))

@@ -17,11 +17,13 @@
 from __future__ import annotations
 
 import argparse
+import os
+import shlex
 import shutil
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -29,18 +31,48 @@ if TYPE_CHECKING:
     from ..calibration.rounds import Round
 
 
-def print_result(arguments: argparse.Namespace, document: Mapping[str, Any], text: str) -> None:
-    """Print a result: as JSON with --json, else as text for people."""
+# Escape sequences (ECMA-48, select graphic rendition).
+STYLES = {'red': '31;1', 'green': '32;1', 'yellow': '33', 'dim': '2'}
+VERDICTS = {'pass': 'green', 'fail': 'red', 'cannot tell': 'yellow'}
+
+
+def styled(text: str, style: str, stream: TextIO) -> str:
+    """Return a text in a style, on a terminal; as it is elsewhere, and with NO_COLOR.
+
+    https://no-color.org: NO_COLOR counts if it is not empty.
+    """
+    plain = os.environ.get('NO_COLOR') or os.environ.get('TERM') == 'dumb'
+    if not style or plain or not stream.isatty():
+        return text
+    return f'\033[{STYLES[style]}m{text}\033[0m'
+
+
+def styled_verdict(line: str, verdict: str) -> str:
+    """Return the line of a verdict in its colour."""
+    return styled(line, VERDICTS.get(verdict, ''), sys.stdout)
+
+
+def print_result(
+    arguments: argparse.Namespace,
+    document: Mapping[str, Any],
+    text: str,
+    next_step: Sequence[object] = (),
+) -> None:
+    """Print a result: as JSON with --json, else as text for people, with the next command."""
     if arguments.json:
         from ..files.json_file import json_text
 
-        text = json_text(document)
+        print(json_text(document).rstrip('\n'))
+        return
     print(text.rstrip('\n'))
+    if next_step:
+        command = ' '.join(shlex.quote(str(word)) for word in ('fluoro-calib', *next_step))
+        print(styled(f'Next: {command}', 'dim', sys.stdout))
 
 
 def print_note(text: str) -> None:
     """Print a note on standard error."""
-    print(text, file=sys.stderr)
+    print(styled(text, 'yellow', sys.stderr), file=sys.stderr)
 
 
 def print_notes(texts: Iterable[str]) -> None:

@@ -165,4 +165,6 @@ def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> Non
         )
     if outcome.drift:
         lines.append(f'drift watch: {outcome.drift.message}')
-    print_result(arguments, document, '\n'.join(lines))
+    c3d = arguments.out.with_suffix('.c3d')
+    convert = ('convert', arguments.out, '--to', 'c3d', '--rate', 'HZ', '--out', c3d)
+    print_result(arguments, document, '\n'.join(lines), convert)

@@ -17,8 +17,9 @@
 from __future__ import annotations
 
 import argparse
-from pathlib import Path
+from collections.abc import Callable
 
+from .arguments import add_result_folder, result_folder
 from .output import print_result
 
 NAME = 'report'
@@ -28,7 +29,12 @@ EXAMPLE = 'fluoro-calib report result'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument('directory', type=Path, metavar='DIR', help='result folder of calibrate')
+    add_result_folder(parser)
+
+
+def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+    """Find the result folder; call error with a sentence where none is given."""
+    arguments.directory = result_folder(arguments, error)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -50,4 +50,8 @@ def run(arguments: argparse.Namespace) -> None:
     with ProgressBar('radiographs') as bar:
         simulate(arguments.out, options, bar)
     document = {'out': str(arguments.out), **dataclasses.asdict(options)}
-    print_result(arguments, document, f'written to {arguments.out}')
+    calibrate = (
+        *('calibrate', arguments.out / 'calibration'),
+        *('--phantom', arguments.out / 'phantom.csv', '--out', 'result'),
+    )
+    print_result(arguments, document, f'written to {arguments.out}', calibrate)

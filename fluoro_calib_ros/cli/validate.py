@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import DataError
@@ -25,8 +26,10 @@ from .arguments import (
     add_file_options,
     add_fluoroscopes,
     add_phantom,
+    add_result_folder,
     file_settings,
     image_size,
+    result_folder,
 )
 from .output import print_notes, print_result, print_step, print_unpaired
 
@@ -37,7 +40,7 @@ EXAMPLE = 'fluoro-calib validate result'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.add_argument('directory', type=Path, metavar='DIR', help='result folder of calibrate')
+    add_result_folder(parser)
     parser.add_argument(
         '--source',
         type=Path,
@@ -54,6 +57,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_fluoroscopes(parser, 'validate')
     add_collect(parser, 'a bag given as --source')
     add_file_options(parser)
+
+
+def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+    """Find the result folder; call error with a sentence where none is given."""
+    arguments.directory = result_folder(arguments, error)
 
 
 def run(arguments: argparse.Namespace) -> None:

@@ -1,0 +1,78 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Defaults of the command line from a rig.toml."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..files.rig_file import NAME, RigFile, read_rig_file
+
+# Arguments whose default a rig.toml gives, by command; `out` is the key calibration.
+_SOURCE = ('fluoroscopes', 'image_size')
+USED = {
+    'extract': ('phantom',),
+    'calibrate': (*_SOURCE, 'phantom', 'out'),
+    'adjust': (*_SOURCE, 'phantom', 'calibration'),
+    'correct': ('calibration',),
+    'validate': ('calibration',),
+    'report': ('calibration',),
+    'orient': (*_SOURCE, 'phantom', 'calibration'),
+    'reconstruct': (*_SOURCE, 'calibration'),
+    'convert': ('image_size',),
+}
+
+
+def find_rig(words: Sequence[str], command: str) -> RigFile | None:
+    """Return the file of --rig, else the rig.toml of the working directory, else None.
+
+    Raises DataError for a file that is wrong.
+    """
+    if command not in USED:
+        return None
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+    parser.add_argument('--rig', type=Path)
+    try:
+        given = parser.parse_known_args(list(words))[0].rig
+    except argparse.ArgumentError:  # the parser of the command says what is wrong
+        return None
+    if given is None and Path(NAME).is_file():
+        given = Path(NAME)
+    return None if given is None else read_rig_file(given)
+
+
+def add_rig(parser: argparse.ArgumentParser, command: str, rig: RigFile | None) -> None:
+    """Add --rig to the parser of a command, and make the values of the rig its defaults."""
+    if command not in USED:
+        return
+    parser.add_argument(
+        '--rig',
+        type=Path,
+        metavar='FILE',
+        help='names, image size, phantom and folder of the rig, so that flags are unnecessary '
+        f'(default: {NAME}, if there is one); flags take precedence',
+    )
+    if rig is None:
+        return
+    for action in parser._actions:
+        if action.dest not in USED[command]:
+            continue
+        key = 'calibration' if action.dest == 'out' else action.dest
+        value = getattr(rig, key)
+        if value is not None:
+            action.default = value
+            action.required = False

@@ -1,0 +1,106 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""rig.toml: what does not change from command to command, so that flags are unnecessary.
+
+    fluoroscopes = ["a", "b"]
+    image_size = [1024, 1024]     # width, height [px]
+    phantom = "phantom.csv"
+    calibration = "result"        # result folder of calibrate
+
+All keys are optional; paths are relative to the folder of the file.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..errors import DataError
+from .access import read_text
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+NAME = 'rig.toml'
+KEYS = ('fluoroscopes', 'image_size', 'phantom', 'calibration')
+
+
+@dataclass(frozen=True)
+class RigFile:
+    """Content of a rig.toml; None for what it does not say.
+
+    Attributes
+    ----------
+    path : Path
+    fluoroscopes : list of str or None
+    image_size : tuple of int or None
+        Width and height [px].
+    phantom, calibration : Path or None
+        File with the phantom, and result folder.
+    """
+
+    path: Path
+    fluoroscopes: list[str] | None = None
+    image_size: tuple[int, int] | None = None
+    phantom: Path | None = None
+    calibration: Path | None = None
+
+
+def read_rig_file(path: Path) -> RigFile:
+    """Read a rig.toml. Raises DataError that names file and key."""
+    try:
+        document = tomllib.loads(read_text(path))
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise DataError(f'{path}: this is no TOML ({error})') from None
+    for key in document:
+        if key not in KEYS:
+            raise DataError(f'{path}, key {key}: unknown, there are {", ".join(KEYS)}')
+    return RigFile(
+        path,
+        _names(path, document.get('fluoroscopes')),
+        _size(path, document.get('image_size')),
+        _path(path, 'phantom', document.get('phantom')),
+        _path(path, 'calibration', document.get('calibration')),
+    )
+
+
+def _names(path: Path, value: Any) -> list[str] | None:
+    if value is None:
+        return None
+    valid = isinstance(value, list) and value and all(isinstance(v, str) and v for v in value)
+    if not valid or len(set(value)) < len(value):
+        raise DataError(f'{path}, key fluoroscopes: a list of different names, such as ["a", "b"]')
+    return list(value)
+
+
+def _size(path: Path, value: Any) -> tuple[int, int] | None:
+    if value is None:
+        return None
+    whole = isinstance(value, list) and all(type(v) is int and v > 0 for v in value)
+    if not whole or len(value) != 2:
+        raise DataError(f'{path}, key image_size: width and height [px], such as [1024, 1024]')
+    return value[0], value[1]
+
+
+def _path(path: Path, key: str, value: Any) -> Path | None:
+    if value is None:
+        return None
+    if not isinstance(value, str) or not value or '\0' in value:
+        raise DataError(f'{path}, key {key}: a path is a text, such as "phantom.csv"')
+    return path.parent / value

@@ -1,0 +1,145 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""rig.toml, names of arguments, completion and colours of the command line."""
+
+import io
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from fluoro_calib_ros.cli import COMMANDS, main, make_parser
+from fluoro_calib_ros.cli.output import styled
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.files.rig_file import RigFile, read_rig_file
+
+
+@pytest.fixture
+def rig(tmp_path):
+    def write(text, name='rig.toml'):
+        path = tmp_path / name
+        path.write_text(text)
+        return path
+
+    return write
+
+
+def parsed(words, rig_file=None):
+    return make_parser(words[0], rig_file).parse_args(words)
+
+
+WHOLE = """
+fluoroscopes = ["a", "b"]
+image_size = [1024, 1000]
+phantom = "cube/phantom.csv"
+calibration = "result"
+"""
+
+
+def test_rig_file_makes_flags_unnecessary(rig, tmp_path):
+    content = read_rig_file(rig(WHOLE))
+    arguments = parsed(['calibrate', 'points.csv'], content)
+    assert arguments.fluoroscopes == ['a', 'b'] and arguments.image_size == (1024, 1000)
+    assert arguments.phantom == tmp_path / 'cube' / 'phantom.csv'
+    assert arguments.out == tmp_path / 'result'
+    assert parsed(['orient', 'capture'], content).calibration == tmp_path / 'result'
+    flags = ['calibrate', 'points.csv', '--out', 'x', '--fluoroscopes', 'c']
+    arguments = parsed(flags, content)
+    assert arguments.out == Path('x') and arguments.fluoroscopes == ['c']
+
+
+def test_what_the_rig_file_does_not_say_is_required_as_before(rig, capsys):
+    with pytest.raises(SystemExit):
+        parsed(['calibrate', 'points.csv'], RigFile(Path('rig.toml')))
+    assert '--phantom, --out' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    'text, cause',
+    [
+        ('phantm = "p.csv"', 'key phantm: unknown, there are fluoroscopes, image_size, phantom'),
+        ('image_size = [1024]', 'key image_size: width and height'),
+        ('image_size = "1024x1024"', 'key image_size: width and height'),
+        ('image_size = [true, 5]', 'key image_size: width and height'),
+        ('fluoroscopes = ["a", "a"]', 'key fluoroscopes: a list of different names'),
+        ('fluoroscopes = "a"', 'key fluoroscopes: a list of different names'),
+        ('phantom = 3', 'key phantom: a path is a text'),
+        ('phantom = ', 'this is no TOML'),
+        ('a = ' + 5000 * '[', 'this is no TOML'),
+    ],
+)
+def test_wrong_rig_file_is_refused_with_file_and_key(rig, text, cause):
+    path = rig(text)
+    with pytest.raises(DataError) as refusal:
+        read_rig_file(path)
+    assert str(refusal.value).startswith(str(path)) and cause in str(refusal.value)
+
+
+def test_rig_file_of_the_working_directory_and_of_the_flag(rig, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    rig('calibration = "nowhere"')
+    other = rig('calibration = "elsewhere"', 'other.toml')
+    for words, name in (['report'], 'nowhere'), (['report', '--rig', str(other)], 'elsewhere'):
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+        error = capsys.readouterr().err
+        assert ended.value.code == 1 and name in error
+        assert error.startswith('defaults of ')
+    with pytest.raises(SystemExit):
+        main(['report', '--rig', 'missing.toml'])
+    assert 'missing.toml: there is no such file' in capsys.readouterr().err
+
+
+def test_result_folder_is_given_by_place_or_by_flag():
+    for words in (['report', 'result'], ['report', '--calibration', 'result']):
+        arguments = parsed(words)
+        arguments.module.check(arguments, pytest.fail)
+        assert arguments.directory == Path('result')
+    words = ['correct', 'p.csv', '--calibration', 'r', '--out', 'o.csv']
+    for flag in ('--fluoroscope', '--fluoroscopes'):
+        assert parsed([*words, flag, 'a']).fluoroscope == 'a'
+
+
+def test_source_is_the_first_argument_of_every_command():
+    parser = make_parser()
+    commands = next(a for a in parser._actions if a.dest == 'command').choices
+    for module in COMMANDS:
+        places = [a for a in commands[module.NAME]._actions if not a.option_strings]
+        if places and module.NAME not in ('bag', 'compare', 'report', 'validate'):
+            assert places[0].metavar == 'SOURCE', module.NAME
+
+
+def test_completion_script_is_valid_bash(capsys):
+    pytest.importorskip('shtab')
+    with pytest.raises(SystemExit) as ended:
+        main(['--print-completion', 'bash'])
+    script = capsys.readouterr().out
+    assert ended.value.code == 0 and 'mayacam2' in script
+    checked = subprocess.run(['bash', '-n'], input=script, text=True, capture_output=True)
+    assert checked.returncode == 0, checked.stderr
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+def test_colours_are_for_terminals_without_no_color(monkeypatch):
+    monkeypatch.delenv('NO_COLOR', raising=False)
+    monkeypatch.setenv('TERM', 'xterm')
+    assert styled('pass', 'green', Terminal()) == '\033[32;1mpass\033[0m'
+    assert styled('pass', 'green', io.StringIO()) == 'pass'
+    monkeypatch.setenv('NO_COLOR', '1')
+    assert styled('pass', 'green', Terminal()) == 'pass'

@@ -25,15 +25,18 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from .detection import BLOB_RADIUS, MIN_SIZE, field_of_view
 
 SCALES = (1.1, 1.5, 2.1, 3.0, 4.2)  # standard deviations of the blur [px]
-NEAR_PX = 4  # from a given point, within which its shadow is
+NOISE_WEIGHT = 0.1  # of the response, in the noise that it is compared with
+NEAR_PX = 3  # from a given point, within which its shadow is
 MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
 MIN_SNR = 4.5  # of a response, over the noise of the response
 BACKGROUND_PX = 15  # half the width of the box whose mean is the light around a pixel
+SAME_PX = 1.0  # between maxima that are one shadow
 BORDER = 3  # scales of the blur at the edge of a window that are not searched
 
 
@@ -46,6 +49,15 @@ class Shadows:
 
     uv: np.ndarray
     strength: np.ndarray
+
+    def distinct(self) -> Shadows:
+        """Return the shadows without those at the place of a stronger one."""
+        order = np.argsort(-self.strength, kind='stable')
+        uv = self.uv[order]
+        tree = cKDTree(uv)
+        again = {int(two) for one, two in tree.query_pairs(SAME_PX) if one < two}
+        kept = order[[number for number in range(len(order)) if number not in again]]
+        return Shadows(self.uv[kept], self.strength[kept])
 
 
 @dataclass(frozen=True)
@@ -141,15 +153,18 @@ def learn_look(image: np.ndarray, near: np.ndarray | None, count: int) -> Marker
     grey = image.astype(np.float32)
     around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
     top = float(np.iinfo(image.dtype).max)
-    best: tuple[float, float, bool] | None = None
+    best: tuple[float, float, float, bool] | None = None
     for scale in SCALES:
         for inverted, response in zip((False, True), _responses(grey, scale)):
             relative = response / np.maximum(top - around if inverted else around, 1e-3 * top)
             typical = _typical(relative, scale, near, count)
-            if best is None or typical > best[0]:
-                best = (typical, scale, inverted)
+            # Small scales have the strongest response to noise, too.
+            noise = float(np.median(relative[relative > 0])) if (relative > 0).any() else 1.0
+            merit = typical / (noise + NOISE_WEIGHT * typical)
+            if best is None or merit * typical > best[0]:
+                best = (merit * typical, typical, scale, inverted)
     assert best is not None
-    strength, scale, inverted = best
+    _, strength, scale, inverted = best
     light = top - grey if inverted else grey
     field = field_of_view(light, scale)
     relative = _responses(light, scale)[0] / np.maximum(
@@ -202,14 +217,8 @@ def search_windows(
     place = found.uv.copy()
     place[:, 1] -= number * size
     place += middle[number] - half - border
-    order = np.argsort(-found.strength, kind='stable')
-    place = place[order]
-    strength = found.strength[order]
-    # A shadow that two windows contain is the same pixel in both.
-    pixel = np.rint(place * 2).astype(np.int64)
-    _, first = np.unique(pixel[:, 1] * 2**20 + pixel[:, 0], return_index=True)
-    first.sort()
-    return Shadows(place[first], strength[first])
+    # Windows that overlap contain the same shadow.
+    return Shadows(place, found.strength).distinct() if len(place) else found
 
 
 def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:

@@ -33,6 +33,8 @@ FIRST_SPEED_PX = 6.0  # standard deviation of the unknown first velocity [px a f
 FIRST_ACCELERATION_PX = 0.5
 MIN_ACCELERATION_PX = 0.05  # px a squared frame
 FORGET = 0.9  # share of the earlier squared innovations that is kept
+LEADERS = 4  # markers whose changes of velocity an unseen one follows
+LED = 0.5  # share of the acceleration that they do not explain
 MAX_SD_PX = 60.0  # of a prediction
 MODEL_SD_PX = 0.05  # of a place, beyond the noise of the measurement
 FAR = 1e6
@@ -53,12 +55,15 @@ class Motion:
         Of place and velocity, the same along u and v.
     squared : (n,) ndarray
         Running mean of squared accelerations.
+    unlike : (n, n) ndarray
+        Running mean of squared differences of velocities.
     """
 
     uv: np.ndarray
     velocity: np.ndarray
     covariance: np.ndarray
     squared: np.ndarray
+    unlike: np.ndarray
 
     @classmethod
     def start(cls, uv: np.ndarray, sd_px: float) -> Motion:
@@ -68,19 +73,26 @@ class Motion:
         covariance[:, 0, 0] = sd_px**2
         covariance[:, 1, 1] = FIRST_SPEED_PX**2
         squared = np.full(n, FIRST_ACCELERATION_PX**2)
-        return cls(np.array(uv, dtype=float), np.zeros((n, 2)), covariance, squared)
+        unlike = np.full((n, n), FIRST_SPEED_PX**2)
+        np.fill_diagonal(unlike, np.inf)
+        return cls(np.array(uv, dtype=float), np.zeros((n, 2)), covariance, squared, unlike)
 
     @property
     def variance(self) -> np.ndarray:
         """Variances (n,) of a coordinate [px^2]."""
         return self.covariance[:, 0, 0]
 
-    def predict(self, frames: int) -> None:
-        """Move all markers on by a number of frames."""
+    def predict(self, frames: int, led: np.ndarray | None = None) -> None:
+        """Move all markers on by a number of frames.
+
+        led (n,) are those whose velocity follows that of others.
+        """
         t = float(frames)
         self.uv += t * self.velocity
         pooled = float(np.median(self.squared)) if len(self.squared) else 0.0
         q = np.maximum(np.maximum(self.squared, pooled), MIN_ACCELERATION_PX**2)
+        if led is not None:
+            q = np.where(led, LED**2 * pooled + MIN_ACCELERATION_PX**2, q)
         p = self.covariance
         cross = p[:, 0, 1] + t * p[:, 1, 1]
         p[:, 0, 0] += t * (p[:, 0, 1] + cross) + q * t**4 / 4
@@ -111,15 +123,40 @@ class Motion:
         update = FORGET * self.squared[rows] + (1 - FORGET) * seen
         self.squared[rows] = np.where(settled, update, self.squared[rows])
 
-    def place(self, rows: np.ndarray, uv: np.ndarray, sd_px: np.ndarray) -> None:
+    def lead(self, seen: np.ndarray, before: np.ndarray) -> np.ndarray:
+        """Let unseen markers follow those that move alike; returns (n,) which do.
+
+        seen (n,) were measured now, and had velocities before (n, 2).
+        """
+        rows = np.flatnonzero(seen & self.settled)
+        led = np.zeros(len(seen), dtype=bool)
+        if len(rows) < LEADERS:
+            return led
+        velocity = self.velocity[rows]
+        difference = ((velocity[:, None] - velocity[None]) ** 2).sum(axis=2)
+        both = np.ix_(rows, rows)
+        self.unlike[both] = FORGET * self.unlike[both] + (1 - FORGET) * difference
+        self.unlike[rows, rows] = np.inf
+        change = velocity - before[rows]
+        for row in np.flatnonzero(~seen & self.settled).tolist():
+            alike = np.argsort(self.unlike[row, rows], kind='stable')[:LEADERS]
+            self.velocity[row] += np.median(change[alike], axis=0)
+            led[row] = True
+        return led
+
+    def place(
+        self, rows: np.ndarray, uv: np.ndarray, velocity: np.ndarray, sd_px: np.ndarray
+    ) -> None:
         """Put some markers where a better prediction says, if it is better."""
         better = sd_px**2 < self.variance[rows]
         rows = rows[better]
         self.uv[rows] = uv[better]
-        shrink = sd_px[better] ** 2 / self.variance[rows]
-        self.covariance[rows, 0, 0] *= shrink
-        self.covariance[rows, 0, 1] *= np.sqrt(shrink)
-        self.covariance[rows, 1, 0] *= np.sqrt(shrink)
+        self.velocity[rows] = velocity[better]
+        self.covariance[rows] = np.eye(2) * (sd_px[better] ** 2)[:, None, None]
+
+    def scatter(self, row: int) -> None:
+        """Forget where a marker is."""
+        self.covariance[row] = np.diag([MAX_SD_PX**2, FIRST_SPEED_PX**2])
 
     @property
     def settled(self) -> np.ndarray:
@@ -136,6 +173,8 @@ class Motion:
         """Exchange the states of two markers."""
         for values in (self.uv, self.velocity, self.covariance, self.squared):
             values[[one, other]] = values[[other, one]]
+        self.unlike[[one, other]] = self.unlike[[other, one]]
+        self.unlike[:, [one, other]] = self.unlike[:, [other, one]]
 
 
 def costs(uv: np.ndarray, variance: np.ndarray, found: np.ndarray) -> np.ndarray:

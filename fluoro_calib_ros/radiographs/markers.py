@@ -49,7 +49,7 @@ FIRST_SD_PX = 1.5  # of a given place of the first frame
 SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
 SHADOW_SD_PX = 0.35  # of the place of a shadow before it is measured
 MAX_SIGMA_PX = 0.5
-MAX_MISFIT = 6.0
+MAX_MISFIT = 10.0
 DEPTH = (0.5, 1.8)  # of a shadow, over that of its marker
 DEPTH_SD = 1.0  # of the depth of a marker that is not known yet
 KNOWN_DEPTH_SD = 0.15
@@ -58,10 +58,13 @@ MIN_HALF = 4  # of a search window [px]
 MAX_HALF = 48
 SAME_PLACE = 0.35  # of the radius, at which two markers are one shadow
 FALSE_SHADOWS = 0.02  # expected in the gate, from which a marker found again is doubtful
+OTHER_SHADOW = 'another shadow was as near to where it was expected'
 MIN_DENSITY = 2e-6  # of false shadows [1/px^2]
 MIN_MOTION_PX = 0.3
 WIDE_PX = 8.0  # standard deviation of a prediction from which markers beside help
 BESIDE = 8
+MIN_BESIDE = 4
+LOST_SD_PX = 25.0  # of a prediction, from which only markers that move together are found again
 MAX_SHIFT_PX = 60.0
 SHIFTED_SD_PX = 1.2
 
@@ -202,6 +205,7 @@ class _Markers:
     depth: np.ndarray
     depth_sd: np.ndarray
     unseen: np.ndarray  # images since a marker was measured
+    since: np.ndarray  # image with which a doubt began
     partner: list[set[int]] = field(default_factory=list)  # rows it may be exchanged with
 
 
@@ -226,6 +230,9 @@ class MarkerTracker:
         self._images = 0
         self._density = MIN_DENSITY
         self._size: tuple[int, int] | None = None
+        self._gap = 1
+        self._led: np.ndarray | None = None
+        self._suggested: tuple[np.ndarray, ...] | None = None
 
     @property
     def target_id(self) -> np.ndarray:
@@ -274,23 +281,39 @@ class MarkerTracker:
             self._advance(frame)
         return self._measured(image, frame, begin)
 
-    def confirm(self, target_id: int) -> None:
-        """Take back the doubt in a marker, and in those that it may be exchanged with."""
+    def doubted_since(self, target_id: int) -> int | None:
+        """Return the image since which an id may be wrong, None for one that is sure."""
         markers = self._known()
         row = self._row(target_id)
-        for other in markers.partner[row]:
-            if other != row:
-                markers.partner[other].discard(row)
+        return int(markers.since[row]) if markers.partner[row] else None
+
+    def confirm(self, target_id: int) -> None:
+        """Take back the doubt in a marker."""
+        markers = self._known()
+        row = self._row(target_id)
+        for other in markers.partner[row] - {row}:
+            markers.partner[other].discard(row)
         markers.partner[row].clear()
 
     def exchange(self, one: int, other: int) -> None:
-        """Exchange two ids that were found to be the wrong way round, and take back the doubt."""
+        """Exchange two ids that were found to be the wrong way round."""
         markers = self._known()
         first = self._row(one)
         second = self._row(other)
         markers.motion.exchange(first, second)
         for values in (markers.depth, markers.depth_sd, markers.unseen):
             values[[first, second]] = values[[second, first]]
+
+    def partners(self, target_id: int) -> set[int]:
+        """Return the ids that a marker may be exchanged with; its own for something else."""
+        markers = self._known()
+        return {int(markers.target_id[i]) for i in markers.partner[self._row(target_id)]}
+
+    def part(self, one: int, other: int) -> None:
+        """Take back the doubt that two markers were exchanged."""
+        markers = self._known()
+        first = self._row(one)
+        second = self._row(other)
         markers.partner[first].discard(second)
         markers.partner[second].discard(first)
 
@@ -299,14 +322,38 @@ class MarkerTracker:
         markers = self._known()
         row = self._row(target_id)
         self.confirm(target_id)
+        markers.motion.scatter(row)
         markers.unseen[row] = self.options.lost_after + 1
 
-    def suggest(self, target_id: np.ndarray, uv: np.ndarray, sd_px: np.ndarray) -> None:
-        """Use better predictions (k, 2) for the next image, as those from another view."""
-        rows = np.array([self._row(int(i)) for i in target_id], dtype=int)
-        self._suggested = (rows, np.asarray(uv, dtype=float), np.asarray(sd_px, dtype=float))
+    def doubt(self, target_id: int, frame: int) -> None:
+        """Note that an id may be wrong."""
+        markers = self._known()
+        row = self._row(target_id)
+        if not markers.partner[row]:
+            markers.since[row] = frame
+        markers.partner[row].add(row)
 
-    _suggested: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    def unsure(self) -> np.ndarray:
+        """Ids (k,) of markers that were not measured last, or are doubtful."""
+        markers = self._known()
+        doubtful = np.array([bool(partner) for partner in markers.partner])
+        return markers.target_id[(markers.unseen > 0) | doubtful]
+
+    def suggest(
+        self, target_id: np.ndarray, uv: np.ndarray, velocity: np.ndarray, sd_px: np.ndarray
+    ) -> None:
+        """Offer predictions for the next image, such as those from another view.
+
+        Parameters
+        ----------
+        target_id : (k,) ndarray
+        uv, velocity : (k, 2) ndarray
+            [px], [px a frame].
+        sd_px : (k,) ndarray
+            Where it is smaller than that of the own prediction, this one is used.
+        """
+        rows = np.array([self._row(int(i)) for i in target_id], dtype=int)
+        self._suggested = (rows, np.asarray(uv), np.asarray(velocity), np.asarray(sd_px))
 
     def _known(self) -> _Markers:
         if self._markers is None:
@@ -337,6 +384,8 @@ class MarkerTracker:
             )
         place = uv.copy()
         place[row] = found.uv[column]
+        unseen = np.ones(len(uv), dtype=int)
+        unseen[row] = 0
         top = float(np.iinfo(image.dtype).max)
         light = image.astype(np.float32)
         light = top - light if look.inverted else light
@@ -350,6 +399,7 @@ class MarkerTracker:
             motion,
             np.ones(n),
             np.full(n, DEPTH_SD),
+            unseen,
             np.zeros(n, dtype=int),
             [set() for _ in range(n)],
         )
@@ -365,13 +415,11 @@ class MarkerTracker:
         self._gap = frame - self._frame
         self._frame = frame
         self._images += 1
-        markers.motion.predict(self._gap)
+        markers.motion.predict(self._gap, self._led)
         markers.unseen += 1
         if self._suggested is not None:
             markers.motion.place(*self._suggested)
             self._suggested = None
-
-    _gap = 1
 
     def _measured(self, image: np.ndarray, frame: int, begin: float) -> MarkerFrame:
         """Find and measure the markers of an image."""
@@ -382,7 +430,9 @@ class MarkerTracker:
         found = self._search(image, windows)
         self._regroup(found)
         variance = motion.variance + SHADOW_SD_PX**2
-        row, column = assign(motion.uv, variance, found.uv, self.options.gate)
+        near = np.flatnonzero(variance < LOST_SD_PX**2)
+        row, column = assign(motion.uv[near], variance[near], found.uv, self.options.gate)
+        row = near[row]
         start = motion.uv.copy()
         start[row] = found.uv[column]
         assigned = np.zeros(len(start), dtype=bool)
@@ -406,7 +456,9 @@ class MarkerTracker:
         overlapped[tried] = beads.overlapped
         depth = markers.depth.copy()
         depth[tried] = beads.depth
+        free = np.delete(found.uv, column, axis=0)
         doubts = self._doubt(uv, sigma, measured, frame)
+        doubts += self._doubt_shadows(uv, measured & assigned, free, frame)
         self._take(np.flatnonzero(measured), uv, sigma, depth, overlapped)
         return self._result(frame, (uv, sigma, overlapped, measured), doubts, begin)
 
@@ -435,11 +487,7 @@ class MarkerTracker:
             return parts[0]
         uv = np.concatenate([part.uv for part in parts])
         strength = np.concatenate([part.strength for part in parts])
-        if not len(uv):
-            return Shadows(uv, strength)
-        again = cdist(parts[1].uv, parts[0].uv).min(axis=1, initial=np.inf) < 1.0
-        kept = np.concatenate([np.ones(len(parts[0].uv), dtype=bool), ~again])
-        return Shadows(uv[kept], strength[kept])
+        return Shadows(uv, strength).distinct() if len(uv) else parts[0]
 
     def _regroup(self, found: Shadows) -> None:
         """Move markers whose velocity is not known, or that are lost, with those beside them.
@@ -449,7 +497,10 @@ class MarkerTracker:
         """
         markers = self._known()
         motion = markers.motion
-        wide = (~motion.settled | (motion.variance > WIDE_PX**2)) & (self._images > 0)
+        if self._images == 0:
+            return
+        self._follow_beside()
+        wide = ~motion.settled | (motion.variance > WIDE_PX**2)
         if not wide.any() or len(found.uv) < 2 or len(motion.uv) < 2:
             return
         tree = cKDTree(found.uv)
@@ -466,6 +517,20 @@ class MarkerTracker:
                 if not motion.settled[row]:
                     velocity = shift / self._gap
                 motion.redirect(row, before[row] + shift, velocity, SHIFTED_SD_PX)
+
+    def _follow_beside(self) -> None:
+        """Give markers of unknown velocity that of those beside them, if there are some."""
+        motion = self._known().motion
+        known = np.flatnonzero(motion.settled & (self._known().unseen <= 1))
+        if len(known) < MIN_BESIDE:
+            return
+        for row in np.flatnonzero(~motion.settled).tolist():
+            away = np.linalg.norm(motion.uv[known] - motion.uv[row], axis=1)
+            beside = known[np.argsort(away, kind='stable')[:MIN_BESIDE]]
+            velocity = np.median(motion.velocity[beside], axis=0)
+            spread = float(np.abs(motion.velocity[beside] - velocity).max())
+            uv = motion.uv[row] + self._gap * (velocity - motion.velocity[row])
+            motion.redirect(row, uv, velocity, max(spread, SHIFTED_SD_PX))
 
     def _merged(self, start: np.ndarray, assigned: np.ndarray) -> None:
         """Let markers without a shadow share that of a marker beside them.
@@ -525,6 +590,9 @@ class MarkerTracker:
                 measured[one] = measured[two] = False
                 continue
             if two not in markers.partner[one]:
+                for row in (one, two):
+                    if not markers.partner[row]:
+                        markers.since[row] = frame
                 markers.partner[one].add(two)
                 markers.partner[two].add(one)
                 ids = (int(markers.target_id[one]), int(markers.target_id[two]))
@@ -533,10 +601,31 @@ class MarkerTracker:
         for row in np.flatnonzero(again).tolist():
             area = np.pi * self.options.gate**2 * motion.variance[row]
             if area * self._density > FALSE_SHADOWS and row not in markers.partner[row]:
+                if not markers.partner[row]:
+                    markers.since[row] = frame
                 markers.partner[row].add(row)
                 own = (int(markers.target_id[row]),)
                 text = f'found again after {int(markers.unseen[row]) - 1} images'
                 out.append(Doubt(frame, own, text))
+        return tuple(out)
+
+    def _doubt_shadows(
+        self, uv: np.ndarray, measured: np.ndarray, free: np.ndarray, frame: int
+    ) -> tuple[Doubt, ...]:
+        """Note which markers could as well be a shadow (k, 2) that is none of a marker."""
+        markers = self._known()
+        motion = markers.motion
+        rows = np.flatnonzero(measured & motion.settled)
+        if not len(free) or not len(rows):
+            return ()
+        variance = motion.variance[rows] + SHADOW_SD_PX**2
+        own = ((motion.uv[rows] - uv[rows]) ** 2).sum(axis=1) / variance
+        other = ((motion.uv[rows][:, None] - free[None]) ** 2).sum(axis=2) / variance[:, None]
+        out = []
+        for row in rows[other.min(axis=1) - own < self.options.margin].tolist():
+            if row not in markers.partner[row]:
+                self.doubt(int(markers.target_id[row]), frame)
+                out.append(Doubt(frame, (int(markers.target_id[row]),), OTHER_SHADOW))
         return tuple(out)
 
     def _take(
@@ -549,8 +638,10 @@ class MarkerTracker:
     ) -> None:
         """Update what is known of the markers that were measured."""
         markers = self._known()
+        before = markers.motion.velocity.copy()
         markers.motion.update(rows, uv[rows], sigma[rows], self._gap)
         markers.unseen[rows] = 0
+        self._led = markers.motion.lead(markers.unseen == 0, before)
         free = rows[~overlapped[rows]]
         first = markers.depth_sd[free] > KNOWN_DEPTH_SD
         memory = np.where(first, 0.0, DEPTH_MEMORY)

@@ -85,7 +85,7 @@ class MarkerScene:
     diameters_mm: tuple[float, ...] = (0.8, 1.0)
     attenuation: float = 7.0
     spread_mm: float = 20.0
-    apart_mm: float = 60.0
+    apart_mm: float = 110.0
     speed_mm: float = 0.6
     hidden: float = 0.05
     bones: bool = True
@@ -231,6 +231,9 @@ class MarkerRadiography(Radiography):
         if self.settings.clutter:
             self._open *= clutter(rng, self._open.shape, self.settings.clutter)
         self._plane = self._rays[..., :2].astype(np.float32)
+        coarse = self._rays[::BONE_STEP, ::BONE_STEP].reshape(-1, 3)
+        coarse = coarse / np.linalg.norm(coarse, axis=1, keepdims=True)
+        self._coarse = np.ascontiguousarray(coarse.T, dtype=np.float32)
 
     def take(self, frame: int) -> MarkerImage:
         """Take the radiograph of an image number; the same number gives the same image."""
@@ -265,40 +268,36 @@ class MarkerRadiography(Radiography):
             row = (np.arange((v1 - v0) * FINE) + 0.5) / FINE - 0.5 + v0
             grid = np.meshgrid(column.astype(np.float32), row.astype(np.float32))
             plane = cv2.remap(self._plane, *grid, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+            # Squares of metres less squares of millimetres: single precision is not enough.
             detector = np.dstack([plane, np.full(grid[0].shape, self.settings.detector_mm)])
-            total = np.zeros(grid[0].shape)
-            count = 0
+            total = np.zeros_like(grid[0])
             for number, of_moment in enumerate(sensor):
                 for spot in spots[1 + number % 2 :: 2][:SPOT_POINTS]:
-                    path = sum(
-                        chords(of_moment[one] - spot, detector - spot, radius[one]) for one in rows
-                    )
-                    total += np.exp(-self.markers.scene.attenuation * path)
-                    count += 1
-            passed = cv2.resize(total, (u1 - u0, v1 - v0), interpolation=cv2.INTER_AREA)
-            light[v0:v1, u0:u1] *= (passed / count).astype(np.float32)
+                    passed = np.ones_like(total)
+                    for one in rows:
+                        # Only where the bead is: regions of several beads are wide.
+                        part = tuple(
+                            slice((a - b) * FINE, (c - b) * FINE)
+                            for a, b, c in zip(low[one][::-1], (v0, u0), high[one][::-1])
+                        )
+                        path = chords(of_moment[one] - spot, detector[part] - spot, radius[one])
+                        passed[part] *= np.exp(-self.markers.scene.attenuation * path)
+                    total += passed
+            coarse = cv2.resize(total, (u1 - u0, v1 - v0), interpolation=cv2.INTER_AREA)
+            light[v0:v1, u0:u1] *= coarse / (MOMENTS * SPOT_POINTS)
 
     def _bones(self, poses: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
         """Transmission (h, w) of the bones around the clusters."""
         fluoroscope = self.fluoroscope
-        ray = np.dstack(
-            [
-                self._plane[::BONE_STEP, ::BONE_STEP],
-                np.full(
-                    self._plane[::BONE_STEP, ::BONE_STEP].shape[:2], self.settings.detector_mm
-                ),
-            ]
-        )
-        ray = (ray / np.linalg.norm(ray, axis=-1, keepdims=True)).reshape(-1, 3)
         size = self.markers.scene.spread_mm
-        path = np.zeros(len(ray), dtype=np.float32)
+        path = np.zeros(self._coarse.shape[1], dtype=np.float32)
         for rotation, shift in poses:
             to_bone = (fluoroscope.rotation @ rotation).T
             source = rotation.T @ (fluoroscope.position_mm - shift)
-            direction = (ray @ to_bone.T).astype(np.float32)
             for factor, sign in ((1.0, 1.0), (0.78, -1.0)):
                 axes = factor * size * np.array([0.75, 0.75, 2.2])
-                path += sign * _ellipsoid_path(source / axes, direction / axes)
+                direction = (to_bone / axes[:, None]).astype(np.float32) @ self._coarse
+                path += np.float32(sign) * _ellipsoid_path(source / axes, direction)
         shape = self._plane[::BONE_STEP, ::BONE_STEP].shape[:2]
         passed = np.exp(-BONE_ATTENUATION * path).astype(np.float32).reshape(shape)
         height, width = self._plane.shape[:2]
@@ -370,9 +369,10 @@ def _regions(
 
 
 def _ellipsoid_path(source: np.ndarray, direction: np.ndarray) -> np.ndarray:
-    """Lengths (n,) of rays in an ellipsoid, scaled to the unit sphere; directions (n, 3)."""
-    a = (direction * direction).sum(axis=1)
-    b = direction @ source.astype(np.float32)
+    """Lengths (n,) of rays in an ellipsoid, scaled to the unit sphere; directions (3, n)."""
+    x, y, z = direction
+    a = x * x + y * y + z * z
+    b = source.astype(np.float32) @ direction
     c = np.float32(source @ source - 1)
     return 2 * np.sqrt(np.maximum(b * b - a * c, 0)) / a
 

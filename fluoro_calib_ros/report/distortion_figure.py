@@ -16,7 +16,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -31,20 +32,59 @@ from .text import model_text
 # Along the longer side of the image.
 FIELD_CELLS = 160
 FIELD_ARROWS = 17
+SCALE_CELLS = 48
 # Of the longer side, around the image for the arrows at its rim, and twice that below it.
 MARGIN = 0.09
 MIN_ARROW_PX = 1e-6
 ROUND_NUMBERS = (1, 1.5, 2, 3, 5, 7)
 
 
+@dataclass(frozen=True)
+class Scale:
+    """Largest magnitude and largest standard deviation [px] of figures that are compared."""
+
+    magnitude_px: float
+    sd_px: float
+
+
+def common_scale(fields: Iterable[tuple[CorrectionModel, tuple[int, int]]]) -> Scale:
+    """Return the scale of the figures of several fluoroscopes: models with their image sizes."""
+    magnitude = sd = MIN_ARROW_PX
+    for model, image_size in fields:
+        field = _field_on_grid(model, image_size, SCALE_CELLS)[1]
+        inside = ~field.outside
+        magnitude = max(magnitude, float(np.max(np.hypot(*field.duv[inside].T), initial=0.0)))
+        sd = max(sd, float(np.nanmax(np.append(field.sd[inside], 0.0))))
+    return Scale(magnitude, sd)
+
+
 def distortion_figure(
-    model: CorrectionModel, name: str, image_size: tuple[int, int], interior_estimated: bool
+    model: CorrectionModel,
+    name: str,
+    image_size: tuple[int, int],
+    interior_estimated: bool,
+    scale: Scale | None = None,
 ) -> Figure:
     """Learned distortion as arrows over its magnitude, and its standard deviation.
 
-    The training points are shown, too. interior_estimated: whether the interior orientation was
-    estimated with the model.
+    Parameters
+    ----------
+    model : CorrectionModel
+        Its training points are shown, too.
+    name : str
+        Fluoroscope.
+    image_size : tuple of int
+        Width and height [px].
+    interior_estimated : bool
+        Whether the interior orientation was estimated with the model.
+    scale : Scale, optional
+        That of the figures of all fluoroscopes; by default that of the model.
+
+    Returns
+    -------
+    Figure
     """
+    scale = scale or common_scale([(model, image_size)])
     width, height = np.asarray(image_size) + np.array([2, 3]) * MARGIN * max(image_size)
     figure = new_figure(
         15,
@@ -54,15 +94,17 @@ def distortion_figure(
     )
     left, right = figure.subplots(1, 2)
     centres, field = _field_on_grid(model, image_size, FIELD_CELLS)
-    for axes, values, colours, label in (
-        (left, np.hypot(*field.duv.T), 'YlOrRd', 'magnitude [px]'),
-        (right, field.sd, 'cividis', 'standard deviation [px]'),
+    for axes, values, colours, label, largest in (
+        (left, np.hypot(*field.duv.T), 'YlOrRd', 'magnitude [px]', scale.magnitude_px),
+        (right, field.sd, 'cividis', 'standard deviation [px]', scale.sd_px),
     ):
         shown = np.ma.masked_array(values, field.outside).reshape(len(centres[1]), len(centres[0]))
         _draw_image_frame(axes, image_size)
-        mesh = axes.pcolormesh(*centres, shown, cmap=colours, vmin=0, shading='nearest')
+        mesh = axes.pcolormesh(
+            *centres, shown, cmap=colours, vmin=0, vmax=largest, shading='nearest'
+        )
         figure.colorbar(mesh, ax=axes, label=label)
-    factor = _draw_arrows(left, model, image_size)
+    factor = _draw_arrows(left, model, image_size, scale.magnitude_px)
     left.set_title(
         f'Displacement (du, dv) = observed - undistorted,\narrows magnified {factor:g} times'
     )
@@ -112,12 +154,16 @@ def _draw_image_frame(axes: Axes, image_size: Sequence[int]) -> None:
     axes.grid(False)
 
 
-def _draw_arrows(axes: Axes, model: CorrectionModel, image_size: Sequence[int]) -> float:
-    """Draw arrows of the field and a reference arrow below the image; return their enlargement."""
+def _draw_arrows(
+    axes: Axes, model: CorrectionModel, image_size: Sequence[int], largest: float
+) -> float:
+    """Draw arrows of the field and a reference arrow below the image; return their enlargement.
+
+    largest: length of the longest arrow [px]. Arrows begin in the calibrated area only.
+    """
     centres, field = _field_on_grid(model, image_size, FIELD_ARROWS)
     u, v = (grid.ravel()[~field.outside] for grid in np.meshgrid(*centres))
     duv = field.duv[~field.outside]
-    largest = max(float(np.max(np.hypot(*duv.T), initial=0.0)), MIN_ARROW_PX)
     # At most two cells long: arrows hardly overlap, and small ones can be seen.
     factor = _round_down(2 * max(image_size) / FIELD_ARROWS / largest)
     reference = _round_down(largest)

@@ -33,7 +33,7 @@ from ..files.atomic import write_bytes
 from ..photogrammetry.noise import MIN_REDUNDANCY
 from ..photogrammetry.precision import geometric_redundancy
 from .cost_figure import cost_figure
-from .distortion_figure import distortion_figure
+from .distortion_figure import Scale, common_scale, distortion_figure
 from .residual_figures import histogram_figure, position_figure
 from .style import STYLE, png_bytes
 
@@ -52,8 +52,14 @@ def write_figures(result: CalibrationResult, directory: str | os.PathLike[str]) 
     make_folder(directory)
     drawn = {}
     with style.context(['default', STYLE]):  # independent of matplotlibrc
+        scale = common_scale(
+            (run.models[name], run.measured.image_size[number])
+            for run in result.runs.values()
+            for number, name in enumerate(run.measured.fluoroscopes)
+            if run.models[name].corrects
+        )
         for label, run in result.runs.items():
-            for name, figure in _figures_of_run(label, run):
+            for name, figure in _figures_of_run(label, run, scale):
                 drawn[name] = png_bytes(figure)
     paths = []
     for name, content in drawn.items():
@@ -63,8 +69,10 @@ def write_figures(result: CalibrationResult, directory: str | os.PathLike[str]) 
     return paths
 
 
-def _figures_of_run(label: str, run: SelfCalibration) -> Iterator[tuple[str, Figure]]:
-    """File names and figures of one run."""
+def _figures_of_run(
+    label: str, run: SelfCalibration, scale: Scale
+) -> Iterator[tuple[str, Figure]]:
+    """File names and figures of one run; scale: of the distortions."""
     network = run.measured.network
     if any(model.corrects for model in run.models.values()):
         yield f'cost_{label}.png', cost_figure(run)
@@ -81,5 +89,5 @@ def _figures_of_run(label: str, run: SelfCalibration) -> Iterator[tuple[str, Fig
         model = run.models[name]
         if model.corrects:
             interior_estimated = bool(network.interior_free[number])
-            distortion = distortion_figure(model, name, image_size, interior_estimated)
+            distortion = distortion_figure(model, name, image_size, interior_estimated, scale)
             yield f'distortion_{name}.png', distortion

@@ -33,7 +33,7 @@ from ..exposures.names import Names
 from ..exposures.phantom import Phantom
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
-from .distortion_figure import distortion_figure
+from .distortion_figure import Scale, common_scale, distortion_figure
 from .report_figures import (
     bead_shifts,
     covered_cells,
@@ -103,7 +103,10 @@ def report_html(given: ReportInput) -> str:
     )
     residuals = {name: _residuals(given, name) for name in given.calibrations}
     with style.context(['default', STYLE]):
-        pictures = {name: _pictures(given, name, residuals[name]) for name in residuals}
+        scale = common_scale(
+            (c.model, c.image_size) for c in given.calibrations.values() if c.model.kind != 'none'
+        )
+        pictures = {name: _pictures(given, name, residuals[name], scale) for name in residuals}
         beads = _bead_picture(given)
     return environment.get_template('report.html').render(
         given=given,
@@ -113,6 +116,7 @@ def report_html(given: ReportInput) -> str:
         beads=beads,
         rig=_rig(given),
         outliers=_outliers(given),
+        adjustments=given.result.get('adjustments', []),
         correlations=given.result.get('correlations', [])[:MAX_ROWS],
         versions=versions(),
         text=_text,
@@ -194,6 +198,10 @@ def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[st
         'correction_sd': float(np.median(sd)),
         'largest': _largest(residuals),
         'correlation': _correlation(calibration.interior_covariance),
+        'exterior': [
+            (exposures.get(int(e['exposure']), e['exposure']), e)
+            for e in given.result['fluoroscopes'][name]['exposures']
+        ],
         'exposures': [
             (exposures.get(number, number), *rest) for number, *rest in residuals.of_exposures()
         ],
@@ -212,14 +220,16 @@ def _correlation(covariance: np.ndarray) -> list[list[float]]:
     return (covariance / scale).tolist()
 
 
-def _pictures(given: ReportInput, name: str, residuals: Residuals) -> list[tuple[str, str]]:
+def _pictures(
+    given: ReportInput, name: str, residuals: Residuals, scale: Scale
+) -> list[tuple[str, str]]:
     """Return title and PNG (base64) of the pictures of a fluoroscope."""
     calibration = given.calibrations[name]
     size = calibration.image_size
     figures: list[tuple[str, Figure]] = []
     if calibration.model.kind != 'none':
         field_figure = distortion_figure(
-            calibration.model, name, size, calibration.interior_estimated
+            calibration.model, name, size, calibration.interior_estimated, scale
         )
         figures.append(('Distortion and its standard deviation', field_figure))
     if residuals.inlier.any():

@@ -74,7 +74,7 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
         'Fluoroscope': name if len(name) < COLUMN_WIDTH else name[: COLUMN_WIDTH - 4] + '...',
         **_rmse_rows(figures),
         'correction model': figures.model_kind,
-        'neighbours k': str(figures.k) if model.corrects else '-',
+        'neighbours k': str(figures.k) if model.corrects and figures.k else '-',
         'iterations': '-' if run is None else str(len(run.history)),
         'converged': 'yes' if converged else 'NO',
         'observations': str(figures.observations),

@@ -43,6 +43,7 @@ from typing import IO, TYPE_CHECKING, Any
 import cv2
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from scipy.ndimage import map_coordinates
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
@@ -82,6 +83,8 @@ CASES = {  # name: (encoding, rate, node)
     'mono16 60 Hz': ('mono16', 60, 'image_node'),
     'mono16 60 Hz, relay': ('mono16', 60, 'relay'),
 }
+CORNER = (744, 20, 260)  # left, top, side [px]
+ORANGE = '#D55E00'
 OUTPUTS = {'image_node': 'a/image_corrected', 'relay': 'a/relayed'}
 
 
@@ -325,29 +328,55 @@ def run(
     )
 
 
-def draw(path: str, lines: int = 15) -> None:
-    """Draw a square pattern of beads as observed and as corrected, with straight lines."""
+def draw(path: str, lines: int = 25) -> None:
+    """Draw a square pattern of beads as observed and as corrected, magnified in a corner."""
     fluoroscope = virtual_rig(1).fluoroscopes[0]
     calibration = calibration_of_the_rig()[0]
     at = np.linspace(24, 999, lines)
-    observed = fluoroscope.distortion.distort(
-        np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
-    )
-    seen = np.all((observed > 4) & (observed < 1019), axis=1)[:, None]
-    image = bead_image(observed, bead_px=4.5, contrast=0.8)
-    figure = Figure(figsize=(8.4, 4.5), dpi=120, layout='constrained')
+    grid = np.stack(np.meshgrid(at, at), axis=-1).reshape(-1, 2)
+    observed = fluoroscope.distortion.distort(grid)
+    correction = calibration.correct(observed)
+    seen = np.all((observed > 4) & (observed < 1019), axis=1) & (correction.status == 0)
+    # The gauge: a distortion is known up to a change of the orientation, a projective map.
+    plane = cv2.findHomography(grid[seen], correction.uv[seen])[0]
+    straight = cv2.perspectiveTransform(grid[:, None], plane)[:, 0]
+    image = bead_image(observed[seen], bead_px=4.5, contrast=0.8)
+    corrected = ImageCorrector(calibration).correct(image)
+    figure = Figure(figsize=(13.2, 3.9), dpi=100, layout='constrained')
+    whole, *corners, difference = figure.subplots(1, 4)
+    whole.imshow(image, cmap='gray', vmin=0, vmax=255, interpolation='antialiased')
+    whole.set(title='observed', xlim=(-0.5, 1023.5), ylim=(1023.5, -0.5))
+    left, top, side = CORNER
+    whole.add_patch(Rectangle((left, top), side, side, fill=False, edgecolor=ORANGE, linewidth=2))
     for axes, name, shown, uv in zip(
-        figure.subplots(1, 2),
+        corners,
         ('observed', 'corrected'),
-        (image, ImageCorrector(calibration).correct(image)),
-        (observed, calibration.correct(observed).uv),
+        (image, corrected),
+        (observed, correction.uv),
     ):
-        axes.imshow(shown, cmap='gray', vmin=0, vmax=255, interpolation='antialiased')
-        uv = np.where(seen, uv, np.nan).reshape(lines, lines, 2)
-        for line in (uv[1], uv[-2], uv[:, 1], uv[:, -2]):
-            axes.plot(*line[np.isfinite(line[:, 0])][[0, -1]].T, color='#D55E00', linewidth=1)
-        axes.set(title=name, xticks=[], yticks=[], xlim=(-0.5, 1023.5), ylim=(1023.5, -0.5))
+        axes.imshow(shown, cmap='gray', vmin=0, vmax=255)
+        for line in np.concatenate(
+            [straight.reshape(lines, lines, 2), straight.reshape(lines, lines, 2).swapaxes(0, 1)]
+        ):
+            axes.plot(*line.T, color=ORANGE, linewidth=0.9)
+        off = np.linalg.norm((uv - straight)[seen & _in_corner(straight)], axis=1)
+        rms = np.sqrt(np.mean(off**2))
+        axes.set_title(
+            f'corner, {name}: {rms:.2f} px (RMS),\n{off.max():.1f} px at most off the lines'
+        )
+    difference.imshow(corrected.astype(float) - image, cmap='RdBu', vmin=-150, vmax=150)
+    difference.set_title('corner: corrected minus observed\n(blue: brighter, red: darker)')
+    for axes in (*corners, difference):
+        axes.set(xlim=(left, left + side), ylim=(top + side, top))
+    for axes in (whole, *corners, difference):
+        axes.set(xticks=[], yticks=[])
     figure.savefig(path)
+
+
+def _in_corner(uv: np.ndarray) -> np.ndarray:
+    """Whether points are in the magnified corner."""
+    left, top, side = CORNER
+    return np.all((uv > (left, top)) & (uv < (left + side, top + side)), axis=1)
 
 
 def text_of(core: Sequence[dict[str, Any]], cases: dict[str, dict[str, Any]]) -> str:

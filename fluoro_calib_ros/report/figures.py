@@ -53,10 +53,10 @@ def write_figures(result: CalibrationResult, directory: str | os.PathLike[str]) 
     drawn = {}
     with style.context(['default', STYLE]):  # independent of matplotlibrc
         scale = common_scale(
-            (run.models[name], run.measured.image_size[number])
+            (run.models[name], image_size)
             for run in result.runs.values()
-            for number, name in enumerate(run.measured.fluoroscopes)
-            if run.models[name].corrects
+            for name, image_size in zip(run.measured.fluoroscopes, run.measured.image_size)
+            if name in run.models and run.models[name].corrects
         )
         for label, run in result.runs.items():
             for name, figure in _figures_of_run(label, run, scale):

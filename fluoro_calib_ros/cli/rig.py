@@ -33,7 +33,7 @@ USED = {
     'report': ('calibration',),
     'orient': (*_SOURCE, 'phantom', 'calibration'),
     'reconstruct': (*_SOURCE, 'calibration'),
-    'convert': ('image_size',),
+    'convert': _SOURCE,
 }
 
 

@@ -1,0 +1,62 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The commands of docs/tutorial.md, as they stand there."""
+
+import csv
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.cli import main
+
+TEXT = (Path(__file__).parents[2] / 'docs' / 'tutorial.md').read_text()
+OFFLINE = TEXT.partition('## 10. Live')[0]
+COMMANDS = [shlex.split(line)[1:] for line in re.findall('^    (fluoro-calib .*)$', OFFLINE, re.M)]
+RIG = re.search('```toml\n(.*?)```', TEXT, re.S)[1]
+
+
+@pytest.mark.long
+def test_commands_of_the_tutorial(tmp_path, monkeypatch, capsys):
+    """From XMALab's tables to points within 0.5 mm of the truth; validate takes half a minute."""
+    monkeypatch.chdir(tmp_path)
+    assert len(COMMANDS) == 14
+    for command in COMMANDS:
+        if command[0] == 'calibrate':
+            Path('rig.toml').write_text(RIG)
+        if command[0] != 'validate':
+            main(command)
+    assert 'marker' in Path('walk_undistorted.csv').read_text()
+    assert Path('points.c3d').stat().st_size and len(list(Path('mayacam').iterdir())) == 2
+    assert 'Calibration report' in Path('result/report.html').read_text()
+
+    with open('points.csv') as file:
+        found = {(int(r['frame']), int(r['target_id'])): r for r in csv.DictReader(file)}
+    with open('lab/truth/markers.csv') as file:
+        truth = {(int(r['frame']), int(r['target_id'])): r for r in csv.DictReader(file)}
+    keys = sorted(found)
+    ours, true = (
+        np.array([[float(rows[key][axis]) for axis in axes] for key in keys])
+        for rows, axes in ((found, 'xyz'), (truth, ('x_mm', 'y_mm', 'z_mm')))
+    )
+    # Distances do not depend on the frame, which is that of exposure 1 here.
+    first = [k for k, key in enumerate(keys) if key[0] == keys[0][0]]
+    apart = [
+        np.linalg.norm(points[first][:, None] - points[first][None], axis=2)
+        for points in (ours, true)
+    ]
+    assert np.sqrt(np.mean((apart[0] - apart[1]) ** 2)) < 0.3

@@ -44,13 +44,18 @@ SURE = ((0.85, 0.4), (0.75, 0.95))
 MARGIN = 0.06
 MARGIN_BEADS = 8
 # Levels of the search: neighbours of a bead in the phantom, in the image, beads tried, and limits
-# of the scale by the extent of what is seen. The first finds most poses, the second those that see
-# all faces of a phantom from the edge, the third a small part of a phantom.
+# of the scale by the extent of what is seen. The first finds most poses, the second and third find
+# those that see all faces of a phantom from the edge, the last a small part of a phantom.
 LEVELS = (
     (8, 6, 8, (0.85, 1.4)),
-    (14, 8, 16, (0.85, 1.4)),
+    (8, 6, 72, (0.85, 1.4)),
+    (14, 8, 12, (0.85, 1.4)),
     (8, 6, 6, (0.7, 3.0)),
 )
+CENTRAL = 8  # beads of the middle that are tried first
+APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
+AGREED = 3  # matches of the same pose after which the search ends, if it is evident
+CLIMBS = 12  # from a match to a better one by a symmetry
 RIVAL_STEPS = 3
 SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
 SYMMETRY_REACH = 0.3  # of the distance between neighbours
@@ -134,10 +139,15 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
             f'only {len(seen.uv)} beads are found in the image, at least {MIN_BEADS} are needed'
         )
     best: Match | None = None
+    agreed = 0
     for candidate in _candidates(seen, model, lens):
+        agreed += best is not None and _same(candidate, best)
         if best is None or candidate.score > best.score:
+            agreed = agreed if best is not None and _same(candidate, best) else 1
             best = candidate
-        if is_sure(best):
+            if _is_evident(best) and not is_sure(best):
+                best, _ = _climbed(best, seen, model)
+        if is_sure(best) or (agreed >= AGREED and _is_evident(best)):
             break
     if best is None:
         raise DataError('no pose of the phantom fits the beads in the image')
@@ -150,6 +160,11 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
 def is_sure(best: Match) -> bool:
     """Return whether a better match need not be searched for."""
     return any(best.found >= found and best.explained >= explained for found, explained in SURE)
+
+
+def _is_evident(best: Match) -> bool:
+    """Return whether enough of what is predicted is found, and the reverse."""
+    return best.found >= MIN_FOUND and best.explained >= MIN_EXPLAINED
 
 
 def _check_evidence(best: Match) -> None:
@@ -171,10 +186,9 @@ def _unambiguous(best: Match, seen: Seen, model: PhantomModel) -> Match:
 
     Raises DataError where another one fits nearly as well.
     """
-    matches = [best, *_alternatives(best, seen, model)]
-    first = max(matches, key=lambda one: one.score)
-    for rival in matches:
-        if rival is first or _same(rival, first):
+    first, rivals = _climbed(best, seen, model)
+    for rival in rivals:
+        if _same(rival, first):
             continue
         if rival.score > first.score - max(MARGIN_BEADS, MARGIN * first.score):
             raise DataError(
@@ -183,6 +197,20 @@ def _unambiguous(best: Match, seen: Seen, model: PhantomModel) -> Match:
                 'break its symmetry'
             )
     return first
+
+
+def _climbed(best: Match, seen: Seen, model: PhantomModel) -> tuple[Match, list[Match]]:
+    """Return the best match that symmetries of the phantom lead to, and those from it.
+
+    On a nearly regular phantom the search finds poses that are several steps of its pattern off.
+    """
+    for _ in range(CLIMBS):
+        rivals = list(_alternatives(best, seen, model))
+        better = max(rivals, key=lambda one: one.score, default=best)
+        if better.score <= best.score:
+            break
+        best = better
+    return best, rivals
 
 
 def _alternatives(best: Match, seen: Seen, model: PhantomModel) -> Iterator[Match]:
@@ -232,12 +260,23 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
 
 
 def _seeds(seen: Seen) -> np.ndarray:
-    """Rows of beads to begin with: from the middle outwards, far from each other."""
+    """Rows of beads to begin with: some of the middle, then those that stand apart, at random.
+
+    Distortion is least in the middle. Where faces are seen from the edge, beads of several faces
+    are neighbours in the image, the least so where beads stand apart.
+    """
+    n = len(seen.uv)
+    rng = np.random.default_rng(0)
     centre = np.median(seen.uv, axis=0)
     distance = np.linalg.norm(seen.uv - centre, axis=1)
-    rest = np.argsort(distance, kind='stable')[: max(60, len(seen.uv) // 2)]
-    rng = np.random.default_rng(0)
-    return np.concatenate([rest[:1], rng.permutation(rest[1:])])
+    middle = np.argsort(distance, kind='stable')[: max(60, n // 2)]
+    first = np.concatenate([middle[:1], rng.permutation(middle[1:])])[:CENTRAL]
+    spacing = seen.tree.query(seen.uv, k=[min(4, n)])[0][:, 0]
+    order = np.argsort(-spacing, kind='stable')
+    apart = rng.permutation(order[: int(np.ceil(APART * n))])
+    rest = order[int(np.ceil(APART * n)) :]
+    later = np.concatenate([apart, rest])
+    return np.concatenate([first, later[~np.isin(later, first)]])
 
 
 def _scales(seen: Seen, model: PhantomModel, limits: tuple[float, float]) -> tuple[float, float]:

@@ -15,6 +15,7 @@
 """Calibration, correction and reconstruction of the fluoroscopes of one rig.
 
 ros2 launch fluoro_calib_ros fluoro_calib.launch.py phantom:=/path/to/phantom.csv
+ros2 launch fluoro_calib_ros fluoro_calib.launch.py phantom:=/path/to/phantom.csv from_images:=true
 ros2 launch fluoro_calib_ros fluoro_calib.launch.py --show-args
 """
 
@@ -61,10 +62,17 @@ PARAMETERS = (
         'fluoro_calib/<namespace> in $ROS_HOME or ~/.ros, for the calibration node)',
     ),
     Argument('rig_frame', '', 'name of the rig frame on /tf_static'),
+    Argument('principal_distance', '', 'principal distance, to some 10 %, for from_images [px]'),
     Argument('autostart', '', 'false: a lifecycle manager configures and activates the nodes'),
 )
 SWITCHES = (
     Argument('calibration', 'true', 'false: without the calibration node', SWITCH),
+    Argument(
+        'from_images',
+        'false',
+        'true: find the beads of the phantom in images; the simulator then publishes radiographs',
+        SWITCH,
+    ),
     Argument('images', 'false', 'true: correct images, too', SWITCH),
     Argument('simulate', 'false', 'true: with the virtual rig', SWITCH),
     Argument('rviz', 'false', 'true: show points and optical frames in RViz', SWITCH),
@@ -86,6 +94,7 @@ OTHERS = (
 # Parameters of the nodes that launch arguments set.
 RIG = ('fluoroscopes', 'calibration_directory', 'autostart')
 OF_NODE = {
+    'extraction_node': ('phantom', 'fluoroscopes', 'autostart', 'principal_distance'),
     'calibration_node': ('phantom', *RIG, 'rig_frame'),
     'correction_node': RIG,
     'reconstruction_node': (*RIG, 'rig_frame'),
@@ -117,8 +126,9 @@ def nodes_of_rig(context):
         for name in ('phantom', 'calibration_directory', 'rig_frame', 'bag', 'folder'):
             if name in given:
                 given[name] = parameters[name]  # also where it reads like a number
-        if 'rate' in given:
-            given['rate'] = float(given['rate'])
+        for name in ('rate', 'principal_distance'):
+            if name in given:
+                given[name] = float(given[name])
         return Node(
             package=PACKAGE,
             executable=executable,
@@ -139,6 +149,8 @@ def nodes_of_rig(context):
     actions = [SetParameter('use_sim_time', values['use_sim_time'] == 'true')]
     if values['calibration'] == 'true':
         actions.append(configured('calibration_node', needed=values['respawn'] == 'false'))
+    if values['from_images'] == 'true':
+        actions.append(configured('extraction_node', needed=values['respawn'] == 'false'))
     actions += [configured('correction_node'), configured('reconstruction_node')]
     if values['images'] == 'true':
         actions.append(configured('image_node'))
@@ -161,8 +173,10 @@ def nodes_of_rig(context):
         readers = 1 + (values['calibration'] == 'true') + bool(values['record'])
         actions.append(node('player_node', {**bag, 'wait_for_readers': str(readers)}))
     if values['simulate'] == 'true':
-        simulated = ('fluoroscopes', 'scene', 'rate')
-        actions.append(node('simulator_node', {name: values[name] for name in simulated}))
+        simulated = {name: values[name] for name in ('fluoroscopes', 'scene', 'rate')}
+        if values['from_images'] == 'true':
+            simulated['images'] = 'clean'
+        actions.append(node('simulator_node', simulated))
     return actions
 
 

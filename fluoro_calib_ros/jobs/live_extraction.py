@@ -20,6 +20,7 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -31,6 +32,7 @@ from ..radiographs.extraction import Extraction, Nearby, extract_beads
 from ..radiographs.matching import PhantomModel
 from ..radiographs.overlay import draw_overlay
 from ..radiographs.view import Lens, View
+from .service_process import ServiceProcess
 
 VIEWS = 30  # solved images whose distortion helps where a pose is not found
 
@@ -88,6 +90,15 @@ class LiveExtractor(Protocol):
 
 # Makes the extractor of a fluoroscope, in the process in which it is to run.
 MakeExtractor = Callable[[], LiveExtractor]
+
+
+def extraction_process(make: MakeExtractor) -> ServiceProcess:
+    """Return a process that extracts the images of one fluoroscope; it is called as `extract`."""
+    return ServiceProcess(partial(_extract_of, make), 'the extraction')
+
+
+def _extract_of(make: MakeExtractor) -> Callable[..., LiveObservations]:
+    return make().extract
 
 
 @dataclass(frozen=True)

@@ -12,14 +12,33 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Processes that end with the one that has started them."""
+"""Processes that end with the one that has started them, and only with it."""
 
 from __future__ import annotations
 
 import os
+import signal
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
 
 PARENT_POLL_S = 0.5  # interval at which a worker looks whether its caller is alive [s]
+
+
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Keep interrupts from the keyboard from the processes that are started meanwhile.
+
+    They inherit the mask of the calling thread: an interrupt only reaches the caller, which ends
+    them.
+    """
+    resource_tracker.ensure_running()  # unblocks interrupts when it is started
+    masked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, masked)
 
 
 def end_with_parent(parent: int) -> None:

@@ -18,13 +18,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import signal
 import threading
 from multiprocessing.connection import Connection
 
 from ..calibration.request import CalibrationRequest
 from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run_calibration
-from .parent_watch import end_with_parent
+from .parent_watch import end_with_parent, interrupts_blocked
 
 POLL_S = 0.05  # interval at which the caller may cancel [s]
 NICE = 10  # lower priority than the live nodes
@@ -49,11 +48,8 @@ def run_in_worker_process(
     process = context.Process(
         target=_work, daemon=True, args=(sender, request, validate, rig, os.getpid())
     )
-    # The process inherits the mask: an interrupt from the keyboard only reaches the caller, which
-    # terminates the process.
-    masked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
-    process.start()
-    signal.pthread_sigmask(signal.SIG_SETMASK, masked)
+    with interrupts_blocked():
+        process.start()
     sender.close()
     try:
         return _outcome(receiver, progress, raise_if_cancelled)

@@ -22,7 +22,6 @@ from __future__ import annotations
 
 import threading
 import time
-from array import array
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -31,19 +30,28 @@ import numpy as np
 from fluoro_calib_msgs.msg import TargetObservations
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
-from std_msgs.msg import Header
 
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.numbering import ExposureNumbers
 from ..exposures.pairing import PairingOptions
-from ..jobs.extraction_process import ExtractionProcess
-from ..jobs.live_extraction import LiveObservations, MakeExtractor, PhantomSettings
+from ..jobs.live_extraction import (
+    LiveObservations,
+    MakeExtractor,
+    PhantomSettings,
+    extraction_process,
+)
+from ..jobs.service_process import ServiceProcess
 from ..jobs.sources import read_survey
 from ..options import option
 from .image_node import INPUTS
 from .messages.fields import NS_PER_S
-from .messages.image import IMAGE_REFUSALS, ImageConverter, use_single_thread
+from .messages.image import (
+    IMAGE_REFUSALS,
+    ImageConverter,
+    message_from_image,
+    use_single_thread,
+)
 from .messages.target_observations import message_from_frame
 from .runtime.diagnostics import OK, WARN, LatencyWindow, Status
 from .runtime.errors import StartError
@@ -172,7 +180,7 @@ class ExtractionNode(StreamNode):
         self._inputs = INPUTS[self._settings.inputs]
         self._make = self._extractor()
         self._threads: list[threading.Thread] = []
-        self._processes: list[ExtractionProcess] = []
+        self._processes: list[ServiceProcess] = []
         self._queue: ExposureQueue[_Task] = ExposureQueue(self.names, self._settings.queue_size)
         use_single_thread()
         self.reset()
@@ -225,7 +233,7 @@ class ExtractionNode(StreamNode):
         """Start the processes that extract, then the stream reader."""
         self._queue = ExposureQueue(self.names, self._settings.queue_size)
         for name in self.names:
-            process = ExtractionProcess(self._make)
+            process = extraction_process(self._make)
             process.start()
             thread = threading.Thread(
                 target=self._serve, args=(name, self._queue, process), name=name, daemon=True
@@ -269,7 +277,7 @@ class ExtractionNode(StreamNode):
 
     # -- the threads of the fluoroscopes
 
-    def _serve(self, name: str, queue: ExposureQueue[_Task], process: ExtractionProcess) -> None:
+    def _serve(self, name: str, queue: ExposureQueue[_Task], process: ServiceProcess) -> None:
         """Extract the images of a fluoroscope until the queue is closed."""
         stream = self.streams[name]
         while (task := queue.get(name)) is not None:
@@ -282,12 +290,12 @@ class ExtractionNode(StreamNode):
                     return  # the process has been ended
                 stream.refusals.fail(f'{name}/{self._inputs[0][1]}', error)
 
-    def _extract(self, stream: _ImageStream, task: _Task, process: ExtractionProcess) -> None:
+    def _extract(self, stream: _ImageStream, task: _Task, process: ServiceProcess) -> None:
         """Extract an image and publish its observations. Raises Refused and RuntimeError."""
         message = task.message
         image = stream.decoded(message)
         overlay = self._overlays[stream.name]
-        found = process.extract(image, task.number, bool(overlay.get_subscription_count()))
+        found = process(image, task.number, bool(overlay.get_subscription_count()))
         if not found.reason:
             self._publish(stream, task, found, (image.shape[1], image.shape[0]))
         else:
@@ -300,7 +308,9 @@ class ExtractionNode(StreamNode):
         stream.last = found
         stream.seconds += found.seconds
         if found.picture is not None:
-            overlay.publish(_picture_message(message.header, found.picture))
+            overlay.publish(
+                message_from_image(message.header, np.ascontiguousarray(found.picture))
+            )
 
     def _publish(
         self,
@@ -382,14 +392,6 @@ class ExtractionNode(StreamNode):
         if stream.last is not None and stream.last.reason:
             return WARN, f'no observations in the last image: {stream.last.reason}'
         return stream.refusals.refusal_status() or (OK, 'extracting')
-
-
-def _picture_message(header: Header, picture: np.ndarray) -> Image:
-    """Return the Image of a picture (h, w, 3) of blue, green and red."""
-    height, width = picture.shape[:2]
-    message = Image(header=header, height=height, width=width, encoding='bgr8', step=3 * width)
-    message.data = array('B', picture.tobytes())
-    return message
 
 
 def main(args: Sequence[str] | None = None) -> None:

@@ -16,27 +16,40 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 import traceback
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import rclpy
 from fluoro_calib_msgs.msg import TargetObservations
+from sensor_msgs.msg import Image
+from std_msgs.msg import Header
 
 from ..exposures.frame import Frame
+from ..jobs.rendering import (
+    MARKER_ATTENUATION,
+    MARKER_MM,
+    SETTINGS,
+    RenderedScene,
+    Renderers,
+)
 from ..options import option
 from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from ..simulation.exposures import Detection, detect_beads, phantom_poses
 from ..simulation.rig import virtual_rig
 from ..simulation.tracking import CLUSTER_MARKERS, simulate_grid, simulate_tracking
+from .messages.fields import stamp_from_nanoseconds
+from .messages.image import message_from_image
 from .messages.target_observations import message_from_frame, set_number_and_stamp
 from .runtime.discovery import wait_for_readers, wait_until_acknowledged
+from .runtime.errors import StartError
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, RigParameters
-from .runtime.qos import observations_qos, qos_overrides
+from .runtime.qos import images_qos, observations_qos, qos_overrides
 
 SCENES = ('phantom', 'standing', 'markers', 'grid')
 LOOP_S = 10.0  # length of a scene that is computed in advance and repeated
@@ -70,6 +83,12 @@ class SimulatorParameters(RigParameters):
     false_matches: float = option(
         0.01, "fraction of the phantom's targets with a wrong number", minimum=0.0, maximum=0.5
     )
+    images: str = option(
+        'none',
+        'radiographs instead of observations, at most as many as can be rendered, clean or with '
+        'clutter and little dose; not of the scene grid',
+        choices=('none', *SETTINGS),
+    )
     stand_time: float = option(
         1.0,
         'time for which the phantom stands in a pose',
@@ -100,7 +119,7 @@ PARAMETERS = (_NODE,)
 
 
 class SimulatorNode(ParameterNode):
-    """Publishes target observations of every fluoroscope at a rate, with present stamps."""
+    """Publishes target observations, or radiographs, of every fluoroscope with present stamps."""
 
     def __init__(self) -> None:
         super().__init__('simulator_node')
@@ -109,16 +128,21 @@ class SimulatorNode(ParameterNode):
         self._rng = np.random.default_rng([parameters.seed, 4])
         self._detection = Detection(parameters.noise, parameters.false_matches)
         self._poses = phantom_poses(self._rng, parameters.poses)
+        self._with_images = parameters.images != 'none'
+        if self._with_images and parameters.scene == 'grid':
+            raise StartError('parameter images: there are no radiographs of the scene grid')
         self._outputs = {
             name: self.create_publisher(
-                TargetObservations,
-                f'{name}/target_observations',
-                observations_qos(),
+                Image if self._with_images else TargetObservations,
+                f'{name}/image_raw' if self._with_images else f'{name}/target_observations',
+                images_qos() if self._with_images else observations_qos(),
                 qos_overriding_options=qos_overrides(),
             )
             for name in parameters.fluoroscopes
         }
+        self._moving_mm = np.zeros((0, 0, 3))  # markers in radiographs
         self._precomputed = self._precompute()
+        self._renderers: Renderers | None = None
         self._stopping = threading.Event()
         self.failed = False
         self._worker = threading.Thread(target=self._run, daemon=True)
@@ -128,14 +152,16 @@ class SimulatorNode(ParameterNode):
         """Return the messages of a scene that is repeated; nothing for one that is drawn live."""
         parameters = self._settings
         if parameters.scene == 'markers':
-            frames = simulate_tracking(
+            tracking = simulate_tracking(
                 self._rig,
                 LOOP_S,
                 parameters.rate,
                 parameters.seed,
                 parameters.noise,
                 clusters=parameters.clusters,
-            ).frames
+            )
+            self._moving_mm = tracking.points_mm
+            frames = tracking.frames
         elif parameters.scene == 'grid':
             count = max(1, round(LOOP_S * parameters.rate))
             frames = simulate_grid(self._rig, count, parameters.seed, parameters.noise)
@@ -151,6 +177,8 @@ class SimulatorNode(ParameterNode):
         parameters = self._settings
         outputs = self._outputs.values()
         try:
+            if self._with_images:
+                self._start_rendering()
             wait_for_readers(self, outputs, parameters.wait_for_readers, self._stopping)
             start = time.monotonic()
             number = 0
@@ -159,7 +187,13 @@ class SimulatorNode(ParameterNode):
                 if self._stopping.wait(max(0.0, due - time.monotonic())):
                     return
                 number += 1
-                self._publish(number)
+                if not self._with_images:
+                    self._publish(number)
+                    continue
+                # As a camera does that is too slow: what is missed is left out.
+                late = math.floor((time.monotonic() - start) * parameters.rate)
+                number = max(number, min(late, parameters.frames or late))
+                self._publish_images(number)
             wait_until_acknowledged(outputs, self._stopping)
             rclpy.try_shutdown()
         except Exception:
@@ -167,6 +201,37 @@ class SimulatorNode(ParameterNode):
                 self.get_logger().fatal(traceback.format_exc())
                 self.failed = True
                 rclpy.try_shutdown()
+        finally:
+            if self._renderers is not None:
+                self._renderers.close()
+
+    def _start_rendering(self) -> None:
+        """Start the processes that render, and wait until they are ready."""
+        settings = SETTINGS[self._settings.images]
+        if self._settings.scene == 'markers':
+            settings = replace(settings, bead_attenuation=MARKER_ATTENUATION)
+        self._renderers = Renderers(self._rig.fluoroscopes, settings)
+        self._renderers.start()
+        self._renderers.images(self._rendered_scene(1))  # so that the first one is not late
+
+    def _publish_images(self, number: int) -> None:
+        """Render and publish the radiographs of an exposure, with the stamp of its beginning."""
+        assert self._renderers is not None
+        stamp = stamp_from_nanoseconds(self.get_clock().now().nanoseconds)
+        scene = self._rendered_scene(number)
+        for name, image in self._renderers.images(scene).items():
+            header = Header(stamp=stamp, frame_id=f'{name}_optical')
+            self._outputs[name].publish(message_from_image(header, image))
+
+    def _rendered_scene(self, number: int) -> RenderedScene:
+        """Return what the fluoroscopes see in an exposure."""
+        standing = np.eye(3), np.zeros(3)
+        if self._settings.scene == 'markers':
+            points = self._moving_mm[(number - 1) % len(self._moving_mm)]
+            diameter = np.full(len(points), MARKER_MM)
+            return RenderedScene(points, standing, number, diameter, plates=False)
+        pose = self._pose(number) if self._settings.scene == 'phantom' else standing
+        return RenderedScene(self._rig.true_mm, pose, number)
 
     def _publish(self, number: int) -> None:
         """Publish the frames of an exposure."""
@@ -226,6 +291,8 @@ class SimulatorNode(ParameterNode):
     def stop(self) -> None:
         """Stop publishing before the node is destroyed."""
         self._stopping.set()
+        if self._renderers is not None:
+            self._renderers.close()
         self._worker.join(2.0)
 
 

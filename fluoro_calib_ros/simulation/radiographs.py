@@ -235,7 +235,7 @@ class Radiography:
         weight = np.maximum(1 - np.abs(place[:, None] - around), 0)  # (fine, coarse)
         rows = np.tensordot(weight, coarse, axes=(1, 1))  # (fine, n, coarse, 3)
         both = np.tensordot(weight, rows, axes=(1, 2))  # (fine across, fine down, n, 3)
-        return both.transpose(2, 1, 0, 3).reshape(len(low), -1, 3)
+        return both.transpose(2, 1, 0, 3).reshape(len(low), (count * fine) ** 2, 3)
 
     def _plates(self, rotation: np.ndarray, origin: np.ndarray) -> np.ndarray:
         """Transmission (h, w) of the four plates of the cube.

@@ -21,8 +21,7 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.exposures.numbering import ExposureNumbers
-from fluoro_calib_ros.jobs.extraction_process import ExtractionProcess
-from fluoro_calib_ros.jobs.live_extraction import LiveObservations
+from fluoro_calib_ros.jobs.live_extraction import LiveObservations, extraction_process
 from fluoro_calib_ros.nodes.runtime.exposure_queue import ExposureQueue
 
 MS = 1_000_000
@@ -96,10 +95,10 @@ class Fragile:
 
 
 def test_a_failure_loses_one_image_and_closing_ends_the_one_in_work():
-    process = ExtractionProcess(Fragile)
+    process = extraction_process(Fragile)
 
     def extract(value):
-        return process.extract(np.full((2, 2), value, np.uint8), 1).expected
+        return process(np.full((2, 2), value, np.uint8), 1).expected
 
     assert extract(0) == 1
     with pytest.raises(RuntimeError, match='one'):

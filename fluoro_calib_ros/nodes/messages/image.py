@@ -159,6 +159,20 @@ def colour_message(image: np.ndarray, stamp: Time, frame_id: str) -> Image:
     return message
 
 
+def message_from_image(header: Header, image: np.ndarray) -> Image:
+    """Return the Image of a grey image (h, w), or of a picture (h, w, 3): blue, green, red."""
+    colour = image.ndim == 3
+    message = Image(
+        header=header,
+        height=image.shape[0],
+        width=image.shape[1],
+        encoding='bgr8' if colour else ENCODINGS[image.dtype],
+        step=image.strides[0],
+    )
+    message.data = array('B', image.tobytes())
+    return message
+
+
 def compressed_message(
     message: Image, image: np.ndarray, kind: str, quality: int
 ) -> CompressedImage:

@@ -1,0 +1,138 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A function with a memory, in a process of its own."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from typing import Any
+
+import cv2
+from threadpoolctl import threadpool_limits
+
+from .parent_watch import end_with_parent, interrupts_blocked
+
+NICE = 5  # lower priority than the live nodes, higher than a calibration
+END_S = 1.0  # in which a process that has closed its connection ends
+
+
+class ServiceProcess:
+    """Calls a function in another process, call after call, on one core.
+
+    One thread calls it, any may close it. After a failure the next call starts a new process.
+
+    Parameters
+    ----------
+    make : callable
+        Makes the function in the process; it has to be picklable.
+    what : str
+        What the process does, for errors.
+    """
+
+    def __init__(self, make: Callable[[], Callable[..., Any]], what: str) -> None:
+        self._make = make
+        self._what = what
+        self._lock = threading.Lock()
+        self._closed = False
+        self._process: SpawnProcess | None = None
+        self._connection: Connection | None = None
+
+    def start(self) -> None:
+        """Start the process, so that it is ready for the first call."""
+        with self._lock:
+            if self._process is not None or self._closed:
+                return
+            context = multiprocessing.get_context('spawn')  # a fork would copy locks of threads
+            self._connection, other = context.Pipe()
+            self._process = context.Process(
+                target=_work, daemon=True, args=(other, self._make, os.getpid())
+            )
+            with interrupts_blocked():
+                self._process.start()
+            other.close()
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Return the result of a call. Raises RuntimeError where function or process fails."""
+        self.send(*arguments)
+        return self.receive()
+
+    def send(self, *arguments: Any) -> None:
+        """Begin a call; its result is received before the next one. Raises RuntimeError."""
+        self.start()
+        try:
+            self._open_connection().send(arguments)
+        except OSError:
+            raise self._ended() from None
+
+    def receive(self) -> Any:
+        """Return the result of the call that was begun. Raises RuntimeError."""
+        try:
+            result = self._open_connection().recv()
+        except (EOFError, OSError):
+            raise self._ended() from None
+        if isinstance(result, BaseException):
+            raise RuntimeError(f'{self._what} failed: {result}') from result
+        return result
+
+    def close(self) -> None:
+        """End the process, also during a call, which then raises RuntimeError."""
+        self._closed = True
+        self._end(0)
+
+    def _open_connection(self) -> Connection:
+        connection = self._connection
+        if connection is None:
+            raise RuntimeError(f'{self._what} was ended')
+        return connection
+
+    def _ended(self) -> RuntimeError:
+        """Clear up after a process that has ended by itself, and return the error."""
+        status = self._end(END_S)
+        return RuntimeError(f'the process of {self._what} ended with status {status}')
+
+    def _end(self, patience_s: float) -> int | None:
+        """End the process, by force where it does not end itself; returns its exit status."""
+        with self._lock:
+            process = self._process
+            self._process = None
+            self._connection = None
+        if process is None:
+            return None
+        process.join(patience_s)
+        process.terminate()
+        process.join()
+        return process.exitcode
+
+
+def _work(connection: Connection, make: Callable[[], Callable[..., Any]], parent: int) -> None:
+    """Answer calls until the caller has closed the connection or has died."""
+    os.nice(NICE)
+    cv2.setNumThreads(1)
+    threading.Thread(target=end_with_parent, args=(parent,), daemon=True).start()
+    with suppress(EOFError, OSError), threadpool_limits(1):
+        function = make()
+        while True:
+            arguments = connection.recv()
+            try:
+                result = function(*arguments)
+            except Exception as error:  # this call is lost, the next one is not
+                result = RuntimeError(repr(error))
+            connection.send(result)

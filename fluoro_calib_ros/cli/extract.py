@@ -75,6 +75,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='processes (default: as many as there are cores)',
     )
     add_scheduler(parser)
+    parser.add_argument(
+        '--regular-grid',
+        action='store_true',
+        help='the phantom is a regular flat grid, which fits in many places: take any of them; '
+        'this serves the distortion of one fluoroscope, not the orientation of two',
+    )
     add_file_options(parser)
 
 
@@ -98,6 +104,7 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.overlay,
         arguments.workers,
         arguments.scheduler,
+        arguments.regular_grid,
     )
     with ProgressBar('extract') as bar:
         outcome = run_extraction(request, bar)

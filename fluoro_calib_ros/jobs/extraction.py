@@ -34,6 +34,7 @@ from ..files.access import check_safe_name, make_folder
 from ..files.atomic import write_bytes
 from ..radiographs.assumptions import assumed_lens, may_be_found, shared_lens
 from ..radiographs.extraction import Extraction, Nearby, extract_beads
+from ..radiographs.lattice import FlatGrid
 from ..radiographs.matching import PhantomModel
 from ..radiographs.overlay import draw_overlay
 from ..radiographs.view import Lens, View
@@ -109,6 +110,8 @@ class ExtractionRequest:
         Processes; 0: as many as there are cores.
     scheduler : str or None
         Address of a Dask scheduler whose workers extract, in place of processes.
+    regular_grid : bool
+        The phantom is a regular flat grid. Its place and turn are arbitrary by whole steps.
     """
 
     sources: Sequence[Path]
@@ -118,6 +121,7 @@ class ExtractionRequest:
     overlay: Path | None = None
     workers: int = 0
     scheduler: str | None = None
+    regular_grid: bool = False
 
 
 @dataclass(frozen=True)
@@ -146,19 +150,20 @@ class _Task:
     fluoroscope: str
     lens: Lens
     overlay: bool
+    regular_grid: bool
 
 
 @lru_cache(maxsize=4)
-def _model_of(beads: bytes, diameters: bytes | None) -> PhantomModel:
+def _model_of(beads: bytes, diameters: bytes | None, regular: bool) -> PhantomModel:
     """Return a phantom, prepared for matching; a worker keeps it between tasks."""
     diameter_mm = None if diameters is None else np.frombuffer(diameters)
-    return PhantomModel.of(np.frombuffer(beads).reshape(-1, 3), diameter_mm)
+    return PhantomModel.of(np.frombuffer(beads).reshape(-1, 3), diameter_mm, regular)
 
 
 def _extract(phantom: Phantom, task: _Task) -> list[ImageResult]:
     """Extract the images of a task, each from the pose of the one before, where that leads."""
     diameters = None if phantom.diameter_mm is None else phantom.diameter_mm.tobytes()
-    model = _model_of(phantom.xyz_mm.tobytes(), diameters)
+    model = _model_of(phantom.xyz_mm.tobytes(), diameters, task.regular_grid)
     near: Nearby | None = None
     results = []
     for source in task.images:
@@ -242,6 +247,8 @@ def run_extraction(
         For sources that cannot be read, and where no image gives observations.
     """
     sources = open_sources(request.sources, request.fluoroscope)
+    if request.regular_grid and FlatGrid.of(request.phantom.xyz_mm) is None:
+        raise DataError('the phantom is no flat grid with rows and columns')
     if request.overlay is not None:
         make_folder(request.overlay)
     with open_workers(request.workers, request.scheduler, sources.count) as workers:
@@ -314,7 +321,8 @@ def _group(number: int, image: SourceImage) -> tuple[int, int]:
 def _task(request: ExtractionRequest, images: tuple[SourceImage, ...], lens: Lens | None) -> _Task:
     # Without a lens none of the images can be read, so that it is not used.
     lens = lens or Lens((1, 1), 1.0)
-    return _Task(images, request.fluoroscope, lens, request.overlay is not None)
+    overlay = request.overlay is not None
+    return _Task(images, request.fluoroscope, lens, overlay, request.regular_grid)
 
 
 def _with_picture_written(request: ExtractionRequest, result: ImageResult) -> ImageResult:

@@ -30,6 +30,7 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from .growth import Match, Seen, grow, settle, start_view
+from .lattice import FlatGrid, grid_matches
 from .pose_search import Triples, local_poses, nearby_map, triples_of
 from .view import Lens, View, fit_view
 
@@ -101,19 +102,33 @@ class PhantomModel:
     triples : tuple of Triples
         By level of the search.
     symmetries : tuple of Symmetry
+    grid : FlatGrid or None
+        For a flat grid.
+    regular : bool
+        Any of several poses that fit equally well is taken: a regular grid looks alike in all.
     """
 
     xyz: np.ndarray
     diameter_mm: np.ndarray | None
     triples: tuple[Triples, ...]
     symmetries: tuple[Symmetry, ...]
+    grid: FlatGrid | None
+    regular: bool = False
 
     @classmethod
-    def of(cls, xyz: np.ndarray, diameter_mm: np.ndarray | None = None) -> PhantomModel:
-        """Return the model of beads (n, 3) [mm] with diameters (n,) [mm], if they are known."""
+    def of(
+        cls, xyz: np.ndarray, diameter_mm: np.ndarray | None = None, regular: bool = False
+    ) -> PhantomModel:
+        """Return the model of beads (n, 3) [mm] with diameters (n,) [mm], if they are known.
+
+        Raises DataError for a regular phantom that is no flat grid.
+        """
+        grid = FlatGrid.of(xyz)
+        if regular and grid is None:
+            raise DataError('the phantom is no flat grid with rows and columns')
         by_count = {level[0]: triples_of(xyz, level[0]) for level in LEVELS}
         triples = tuple(by_count[level[0]] for level in LEVELS)
-        return cls(xyz, diameter_mm, triples, tuple(_symmetries(xyz)))
+        return cls(xyz, diameter_mm, triples, tuple(_symmetries(xyz)), grid, regular)
 
 
 def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
@@ -184,8 +199,10 @@ def _check_evidence(best: Match) -> None:
 def _unambiguous(best: Match, seen: Seen, model: PhantomModel) -> Match:
     """Return the best of a match and what the symmetries of the phantom make of it.
 
-    Raises DataError where another one fits nearly as well.
+    Raises DataError where another one fits nearly as well, unless the phantom is regular.
     """
+    if model.regular:
+        return best
     first, rivals = _climbed(best, seen, model)
     for rival in rivals:
         if _same(rival, first):
@@ -242,6 +259,8 @@ def _same(one: Match, other: Match) -> bool:
 
 def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     """Yield matches of poses, the likeliest first."""
+    if model.grid is not None:
+        yield from grid_matches(model.grid, model.xyz, seen, lens)
     beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
     beads[~seen.field] = 2
     order = _seeds(seen)

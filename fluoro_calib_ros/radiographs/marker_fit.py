@@ -32,7 +32,8 @@ from .marker_light import LightWindows
 from .measurement import Beads, Noise
 from .profile import Profile
 
-STEPS = 4
+STEPS = 4  # of markers whose shadows touch
+STEPS_ALONE = 3
 NEIGHBOURS = 3
 MARGIN_PX = 2.0  # of background around the shadow
 TERMS = 6  # of the background: a polynomial of degree 2
@@ -48,7 +49,7 @@ CROSSED = 1.2  # factor on the standard deviation where shadows cross
 FINE = 3  # points across a pixel of the grid on which shadows that touch are blurred
 CROSSING_STEP = 2  # before which they are
 # Largest motion [px] for a number of points along the way.
-QUADRATURE = ((0.35, 1), (3.0, 2), (6.0, 3), (10.0, 5), (np.inf, 7))
+QUADRATURE = ((0.7, 1), (3.0, 2), (6.0, 3), (10.0, 5), (np.inf, 7))
 DISTURBED = 1.6  # misfit from which pixels with large residuals count less
 ROBUST = 2.5
 
@@ -105,6 +106,8 @@ class _Fit:
         axis = np.arange(-half, half + 1)
         grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
         self.offset = grid[(grid * grid).sum(axis=1) <= (reach + MARGIN_PX) ** 2]
+        self.offset_u = np.ascontiguousarray(self.offset[:, 0], dtype=float)
+        self.offset_v = np.ascontiguousarray(self.offset[:, 1], dtype=float)
         x, y = self.offset.T / half
         self.basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
         self.middle = np.rint(self.uv).astype(int)
@@ -130,13 +133,14 @@ class _Fit:
         crowd = np.minimum(close.sum(axis=1), NEIGHBOURS)
         alone = np.flatnonzero(crowd == 0)
         groups = [(alone, np.zeros((len(alone), 0), dtype=int))] if len(alone) else []
-        rows = np.flatnonzero(crowd)
-        if len(rows):
-            count = int(crowd.max())
-            near = np.argsort(distance[rows], axis=1, kind='stable')[:, :count]
-            groups.append((rows, np.where(np.take_along_axis(close[rows], near, 1), near, -1)))
-        self.crowded = rows
-        self.alone_only = len(rows) == 0 and n > 0
+        for low, high in ((1, 1), (2, NEIGHBOURS)):
+            rows = np.flatnonzero((crowd >= low) & (crowd <= high))
+            if len(rows):
+                near = np.argsort(distance[rows], axis=1, kind='stable')[:, :high]
+                there = np.take_along_axis(close[rows], near, axis=1)
+                groups.append((rows, np.where(there, near, -1)))
+        self.crowded = np.flatnonzero(crowd)
+        self.neighbours = [np.flatnonzero(row) for row in close]
         return groups
 
     def run(self) -> None:
@@ -144,51 +148,70 @@ class _Fit:
         for step in range(STEPS):
             if step == CROSSING_STEP and len(self.crowded):
                 self._cross()
-            moved = [self._step(*group, final=step == STEPS - 1) for group in self.groups]
-            for (rows, _), (uv, depth, background) in zip(self.groups, moved):
+            for rows, near in self.groups:
+                alone = not near.shape[1]
+                if alone and step >= STEPS_ALONE:
+                    continue
+                final = step == (STEPS_ALONE if alone else STEPS) - 1
+                uv, depth, background = self._step(rows, near, final)
                 self.uv[rows] = uv
                 self.depth[rows] = depth
                 self.background[rows] = background
 
-    def _shadow(self, rows: np.ndarray, place: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Shadows (..., m) of markers at places (..., m, 2), and their derivatives by the centre.
+    def _shadow(
+        self, rows: np.ndarray, middle: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Shadows (g, k, m) in windows around pixels middle (g, 2), and derivatives by the centre.
 
-        rows (...,) are the markers.
+        rows (g, k) are the markers.
         """
-        shape = (*rows.shape, place.shape[-2])
-        shadow: np.ndarray = np.zeros(shape)
-        slope: np.ndarray = np.zeros((*shape, 2))
-        for number in range(len(self.way)):
-            away = place - (self.uv[rows] + self.way[number, rows])[..., None, :]
-            distance = np.sqrt(away[..., 0] ** 2 + away[..., 1] ** 2)
-            value, derivative = self.profile.shadow(distance)
-            shadow += self.way_weight[number] * value
-            factor = (-self.way_weight[number]) * derivative / np.maximum(distance, 1e-9)
-            slope += factor[..., None] * away
-        return shadow, slope
+        # Points along the way are the first axis; few large arrays are faster than many small.
+        centre = self.way[:, rows] + (self.uv[rows] - middle[:, None])
+        x = self.offset_u - centre[..., 0, None]
+        y = self.offset_v - centre[..., 1, None]
+        distance = np.sqrt(x * x + y * y)
+        value, derivative = self.profile.shadow(distance)
+        derivative /= np.maximum(distance, 1e-9)
+        x *= derivative
+        y *= derivative
+        if len(self.way) == 1:
+            return value[0], -x[0], -y[0]
+        weight = self.way_weight[:, None, None, None]
+        return (
+            (weight * value).sum(axis=0),
+            -(weight * x).sum(axis=0),
+            -(weight * y).sum(axis=0),
+        )
 
     def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Light (g, m) and its derivatives (g, TERMS + 3 + 3 k, m)."""
         everyone = np.concatenate([rows[:, None], near], axis=1)
-        there = everyone >= 0
-        place = (self.middle[rows, None] + self.offset)[:, None]
-        shadow, slope = self._shadow(everyone, place)
-        depth = np.where(there, self.depth[everyone], 0.0)[..., None]
-        passed = np.maximum(1 - depth * shadow, MIN_PASSED)
-        product = np.prod(passed, axis=1) if near.shape[1] else passed[:, 0]
+        shadow, by_u, by_v = self._shadow(everyone, self.middle[rows])
         scatter = self.profile.scatter
         plane = self.background[rows] @ self.basis.T
         plane = np.maximum(plane, 1e-3 * np.abs(self.background[rows, :1]) + 1e-6)
-        crossing = self.crossing[rows] if near.shape[1] else 0.0
-        relative = scatter + (1 - scatter) * (product + crossing)
-        by_shadow = -(1 - scatter) * (plane * product)[:, None] / passed
         g, k, m = shadow.shape
         jacobian = np.empty((g, TERMS + 3 * k, m))
-        jacobian[:, :TERMS] = relative[:, None] * self.basis.T
-        by_place = by_shadow * depth
-        jacobian[:, TERMS::3] = by_place * slope[..., 0]
-        jacobian[:, TERMS + 1 :: 3] = by_place * slope[..., 1]
-        jacobian[:, TERMS + 2 :: 3] = by_shadow * shadow * there[..., None]
+        if k == 1:
+            depth = self.depth[rows, None]
+            relative = 1 - (1 - scatter) * np.minimum(depth * shadow[:, 0], 1 - MIN_PASSED)
+            by_shadow = (scatter - 1) * plane
+            by_place = by_shadow * depth
+            np.multiply(by_place, by_u[:, 0], out=jacobian[:, TERMS])
+            np.multiply(by_place, by_v[:, 0], out=jacobian[:, TERMS + 1])
+            np.multiply(by_shadow, shadow[:, 0], out=jacobian[:, TERMS + 2])
+        else:
+            there = everyone >= 0
+            depth = np.where(there, self.depth[everyone], 0.0)[..., None]
+            passed = np.maximum(1 - depth * shadow, MIN_PASSED)
+            product = np.prod(passed, axis=1)
+            relative = scatter + (1 - scatter) * (product + self.crossing[rows])
+            by_shadow = -(1 - scatter) * (plane * product)[:, None] / passed
+            by_place = by_shadow * depth
+            jacobian[:, TERMS::3] = by_place * by_u
+            jacobian[:, TERMS + 1 :: 3] = by_place * by_v
+            jacobian[:, TERMS + 2 :: 3] = by_shadow * shadow * there[..., None]
+        np.multiply(relative[:, None], self.basis.T, out=jacobian[:, :TERMS])
         return plane * relative, jacobian
 
     def _step(
@@ -258,7 +281,6 @@ class _Fit:
         rows = self.crowded[self.distance[self.crowded] < reach]
         if not len(rows):
             return
-        near = dict(zip(self.groups[-1][0].tolist(), self.groups[-1][1]))
         self.crossing = np.zeros((len(self.uv), len(self.offset)))
         half = int(np.abs(self.offset).max()) + int(np.ceil(3 * self.profile.blur_px))
         axis = np.arange(-half * FINE, half * FINE + 1) / FINE
@@ -266,7 +288,7 @@ class _Fit:
         row = (self.offset[:, 1] + half) * FINE
         column = (self.offset[:, 0] + half) * FINE
         for one in rows:
-            members = np.array([one, *(i for i in near[one] if i >= 0)])
+            members = np.concatenate([[one], self.neighbours[one][:NEIGHBOURS]])
             together = np.zeros((len(axis), len(axis)))
             for weight, way in zip(self.way_weight, self.way):
                 passed = np.ones_like(together)
@@ -276,8 +298,8 @@ class _Fit:
                     passed *= 1 - self.depth[member] * self.profile.absorbed(squared)
                 together += weight * passed
             smooth = cv2.GaussianBlur(together, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE)
-            shadow, _ = self._shadow(members, (self.middle[one] + self.offset)[None])
-            apart = np.prod(1 - self.depth[members][:, None] * shadow, axis=0)
+            shadow, _, _ = self._shadow(members[None], self.middle[one][None])
+            apart = np.prod(1 - self.depth[members][:, None] * shadow[0], axis=0)
             self.crossing[one] = smooth[row, column] - apart
 
     def typical(self) -> float:

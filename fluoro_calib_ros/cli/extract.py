@@ -17,17 +17,27 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .arguments import add_phantom, add_scheduler, file_settings, number_in
+from ..errors import DataError
+from .arguments import (
+    add_option,
+    add_phantom,
+    add_scheduler,
+    file_settings,
+    names,
+    number_in,
+)
 from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
     from ..jobs.extraction import ExtractionOutcome
+    from ..jobs.marker_extraction import DoubtfulSpan, MarkerOutcome, MarkerRequest
 
 NAME = 'extract'
-HELP = 'Find, measure and match the beads of a phantom in radiographs.'
+HELP = 'Find and measure the beads of a phantom in radiographs, or follow implanted markers.'
 EXAMPLE = (
     'fluoro-calib extract images/a --phantom phantom.csv --fluoroscope a --out observations.csv'
 )
@@ -35,6 +45,8 @@ EXAMPLE = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
+    from ..options import declared
+    from ..radiographs.markers import MarkerOptions
     from .arguments import add_file_options
 
     parser.add_argument(
@@ -48,10 +60,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_phantom(
         parser,
+        required=False,
         help='surveyed coordinates target_id,x,y,z,sd[,diameter] [mm], or an XMALab frame '
         'specification, project or .xyz file',
     )
-    parser.add_argument('--fluoroscope', required=True, metavar='NAME', help='of the images')
+    parser.add_argument(
+        '--fluoroscope',
+        required=True,
+        type=names,
+        metavar='NAME',
+        help='of the images; A,B for markers of two calibrated fluoroscopes, with one SOURCE for '
+        'each, or one that has a folder or a topic of each',
+    )
     parser.add_argument(
         '--out', required=True, type=Path, metavar='CSV', help='file of observations to write'
     )
@@ -81,25 +101,92 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='the phantom is a regular flat grid, which fits in many places: take any of them; '
         'this serves the distortion of one fluoroscope, not the orientation of two',
     )
+    group = parser.add_argument_group('markers in motion')
+    group.add_argument(
+        '--markers',
+        type=Path,
+        metavar='FILE',
+        help='ids and places of the markers in one exposure, to a pixel or two: '
+        'fluoroscope,exposure,target_id,u,v, or XMALab points; they are followed from it on',
+    )
+    group.add_argument(
+        '--calibration',
+        type=Path,
+        metavar='DIR',
+        help='result folder of calibrate, for two fluoroscopes that are followed together',
+    )
+    group.add_argument(
+        '--orientation',
+        type=Path,
+        metavar='FILE',
+        help='orientation of the rig (default: rig_orientation.npz in the result folder)',
+    )
+    group.add_argument(
+        '--cluster',
+        action='append',
+        default=[],
+        metavar="'NAME: ID ID ...'",
+        help="markers that are rigid together, such as 'tibia: 1001 1002 1003'; with two "
+        'fluoroscopes, they predict and check each other; may be repeated',
+    )
+    options = declared(MarkerOptions)
+    for option in ('shutter', 'gate', 'lost_after', 'search_every'):
+        add_option(group, options[option])
     add_file_options(parser)
 
 
+def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+    """Read the clusters; call error with a sentence for arguments that exclude each other."""
+    from ..drift.clusters import parse_clusters
+
+    try:
+        arguments.clusters = parse_clusters(arguments.cluster)
+    except ValueError as fault:
+        error(f'--cluster: {fault}')
+    if arguments.markers is None:
+        if arguments.phantom is None:
+            error('give --phantom for beads of a phantom, or --markers for markers in motion')
+        if len(arguments.fluoroscope) != 1:
+            error('--fluoroscope: the images of a phantom are of one fluoroscope')
+        if arguments.clusters:
+            error('--cluster is for --markers')
+        return
+    if len(arguments.fluoroscope) > 2:
+        error('--fluoroscope: markers are followed with one or two fluoroscopes')
+    if len(arguments.fluoroscope) == 2:
+        if arguments.calibration is None:
+            error('markers of two fluoroscopes are followed with their --calibration')
+        if len(arguments.sources) > 2:
+            error('give one SOURCE for each fluoroscope, or one for both')
+    elif arguments.clusters:
+        error('--cluster is for two fluoroscopes')
+
+
 def run(arguments: argparse.Namespace) -> None:
-    """Extract the beads of images. Raises DataError."""
+    """Extract the beads or markers of images. Raises DataError."""
+    if arguments.markers is not None:
+        _run_markers(arguments)
+    else:
+        _run_phantom(arguments)
+
+
+def _run_phantom(arguments: argparse.Namespace) -> None:
+    """Extract the beads of a phantom. Raises DataError."""
     from ..files.access import check_safe_name
     from ..files.extracted import write_extracted
     from ..files.folder import check_output_file
     from ..jobs.extraction import ExtractionRequest, run_extraction
     from ..jobs.sources import read_survey
 
-    check_safe_name(arguments.fluoroscope, '--fluoroscope')
+    fluoroscope = arguments.fluoroscope[0]
+    check_safe_name(fluoroscope, '--fluoroscope')
     check_output_file(arguments.out, (*arguments.sources, arguments.phantom))
     survey = read_survey(arguments.phantom, file_settings(arguments))
     print_notes(survey.notes)
     request = ExtractionRequest(
         arguments.sources,
         survey.phantom,
-        arguments.fluoroscope,
+        fluoroscope,
         arguments.principal_distance,
         arguments.overlay,
         arguments.workers,
@@ -148,3 +235,142 @@ def _text(out: Path, outcome: ExtractionOutcome) -> str:
         f'{len(frames)} of {len(outcome.results)} images with {beads} beads, '
         f'{beads / len(frames):.0f} an image\nwritten to {out}'
     )
+
+
+def _run_markers(arguments: argparse.Namespace) -> None:
+    """Follow markers through images. Raises DataError."""
+    from ..files.access import check_safe_name
+    from ..files.extracted import write_markers
+    from ..files.folder import check_output_file
+    from ..jobs.marker_extraction import run_marker_extraction
+
+    for name in arguments.fluoroscope:
+        check_safe_name(name, '--fluoroscope')
+    inputs = [*arguments.sources, arguments.markers]
+    if arguments.calibration is not None:
+        inputs.append(arguments.calibration)
+    check_output_file(arguments.out, inputs)
+    request = _marker_request(arguments)
+    with ProgressBar('extract') as bar:
+        outcome = run_marker_extraction(request, bar)
+    write_markers(arguments.out, outcome.frames(), request.target_names)
+    for name, results in outcome.results.items():
+        for result in results:
+            if result.markers.reason:
+                print_note(f'fluoroscope {name}: {result.place}: {result.markers.reason}')
+        if outcome.before[name]:
+            print_note(
+                f'fluoroscope {name}: {outcome.before[name]} images before exposure '
+                f'{results[0].exposure}, for which the markers are given, are not used'
+            )
+    for text in _doubt_texts(outcome.spans(), request):
+        print_note(text)
+    print_result(
+        arguments, _marker_document(arguments.out, outcome), _marker_text(arguments.out, outcome)
+    )
+
+
+def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
+    """Read what is known of the markers and the fluoroscopes. Raises DataError."""
+    from ..files.rig_orientation import load_orientation, orientation_path
+    from ..jobs.marker_extraction import MarkerRequest, sequences
+    from ..jobs.reconstruction import check_orientation
+    from ..jobs.sources import read_calibrations, read_source
+    from ..radiographs.markers import MarkerOptions
+
+    sources, image_size = sequences(arguments.sources, arguments.fluoroscope)
+    recording = read_source(
+        arguments.markers,
+        image_size=image_size,
+        fluoroscopes=arguments.fluoroscope,
+        settings=file_settings(arguments, image_size=image_size),
+    )
+    print_notes(recording.notes)
+    options = MarkerOptions(
+        gate=arguments.gate,
+        shutter=arguments.shutter,
+        lost_after=arguments.lost_after,
+        search_every=arguments.search_every,
+    )
+    calibrations = {}
+    orientation = None
+    if len(sources) == 2:
+        calibrations = read_calibrations(arguments.calibration, arguments.fluoroscope)
+        path = arguments.orientation or orientation_path(arguments.calibration)
+        orientation = load_orientation(path).subset(arguments.fluoroscope)
+        try:
+            check_orientation(orientation, calibrations)
+        except DataError as error:
+            raise DataError(f'{path}: {error}') from None
+    return MarkerRequest(
+        sources,
+        recording.frames,
+        options,
+        calibrations,
+        orientation,
+        arguments.clusters,
+        arguments.overlay,
+        recording.names.target_names(),
+    )
+
+
+def _doubt_texts(spans: list[DoubtfulSpan], request: MarkerRequest) -> list[str]:
+    """Return a sentence for each id that may be wrong."""
+    out = []
+    for span in spans:
+        name = request.target_names.get(span.target_id, str(span.target_id))
+        others = ' or '.join(request.target_names.get(i, str(i)) for i in span.others)
+        what = f'may be {others}' if others else 'may be something else'
+        out.append(
+            f'fluoroscope {span.fluoroscope}: marker {name} {what} in exposures {span.first} to '
+            f'{span.last}: {span.reason}'
+        )
+    return out
+
+
+def _marker_document(out: Path, outcome: MarkerOutcome) -> dict[str, Any]:
+    """Return the summary that --json prints."""
+    return {
+        'out': str(out),
+        'fluoroscopes': {
+            name: {
+                'images': len(results),
+                'observations': sum(len(r.markers.target_id) for r in results),
+                'overlapped': sum(int(r.markers.overlapped.sum()) for r in results),
+                'doubtful': sum(int(r.markers.doubtful.sum()) for r in results),
+                'missing': sum(len(r.markers.missing) for r in results),
+                'exposures': [
+                    {
+                        'exposure': r.exposure,
+                        'place': r.place,
+                        'observations': len(r.markers.target_id),
+                        'missing': r.markers.missing.tolist(),
+                        'doubtful': r.markers.target_id[r.markers.doubtful].tolist(),
+                        'reason': r.markers.reason,
+                        'seconds': r.markers.seconds,
+                    }
+                    for r in results
+                ],
+            }
+            for name, results in outcome.results.items()
+        },
+        'doubtful_ids': [vars(span) for span in outcome.spans()],
+        'decisions': [vars(decision) for decision in outcome.decisions],
+    }
+
+
+def _marker_text(out: Path, outcome: MarkerOutcome) -> str:
+    """Return the summary for people."""
+    lines = []
+    for name, results in outcome.results.items():
+        found = sum(len(r.markers.target_id) for r in results)
+        all_of_them = found + sum(len(r.markers.missing) for r in results)
+        doubtful = sum(int(r.markers.doubtful.sum()) for r in results)
+        lines.append(
+            f'fluoroscope {name}: {len(results)} images, {found} of {all_of_them} places of '
+            f'markers measured, {doubtful} with a doubtful id'
+        )
+    exchanged = [d for d in outcome.decisions if d.kind == 'exchanged']
+    if exchanged:
+        lines.append(f'{len(exchanged)} pairs of ids were exchanged back')
+    return '\n'.join([*lines, f'written to {out}'])

@@ -12,12 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Observations of images as CSV: `fluoroscope,exposure,target_id,u,v,sigma,overlapped`."""
+"""Observations of images as CSV: `fluoroscope,exposure,target_id,u,v,sigma,overlapped`.
+
+Markers that were followed have a further column `doubtful`.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -42,19 +45,34 @@ def write_extracted(
     with atomic_file(path, 'w') as file:
         write_rows(file, [(*COLUMNS, 'sigma', 'overlapped')])
         for frame, overlapped in frames:
-            check_safe_name(frame.fluoroscope, path)
-            assert frame.sigma is not None
-            numbers = np.round(np.column_stack([frame.uv, frame.sigma]), DECIMALS).tolist()
-            write_rows(
-                file,
-                (
-                    [
-                        frame.fluoroscope,
-                        frame.number,
-                        target_names.get(int(target), int(target)),
-                        *row,
-                        int(flag),
-                    ]
-                    for target, row, flag in zip(frame.target_id, numbers, overlapped)
-                ),
-            )
+            write_rows(file, _rows(path, frame, [overlapped], target_names))
+
+
+def write_markers(
+    path: str | os.PathLike[str],
+    frames: Iterable[tuple[Frame, np.ndarray, np.ndarray]],
+    target_names: Mapping[int, str],
+) -> None:
+    """Write frames, with flags (n,) of overlapped markers and of doubtful ids, to a CSV file.
+
+    Markers with a name are written by it. Raises DataError where the file cannot be written.
+    """
+    with atomic_file(path, 'w') as file:
+        write_rows(file, [(*COLUMNS, 'sigma', 'overlapped', 'doubtful')])
+        for frame, overlapped, doubtful in frames:
+            write_rows(file, _rows(path, frame, [overlapped, doubtful], target_names))
+
+
+def _rows(
+    path: str | os.PathLike[str],
+    frame: Frame,
+    flags: Sequence[np.ndarray],
+    target_names: Mapping[int, str],
+) -> Iterator[list[object]]:
+    """Yield the rows of a frame, with flags (n,) as the last columns."""
+    check_safe_name(frame.fluoroscope, path)
+    assert frame.sigma is not None
+    numbers = np.round(np.column_stack([frame.uv, frame.sigma]), DECIMALS).tolist()
+    flagged = np.column_stack(flags).astype(int).tolist()
+    for target, row, flag in zip(frame.target_id.tolist(), numbers, flagged):
+        yield [frame.fluoroscope, frame.number, target_names.get(target, target), *row, *flag]

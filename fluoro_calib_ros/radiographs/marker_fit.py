@@ -125,7 +125,6 @@ class _Fit:
 
     def _groups(self, together: float) -> list[tuple[np.ndarray, np.ndarray]]:
         """Rows of markers and of their neighbours, -1 for none: those alone, and the others."""
-        n = len(self.uv)
         distance = cdist(self.uv, self.uv)
         np.fill_diagonal(distance, np.inf)
         self.distance = distance.min(axis=1, initial=np.inf)

@@ -215,13 +215,13 @@ class MarkerPair:
         self._agreed = np.zeros((2, n), dtype=int)
         self._wrong = np.zeros((2, n), dtype=int)
 
-    def update(self, images: Mapping[str, np.ndarray], frame: int) -> PairFrame:
+    def update(self, images: Mapping[str, np.ndarray | None], frame: int) -> PairFrame:
         """Measure the markers of the next images.
 
         Parameters
         ----------
-        images : mapping of str to ndarray
-            By fluoroscope.
+        images : mapping of str to ndarray or None
+            By fluoroscope; one may be missing, after the first exposure.
         frame : int
             Number of the exposure, above that of the one before.
 
@@ -235,11 +235,10 @@ class MarkerPair:
             As MarkerTracker.update, and for an image of another size than the calibration's.
         """
         for name in self.names:
-            if name not in images:
-                raise DataError(f'exposure {frame}: there is no image of fluoroscope {name}')
+            image = images.get(name)
             expected = self.calibrations[name].image_size
-            if self._frame == 0 and images[name].shape[::-1] != tuple(expected):
-                width, height = images[name].shape[::-1]
+            if self._frame == 0 and image is not None and image.shape[::-1] != tuple(expected):
+                width, height = image.shape[::-1]
                 raise DataError(
                     f'fluoroscope {name}: the image is {width} x {height} px, but the '
                     f'calibration is for {expected[0]} x {expected[1]} px'
@@ -247,7 +246,8 @@ class MarkerPair:
         if self._frame:
             self._suggest(frame - self._frame)
         views = {
-            name: tracker.update(images[name], frame) for name, tracker in self.trackers.items()
+            name: tracker.update(images.get(name), frame)
+            for name, tracker in self.trackers.items()
         }
         exposure = self._exposure(views)
         expected_mm, sure = self._expected(exposure)

@@ -244,12 +244,13 @@ class MarkerTracker:
         """Shadow of a typical marker, None before the first image."""
         return self._profile
 
-    def update(self, image: np.ndarray, frame: int) -> MarkerFrame:
+    def update(self, image: np.ndarray | None, frame: int) -> MarkerFrame:
         """Measure the markers of the next image.
 
         Parameters
         ----------
-        image : (h, w) ndarray of uint8 or uint16
+        image : (h, w) ndarray of uint8 or uint16, or None
+            None where there is no image of this number.
         frame : int
             Number of the image, above that of the one before; markers move on through numbers
             that are left out.
@@ -268,6 +269,8 @@ class MarkerTracker:
         if self._markers is not None and frame <= self._frame:
             raise DataError(f'image {frame} does not come after image {self._frame}')
         try:
+            if image is None:
+                raise DataError('there is no image')
             check_image(image, self._size)
         except DataError as error:
             if self._markers is None:

@@ -1,0 +1,414 @@
+"""The marker job: image sequences of one or two fluoroscopes to observations of markers.
+
+Images are read ahead in threads, since decoding takes as long as following. Two calibrated views
+are followed together, image by image, because each predicts and checks the other; what they decide
+later on an earlier doubt is written into the earlier images.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ..calibration.result import FluoroscopeCalibration
+from ..drift.clusters import Cluster
+from ..errors import DataError
+from ..exposures.frame import Frame
+from ..files.access import make_folder
+from ..files.atomic import write_bytes
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..radiographs.marker_overlay import draw_markers
+from ..radiographs.marker_pair import Decision, MarkerPair, revise
+from ..radiographs.markers import (
+    Doubt,
+    FirstMarkers,
+    MarkerFrame,
+    MarkerOptions,
+    MarkerTracker,
+)
+from .extraction import Progress
+from .image_sources import (
+    ImageSources,
+    SourceImage,
+    fluoroscope_folders,
+    is_image_bag,
+    open_sources,
+)
+
+AHEAD = 3  # images that are read before they are wanted
+
+
+@dataclass(frozen=True)
+class MarkerRequest:
+    """Image sequences of one or two fluoroscopes, and their markers.
+
+    Attributes
+    ----------
+    sources : mapping of str to sequence of Path
+        Images by fluoroscope.
+    first : mapping of str to sequence of Frame
+        Markers of one or more exposures, by fluoroscope. Following begins with the first image
+        that has one.
+    options : MarkerOptions
+    calibrations : mapping of str to FluoroscopeCalibration
+        Of two fluoroscopes.
+    orientation : RigOrientation or None
+        Of two fluoroscopes.
+    clusters : tuple of Cluster
+        Markers that are rigid together, of two fluoroscopes.
+    overlay : Path or None
+        Folder for pictures.
+    target_names : mapping of int to str
+        Names of markers, for pictures.
+    """
+
+    sources: Mapping[str, Sequence[Path]]
+    first: Mapping[str, Sequence[Frame]]
+    options: MarkerOptions = field(default_factory=MarkerOptions)
+    calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
+    orientation: RigOrientation | None = None
+    clusters: tuple[Cluster, ...] = ()
+    overlay: Path | None = None
+    target_names: Mapping[int, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class MarkerImageResult:
+    """Markers of one image, and where it comes from."""
+
+    exposure: int
+    place: str
+    markers: MarkerFrame
+
+
+@dataclass(frozen=True)
+class DoubtfulSpan:
+    """An id that may be wrong in some exposures.
+
+    Attributes
+    ----------
+    fluoroscope : str
+    target_id : int
+    first, last : int
+        Exposures.
+    images : int
+    others : tuple of int
+        Markers that it may be exchanged with; none where it may be something else.
+    reason : str
+    """
+
+    fluoroscope: str
+    target_id: int
+    first: int
+    last: int
+    images: int
+    others: tuple[int, ...]
+    reason: str
+
+
+@dataclass(frozen=True)
+class MarkerOutcome:
+    """Followed markers.
+
+    Attributes
+    ----------
+    results : mapping of str to tuple of MarkerImageResult
+        By fluoroscope, in the order of the exposures.
+    decisions : tuple of Decision
+        What the two views decided on doubtful ids; the results obey them.
+    image_size : mapping of str to (int, int)
+    before : mapping of str to int
+        Images before the first one with given markers, which were not used.
+    """
+
+    results: Mapping[str, tuple[MarkerImageResult, ...]]
+    decisions: tuple[Decision, ...]
+    image_size: Mapping[str, tuple[int, int]]
+    before: Mapping[str, int]
+
+    def frames(self) -> list[tuple[Frame, np.ndarray, np.ndarray]]:
+        """Observations, with flags (n,) of overlapped markers and of doubtful ids."""
+        out = []
+        for name, results in self.results.items():
+            for result in results:
+                found = result.markers
+                if not len(found.target_id):
+                    continue
+                frame = Frame(
+                    name,
+                    result.exposure,
+                    found.target_id,
+                    found.uv,
+                    self.image_size[name],
+                    found.sigma,
+                )
+                out.append((frame, found.overlapped, found.doubtful))
+        return out
+
+    def spans(self) -> list[DoubtfulSpan]:
+        """Return what is still doubtful, by fluoroscope, marker and run of exposures."""
+        out = []
+        for name, results in self.results.items():
+            open_spans: dict[int, DoubtfulSpan] = {}
+            causes: dict[int, Doubt] = {}
+            for result in results:
+                found = result.markers
+                for doubt in found.doubts:
+                    for target in doubt.target_id:
+                        causes[target] = doubt
+                for target in found.target_id[~found.doubtful].tolist():
+                    if target in open_spans:
+                        out.append(open_spans.pop(target))
+                for target in found.target_id[found.doubtful].tolist():
+                    span = open_spans.get(target)
+                    if span is None:
+                        cause = causes.get(target)
+                        others = () if cause is None else cause.target_id
+                        reason = 'the views do not agree' if cause is None else cause.reason
+                        others = tuple(i for i in others if i != target)
+                        first = result.exposure
+                        span = DoubtfulSpan(name, target, first, first, 0, others, reason)
+                    open_spans[target] = replace(
+                        span, last=result.exposure, images=span.images + 1
+                    )
+            out += open_spans.values()
+        return out
+
+
+def sequences(
+    sources: Sequence[Path], fluoroscopes: Sequence[str]
+) -> tuple[dict[str, list[Path]], tuple[int, int]]:
+    """Return the sources of each fluoroscope, and the size of the first image [px].
+
+    Two fluoroscopes have one source each, or share a folder with a folder for each, or a bag.
+    Raises DataError.
+    """
+    if len(fluoroscopes) == 1:
+        out = {fluoroscopes[0]: list(sources)}
+    elif len(sources) == len(fluoroscopes):
+        out = {name: [source] for name, source in zip(fluoroscopes, sources)}
+    else:
+        folders = fluoroscope_folders(sources[0])
+        out = {}
+        for name in fluoroscopes:
+            if folders and name not in folders:
+                raise DataError(
+                    f'{sources[0]}: there is no folder {name} with images, only '
+                    f'{", ".join(folders)}'
+                )
+            out[name] = [folders.get(name, sources[0])]
+        if not folders and not is_image_bag(sources[0]):
+            raise DataError(
+                f'{sources[0]}: images of {" and ".join(fluoroscopes)} are expected in a folder '
+                'for each, in a bag, or in two sources'
+            )
+    first = next(open_sources(out[fluoroscopes[0]], fluoroscopes[0]).images(), None)
+    if first is None:
+        raise DataError(f'{sources[0]}: there are no images')
+    if isinstance(first.image, DataError):
+        raise first.image
+    return out, (first.image.shape[1], first.image.shape[0])
+
+
+def run_marker_extraction(
+    request: MarkerRequest, progress: Progress | None = None
+) -> MarkerOutcome:
+    """Follow markers through the images of one or two fluoroscopes.
+
+    A damaged image, or one of another size, is passed over, and its result says why.
+
+    Parameters
+    ----------
+    request : MarkerRequest
+    progress : callable, optional
+        Called after every exposure with the number of those that are done, and their total.
+
+    Returns
+    -------
+    MarkerOutcome
+
+    Raises
+    ------
+    DataError
+        For sources that cannot be read, markers that are not in the images, and fluoroscopes
+        without calibration.
+    """
+    names = list(request.sources)
+    sources = {name: open_sources(request.sources[name], name) for name in names}
+    if request.overlay is not None:
+        make_folder(request.overlay)
+    follower = _Follower(request)
+    total = max(source.count for source in sources.values())
+    cv2.setNumThreads(1)
+    with threadpool_limits(1):
+        for number, images in enumerate(_exposures(sources), 1):
+            follower.add(images)
+            if progress is not None:
+                progress(number, max(total, number))
+    outcome = follower.outcome()
+    if request.overlay is not None:
+        _write_pictures(request, sources, outcome)
+    return outcome
+
+
+class _Follower:
+    """Follows markers from the first exposure that has some, and corrects earlier results."""
+
+    def __init__(self, request: MarkerRequest) -> None:
+        self._request = request
+        self._names = list(request.sources)
+        self._given = {
+            name: {frame.number: frame for frame in request.first.get(name, ())}
+            for name in self._names
+        }
+        for name in self._names:
+            if not self._given[name]:
+                raise DataError(f'there are no given markers of fluoroscope {name}')
+        self._pair: MarkerPair | None = None
+        self._single: MarkerTracker | None = None
+        self._results: dict[str, list[MarkerImageResult]] = {name: [] for name in self._names}
+        self._decisions: list[Decision] = []
+        self._size: dict[str, tuple[int, int]] = {}
+        self._before = dict.fromkeys(self._names, 0)
+        self._start = self._first_exposure()
+
+    def _first_exposure(self) -> int:
+        """First exposure of which markers of all fluoroscopes are given. Raises DataError."""
+        common = set.intersection(*(set(of_view) for of_view in self._given.values()))
+        if not common:
+            raise DataError(
+                f'the markers of {" and ".join(self._names)} are not given for the same exposure'
+            )
+        return min(common)
+
+    @property
+    def _begun(self) -> bool:
+        return self._pair is not None or self._single is not None
+
+    def add(self, images: Mapping[str, SourceImage]) -> None:
+        """Follow the markers through the images of one exposure, by fluoroscope."""
+        exposure = next(iter(images.values())).exposure
+        if not self._begun:
+            if exposure != self._start or len(images) < len(self._names):
+                for name in images:
+                    self._before[name] += 1
+                return
+            self._begin(images)
+        arrays = {
+            name: None if isinstance(image.image, DataError) else image.image
+            for name, image in images.items()
+        }
+        if self._pair is not None:
+            found = self._pair.update(arrays, exposure)
+            views = found.views
+            self._decisions += found.decisions
+            for decision in found.decisions:
+                self._correct(decision)
+        else:
+            assert self._single is not None
+            name = self._names[0]
+            views = {name: self._single.update(arrays[name], exposure)}
+        for name, image in images.items():
+            view = views[name]
+            if isinstance(image.image, DataError):
+                view = replace(view, reason=str(image.image))
+            self._results[name].append(MarkerImageResult(exposure, image.place, view))
+
+    def _begin(self, images: Mapping[str, SourceImage]) -> None:
+        """Make the tracker for the first images. Raises DataError for one that is damaged."""
+        first = {}
+        for name in self._names:
+            image = images[name].image
+            if isinstance(image, DataError):
+                raise image
+            self._size[name] = (image.shape[1], image.shape[0])
+            frame = self._given[name][self._start]
+            try:
+                first[name] = FirstMarkers(frame.target_id, frame.uv)
+            except DataError as error:
+                raise DataError(f'fluoroscope {name}, exposure {self._start}: {error}') from None
+        request = self._request
+        if len(self._names) == 1:
+            self._single = MarkerTracker(request.options, first=first[self._names[0]])
+            return
+        if request.orientation is None:
+            raise DataError('two fluoroscopes are followed together only with their calibration')
+        self._pair = MarkerPair(
+            request.calibrations,
+            request.orientation,
+            request.options,
+            first=first,
+            clusters=request.clusters,
+        )
+
+    def _correct(self, decision: Decision) -> None:
+        """Apply a decision to the earlier images since the doubt began."""
+        results = self._results[decision.fluoroscope]
+        for number in range(len(results) - 1, -1, -1):
+            if results[number].exposure < decision.since:
+                break
+            markers = revise(results[number].markers, decision)
+            results[number] = replace(results[number], markers=markers)
+
+    def outcome(self) -> MarkerOutcome:
+        """Return all results. Raises DataError where following did not begin."""
+        if not self._begun:
+            raise DataError(
+                f'the markers are given for exposure {self._start}, but there is no image of it '
+                f'of {" and ".join(self._names)}'
+            )
+        return MarkerOutcome(
+            {name: tuple(results) for name, results in self._results.items()},
+            tuple(self._decisions),
+            self._size,
+            self._before,
+        )
+
+
+def _exposures(sources: Mapping[str, ImageSources]) -> Iterator[dict[str, SourceImage]]:
+    """Yield the images of each exposure, by fluoroscope, in the order of the exposures."""
+    readers = {name: _ahead(source.images()) for name, source in sources.items()}
+    waiting = {name: next(reader, None) for name, reader in readers.items()}
+    while True:
+        there = {name: image for name, image in waiting.items() if image is not None}
+        if not there:
+            return
+        exposure = min(image.exposure for image in there.values())
+        now = {name: image for name, image in there.items() if image.exposure == exposure}
+        yield now
+        for name in now:
+            waiting[name] = next(readers[name], None)
+
+
+def _ahead(images: Iterator[SourceImage]) -> Iterator[SourceImage]:
+    """Yield images that a thread reads before they are wanted."""
+    waiting: deque[Future[SourceImage | None]] = deque()
+    with ThreadPoolExecutor(1) as pool:
+        while True:
+            while len(waiting) < AHEAD:
+                waiting.append(pool.submit(next, images, None))
+            image = waiting.popleft().result()
+            if image is None:
+                return
+            yield image
+
+
+def _write_pictures(
+    request: MarkerRequest, sources: Mapping[str, ImageSources], outcome: MarkerOutcome
+) -> None:
+    """Write a picture of every image that can be read, with the final ids."""
+    assert request.overlay is not None
+    for name, source in sources.items():
+        found = {result.exposure: result.markers for result in outcome.results[name]}
+        for image in source.images():
+            if image.exposure in found and not isinstance(image.image, DataError):
+                picture = draw_markers(image.image, found[image.exposure], request.target_names)
+                path = request.overlay / f'{name}_{image.exposure:04d}.png'
+                write_bytes(path, cv2.imencode('.png', picture)[1].tobytes())

@@ -1,0 +1,63 @@
+"""Pictures of the markers that were followed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from .markers import MarkerFrame
+from .overlay import MATCHED, OVERLAPPED, REFUSED, UNEXPLAINED
+
+TEXT_HEIGHT = 18
+RADIUS_PX = 7
+
+
+def draw_markers(
+    image: np.ndarray, found: MarkerFrame, target_names: Mapping[int, str] | None = None
+) -> np.ndarray:
+    """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w).
+
+    Green circles are markers, light blue ones overlapped markers, yellow ones markers whose id
+    is doubtful; red crosses are where markers that are not seen are believed to be.
+    """
+    target_names = target_names or {}
+    low, high = np.percentile(image[::4, ::4], [0.5, 99.8])
+    grey = np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
+    factor = 2 if max(image.shape) <= 512 else 1
+    if factor > 1:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    size = cv2.getTextSize('0', cv2.FONT_HERSHEY_SIMPLEX, 0.35, 1)[0][1]
+    marks = [
+        (target, uv, UNEXPLAINED if doubtful else OVERLAPPED if overlapped else MATCHED, True)
+        for target, uv, overlapped, doubtful in zip(
+            found.target_id, found.uv, found.overlapped, found.doubtful
+        )
+    ]
+    marks += [(target, uv, REFUSED, False) for target, uv in zip(found.missing, found.predicted)]
+    for target, uv, colour, seen in marks:
+        if not np.isfinite(uv).all() or np.abs(uv).max() > 2**14:
+            continue
+        u, v = np.rint((uv + 0.5) * factor - 0.5).astype(int).tolist()
+        if seen:
+            cv2.circle(picture, (u, v), RADIUS_PX, colour, 1, cv2.LINE_AA)
+        else:
+            cv2.drawMarker(picture, (u, v), colour, cv2.MARKER_TILTED_CROSS, RADIUS_PX, 1)
+        text = target_names.get(int(target), str(int(target)))
+        place = (u + RADIUS_PX + 1, v + size // 2)
+        font = cv2.FONT_HERSHEY_SIMPLEX
+        cv2.putText(picture, text, place, font, 0.35, colour, 1, cv2.LINE_AA)
+    lines = [
+        (f'{len(found.target_id)} markers, {int(found.overlapped.sum())} overlapped', MATCHED),
+        (f'{int(found.doubtful.sum())} with a doubtful id', UNEXPLAINED),
+        (f'{len(found.missing)} not seen', REFUSED),
+    ]
+    if found.reason:
+        lines.append((found.reason, REFUSED))
+    band = np.zeros((TEXT_HEIGHT * len(lines) + 8, picture.shape[1], 3), np.uint8)
+    for number, (text, colour) in enumerate(lines):
+        place = (6, TEXT_HEIGHT * (number + 1) - 2)
+        cv2.putText(band, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return np.vstack([picture, band])

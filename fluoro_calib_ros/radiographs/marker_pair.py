@@ -47,7 +47,7 @@ DECIDED = 3  # exposures that agree before an id is confirmed
 DECIDED_ALONE = 8  # by epipolar distances alone
 WRONG = 3  # exposures that disagree before an id is wrong
 NEAR_PX = 1.0  # from where its cluster says, that a marker is; or so many
-NEAR_SIGMAS = 4.0
+NEAR_SIGMAS = 3.5
 FAR = 1.5  # times that, from which it is something else
 PREDICTED_SD_PX = 1.0
 FORGET_VELOCITY = 0.5
@@ -65,7 +65,7 @@ class Decision:
     kind : {'confirmed', 'exchanged', 'dropped'}
     fluoroscope : str
     frame, since : int
-        The image of the decision, and the one with which the doubt began.
+        The image of the decision, and the first one that it holds for.
     target_id : tuple of int
         One id, or the two that were exchanged.
     """
@@ -213,6 +213,8 @@ class MarkerPair:
         self._frame = 0
         self._evidence: dict[tuple[int, int, int], float] = defaultdict(float)
         self._agreed = np.zeros((2, n), dtype=int)
+        self._right = np.zeros((2, n), dtype=int)
+        self._seen_right = np.zeros((2, n), dtype=int)
         self._wrong = np.zeros((2, n), dtype=int)
 
     def update(self, images: Mapping[str, np.ndarray | None], frame: int) -> PairFrame:
@@ -351,6 +353,7 @@ class MarkerPair:
         near = np.maximum(NEAR_PX, NEAR_SIGMAS * exposure.sigma[view])
         right = away < near
         wrong = away > FAR * near
+        self._seen_right[view, right] = frame
         self._wrong[view] = np.where(wrong, self._wrong[view] + 1, 0)
         for row in np.flatnonzero(wrong & ~exposure.doubtful[view]):
             tracker.doubt(int(self.target_id[row]), frame)
@@ -365,6 +368,8 @@ class MarkerPair:
             since = min(
                 tracker.doubted_since(ids[0]) or frame, tracker.doubted_since(ids[1]) or frame
             )
+            # They were not exchanged while one of them was where its cluster says.
+            since = max(since, int(self._seen_right[view, [one, two]].max()) + 1)
             tracker.exchange(*ids)
             out.append(Decision('exchanged', name, frame, since, ids))
             exchanged |= {one, two}
@@ -378,16 +383,27 @@ class MarkerPair:
             alone = np.nanmin(beside, initial=np.inf) > FAR * near[row]
             if row in exchanged:
                 continue
-            self._agreed[view, row] = self._agreed[view, row] + 1 if right[row] and alone else 0
+            self._agree(view, row, bool(right[row] and alone), frame)
             if began is not None and self._agreed[view, row] >= DECIDED:
                 tracker.confirm(number)
-                out.append(Decision('confirmed', name, frame, began, (number,)))
+                out.append(
+                    Decision('confirmed', name, frame, int(self._right[view, row]), (number,))
+                )
                 self._agreed[view, row] = 0
             elif self._wrong[view, row] >= WRONG:
                 tracker.forget(number)
                 out.append(Decision('dropped', name, frame, began or frame - WRONG + 1, (number,)))
                 self._wrong[view, row] = 0
         return out
+
+    def _agree(self, view: int, row: int, agrees: bool, frame: int) -> None:
+        """Count the exposures that agree with a doubtful id, one after the other."""
+        if not agrees:
+            self._agreed[view, row] = 0
+            return
+        if self._agreed[view, row] == 0:
+            self._right[view, row] = frame
+        self._agreed[view, row] += 1
 
     def _crossed(
         self, seen: np.ndarray, place: np.ndarray, near: np.ndarray, suspects: np.ndarray
@@ -432,10 +448,11 @@ class MarkerPair:
                         out += self._both_ways(view, exposure, (int(row), other), frame)
                 if not others and not tracker.partners(number) - {number}:
                     agrees = exposure.standardised[row] < AGREE
-                    self._agreed[view, row] = self._agreed[view, row] + 1 if agrees else 0
+                    self._agree(view, row, bool(agrees), frame)
                     if self._agreed[view, row] >= DECIDED_ALONE:
                         tracker.confirm(number)
-                        out.append(Decision('confirmed', name, frame, since, (number,)))
+                        begin = int(self._right[view, row])
+                        out.append(Decision('confirmed', name, frame, begin, (number,)))
                         self._agreed[view, row] = 0
             for row in np.flatnonzero(both):
                 bad = exposure.standardised[row] > DISAGREE
@@ -533,10 +550,12 @@ def revise(found: MarkerFrame, decision: Decision) -> MarkerFrame:
     doubtful = found.doubtful.copy()
     if decision.kind == 'exchanged':
         one, two = decision.target_id
+        # The exposure in which they were exchanged is not known, so they stay doubtful.
+        doubtful |= np.isin(found.target_id, decision.target_id)
         ids = np.where(
             found.target_id == one, two, np.where(found.target_id == two, one, found.target_id)
         )
-        return replace(found, target_id=ids)
+        return replace(found, target_id=ids, doubtful=doubtful)
     row = found.target_id == decision.target_id[0]
     if decision.kind == 'confirmed':
         doubtful[row] = False

@@ -48,7 +48,7 @@ from .profile import Profile
 FIRST_SD_PX = 1.5  # of a given place of the first frame
 SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
 SHADOW_SD_PX = 0.35  # of the place of a shadow before it is measured
-MAX_SIGMA_PX = 0.5
+MAX_SIGMA_PX = 0.4
 MAX_MISFIT = 10.0
 DEPTH = (0.5, 1.8)  # of a shadow, over that of its marker
 DEPTH_SD = 1.0  # of the depth of a marker that is not known yet

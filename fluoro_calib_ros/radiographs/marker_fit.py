@@ -39,6 +39,7 @@ MARGIN_PX = 2.0  # of background around the shadow
 TERMS = 6  # of the background: a polynomial of degree 2
 OWN = TERMS + 3  # unknowns of a marker alone: its background, centre and depth
 NEIGHBOUR_SD_PX = 0.3  # of a step of a neighbour, which its own fit finds
+ALONE_SD = 1.0  # of the depth of a marker alone
 NEIGHBOUR_SD = 0.2  # of a step of a neighbour's depth
 MAX_STEP_PX = 0.8
 DEPTHS = (0.05, 3.0)
@@ -229,7 +230,8 @@ class _Fit:
                 weight = weight / (1 + disturbed[:, None] * squared / ROBUST**2)
         weighted = jacobian * weight[:, None]
         prior = np.zeros(jacobian.shape[:2])
-        prior[:, TERMS + 2] = self.guess.depth_sd[rows] ** -2.0
+        # The depth of a marker alone tells whether it is one, so it is hardly constrained.
+        prior[:, TERMS + 2] = (self.guess.depth_sd[rows] if near.shape[1] else ALONE_SD) ** -2.0
         for number in range(near.shape[1]):
             first = OWN + 3 * number
             # An absent neighbour has no derivatives; any prior keeps its step zero.

@@ -35,6 +35,7 @@ NOISE_WEIGHT = 0.1  # of the response, in the noise that it is compared with
 NEAR_PX = 3  # from a given point, within which its shadow is
 MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
 MIN_SNR = 4.5  # of a response, over the noise of the response
+WINDOW_BACKGROUND_PX = 6  # the same along the rows of a window
 BACKGROUND_PX = 15  # half the width of the box whose mean is the light around a pixel
 SAME_PX = 1.0  # between maxima that are one shadow
 BORDER = 3  # scales of the blur at the edge of a window that are not searched
@@ -75,7 +76,9 @@ class MarkerLook:
     strength : float
         Response to a typical marker over the light around it.
     floor : float
-        Response below which noise is.
+        Response below which noise is, in the light of the middle of the range.
+    light : float
+        That light.
     """
 
     scale: float
@@ -83,6 +86,7 @@ class MarkerLook:
     field: np.ndarray
     strength: float
     floor: float
+    light: float
 
     @property
     def radius_px(self) -> float:
@@ -179,7 +183,8 @@ def learn_look(image: np.ndarray, near: np.ndarray | None, count: int) -> Marker
             if near is not None
             else 'there are no markers in the image, nothing round rises above the noise'
         )
-    return MarkerLook(scale, inverted, field, strength, floor)
+    usual = float(np.median(light[field])) if field.any() else float(light.mean())
+    return MarkerLook(scale, inverted, field, strength, floor, max(usual, 1.0))
 
 
 def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
@@ -187,7 +192,7 @@ def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
     grey = image.astype(np.float32)
     light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
     around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
-    response = _responses(light, look.scale)[0] / np.maximum(around, 1.0)
+    response = _relative(_responses(light, look.scale)[0], around, look)
     response[~look.field] = 0
     response[[0, -1]] = 0
     response[:, [0, -1]] = 0
@@ -203,9 +208,9 @@ def search_windows(
     axis = np.arange(-half - border, half + border + 1)
     offset = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     grey, valid = windows.read(middle, offset)
-    around = np.maximum(grey.mean(axis=1), 1.0)
-    response = _responses(grey.reshape(-1, size), look.scale)[0].reshape(len(middle), size, size)
-    response /= around[:, None, None]
+    around = cv2.blur(grey.reshape(-1, size), (2 * WINDOW_BACKGROUND_PX + 1, 1))
+    response = _relative(_responses(grey.reshape(-1, size), look.scale)[0], around, look)
+    response = response.reshape(len(middle), size, size)
     response *= valid.reshape(response.shape)
     # The seams between windows lie in their borders.
     response[:, :border] = 0
@@ -219,6 +224,14 @@ def search_windows(
     place += middle[number] - half - border
     # Windows that overlap contain the same shadow.
     return Shadows(place, found.strength).distinct() if len(place) else found
+
+
+def _relative(response: np.ndarray, around: np.ndarray, look: MarkerLook) -> np.ndarray:
+    """Responses over the light around, 0 where noise explains them: it grows in the dark."""
+    light = np.maximum(around, 1e-3 * look.light)
+    relative = response / light
+    relative[relative < look.floor * np.sqrt(np.maximum(look.light / light, 1.0))] = 0
+    return np.asarray(relative)
 
 
 def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:

@@ -212,6 +212,7 @@ class MarkerPair:
         self._age = np.zeros(n, dtype=int)
         self._frame = 0
         self._evidence: dict[tuple[int, int, int], float] = defaultdict(float)
+        self._kept: dict[tuple[int, int, int], int] = {}
         self._agreed = np.zeros((2, n), dtype=int)
         self._right = np.zeros((2, n), dtype=int)
         self._seen_right = np.zeros((2, n), dtype=int)
@@ -374,7 +375,7 @@ class MarkerPair:
             out.append(Decision('exchanged', name, frame, since, ids))
             exchanged |= {one, two}
             self._wrong[view, [one, two]] = 0
-        for row in suspects:
+        for row in suspects.tolist():
             number = int(self.target_id[row])
             began = tracker.doubted_since(number)
             beside = np.linalg.norm(place - seen[row], axis=1)
@@ -433,7 +434,7 @@ class MarkerPair:
         both = np.isfinite(exposure.standardised) & ~known
         for view, name in enumerate(self.names):
             tracker = self.trackers[name]
-            for row in np.flatnonzero(both & exposure.doubtful[view]):
+            for row in np.flatnonzero(both & exposure.doubtful[view]).tolist():
                 number = int(self.target_id[row])
                 since = tracker.doubted_since(number)
                 if since is None:
@@ -476,20 +477,24 @@ class MarkerPair:
         keep = np.minimum(exposure.standardised[pair] ** 2, MAX_COST).sum()
         change = np.minimum(np.nan_to_num(other, nan=np.inf) ** 2, MAX_COST).sum()
         key = (view, *rows)
+        if change < keep or key not in self._evidence:
+            self._kept[key] = frame
         self._evidence[key] += float(change - keep)
         ids = (int(self.target_id[rows[0]]), int(self.target_id[rows[1]]))
         since = min(tracker.doubted_since(ids[0]) or frame, tracker.doubted_since(ids[1]) or frame)
         if abs(self._evidence[key]) < MAX_COST:
             return []
         exchanged = self._evidence.pop(key) < 0
+        kept = self._kept.pop(key)
         out = []
         if exchanged:
             tracker.exchange(*ids)
             out.append(Decision('exchanged', name, frame, since, ids))
+            kept = frame
+        tracker.part(*ids)
         for number in ids:
-            tracker.part(*ids)
             if tracker.doubted_since(number) is None:
-                out.append(Decision('confirmed', name, frame, since, (number,)))
+                out.append(Decision('confirmed', name, frame, kept, (number,)))
         return out
 
     def _remember(

@@ -48,7 +48,7 @@ from .profile import Profile
 FIRST_SD_PX = 1.5  # of a given place of the first frame
 SHARE = 0.35  # of the response to a typical marker, from which a shadow may be a marker
 SHADOW_SD_PX = 0.35  # of the place of a shadow before it is measured
-MAX_SIGMA_PX = 0.4
+MAX_SIGMA_PX = 0.3
 MAX_MISFIT = 10.0
 DEPTH = (0.5, 1.8)  # of a shadow, over that of its marker
 DEPTH_SD = 1.0  # of the depth of a marker that is not known yet
@@ -60,7 +60,8 @@ SAME_PLACE = 0.35  # of the radius, at which two markers are one shadow
 FALSE_SHADOWS = 0.02  # expected in the gate, from which a marker found again is doubtful
 OTHER_SHADOW = 'another shadow was as near to where it was expected'
 MIN_DENSITY = 2e-6  # of false shadows [1/px^2]
-MIN_MOTION_PX = 0.3
+MERGED_PX = 5.0  # between predictions, within which two markers are one shadow
+MERGED_FRAMES = 6  # for which neither of them is measured; then one is, with a doubt
 WIDE_PX = 8.0  # standard deviation of a prediction from which markers beside help
 BESIDE = 8
 MIN_BESIDE = 4
@@ -586,12 +587,18 @@ class MarkerTracker:
         pairs = doubtful_pairs(motion.uv, variance, measured, uv, self.options.margin)
         # Ids of the first image are given; before a velocity is known, nothing can be said.
         settled = motion.settled & (self._images > 0)
-        for one, two in pairs.tolist():
-            if not (settled[one] and settled[two]):
-                continue
-            if not (measured[one] and measured[two]):
-                measured[one] = measured[two] = False
-                continue
+        apart = np.linalg.norm(motion.uv[pairs[:, 0]] - motion.uv[pairs[:, 1]], axis=1)
+        for (one, two), distance in zip(pairs.tolist(), apart.tolist()):
+            both_settled = settled[one] and settled[two]
+            if measured[one] and measured[two]:
+                if not both_settled:
+                    continue
+            else:
+                if not (both_settled or distance < MERGED_PX):
+                    continue
+                if max(markers.unseen[one], markers.unseen[two]) <= MERGED_FRAMES:
+                    measured[one] = measured[two] = False
+                    continue
             if two not in markers.partner[one]:
                 for row in (one, two):
                     if not markers.partner[row]:

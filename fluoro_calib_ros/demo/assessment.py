@@ -24,8 +24,10 @@ from typing import Any
 
 import numpy as np
 
+from ..calibration.result import FluoroscopeCalibration
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_quaternion
+from ..simulation.distortion import DistortionField
 
 # Frames and source timestamps [ns] by (fluoroscope, frame number); frames have target_id, u and v.
 Frames = Mapping[tuple[str, int], tuple[Any, int]]
@@ -92,6 +94,32 @@ def image_errors(
             projective_misfit(np.concatenate(observed), ideal),
             projective_misfit(np.concatenate(undistorted), ideal),
         )
+    return errors
+
+
+def calibration_errors(
+    bags: Path, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> dict[str, float]:
+    """Return the RMSE of the true markers, observed without noise and corrected [px].
+
+    By fluoroscope, after the best projective map, as for image_errors().
+    """
+    rig = json.loads((bags / 'truth' / 'rig.json').read_text())['fluoroscopes']
+    points = np.array(list(_true_markers(bags).values()))
+    errors = {}
+    for name, calibration in calibrations.items():
+        ideal = _ideal_projection(rig[name], points)
+        parts = rig[name]['distortion']
+        field = DistortionField(
+            np.array(parts['centre']),
+            parts['pincushion'],
+            np.array(parts['s_shape']),
+            parts['spiral'],
+            np.array(parts['ripples']),
+        )
+        observed = field.distort(ideal)
+        u, v, *_ = calibration.correct_arrays(observed[:, 0], observed[:, 1])
+        errors[name] = projective_misfit(np.column_stack([u, v]), ideal)
     return errors
 
 

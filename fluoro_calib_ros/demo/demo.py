@@ -13,7 +13,7 @@
 # limitations under the License.
 
 """Run the main job on recorded bags over real ROS 2: collect, self-calibrate, correct and
-reconstruct live, and report.
+reconstruct live, calibrate from radiographs, and report.
 """
 
 from __future__ import annotations
@@ -34,10 +34,11 @@ from ..errors import DataError
 from ..exposures.collector import collect_recorded
 from ..files.atomic import write_text
 from ..files.phantom import read_phantom
-from ..nodes.demo_client import DemoClient, DemoError, demo_client
+from ..nodes.demo_client import DemoClient, DemoError, demo_clients
 from ..report.figures import write_figures
 from ..report.tables import markdown_table, summary_table
 from .assessment import image_errors, latencies_ms, space_figures
+from .image_twin import NAMESPACE, ImageTwin, calibrate_from_images, comparison_table
 from .node_processes import NodeProcesses, isolate_ros_graph
 
 QUIET_S = 3.0  # after which no more messages are expected
@@ -112,7 +113,9 @@ def wait_for_stream(
         del client.corrected[key]
 
 
-def report(bags: Path, out: Path, client: DemoClient, lost: int, start: float) -> bool:
+def report(
+    bags: Path, out: Path, client: DemoClient, lost: int, start: float, comparison: str
+) -> bool:
     """Write and print the table; returns whether live and offline calibration are identical.
 
     The figures need the residuals, so the bag is calibrated once more without ROS.
@@ -126,8 +129,10 @@ def report(bags: Path, out: Path, client: DemoClient, lost: int, start: float) -
         Number of corrected frames that did not arrive.
     start : float
         Monotonic time of the start of the demonstration [s].
+    comparison : str
+        Table of the calibrations from coordinates and from images.
     """
-    print('4  the same bag without ROS, figures and table')
+    print('5  the same bag without ROS, figures and table')
     frames, _ = collect_recorded(read_frames(bags / 'calibration').frames)
     job = calibrate(frames, read_phantom(bags / 'phantom.csv'))
     figures = write_figures(job, out / 'figures')
@@ -136,6 +141,7 @@ def report(bags: Path, out: Path, client: DemoClient, lost: int, start: float) -
         for name, calibration in client.calibrations.items()
     }
     lines = [*_image_lines(bags, client, job), '', _space_line(bags, client), '']
+    lines += ['Calibrated from coordinates and from radiographs:', comparison, '']
     lines.append(
         'Calibration through the nodes and without ROS the same to the last bit: '
         + ', '.join(f'{name} {"yes" if ok else "NO"}' for name, ok in same.items())
@@ -256,9 +262,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     isolate_ros_graph()
     try:
         names = sorted(read_frames(options.bags / 'calibration').frames)
-        with demo_client(names) as client:
+        options.out.mkdir(parents=True, exist_ok=True)
+        twin = ImageTwin(options.bags, options.out / 'calibration_images', names)
+        with demo_clients(names, '', NAMESPACE) as (client, of_images), twin:
             lost = run_graph(options.bags, options.out, client)
-            good = report(options.bags, options.out, client, lost, start)
+            print('4  the same from radiographs: player -> extraction node -> calibration node')
+            from_images = calibrate_from_images(twin, options.bags, options.out, of_images)
+            comparison = comparison_table(
+                options.bags,
+                names,
+                {'coordinates': client.calibrations, 'images': from_images},
+            )
+            good = report(options.bags, options.out, client, lost, start, comparison)
     except (DemoError, DataError, OSError) as error:
         print(f'fluoro_calib_demo: {error}', file=sys.stderr)
         sys.exit(1)

@@ -35,11 +35,13 @@ FIRST_PARTICIPANT = 10
 class NodeProcesses:
     """Node processes that end together; a context manager.
 
-    log_directory: the output of each node goes to NAME.log in it.
+    log_directory: the output of each node goes to NAME.log in it. namespace: of the nodes; with
+    one, the log is NAMESPACE_NAME.log.
     """
 
-    def __init__(self, log_directory: Path) -> None:
+    def __init__(self, log_directory: Path, namespace: str = '') -> None:
         self._directory = log_directory
+        self._namespace = namespace
         self._processes: list[subprocess.Popen] = []
 
     def start(self, name: str, parameters: Mapping[str, object] | None = None) -> subprocess.Popen:
@@ -47,7 +49,10 @@ class NodeProcesses:
         command = [sys.executable, '-m', f'fluoro_calib_ros.nodes.{name}', '--ros-args']
         for key, value in (parameters or {}).items():
             command += ['-p', f'{key}:={value}']
-        with open(self._directory / f'{name}.log', 'ab') as log:
+        if self._namespace:
+            command += ['-r', f'__ns:=/{self._namespace}']
+        log_name = '_'.join(filter(None, (self._namespace, name)))
+        with open(self._directory / f'{log_name}.log', 'ab') as log:
             # In a session of its own: an interrupt from the keyboard reaches the nodes from here,
             # in order.
             process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)

@@ -60,6 +60,8 @@ class DemoClient(Node):
     ----------
     names : sequence of str
         Fluoroscopes.
+    namespace : str
+        Of the graph.
     exposures : dict of str to int
         Number of collected exposures by fluoroscope.
     corrected_readers : dict of str to int
@@ -70,8 +72,8 @@ class DemoClient(Node):
         ReconstructedPoints messages and their source timestamps [ns].
     """
 
-    def __init__(self, names: Sequence[str]) -> None:
-        super().__init__('demo_client')
+    def __init__(self, names: Sequence[str], namespace: str = '') -> None:
+        super().__init__('demo_client', namespace=namespace)
         self.names = tuple(names)
         self.exposures: dict[str, int] = {}
         self.corrected_readers: dict[str, int] = {}
@@ -218,14 +220,15 @@ class DemoClient(Node):
 
 
 @contextmanager
-def demo_client(names: Sequence[str]) -> Iterator[DemoClient]:
-    """Run a DemoClient in a ROS context of its own."""
+def demo_clients(names: Sequence[str], *namespaces: str) -> Iterator[list[DemoClient]]:
+    """Run a DemoClient for each namespace in a ROS context of their own."""
     rclpy.init(args=[])
     try:
-        client = DemoClient(names)
+        clients = [DemoClient(names, namespace) for namespace in namespaces]
         try:
-            yield client
+            yield clients
         finally:
-            client.destroy_node()
+            for client in clients:
+                client.destroy_node()
     finally:
         rclpy.try_shutdown()

@@ -1,0 +1,203 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The way from images: radiographs of some of the exposures are extracted and calibrated with."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..bags.definitions import message_class
+from ..bags.images import IMAGE
+from ..bags.writer import BagWriter
+from ..calibration.result import FluoroscopeCalibration
+from ..jobs.rendering import SETTINGS, RenderedScene, Renderers
+from ..nodes.demo_client import DemoClient, DemoError
+from ..report.tables import markdown_table
+from ..simulation.exposures import simulate_exposures
+from ..simulation.rig import VirtualRig, virtual_rig
+from .assessment import calibration_errors
+from .node_processes import NodeProcesses
+
+NAMESPACE = 'images'
+EXPOSURES = 6  # of those of the bag
+START_NS = 1_700_000_000_000_000_000
+INTERVAL_NS = 500_000_000
+
+
+class ImageTwin:
+    """Renders a twin of the calibration bag that is made of images, in a thread.
+
+    Parameters
+    ----------
+    bags : Path
+        Folder of the bags, whose truth names the virtual rig.
+    out : Path
+        Bag to write.
+    names : sequence of str
+        Fluoroscopes.
+    """
+
+    def __init__(self, bags: Path, out: Path, names: Sequence[str]) -> None:
+        made_with = json.loads((bags / 'truth' / 'rig.json').read_text())['made_with']
+        self.bag = out
+        self._rig = virtual_rig(made_with['seed'], made_with['strength'], names)
+        exposures = made_with['exposures']
+        self._poses = simulate_exposures(self._rig, exposures, made_with['seed']).poses
+        self.numbers = np.unique(np.linspace(0, exposures - 1, EXPOSURES).astype(int))
+        # A point source is rendered in half the time.
+        settings = replace(SETTINGS['clean'], bits=8, focal_spot_mm=0.0)
+        self._renderers = Renderers(self._rig.fluoroscopes, settings)
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> ImageTwin:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._renderers.close()
+        self._thread.join()
+
+    def wait(self) -> None:
+        """Wait until the bag is written. Raises DemoError."""
+        self._thread.join()
+        if self._error is not None:
+            raise DemoError(f'no radiographs were rendered: {self._error}')
+
+    def _run(self) -> None:
+        try:
+            _write_images(self.bag, self._rig, self._scenes(), self._renderers)
+        except Exception as error:  # told by wait()
+            self._error = error
+        finally:
+            self._renderers.close()
+
+    def _scenes(self) -> list[RenderedScene]:
+        return [
+            RenderedScene(self._rig.true_mm, self._poses[number], int(number))
+            for number in self.numbers
+        ]
+
+
+def _write_images(
+    path: Path, rig: VirtualRig, scenes: Sequence[RenderedScene], renderers: Renderers
+) -> None:
+    """Render scenes into a bag."""
+    kind = message_class(IMAGE)
+    header = message_class('std_msgs/msg/Header')
+    time = message_class('builtin_interfaces/msg/Time')
+    with BagWriter(path, overwrite=True) as bag:
+        for number, scene in enumerate(scenes):
+            stamp_ns = START_NS + number * INTERVAL_NS
+            stamp = time(*divmod(stamp_ns, 10**9))
+            for name, image in renderers.images(scene).items():
+                height, width = image.shape
+                message = kind(
+                    header(stamp, f'{name}_optical'),
+                    height,
+                    width,
+                    'mono8',
+                    0,
+                    width,
+                    image.reshape(-1),
+                )
+                bag.write(f'/{name}/image_raw', IMAGE, message, stamp_ns)
+
+
+def calibrate_from_images(
+    twin: ImageTwin, bags: Path, out: Path, client: DemoClient
+) -> Mapping[str, FluoroscopeCalibration]:
+    """Play the twin through the extraction node into another calibration node, and calibrate.
+
+    Parameters
+    ----------
+    twin : ImageTwin
+    bags, out : Path
+    client : DemoClient
+        In the namespace of the images.
+
+    Returns
+    -------
+    mapping of str to FluoroscopeCalibration
+
+    Raises
+    ------
+    DemoError
+    """
+    twin.wait()
+    count = len(twin.numbers)
+    rig: dict[str, Any] = {
+        'fluoroscopes': f'[{",".join(client.names)}]',
+        'phantom': bags / 'phantom.csv',
+    }
+    with NodeProcesses(out, NAMESPACE) as nodes:
+        nodes.start('extraction_node', rig)
+        nodes.start(
+            'calibration_node', {**rig, 'calibration_directory': out / NAMESPACE / 'calibration'}
+        )
+        client.wait(lambda: client.exposures or nodes.failed(), 60, 'the calibration node')
+        nodes.start('player_node', {'bag': twin.bag})
+        client.wait(
+            lambda: min(client.exposures.values(), default=0) >= count or nodes.failed(),
+            120,
+            'the exposures from images',
+        )
+        if nodes.failed():
+            raise DemoError(f'a node ended with a fault, see the logs in {out}')
+        message = client.self_calibrate(lambda line: None)
+        print(f'    {message}')
+        client.wait(lambda: len(client.calibrations) == len(client.names), 20, 'the calibrations')
+    return client.calibrations
+
+
+def comparison_table(
+    bags: Path,
+    names: Sequence[str],
+    ways: Mapping[str, Mapping[str, FluoroscopeCalibration]],
+) -> str:
+    """Return a table of the calibrations by coordinates and by images, with the truth."""
+    head = [
+        'fluoroscope',
+        'from',
+        'exposures',
+        'image points',
+        'RMSE [px]',
+        'c [px]',
+        'error of corrected markers [px]',
+    ]
+    rows = []
+    for way, calibrations in ways.items():
+        errors = calibration_errors(bags, calibrations)
+        for name in names:
+            calibration = calibrations[name]
+            rows.append(
+                [
+                    name,
+                    way,
+                    str(calibration.exposures),
+                    str(calibration.observations),
+                    f'{np.hypot(*calibration.rmse_after) / np.sqrt(2):.3f}',
+                    f'{calibration.interior[2]:.2f}',
+                    f'{errors[name]:.3f}',
+                ]
+            )
+    return markdown_table(head, sorted(rows))

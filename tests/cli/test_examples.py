@@ -14,10 +14,14 @@
 
 """The examples run, and the public interface is what they import."""
 
+import json
 import pathlib
+import re
 import subprocess
 import sys
+from dataclasses import replace
 
+import matplotlib
 import pytest
 
 import fluoro_calib_ros as fc
@@ -65,6 +69,29 @@ def test_every_example_is_listed_and_tested():
     of_nodes = (ROOT / 'tests' / 'ros' / 'test_motion_tracking.py').read_text()
     for name in scripts:
         assert f"example('{name}'" in tests or f"EXAMPLES / '{name}'" in of_nodes, name
+
+
+@pytest.mark.long
+def test_notebook_runs_and_prints_what_it_shows(monkeypatch, capsys):
+    def short(source, **settings):
+        recording = api.read_source(source, **settings)
+        frames = {name: of[:30] for name, of in recording.frames.items()}
+        return replace(recording, frames=frames)
+
+    matplotlib.use('Agg')
+    monkeypatch.chdir(EXAMPLES)
+    monkeypatch.setattr(fc, 'read_source', short)
+    cells = json.loads((EXAMPLES / 'calibration.ipynb').read_text())['cells']
+    names: dict = {}
+    shown = ''
+    for cell in cells:
+        if cell['cell_type'] == 'code':
+            exec(''.join(cell['source']), names)
+            texts = [o['text'] for o in cell['outputs'] if o['output_type'] == 'stream']
+            shown += ''.join(line for text in texts for line in text)
+    said = capsys.readouterr().out
+    assert said.split(':')[0] == 'a' and re.findall('[a-z]+', said) == re.findall('[a-z]+', shown)
+    assert names['reconstruction'].status_counts['OK'] > 700
 
 
 @pytest.mark.long

@@ -36,6 +36,9 @@ _REMEDIES = {
     'textual': 'the dashboard needs it: pip install textual',
 }
 
+# Modules that a user knows as a command.
+COMMANDS = {'watch': 'fluoro-calib watch'}
+
 
 def calibration_node() -> None:
     """Run the calibration node."""
@@ -77,6 +80,11 @@ def simulator_node() -> None:
     _run('nodes.simulator_node')
 
 
+def bridge_node() -> None:
+    """Run the bridge to Foxglove."""
+    _run('nodes.bridge_node')
+
+
 def watch() -> None:
     """Run the dashboard."""
     _run('nodes.dashboard.watch')
@@ -97,6 +105,7 @@ def missing_module_message(program: str, module: str) -> str:
 def _run(module: str) -> None:
     """Import a module and call its main(). An interrupt during the import ends the process."""
     program = module.rpartition('.')[2]
+    program = COMMANDS.get(program, program)
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # the import takes a second: no traceback
     try:
         main = import_module(f'{__package__}.{module}').main

@@ -25,6 +25,7 @@ from ..errors import DataError
 from . import (
     adjust,
     bag,
+    bridge,
     calibrate,
     compare,
     convert,
@@ -60,6 +61,7 @@ COMMANDS = (
     convert,
     bag,
     watch,
+    bridge,
 )
 
 
@@ -143,7 +145,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
             print_note(f'defaults of {rig.path}')
         options.module.run(options)
     except (DataError, OSError) as error:
-        program = styled(f'fluoro-calib {command}'.rstrip() + ':', 'red', sys.stderr)
+        known = command if command in [module.NAME for module in COMMANDS] else ''
+        program = styled(f'fluoro-calib {known}'.rstrip() + ':', 'red', sys.stderr)
         print(f'{program} {error}', file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:

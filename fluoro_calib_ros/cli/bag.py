@@ -148,7 +148,7 @@ def _record(arguments: argparse.Namespace) -> None:
     parameters['folder'] = str(arguments.out.absolute())
     if arguments.topics:
         parameters['topics'] = arguments.topics
-    _become_node('recorder_node', parameters)
+    become_node('recorder_node', parameters)
 
 
 def _play(arguments: argparse.Namespace) -> None:
@@ -159,10 +159,10 @@ def _play(arguments: argparse.Namespace) -> None:
     }
     if arguments.topics:
         parameters['topics'] = arguments.topics
-    _become_node('player_node', parameters)
+    become_node('player_node', parameters)
 
 
-def _become_node(node: str, parameters: Mapping[str, Any]) -> NoReturn:
+def become_node(node: str, parameters: Mapping[str, Any]) -> NoReturn:
     """Replace this process by a node, which gets the signals and gives the exit status."""
     code = f'from fluoro_calib_ros.entry_points import {node}; {node}()'
     words = ['--ros-args']

@@ -1,0 +1,195 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Node that shows the topics of a rig to Foxglove, also on machines without ROS.
+
+Messages are passed on as they are (CDR), with their definitions, by a WebSocket of foxglove-sdk. A
+topic is subscribed only while somebody looks at it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.qos import DurabilityPolicy
+from rclpy.subscription import Subscription
+
+from ..options import option
+from .recorder_node import adapted_qos, type_hash_text
+from .runtime.errors import StartError
+from .runtime.main import run
+from .runtime.message_types import definition_of, installed_type
+from .runtime.parameters import ParameterGroup, ParameterNode
+
+DISCOVERY_S = 0.2  # period in which new topics, and new readers, are looked for
+DEPTH = 10  # messages that wait, of one topic
+
+
+@dataclass(frozen=True)
+class BridgeParameters:
+    """Parameters of the bridge."""
+
+    host: str = option(
+        '127.0.0.1',
+        'address on which it listens: 127.0.0.1 for programs of this machine, 0.0.0.0 for all; '
+        'nobody is asked for a password',
+    )
+    port: int = option(8765, 'port of the WebSocket; 0: any free one', minimum=0, maximum=65535)
+    topics: tuple[str, ...] = option(('',), 'topics to show; empty: all')
+
+
+_NODE = ParameterGroup(BridgeParameters)
+PARAMETERS = (_NODE,)
+
+
+@dataclass
+class _Shown:
+    """A topic that is offered."""
+
+    topic: str
+    kind: type
+    channel: Any
+    subscription: Subscription | None = None
+    last: bytes = b''  # of a latched topic
+
+
+class BridgeNode(ParameterNode):
+    """Offers topics on a WebSocket, and passes messages on to those who subscribe."""
+
+    def __init__(self) -> None:
+        super().__init__('bridge_node')
+        settings = _NODE.declare(self)
+        self._foxglove = _foxglove()
+        self._wanted = {self.resolve_topic_name(topic) for topic in settings.topics if topic}
+        self._shown: dict[str, _Shown] = {}
+        self._passed_over: set[str] = set()
+        self._lock = threading.Lock()
+        self._readers: Counter[str] = Counter()  # by topic; changed by the server's threads
+        self._newcomers: set[str] = set()  # topics with a reader who missed the latched message
+        self._server = self._start_server(settings)
+        self.create_timer(DISCOVERY_S, self._update)
+        self.get_logger().info(
+            f'open ws://{settings.host}:{self._server.port} in Foxglove; the layout is '
+            'config/foxglove.json'
+        )
+
+    def _start_server(self, settings: BridgeParameters) -> Any:
+        """Start the WebSocket server. Raises StartError."""
+        node = self
+
+        class Listener(self._foxglove.ServerListener):  # type: ignore[name-defined,misc]
+            def on_subscribe(self, client: Any, channel: Any) -> None:
+                node._count_reader(channel.topic, 1)
+
+            def on_unsubscribe(self, client: Any, channel: Any) -> None:
+                node._count_reader(channel.topic, -1)
+
+        try:
+            return self._foxglove.start_server(
+                name=f'fluoro_calib_ros {self.get_namespace()}',
+                host=settings.host,
+                port=settings.port,
+                server_listener=Listener(),
+            )
+        except Exception as error:  # of the SDK, which has no common one
+            raise StartError(
+                f'no WebSocket on {settings.host}:{settings.port} ({error}); parameter port '
+                'chooses another'
+            ) from None
+
+    def _count_reader(self, topic: str, change: int) -> None:
+        with self._lock:
+            self._readers[topic] += change
+            if change > 0:
+                self._newcomers.add(topic)
+
+    def _update(self) -> None:
+        """Offer new topics; subscribe to those with readers, and to no others."""
+        self._discover()
+        with self._lock:
+            read = {topic for topic, count in self._readers.items() if count > 0}
+            newcomers = self._newcomers
+            self._newcomers = set()
+        for shown in self._shown.values():
+            if shown.topic in read and shown.subscription is None:
+                self._subscribe(shown)
+            elif shown.topic not in read and shown.subscription is not None:
+                self.destroy_subscription(shown.subscription)
+                shown.subscription = None
+                shown.last = b''
+            elif shown.topic in newcomers and shown.last:
+                shown.channel.log(shown.last)
+
+    def _discover(self) -> None:
+        for topic, types in self.get_topic_names_and_types():
+            known = topic in self._shown or topic in self._passed_over
+            hidden = any(part.startswith('_') for part in topic.split('/'))
+            if known or hidden or (self._wanted and topic not in self._wanted):
+                continue
+            publishers = self.get_publishers_info_by_topic(topic)
+            if not publishers:
+                continue
+            kind = installed_type(types[0]) if len(types) == 1 else None
+            if kind is None:
+                self._passed_over.add(topic)
+                self.get_logger().warning(f'{topic} is not shown: its type is not installed')
+                continue
+            definition = definition_of(types[0], type_hash_text(publishers[0]))
+            schema = self._foxglove.Schema(
+                name=types[0], encoding=definition.encoding, data=definition.text.encode()
+            )
+            channel = self._foxglove.Channel(topic, schema=schema, message_encoding='cdr')
+            self._shown[topic] = _Shown(topic, kind, channel)
+
+    def _subscribe(self, shown: _Shown) -> None:
+        qos = adapted_qos(self.get_publishers_info_by_topic(shown.topic))
+        is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
+        qos.depth = DEPTH
+
+        def on_message(data: bytes) -> None:
+            shown.channel.log(data)
+            if is_latched:
+                shown.last = data
+
+        shown.subscription = self.create_subscription(
+            shown.kind, shown.topic, on_message, qos, raw=True
+        )
+
+    def stop(self) -> None:
+        """Close the WebSocket."""
+        self._server.stop()
+
+
+def _foxglove() -> Any:
+    """Import the SDK. Raises StartError where it is not installed."""
+    try:
+        import foxglove
+    except ImportError:
+        raise StartError(
+            'the bridge needs foxglove-sdk, which is not installed: pip install foxglove-sdk'
+        ) from None
+    return foxglove
+
+
+def main(args: Sequence[str] | None = None) -> None:
+    """Run the node."""
+    run(BridgeNode, args)
+
+
+if __name__ == '__main__':
+    main()

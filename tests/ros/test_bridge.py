@@ -1,0 +1,71 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The bridge: what Foxglove receives by its WebSocket protocol."""
+
+import asyncio
+import json
+import re
+import struct
+from importlib.util import find_spec
+
+import pytest
+from fluoro_calib_msgs.msg import CalibrationStatus
+from rclpy.serialization import deserialize_message
+from ros_graph import NAMES, Process, entry_point
+
+INSTALLED = bool(find_spec('foxglove') and find_spec('websockets'))
+
+
+@pytest.mark.skipif(bool(find_spec('foxglove')), reason='foxglove-sdk is installed')
+def test_without_the_sdk_it_says_what_to_install(tmp_path, ros):
+    node = Process(entry_point('bridge_node'), tmp_path / 'log')
+    assert node.wait() == 1
+    assert 'pip install foxglove-sdk' in node.log and 'Traceback' not in node.log
+
+
+@pytest.mark.skipif(not INSTALLED, reason='foxglove-sdk and websockets are not installed')
+def test_foxglove_receives_the_messages_with_their_definition(graph, tmp_path):
+    from websockets.asyncio.client import connect
+
+    graph.calibration_node(tmp_path / 'out')
+    bridge = graph.start('bridge_node', {'port': 0})
+    topic = f'{graph.namespace}/a/calibration_status'
+    client = graph.client
+    port = client.wait_until(lambda: re.search(r'ws://127.0.0.1:(\d+)', bridge.log))[1]
+
+    async def foxglove():
+        async with connect(
+            f'ws://127.0.0.1:{port}', subprotocols=['foxglove.sdk.v1'], max_size=None
+        ) as socket:
+            while True:
+                message = await asyncio.wait_for(socket.recv(), 60)
+                if isinstance(message, bytes):
+                    return message
+                document = json.loads(message)
+                for channel in document.get('channels', ()):
+                    if channel['topic'] == topic:
+                        offered.append(channel)
+                        wanted = [{'id': 7, 'channelId': channel['id']}]
+                        await socket.send(json.dumps({'op': 'subscribe', 'subscriptions': wanted}))
+
+    offered = []
+    data = asyncio.run(foxglove())
+    assert data[0] == 1 and struct.unpack_from('<I', data, 1)[0] == 7
+    status = deserialize_message(data[13:], CalibrationStatus)
+    assert status.fluoroscope in NAMES and status.exposures == 0
+    (channel,) = offered
+    assert channel['encoding'] == 'cdr' and channel['schemaEncoding'] == 'ros2msg'
+    assert channel['schemaName'] == 'fluoro_calib_msgs/msg/CalibrationStatus'
+    assert 'float64 coverage' in channel['schema']

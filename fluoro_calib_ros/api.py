@@ -42,6 +42,8 @@ from .files.rig_orientation import load_orientation, save_orientation
 from .jobs.adjustment import adjust
 from .jobs.calibration import CalibrationOutcome, run_calibration
 from .jobs.conversion import ConversionRequest, convert
+from .jobs.extraction import ExtractionOutcome, ExtractionRequest
+from .jobs.extraction import run_extraction as extract
 from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
 from .jobs.result_folder import save_outcome, save_result
@@ -67,6 +69,8 @@ __all__ = [
     'ConversionRequest',
     'CorrectedPoints',
     'DataError',
+    'ExtractionOutcome',
+    'ExtractionRequest',
     'FileSettings',
     'FluoroscopeCalibration',
     'Frame',
@@ -87,6 +91,7 @@ __all__ = [
     'calibrate_with_known_orientations',
     'convert',
     'correct',
+    'extract',
     'load_orientation',
     'orient',
     'read_calibrations',

@@ -159,7 +159,7 @@ def extract_beads(
         if followed is not None:
             return followed
     detections = detect_beads(image)
-    seen = Seen.of(detections.uv, detections.field, detections.radius_px)
+    seen = _seen(detections)
     found = match(seen, model, lens)
     noise = estimate_noise(detections.light, detections.field)
     return _measured(detections, seen, found, model, _Imaging(noise))
@@ -171,7 +171,7 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
         detections = detect_beads(image, near.radius_px, near.inverted)
         if image.shape != near.view.lens.image_size[::-1]:
             return None
-        seen = Seen.of(detections.uv, detections.field, detections.radius_px)
+        seen = _seen(detections)
         found = follow(seen, model, near.view, near.scale_px)
         if found is None:
             return None
@@ -180,6 +180,10 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
     except DataError:
         return None
     return replace(followed, followed=True)
+
+
+def _seen(detections: Detections) -> Seen:
+    return Seen.of(detections.uv, detections.field, detections.radius_px, detections.strength)
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,8 @@ class Seen:
         Of a bead: two closer than this may be found as one.
     tolerance_px : float
         Largest distance from a prediction at which a bead is matched while the pose grows.
+    strength : (n,) ndarray or None
+        Response to each bead, which increases with its size.
     """
 
     uv: np.ndarray
@@ -58,13 +60,21 @@ class Seen:
     field: np.ndarray
     radius_px: float
     tolerance_px: float
+    strength: np.ndarray | None = None
 
     @classmethod
-    def of(cls, uv: np.ndarray, field: np.ndarray, radius_px: float) -> Seen:
+    def of(
+        cls,
+        uv: np.ndarray,
+        field: np.ndarray,
+        radius_px: float,
+        strength: np.ndarray | None = None,
+    ) -> Seen:
         """Return what was found, with a tolerance from the distances between beads."""
         tree = cKDTree(uv)
         distance = tree.query(uv, k=[min(4, len(uv))])[0][:, 0]
-        return cls(uv, tree, field, radius_px, float(np.clip(0.2 * np.median(distance), 2.5, 6)))
+        tolerance = float(np.clip(0.2 * np.median(distance), 2.5, 6))
+        return cls(uv, tree, field, radius_px, tolerance, strength)
 
     def in_field(self, uv: np.ndarray) -> np.ndarray:
         """Return (n,) whether pixels (n, 2) lie in the field; NaN does not."""

@@ -46,10 +46,11 @@ MARGIN = 0.06
 MARGIN_BEADS = 8
 # Levels of the search: neighbours of a bead in the phantom, in the image, beads tried, and limits
 # of the scale by the extent of what is seen. The first finds most poses, the second and third find
-# those that see all faces of a phantom from the edge, the last a small part of a phantom.
+# those that see all faces of a phantom from the edge, or a phantom with other things around it, the
+# last a small part of a phantom.
 LEVELS = (
     (8, 6, 8, (0.85, 1.4)),
-    (8, 6, 72, (0.85, 1.4)),
+    (8, 6, 72, (0.6, 1.4)),
     (14, 8, 12, (0.85, 1.4)),
     (8, 6, 6, (0.7, 3.0)),
 )
@@ -58,6 +59,9 @@ APART = 0.6  # share of the beads, those farthest from their neighbours, that ar
 AGREED = 3  # matches of the same pose after which the search ends, if it is evident
 CLIMBS = 12  # from a match to a better one by a symmetry
 RIVAL_STEPS = 3
+MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
+SIZE_MARGIN = 10.0  # log-likelihood by which sizes must prefer a pose
+SIZE_TAIL = 6.0
 SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
 SYMMETRY_REACH = 0.3  # of the distance between neighbours
 SHIFTS = 6  # to neighbours, as candidates of symmetries
@@ -204,16 +208,44 @@ def _unambiguous(best: Match, seen: Seen, model: PhantomModel) -> Match:
     if model.regular:
         return best
     first, rivals = _climbed(best, seen, model)
-    for rival in rivals:
-        if _same(rival, first):
-            continue
-        if rival.score > first.score - max(MARGIN_BEADS, MARGIN * first.score):
-            raise DataError(
-                'the pose is ambiguous: the phantom fits nearly as well in another one '
-                f'({len(rival.bead)} beads instead of {len(first.bead)}); mark it by beads that '
-                'break its symmetry'
-            )
-    return first
+    limit = first.score - max(MARGIN_BEADS, MARGIN * first.score)
+    equal = [one for one in rivals if one.score > limit and not _same(one, first)]
+    if not equal:
+        return first
+    by_size = _best_by_size([first, *equal], seen, model)
+    if by_size is None:
+        raise DataError(
+            'the pose is ambiguous: the phantom fits nearly as well in another one '
+            f'({len(equal[0].bead)} beads instead of {len(first.bead)}); mark it by beads that '
+            'break its symmetry'
+        )
+    return by_size
+
+
+def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Match | None:
+    """Return the match in which beads are seen as large as they are; None where none stands out.
+
+    The logarithm of the response to a bead is linear in that of the size of its shadow. Matches
+    are compared by the likelihood of the residuals from that line.
+    """
+    diameter = model.diameter_mm
+    if seen.strength is None or diameter is None or np.ptp(diameter) < MIN_SIZES * diameter.min():
+        return None
+    likelihoods = []
+    for one in matches:
+        size = np.log(diameter[one.bead] / np.abs(one.view.depth(model.xyz[one.bead])))
+        response = np.log(np.maximum(seen.strength[one.detection], 1e-3))
+        x = size - size.mean()
+        slope = max(float(x @ response / max(x @ x, 1e-12)), 0.0)
+        residual = response - np.median(response - slope * x) - slope * x
+        spread = 1.4826 * float(np.median(np.abs(residual)))
+        # Beads that overlap or are cut off have any response.
+        squared = np.minimum(residual**2, (SIZE_TAIL * spread) ** 2)
+        likelihoods.append(-0.5 * len(x) * np.log(max(float(squared.mean()), 1e-12)))
+    order = np.argsort(likelihoods)
+    if likelihoods[order[-1]] - likelihoods[order[-2]] < SIZE_MARGIN:
+        return None
+    return matches[order[-1]]
 
 
 def _climbed(best: Match, seen: Seen, model: PhantomModel) -> tuple[Match, list[Match]]:

@@ -185,6 +185,28 @@ def test_the_pose_of_a_regular_phantom_is_refused():
     assert len(found.bead) > 60
 
 
+def regular_cube(large: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """64 beads in four layers, of 2 mm but for some of 3 mm."""
+    axis = np.arange(4) * 40.0 - 60
+    cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    diameter = np.full(64, 2.0)
+    diameter[large] = 3.0
+    return cube, diameter
+
+
+def test_reference_beads_of_another_size_tell_the_sides_of_a_regular_cube():
+    cube, diameter = regular_cube([0, 5, 23, 61])
+    radiography = Radiography(rig().fluoroscopes[0], replace(HARD, bits=16))
+    pose = (matrix_from_vector([0.5, 0.3, 0.2]), np.zeros(3))
+    image = radiography.image(cube, pose, 3, diameter)
+    found = extract_beads(image, PhantomModel.of(cube, diameter), LENS)
+    true = radiography.centres(cube, pose)
+    assert np.abs(found.uv - true[found.bead]).max() < 1.0
+    assert len(found.bead) > 50
+    with pytest.raises(DataError, match='ambiguous'):
+        extract_beads(image, PhantomModel.of(cube), LENS)
+
+
 def small_phantom(seed: int) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-90, 90, (80, 3))
 

@@ -238,25 +238,43 @@ class MarkerRadiography(Radiography):
     def take(self, frame: int) -> MarkerImage:
         """Take the radiograph of an image number; the same number gives the same image."""
         rng = np.random.default_rng([self.seed, 23, frame])
-        scene = self.markers.scene
-        moments = frame + scene.shutter * ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5)
-        points = np.array([self.markers.points_mm(moment) for moment in moments])
-        still = (np.eye(3), np.zeros(3))
-        uv = np.array([self.centres(of_moment, still) for of_moment in points])
-        true = self.centres(self.markers.points_mm(frame), still)
-        light = self._open.copy()
-        if scene.bones:
-            light *= self._bones(self.markers.poses(frame))
-        self._trace(light, points, uv)
-        hidden = self._hide(light, frame, true)
+        light, true, hidden = self._light(frame, np.arange(len(self.markers.target_id)))
         image = self._grey(detected(light, self.settings), rng)
         return MarkerImage(image, true, self.in_field(true, 6.0) & ~hidden)
 
-    def _trace(self, light: np.ndarray, points: np.ndarray, uv: np.ndarray) -> None:
-        """Multiply the light (h, w) by the transmission of markers (moments, n, 3) at uv."""
+    def light(
+        self, frame: int, rows: np.ndarray, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> np.ndarray:
+        """Return the light (h, w) that is expected, 1 in the open beam, of markers in rows (k,).
+
+        They are moved by shift_mm in the rig frame.
+        """
+        light, _, _ = self._light(frame, rows, shift_mm)
+        return detected(light, self.settings)
+
+    def _light(
+        self, frame: int, rows: np.ndarray, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Light (h, w) before the detector, centres (n, 2), and which are hidden (n,)."""
+        scene = self.markers.scene
+        moments = frame + scene.shutter * ((np.arange(MOMENTS) + 0.5) / MOMENTS - 0.5)
+        points = np.array([self.markers.points_mm(moment) for moment in moments])
+        points += np.asarray(shift_mm)
+        still = (np.eye(3), np.zeros(3))
+        uv = np.array([self.centres(of_moment, still) for of_moment in points])
+        true = self.centres(self.markers.points_mm(frame) + np.asarray(shift_mm), still)
+        light = self._open.copy()
+        if scene.bones:
+            light *= self._bones(self.markers.poses(frame))
+        self._trace(light, points[:, rows], uv[:, rows], self.markers.diameter_mm[rows] / 2)
+        return light, true, self._hide(light, frame, true)
+
+    def _trace(
+        self, light: np.ndarray, points: np.ndarray, uv: np.ndarray, radius: np.ndarray
+    ) -> None:
+        """Multiply the light (h, w) by the transmission of markers (moments, k, 3) at uv."""
         fluoroscope = self.fluoroscope
         sensor = (points - fluoroscope.position_mm) @ fluoroscope.rotation.T
-        radius = self.markers.diameter_mm / 2
         reach = radius * fluoroscope.interior[2] / sensor[0, :, 2] * 1.15 + MARGIN_PX
         low = np.floor(uv.min(axis=0) - reach[:, None]).astype(int)
         high = np.ceil(uv.max(axis=0) + reach[:, None]).astype(int) + 1

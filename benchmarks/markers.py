@@ -1,0 +1,336 @@
+"""Following of markers in two views: ids, precision and speed.
+
+    python -m benchmarks.markers --frames 500           all settings, as the table of
+                                                        docs/extraction.md
+    python -m benchmarks.markers --speed                seconds of a core, and where they go
+    python -m benchmarks.markers --picture PATH         an image with its overlay
+
+30 markers in five bones, 1024 x 1024 px, two views with distortion, calibrated from simulated
+exposures of a phantom with noise. Settings of renderer and motion are drawn for every sequence.
+The Cramer-Rao bound is that of the rendered light: its derivatives by the place of a marker,
+against the variance of photons, with unknown depth of the shadow and a background of degree 2, for
+markers that stand alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import pstats
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+from scipy.spatial.distance import cdist
+from threadpoolctl import threadpool_limits
+
+from fluoro_calib_ros.api import calibrate
+from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
+from fluoro_calib_ros.drift.clusters import Cluster
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
+from fluoro_calib_ros.radiographs.marker_overlay import draw_markers
+from fluoro_calib_ros.radiographs.marker_pair import MarkerPair, revise
+from fluoro_calib_ros.radiographs.markers import (
+    FirstMarkers,
+    MarkerFrame,
+    MarkerOptions,
+    MarkerTracker,
+)
+from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.marker_images import (
+    HARD_MARKER_SETTINGS,
+    MARKER_SETTINGS,
+    MarkerImage,
+    MarkerRadiography,
+    MarkerScene,
+    MarkerSequence,
+    MovingMarkers,
+)
+from fluoro_calib_ros.simulation.radiographs import RadiographSettings
+from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+
+FIRST_RIG = 2000  # seeds below are those of development and tests
+FRAMES_OF_A_SEQUENCE = 250
+FALSE_PX = 1.5
+ALONE_PX = 14.0
+BOUND_EVERY = 50
+BOUND_REACH = 7
+STEP_MM = 0.05
+SEED = 100
+GIVEN_SD_PX = 0.5  # of the given places of the first frame
+
+SETS = ('plain', 'usual', 'fast', 'hard')
+
+
+def settings_of(rng: np.random.Generator, kind: str) -> tuple[MarkerScene, RadiographSettings]:
+    """Draw scene and settings of a sequence."""
+    hard = kind == 'hard'
+    settings = replace(
+        HARD_MARKER_SETTINGS if hard else MARKER_SETTINGS,
+        blur_px=rng.uniform(0.6, 1.1),
+        glare=rng.uniform(0.03, 0.2),
+        focal_spot_mm=rng.uniform(0.3, 0.8),
+        round_field=bool(rng.random() < 0.6),
+        inverted=bool(rng.random() < 0.3),
+    )
+    scene = MarkerScene(
+        speed_mm={'plain': 0.3, 'fast': 2.5}.get(kind, 1.0) * rng.uniform(0.8, 1.2),
+        hidden=0.0 if kind == 'plain' else 0.05,
+        bones=kind != 'plain',
+        attenuation=rng.uniform(5.0, 9.0),
+        shutter=rng.uniform(0.2, 0.5),
+    )
+    return scene, settings
+
+
+@dataclass
+class Record:
+    """What was counted and measured."""
+
+    frames: int = 0
+    seen: int = 0
+    measured: int = 0
+    doubtful: int = 0
+    wrong: int = 0
+    unsaid: int = 0
+    wrong_frames: int = 0
+    met: int = 0
+    error: list[np.ndarray] = field(default_factory=list)
+    sigma: list[np.ndarray] = field(default_factory=list)
+    free: list[np.ndarray] = field(default_factory=list)
+    bound: list[np.ndarray] = field(default_factory=list)
+
+    def add(self, found: MarkerFrame, ids: np.ndarray, image: MarkerImage) -> None:
+        """Compare the markers of an image with the truth."""
+        row = np.searchsorted(ids, found.target_id)
+        away = found.uv - image.uv[row]
+        wrong = np.linalg.norm(away, axis=1) > FALSE_PX
+        apart = cdist(image.uv, image.uv)
+        np.fill_diagonal(apart, np.inf)
+        alone = apart.min(axis=1) > ALONE_PX
+        self.frames += 1
+        self.seen += int(image.seen.sum())
+        self.measured += int(image.seen[row].sum())
+        self.doubtful += int(found.doubtful.sum())
+        self.wrong += int(wrong.sum())
+        self.unsaid += int((wrong & ~found.doubtful).sum())
+        self.wrong_frames += bool((wrong & ~found.doubtful).any())
+        self.met += int((apart.min(axis=1) < 4).sum())
+        self.error.append(away[~wrong])
+        self.sigma.append(found.sigma[~wrong])
+        self.free.append((alone & image.seen)[row][~wrong])
+
+    def line(self, kind: str) -> str:
+        """Return a row of the table."""
+        error = np.concatenate(self.error)
+        sigma = np.concatenate(self.sigma)
+        free = np.concatenate(self.free)
+        rmse = float(np.sqrt(np.mean(error[free] ** 2)))
+        scatter = float(np.median(np.abs(error[free]))) / 0.6745
+        normalised = float(np.median(np.abs(error / sigma[:, None])[free])) / 0.6745
+        spread = float(np.sqrt(np.mean((error / sigma[:, None])[free] ** 2)))
+        together = float(np.median(np.abs(error / sigma[:, None])[~free])) / 0.6745
+        bound = float(np.sqrt(np.mean(np.concatenate(self.bound) ** 2))) if self.bound else np.nan
+        return (
+            f'{kind}: images {self.frames}, markers {self.seen}, within 4 px of another '
+            f'{self.met / self.seen:.1%}, measured {self.measured / self.seen:.2%}, doubtful '
+            f'{self.doubtful / self.seen:.2%}, wrong {self.wrong}, of them unsaid {self.unsaid} '
+            f'(in {self.wrong_frames} images), RMSE {rmse:.4f}, by the median {scatter:.4f}, '
+            f'bound {bound:.4f}, normalised {normalised:.2f} (RMS {spread:.2f}), not free '
+            f'{together:.2f}, bias {error[free].mean(axis=0).round(4).tolist()}'
+        )
+
+
+def bounds(radiography: MarkerRadiography, frame: int, true: np.ndarray) -> np.ndarray:
+    """Cramer-Rao bounds (n,) of a coordinate [px] of markers at true (n, 2), NaN if not alone."""
+    every = np.arange(len(true))
+    fluoroscope = radiography.fluoroscope
+    light = radiography.light(frame, every)
+    without = radiography.light(frame, every[:0])
+    slopes = []
+    still = (np.eye(3), np.zeros(3))
+    points = radiography.markers.points_mm(frame)
+    for axis in fluoroscope.rotation[:2]:
+        step = STEP_MM * axis
+        ahead = radiography.light(frame, every, tuple(step))
+        behind = radiography.light(frame, every, tuple(-step))
+        moved = radiography.centres(points + step, still) - radiography.centres(
+            points - step, still
+        )
+        slopes.append((ahead - behind, moved))
+    reach = np.arange(-BOUND_REACH, BOUND_REACH + 1)
+    x, y = (part.ravel() / BOUND_REACH for part in np.meshgrid(reach, reach))
+    basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
+    apart = cdist(true, true)
+    np.fill_diagonal(apart, np.inf)
+    out = np.full(len(true), np.nan)
+    for number in np.flatnonzero(apart.min(axis=1) > ALONE_PX):
+        u, v = np.rint(true[number]).astype(int)
+        part = np.s_[v - BOUND_REACH : v + BOUND_REACH + 1, u - BOUND_REACH : u + BOUND_REACH + 1]
+        if light[part].shape != (len(reach),) * 2:
+            continue
+        here = light[part].ravel()
+        by_axis = np.stack([slope[part].ravel() for slope, _ in slopes])
+        moved = np.stack([moved[number] for _, moved in slopes])
+        by_place = np.linalg.solve(moved, by_axis)
+        rows = np.concatenate([by_place, [here - without[part].ravel()], basis * here])
+        weight = radiography.settings.photons / np.maximum(here, 1e-6)
+        covariance = np.linalg.inv((rows * weight) @ rows.T)
+        out[number] = np.sqrt(0.5 * (covariance[0, 0] + covariance[1, 1]))
+    return out
+
+
+def calibrated(
+    seed: int,
+) -> tuple[VirtualRig, Mapping[str, FluoroscopeCalibration], RigOrientation]:
+    """A rig, and its joint calibration from 15 simulated exposures of each fluoroscope."""
+    rig = virtual_rig(seed)
+    outcome = calibrate(simulate_exposures(rig, 15, seed).frames, rig.phantom, joint=True)
+    assert outcome.orientation is not None
+    return rig, outcome.calibrations, outcome.orientation
+
+
+def first_markers(rng: np.random.Generator, ids: np.ndarray, image: MarkerImage) -> FirstMarkers:
+    """Markers of the first image, given with an error."""
+    uv = image.uv[image.seen]
+    return FirstMarkers(ids[image.seen], uv + rng.normal(0, GIVEN_SD_PX, uv.shape))
+
+
+def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
+    """Follow a sequence; returns what was true live, and after later decisions."""
+    rng = np.random.default_rng([SEED, number, SETS.index(kind)])
+    scene, settings = settings_of(rng, kind)
+    rig, calibrations, orientation = calibrated(FIRST_RIG + 10 * number + SETS.index(kind))
+    markers = MovingMarkers(scene, SEED + 10 * number + SETS.index(kind))
+    sequence = MarkerSequence(rig, markers, settings, frames, SEED + number)
+    ids = markers.target_id
+    clusters = [
+        Cluster(f'bone {cluster}', tuple(ids[markers.cluster == cluster].tolist()))
+        for cluster in range(scene.clusters)
+    ]
+    options = MarkerOptions(shutter=scene.shutter)
+    live = Record()
+    final = Record()
+    views: dict[str, list[MarkerFrame]] = {'a': [], 'b': []}
+    truth: dict[str, list[MarkerImage]] = {'a': [], 'b': []}
+    follower: MarkerPair | None = None
+    with threadpool_limits(1):
+        for exposure, images in enumerate(sequence, 1):
+            if follower is None:
+                first = {name: first_markers(rng, ids, image) for name, image in images.items()}
+                follower = MarkerPair(
+                    calibrations, orientation, options, first=first, clusters=clusters
+                )
+            found = follower.update({n: image.image for n, image in images.items()}, exposure)
+            for name, image in images.items():
+                views[name].append(found.views[name])
+                truth[name].append(replace(image, image=np.zeros(0)))
+                live.add(found.views[name], ids, image)
+            for decision in found.decisions:
+                of_view = views[decision.fluoroscope]
+                for index in range(decision.since - 1, exposure - 1):
+                    of_view[index] = revise(of_view[index], decision)
+    for name in views:
+        for view, image in zip(views[name], truth[name]):
+            final.add(view, ids, image)
+    for fluoroscope in rig.fluoroscopes:
+        radiography = MarkerRadiography(fluoroscope, markers, settings, frames, SEED + number)
+        for exposure in range(BOUND_EVERY, frames + 1, BOUND_EVERY):
+            image = truth[fluoroscope.name][exposure - 1]
+            found_bounds = bounds(radiography, exposure, image.uv)
+            good = np.isfinite(found_bounds) & image.seen
+            live.bound.append(found_bounds[good])
+            final.bound.append(found_bounds[good])
+    return live, final
+
+
+def joined(records: list[Record]) -> Record:
+    """Return the sum of records."""
+    out = Record()
+    for record in records:
+        for name, value in vars(record).items():
+            setattr(out, name, getattr(out, name) + value)
+    return out
+
+
+def measure_speed(frames: int = 80) -> None:
+    """Print the seconds of a core that an image takes, and what they are spent on."""
+    rig = virtual_rig(FIRST_RIG)
+    markers = MovingMarkers(MarkerScene(), SEED)
+    radiography = MarkerRadiography(rig.fluoroscopes[0], markers, MARKER_SETTINGS, frames, SEED)
+    images = [radiography.take(frame) for frame in range(1, frames + 1)]
+    rng = np.random.default_rng(SEED)
+    first = first_markers(rng, markers.target_id, images[0])
+    options = MarkerOptions(shutter=markers.scene.shutter)
+    with threadpool_limits(1):
+        for profiled in (False, True):
+            tracker = MarkerTracker(options, first=first)
+            profile = cProfile.Profile()
+            times = []
+            for frame, image in enumerate(images, 1):
+                if profiled and frame == 2:
+                    profile.enable()
+                began = time.process_time()
+                tracker.update(image.image, frame)
+                times.append(time.process_time() - began)
+            profile.disable()
+            if not profiled:
+                later = np.array(times[1:]) * 1e3
+                print(
+                    f'{len(first.target_id)} markers: first image {times[0] * 1e3:.0f} ms, others '
+                    f'{np.median(later):.1f} ms of a core (95 %: {np.percentile(later, 95):.1f})'
+                )
+    pstats.Stats(profile).sort_stats('cumulative').print_stats(25)
+
+
+def draw(path: Path) -> None:
+    """Write an image with its overlay."""
+    rig = virtual_rig(FIRST_RIG)
+    markers = MovingMarkers(MarkerScene(), SEED + 1)
+    radiography = MarkerRadiography(rig.fluoroscopes[0], markers, HARD_MARKER_SETTINGS, 60, SEED)
+    tracker: MarkerTracker | None = None
+    for frame in range(1, 41):
+        image = radiography.take(frame)
+        if tracker is None:
+            first = FirstMarkers(markers.target_id[image.seen], image.uv[image.seen])
+            tracker = MarkerTracker(MarkerOptions(shutter=0.4), first=first)
+        found = tracker.update(image.image, frame)
+    low = np.maximum(image.uv.min(axis=0).astype(int) - 25, 0)
+    high = image.uv.max(axis=0).astype(int) + 40
+    part = np.s_[low[1] : high[1], low[0] : high[0]]
+    picture = draw_markers(image.image, found)[part]
+    plain = cv2.cvtColor(cv2.convertScaleAbs(image.image), cv2.COLOR_GRAY2BGR)[part]
+    cv2.imwrite(str(path), np.hstack([plain, picture]))
+
+
+def main() -> None:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument('--frames', type=int, default=0, metavar='N', help='exposures of a set')
+    parser.add_argument('--sets', nargs='+', default=SETS, choices=SETS)
+    parser.add_argument('--speed', action='store_true')
+    parser.add_argument('--picture', type=Path)
+    arguments = parser.parse_args()
+    cv2.setNumThreads(1)
+    if arguments.frames:
+        for kind in arguments.sets:
+            records = []
+            for number, start in enumerate(range(0, arguments.frames, FRAMES_OF_A_SEQUENCE)):
+                frames = min(FRAMES_OF_A_SEQUENCE, arguments.frames - start)
+                records.append(follow(kind, number, frames))
+                print('   ', records[-1][1].line(f'{kind} {number}'), flush=True)
+            print(joined([live for live, _ in records]).line(f'{kind}, live'), flush=True)
+            print(joined([final for _, final in records]).line(f'{kind}, revised'), flush=True)
+    if arguments.speed:
+        measure_speed()
+    if arguments.picture:
+        draw(arguments.picture)
+
+
+if __name__ == '__main__':
+    main()

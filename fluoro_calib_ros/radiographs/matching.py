@@ -45,9 +45,9 @@ SURE = ((0.85, 0.4), (0.75, 0.95))
 MARGIN = 0.06
 MARGIN_BEADS = 8
 # Levels of the search: neighbours of a bead in the phantom, in the image, beads tried, and limits
-# of the scale by the extent of what is seen. The first finds most poses, the second and third find
-# those that see all faces of a phantom from the edge, or a phantom with other things around it, the
-# last a small part of a phantom.
+# of the scale by the extent of what is seen. The first finds most poses. The second and third find
+# those that see all faces of a phantom from the edge, or other things around the phantom, the last
+# finds a small part of a phantom.
 LEVELS = (
     (8, 6, 8, (0.85, 1.4)),
     (8, 6, 72, (0.6, 1.4)),

@@ -142,6 +142,47 @@ def test_images_without_the_phantom_give_one_sentence(folder, capsys, image, sen
     assert (folder / 'out.csv').read_text() == 'earlier'
 
 
+def moved(frame: int) -> tuple[np.ndarray, np.ndarray]:
+    """An image of a video: the phantom turns and shifts between them."""
+    rotation = matrix_from_vector([0.3, 0.2 + 0.01 * frame, -0.1])
+    x = beads() @ rotation.T + (2.0 * frame - 10, 0, 900)
+    uv = 1600 * x[:, :2] / x[:, 2:] + (SIZE - 1) / 2
+    return bead_image(uv, (SIZE, SIZE), np.uint8, 2.0, 0.6, 0.01, frame), uv
+
+
+def test_a_phantom_is_followed_through_a_video(folder, capsys):
+    path = folder / 'video.avi'
+    codec = cv2.VideoWriter_fourcc(*'FFV1')
+    video = cv2.VideoWriter(str(path), codec, 30.0, (SIZE, SIZE), isColor=False)
+    for frame in range(14):
+        video.write(moved(frame)[0])
+    video.release()
+    extract(folder, 'video.avi', '--json')
+    exposures = json.loads(capsys.readouterr().out)['exposures']
+    assert [e['followed'] for e in exposures] == [n not in (0, 12) for n in range(14)]
+    frames = read_observations_csv(folder / 'out.csv', (SIZE, SIZE))['a']
+    assert [frame.number for frame in frames] == list(range(1, 15))
+    for frame in frames:
+        error = frame.uv - moved(frame.number - 1)[1][frame.target_id - 1]
+        assert np.abs(error).max() < 1.0 and len(error) > 40
+
+
+@pytest.mark.parametrize('shift_mm', [60.0, 95.0, 130.0])
+def test_a_phantom_partly_out_of_view_gives_no_wrong_observation(folder, shift_mm):
+    x = beads() @ matrix_from_vector([0.4, -0.3, 0.2]).T + (shift_mm, 30.0, 900)
+    uv = 1600 * x[:, :2] / x[:, 2:] + (SIZE - 1) / 2
+    cv2.imwrite(str(folder / 'half.png'), bead_image(uv, (SIZE, SIZE), np.uint8, 2.0, 0.6, 0.01))
+    inside = ((uv > 8) & (uv < SIZE - 8)).all(axis=1)
+    try:
+        extract(folder, 'half.png')
+    except SystemExit:
+        assert inside.sum() < 30
+        return
+    (frame,) = read_observations_csv(folder / 'out.csv', (SIZE, SIZE))['a']
+    assert np.abs(frame.uv - uv[frame.target_id - 1]).max() < 1.0
+    assert len(frame.uv) > 0.7 * inside.sum()
+
+
 def test_a_wrong_principal_distance_gives_no_wrong_observation(folder):
     extract(folder, 'a', '--principal-distance', '1760')
     for frame in read_observations_csv(folder / 'out.csv', (SIZE, SIZE))['a']:

@@ -83,6 +83,13 @@ def test_findings_follow_the_verdict():
     assert text.index('fail') < text.index('the residuals have a trend')
 
 
+def test_brackets_are_shown_and_control_characters_are_not():
+    message = 'fluoroscopes [a, b]: [/x] \x1b[2Jgone'
+    state = replace(STATE, nodes=(NodeState('calibration_node', 'warn', message),))
+    text = text_of(session_text(state))
+    assert '[a, b]: [/x]' in text and '\x1b[2J' not in text
+
+
 def test_without_nodes_it_says_for_what_it_waits():
     assert 'waiting for a calibration node' in text_of(session_text(SessionState()))
 

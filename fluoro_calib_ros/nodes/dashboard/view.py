@@ -54,10 +54,20 @@ def session_text(state: SessionState) -> Group:
     )
 
 
+def plain(text: str) -> str:
+    """Return a text without control characters: a message of any peer must not rule a terminal."""
+    return ''.join(c if c.isprintable() else ' ' for c in text)
+
+
+def _cell(text: str | Text) -> Text:
+    """Return a cell of a table, in which brackets are no markup."""
+    return text if isinstance(text, Text) else Text(plain(text))
+
+
 def _title(state: SessionState) -> list[Text]:
-    title = Text(f'fluoro_calib  {state.namespace}', style='bold')
+    title = Text(plain(f'fluoro_calib  {state.namespace}'), style='bold')
     if state.job:
-        title.append(f'   {state.job}', style='cyan')
+        title.append(plain(f'   {state.job}'), style='cyan')
     return [title, Text()]
 
 
@@ -68,18 +78,18 @@ def _fluoroscopes(state: SessionState) -> Table | Text:
     table = _table()
     table.add_column('fluoroscope', style='dim')
     for fluoroscope in state.fluoroscopes:
-        table.add_column(fluoroscope.name, style='default')
+        table.add_column(Text(plain(fluoroscope.name)), style='default')
     rows: list[tuple[str, Callable[[FluoroscopeState], str | Text]]] = [
         ('state', lambda f: _coloured(f.state)),
         ('frames', _frames),
         ('exposures', lambda f: str(f.exposures) if f.state else '-'),
         ('coverage', _coverage),
-        ('next pose', lambda f: Text(f.next_pose, style='green' if f.ready else 'default')),
+        ('next pose', lambda f: Text(plain(f.next_pose), style='green' if f.ready else 'default')),
         ('calibration', _calibration),
         ('corrected', _corrected),
     ]
     for label, cell in rows:
-        table.add_row(label, *(cell(fluoroscope) for fluoroscope in state.fluoroscopes))
+        table.add_row(label, *(_cell(cell(each)) for each in state.fluoroscopes))
     return table
 
 
@@ -119,7 +129,7 @@ def _nodes(state: SessionState) -> Table:
     table.add_column('state', no_wrap=True)
     table.add_column('')
     for node in state.nodes:
-        table.add_row(node.name, _coloured(node.level), node.message)
+        table.add_row(_cell(node.name), _coloured(node.level), _cell(node.message))
     if not state.nodes:
         table.add_row('none', '', '')
     return table
@@ -133,12 +143,12 @@ def _results(state: SessionState) -> Table:
     if not math.isnan(state.points_latency_ms[0]):
         points += f'  {_latency(*state.points_latency_ms)}'
     table.add_row('points in space', points)
-    table.add_row('orientation', state.orientation or 'none yet')
+    table.add_row('orientation', _cell(state.orientation or 'none yet'))
     table.add_row('drift', _coloured(state.drift_level, state.drift or '-'))
     verdict = _coloured(state.verdict, state.verdict or 'no calibration of this session yet')
     table.add_row('verdict', verdict)
     for finding in state.findings:
-        table.add_row('', finding)
+        table.add_row('', _cell(finding))
     return table
 
 
@@ -147,7 +157,7 @@ def _table(header: bool = True) -> Table:
 
 
 def _coloured(key: str, text: str | None = None) -> Text:
-    return Text(key or '-' if text is None else text, style=COLOURS.get(key, 'default'))
+    return Text(plain(key or '-' if text is None else text), style=COLOURS.get(key, 'default'))
 
 
 def _rate(hz: float) -> str:
@@ -208,7 +218,7 @@ class Dashboard(App[None]):
         if self._note and time.monotonic() > self._confirm_until:
             self._note = ''
         lines = [*state.log, *([self._note] if self._note else [])]
-        self.query_one('#log', Static).update(Text('\n'.join(lines[-LOG_LINES:])))
+        self.query_one('#log', Static).update(Text('\n'.join(map(plain, lines[-LOG_LINES:]))))
 
     def action_ask(self, request: str) -> None:
         """Ask the session for something."""

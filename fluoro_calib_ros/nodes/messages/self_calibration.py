@@ -65,10 +65,11 @@ def fill_feedback(feedback: SelfCalibrate.Feedback, label: str, last: Round) -> 
 
 def feedback_text(feedback: SelfCalibrate.Feedback) -> str:
     """Return the feedback of a round in one line, for people."""
+    neighbours = f'k {feedback.k:3d}  ' if feedback.k else ''
     return (
         f'fluoroscope {feedback.fluoroscope}  round {feedback.iteration:2d}  '
         f'F {feedback.cost_adjustment:10.1f}  G {feedback.cost_regression:10.1f}  '
-        f'k {feedback.k:3d}  RMSE {feedback.rmse_u:.3f} {feedback.rmse_v:.3f} px'
+        f'{neighbours}RMSE {feedback.rmse_u:.3f} {feedback.rmse_v:.3f} px'
     )
 
 

@@ -1,0 +1,71 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""--help of the nodes, and parameters that they do not have."""
+
+import importlib
+import subprocess
+import sys
+from types import SimpleNamespace
+
+import pytest
+
+from fluoro_calib_ros.nodes.runtime.node_help import asks_for_help, help_text
+from fluoro_calib_ros.nodes.runtime.parameters import parameters_of, unknown_parameters
+
+NODES = (
+    'bridge_node',
+    'calibration_node',
+    'correction_node',
+    'image_node',
+    'player_node',
+    'reconstruction_node',
+    'recorder_node',
+    'simulator_node',
+)
+
+
+@pytest.mark.parametrize('name', NODES)
+def test_help_names_task_and_every_parameter(name):
+    module = importlib.import_module(f'fluoro_calib_ros.nodes.{name}')
+    text = help_text(module)
+    assert text.startswith(f'usage: {name} ') and '\nNode that ' in text
+    for parameter, declaration in parameters_of(module.PARAMETERS).items():
+        assert f'\n  {parameter}' in text and declaration.description.split()[0] in text
+
+
+def test_help_is_asked_for_in_front_of_the_arguments_of_ros():
+    assert asks_for_help(['--help']) and asks_for_help(['-h', '--ros-args'])
+    assert not asks_for_help(['--ros-args', '-p', 'x:=--help', '--help'])
+
+
+def test_help_is_printed_without_starting_a_node():
+    command = [sys.executable, '-m', 'fluoro_calib_ros.nodes.correction_node', '--help']
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0 and done.stdout.startswith('usage: correction_node ')
+    assert done.stderr == ''
+
+
+def test_unknown_parameters_are_told_with_what_was_meant():
+    given = dict.fromkeys(('phantm', 'collect', 'zzz', 'use_sim_time', 'qos_overrides./a.x'))
+    known = {'phantom': None, 'collect': None}
+    node = SimpleNamespace(
+        _parameter_overrides=given,
+        has_parameter=known.__contains__,
+        get_parameters_by_prefix=lambda prefix: known,
+    )
+    assert unknown_parameters(node) == [
+        'there is no parameter phantm, it has no effect; did you mean phantom?',
+        'there is no parameter zzz, it has no effect; --help lists the parameters',
+    ]

@@ -59,6 +59,8 @@ class LiveObservations:
         Shares of the expected targets that are found, and of what is found that is expected.
     followed : bool
         Whether the image before gave the start.
+    doubtful : int
+        Targets whose id may be wrong.
     picture : (h, w, 3) ndarray or None
         Overlay of uint8, blue, green, red, if it was asked for.
     seconds : float
@@ -74,6 +76,7 @@ class LiveObservations:
     found: float = 0.0
     explained: float = 0.0
     followed: bool = False
+    doubtful: int = 0
     picture: np.ndarray | None = None
     seconds: float = 0.0
 

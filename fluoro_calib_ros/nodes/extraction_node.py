@@ -25,6 +25,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 from fluoro_calib_msgs.msg import TargetObservations
@@ -41,9 +42,11 @@ from ..jobs.live_extraction import (
     PhantomSettings,
     extraction_process,
 )
+from ..jobs.live_markers import MarkerSettings
 from ..jobs.service_process import ServiceProcess
-from ..jobs.sources import read_survey
+from ..jobs.sources import read_source, read_survey
 from ..options import option
+from ..radiographs.markers import FirstMarkers, MarkerOptions
 from .image_node import INPUTS
 from .messages.fields import NS_PER_S
 from .messages.image import (
@@ -66,7 +69,8 @@ from .runtime.stall import StallDetector
 from .runtime.stream_reader import FaultHandlers
 
 OVERLAY = 'image_overlay'
-MODES = ('phantom',)
+MODES = ('phantom', 'markers')
+LARGEST_PX = 2**14  # of an image, for points whose image is not known yet
 
 
 @dataclass(frozen=True)
@@ -79,6 +83,12 @@ class ExtractionParameters(ManagedParameters):
         'file phantom.csv with the surveyed coordinates of the beads, and with a column diameter '
         'where their sizes differ',
         unit='mm',
+    )
+    markers: str = option(
+        '',
+        'for the mode markers: file with the ids of the markers and where they are in the first '
+        'image, as for fluoro-calib extract --markers; until an image shows them there, the node '
+        'waits',
     )
     principal_distance: float = option(
         0.0,
@@ -101,7 +111,11 @@ class ExtractionParameters(ManagedParameters):
 
 _NODE = ParameterGroup(ExtractionParameters)
 _PAIRING = ParameterGroup(PairingOptions, {'tolerance_s': 'pair_tolerance'})
-PARAMETERS = (_NODE, _PAIRING)
+_FOLLOWING = ParameterGroup(
+    MarkerOptions,
+    {name: name for name in ('gate', 'shutter', 'lost_after', 'search_every')},
+)
+PARAMETERS = (_NODE, _PAIRING, _FOLLOWING)
 
 
 @dataclass(frozen=True)
@@ -178,24 +192,42 @@ class ExtractionNode(StreamNode):
         self.autostart = self._settings.autostart
         self.names = self._settings.fluoroscopes
         self._inputs = INPUTS[self._settings.inputs]
-        self._make = self._extractor()
+        self._make = self._extractors(_FOLLOWING.declare(self))
         self._threads: list[threading.Thread] = []
         self._processes: list[ServiceProcess] = []
         self._queue: ExposureQueue[_Task] = ExposureQueue(self.names, self._settings.queue_size)
         use_single_thread()
         self.reset()
 
-    def _extractor(self) -> MakeExtractor:
-        """Return what makes the extractor of a fluoroscope. Raises StartError."""
-        if not self._settings.phantom:
-            raise StartError('parameter phantom is not set: it names the file phantom.csv')
+    def _extractors(self, following: MarkerOptions) -> Mapping[str, MakeExtractor]:
+        """Return what makes the extractor of each fluoroscope. Raises StartError."""
+        mode = self._settings.mode
+        path = self._settings.phantom if mode == 'phantom' else self._settings.markers
+        if not path:
+            example = 'phantom.csv' if mode == 'phantom' else 'with the markers'
+            raise StartError(f'parameter {mode} is not set: it names the file {example}')
         try:
-            survey = read_survey(expand_path(self._settings.phantom))
+            if mode == 'markers':
+                return self._marker_followers(expand_path(path), following)
+            survey = read_survey(expand_path(path))
         except DataError as error:
             raise StartError(str(error)) from None
         for note in survey.notes:
             self.get_logger().warning(note)
-        return PhantomSettings(survey.phantom, self._settings.principal_distance or None)
+        make = PhantomSettings(survey.phantom, self._settings.principal_distance or None)
+        return dict.fromkeys(self.names, make)
+
+    def _marker_followers(
+        self, path: Path, following: MarkerOptions
+    ) -> Mapping[str, MakeExtractor]:
+        """Return what makes the follower of each fluoroscope. Raises DataError."""
+        size = (LARGEST_PX, LARGEST_PX)
+        recording = read_source(path, image_size=size, fluoroscopes=self.names)
+        followers = {}
+        for name, frames in recording.frames.items():
+            first = min(frames, key=lambda frame: frame.number)
+            followers[name] = MarkerSettings(FirstMarkers(first.target_id, first.uv), following)
+        return followers
 
     # -- lifecycle
 
@@ -233,7 +265,7 @@ class ExtractionNode(StreamNode):
         """Start the processes that extract, then the stream reader."""
         self._queue = ExposureQueue(self.names, self._settings.queue_size)
         for name in self.names:
-            process = extraction_process(self._make)
+            process = extraction_process(self._make[name])
             process.start()
             thread = threading.Thread(
                 target=self._serve, args=(name, self._queue, process), name=name, daemon=True
@@ -365,6 +397,7 @@ class ExtractionNode(StreamNode):
             'found [%]': f'{100 * last.found:.1f}',
             'explained [%]': f'{100 * last.explained:.1f}',
             'overlapped': int(last.overlapped.sum()),
+            'doubtful': last.doubtful,
             'refusal of the last image': last.reason,
             'rate [Hz]': f'{stream.rate_hz:.1f}',
             'time of an image [ms]': f'{1e3 * stream.seconds / max(processed, 1):.0f}',

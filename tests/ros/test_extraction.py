@@ -28,6 +28,7 @@ from sensor_msgs.msg import CompressedImage, Image
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.jobs.calibration import run_calibration
@@ -36,6 +37,8 @@ from fluoro_calib_ros.nodes.messages.fields import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.runtime.qos import images_qos
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.bead_images import bead_image
+from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
 SIZE = 400
 BEADS = np.random.default_rng(5).uniform(-60, 60, (48, 3))
@@ -287,6 +290,32 @@ def test_inactive_node_receives_no_images_and_starts_anew(rig, observed):
     rig.wait_until(lambda: found, what='observations')
     assert found[0].frame_number == 1
     assert rig.node.end() == 0 and 'Traceback' not in rig.node.log
+
+
+def test_markers_of_the_simulator_are_followed(graph):
+    """Radiographs of the simulator; ids and first places from a table."""
+    rate = 0.5
+    tracking = simulate_tracking(virtual_rig(1, names=('a',)), 4.0, rate, 1, 0.0)
+    markers = graph.directory / 'markers.csv'
+    write_observations_csv(markers, {'a': tracking.frames['a'][:1]})
+    found = graph.client.listen('a/target_observations')
+    only_a = {'fluoroscopes': '[a]'}
+    node = graph.start('extraction_node', {**only_a, 'mode': 'markers', 'markers': markers})
+    scene = {'scene': 'markers', 'images': 'clean', 'rate': rate, 'frames': 1, 'noise': 0.0}
+    simulator = graph.start(
+        'simulator_node', {**only_a, **scene, 'wait_for_readers': 1}, wait=False
+    )
+    graph.client.wait_until(lambda: found, what='the markers')
+    assert simulator.wait() == 0, simulator.log
+    true = dict(zip(tracking.marker_id.tolist(), tracking.frames['a'][0].uv))
+    assert set(found[0].target_id) <= set(true) and len(found[0].target_id) > 20
+    error = [np.hypot(u - true[i][0], v - true[i][1]) for i, u, v in zip(*columns(found[0]))]
+    assert np.median(error) < 0.1 and max(error) < 1.0
+    assert node.running and 'Traceback' not in node.log
+
+
+def columns(message):
+    return message.target_id, message.u, message.v
 
 
 def test_node_without_a_phantom_says_so(graph):

@@ -28,6 +28,7 @@ NODES = (
     'bridge_node',
     'calibration_node',
     'correction_node',
+    'extraction_node',
     'image_node',
     'player_node',
     'reconstruction_node',

@@ -1,3 +1,17 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
 """Following of markers in two views: ids, precision and speed.
 
     python -m benchmarks.markers --frames 500           all settings, as the table of
@@ -148,15 +162,15 @@ def bounds(radiography: MarkerRadiography, frame: int, true: np.ndarray) -> np.n
     """Cramer-Rao bounds (n,) of a coordinate [px] of markers at true (n, 2), NaN if not alone."""
     every = np.arange(len(true))
     fluoroscope = radiography.fluoroscope
-    light = radiography.light(frame, every)
-    without = radiography.light(frame, every[:0])
+    light = radiography.expected_light(frame, every)
+    without = radiography.expected_light(frame, every[:0])
     slopes = []
     still = (np.eye(3), np.zeros(3))
     points = radiography.markers.points_mm(frame)
     for axis in fluoroscope.rotation[:2]:
         step = STEP_MM * axis
-        ahead = radiography.light(frame, every, tuple(step))
-        behind = radiography.light(frame, every, tuple(-step))
+        ahead = radiography.expected_light(frame, every, tuple(step))
+        behind = radiography.expected_light(frame, every, tuple(-step))
         moved = radiography.centres(points + step, still) - radiography.centres(
             points - step, still
         )

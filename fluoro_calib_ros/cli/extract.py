@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -33,8 +33,10 @@ from .arguments import (
 from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
+    from ..exposures.frame import Frame
     from ..jobs.extraction import ExtractionOutcome
     from ..jobs.marker_extraction import DoubtfulSpan, MarkerOutcome, MarkerRequest
+    from ..radiographs.marker_ids import ClusterShape
 
 NAME = 'extract'
 HELP = 'Find and measure the beads of a phantom in radiographs, or follow implanted markers.'
@@ -129,6 +131,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="markers that are rigid together, such as 'tibia: 1001 1002 1003'; with two "
         'fluoroscopes, they predict and check each other; may be repeated',
     )
+    group.add_argument(
+        '--cluster-shapes',
+        type=Path,
+        metavar='FILE',
+        help='coordinates target_id,x,y,z,sd [mm] of the markers of each --cluster in a frame of '
+        'its own, or of any phantom format; without --markers, they give the ids',
+    )
     options = declared(MarkerOptions)
     for option in ('shutter', 'gate', 'lost_after', 'search_every'):
         add_option(group, options[option])
@@ -143,7 +152,9 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
         arguments.clusters = parse_clusters(arguments.cluster)
     except ValueError as fault:
         error(f'--cluster: {fault}')
-    if arguments.markers is None:
+    if arguments.cluster_shapes is not None and not arguments.clusters:
+        error('--cluster-shapes: name the markers of each cluster with --cluster')
+    if arguments.markers is None and arguments.cluster_shapes is None:
         if arguments.phantom is None:
             error('give --phantom for beads of a phantom, or --markers for markers in motion')
         if len(arguments.fluoroscope) != 1:
@@ -159,12 +170,12 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
         if len(arguments.sources) > 2:
             error('give one SOURCE for each fluoroscope, or one for both')
     elif arguments.clusters:
-        error('--cluster is for two fluoroscopes')
+        error('--cluster is for two fluoroscopes, the --fluoroscope A,B and their --calibration')
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Extract the beads or markers of images. Raises DataError."""
-    if arguments.markers is not None:
+    if arguments.markers is not None or arguments.cluster_shapes is not None:
         _run_markers(arguments)
     else:
         _run_phantom(arguments)
@@ -246,9 +257,8 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 
     for name in arguments.fluoroscope:
         check_safe_name(name, '--fluoroscope')
-    inputs = [*arguments.sources, arguments.markers]
-    if arguments.calibration is not None:
-        inputs.append(arguments.calibration)
+    given = (arguments.markers, arguments.calibration, arguments.cluster_shapes)
+    inputs = [*arguments.sources, *(path for path in given if path is not None)]
     check_output_file(arguments.out, inputs)
     request = _marker_request(arguments)
     with ProgressBar('extract') as bar:
@@ -273,19 +283,30 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     """Read what is known of the markers and the fluoroscopes. Raises DataError."""
     from ..files.rig_orientation import load_orientation, orientation_path
-    from ..jobs.marker_extraction import MarkerRequest, sequences
+    from ..jobs.marker_extraction import MarkerRequest, sequences, shapes_of
     from ..jobs.reconstruction import check_orientation
-    from ..jobs.sources import read_calibrations, read_source
+    from ..jobs.sources import read_calibrations, read_source, read_survey
     from ..radiographs.markers import MarkerOptions
 
     sources, image_size = sequences(arguments.sources, arguments.fluoroscope)
-    recording = read_source(
-        arguments.markers,
-        image_size=image_size,
-        fluoroscopes=arguments.fluoroscope,
-        settings=file_settings(arguments, image_size=image_size),
-    )
-    print_notes(recording.notes)
+    first: Mapping[str, list[Frame]] = {}
+    target_names: Mapping[int, str] = {}
+    if arguments.markers is not None:
+        recording = read_source(
+            arguments.markers,
+            image_size=image_size,
+            fluoroscopes=arguments.fluoroscope,
+            settings=file_settings(arguments, image_size=image_size),
+        )
+        print_notes(recording.notes)
+        first = recording.frames
+        target_names = recording.names.target_names()
+    shapes: tuple[ClusterShape, ...] = ()
+    if arguments.cluster_shapes is not None:
+        survey = read_survey(arguments.cluster_shapes, file_settings(arguments))
+        print_notes(survey.notes)
+        shapes = shapes_of(arguments.clusters, survey.phantom, arguments.cluster_shapes)
+        target_names = target_names or survey.names.target_names()
     options = MarkerOptions(
         gate=arguments.gate,
         shutter=arguments.shutter,
@@ -304,13 +325,14 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
             raise DataError(f'{path}: {error}') from None
     return MarkerRequest(
         sources,
-        recording.frames,
+        first,
         options,
         calibrations,
         orientation,
-        arguments.clusters,
+        () if shapes else arguments.clusters,
+        shapes,
         arguments.overlay,
-        recording.names.target_names(),
+        target_names,
     )
 
 

@@ -35,9 +35,11 @@ from ..calibration.result import FluoroscopeCalibration
 from ..drift.clusters import Cluster
 from ..errors import DataError
 from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
 from ..files.access import make_folder
 from ..files.atomic import write_bytes
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..radiographs.marker_ids import ClusterShape, identify_markers
 from ..radiographs.marker_overlay import draw_markers
 from ..radiographs.marker_pair import Decision, MarkerPair, revise
 from ..radiographs.markers import (
@@ -56,6 +58,7 @@ from .image_sources import (
     open_sources,
 )
 
+MAX_TRIES = 30  # exposures in which markers are identified by their shapes
 AHEAD = 3  # images that are read before they are wanted
 
 
@@ -77,6 +80,8 @@ class MarkerRequest:
         Of two fluoroscopes.
     clusters : tuple of Cluster
         Markers that are rigid together, of two fluoroscopes.
+    shapes : tuple of ClusterShape
+        Clusters whose shapes are known. They give the ids where no markers are given.
     overlay : Path or None
         Folder for pictures.
     target_names : mapping of int to str
@@ -89,6 +94,7 @@ class MarkerRequest:
     calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
     orientation: RigOrientation | None = None
     clusters: tuple[Cluster, ...] = ()
+    shapes: tuple[ClusterShape, ...] = ()
     overlay: Path | None = None
     target_names: Mapping[int, str] = field(default_factory=dict)
 
@@ -231,6 +237,21 @@ def sequences(
     return out, (first.image.shape[1], first.image.shape[0])
 
 
+def shapes_of(
+    clusters: Sequence[Cluster], phantom: Phantom, path: Path
+) -> tuple[ClusterShape, ...]:
+    """Return the shapes of clusters from coordinates of their markers. Raises DataError."""
+    row = {target: number for number, target in enumerate(phantom.target_id.tolist())}
+    out = []
+    for cluster in clusters:
+        absent = [target for target in cluster.target_id if target not in row]
+        if absent:
+            raise DataError(f'{path}: there is no marker {absent[0]} of cluster {cluster.name}')
+        rows = [row[target] for target in cluster.target_id]
+        out.append(ClusterShape(cluster.name, phantom.target_id[rows], phantom.xyz_mm[rows]))
+    return tuple(out)
+
+
 def run_marker_extraction(
     request: MarkerRequest, progress: Progress | None = None
 ) -> MarkerOutcome:
@@ -282,8 +303,11 @@ class _Follower:
             name: {frame.number: frame for frame in request.first.get(name, ())}
             for name in self._names
         }
+        self._tries = 0
+        self._reason = ''
+        by_shape = bool(request.shapes) and not request.first
         for name in self._names:
-            if not self._given[name]:
+            if not self._given[name] and not by_shape:
                 raise DataError(f'there are no given markers of fluoroscope {name}')
         self._pair: MarkerPair | None = None
         self._single: MarkerTracker | None = None
@@ -291,7 +315,7 @@ class _Follower:
         self._decisions: list[Decision] = []
         self._size: dict[str, tuple[int, int]] = {}
         self._before = dict.fromkeys(self._names, 0)
-        self._start = self._first_exposure()
+        self._start = None if by_shape else self._first_exposure()
 
     def _first_exposure(self) -> int:
         """First exposure of which markers of all fluoroscopes are given. Raises DataError."""
@@ -310,11 +334,12 @@ class _Follower:
         """Follow the markers through the images of one exposure, by fluoroscope."""
         exposure = next(iter(images.values())).exposure
         if not self._begun:
-            if exposure != self._start or len(images) < len(self._names):
+            first = self._first_markers(images, exposure)
+            if not first:
                 for name in images:
                     self._before[name] += 1
                 return
-            self._begin(images)
+            self._begin(images, first)
         arrays = {
             name: None if isinstance(image.image, DataError) else image.image
             for name, image in images.items()
@@ -335,19 +360,51 @@ class _Follower:
                 view = replace(view, reason=str(image.image))
             self._results[name].append(MarkerImageResult(exposure, image.place, view))
 
-    def _begin(self, images: Mapping[str, SourceImage]) -> None:
-        """Make the tracker for the first images. Raises DataError for one that is damaged."""
+    def _first_markers(
+        self, images: Mapping[str, SourceImage], exposure: int
+    ) -> dict[str, FirstMarkers]:
+        """Return the markers of an exposure, none where they are not known. Raises DataError."""
+        if len(images) < len(self._names) or (self._start or exposure) != exposure:
+            return {}
+        if self._start is None:
+            return self._by_shape(images)
         first = {}
+        for name in self._names:
+            frame = self._given[name][exposure]
+            try:
+                first[name] = FirstMarkers(frame.target_id, frame.uv)
+            except DataError as error:
+                raise DataError(f'fluoroscope {name}, exposure {exposure}: {error}') from None
+        return first
+
+    def _by_shape(self, images: Mapping[str, SourceImage]) -> dict[str, FirstMarkers]:
+        """Identify markers by the shapes of their clusters, in one of the first exposures."""
+        request = self._request
+        assert request.orientation is not None
+        arrays = {name: image.image for name, image in images.items()}
+        self._tries += 1
+        try:
+            whole = {n: a for n, a in arrays.items() if not isinstance(a, DataError)}
+            if len(whole) < len(arrays):
+                return {}
+            return identify_markers(
+                whole, request.calibrations, request.orientation, request.shapes
+            )
+        except DataError as error:
+            self._reason = self._reason or str(error)
+            if self._tries >= MAX_TRIES:
+                raise DataError(
+                    f'the markers are in none of the first {self._tries} exposures: {self._reason}'
+                ) from None
+            return {}
+
+    def _begin(self, images: Mapping[str, SourceImage], first: Mapping[str, FirstMarkers]) -> None:
+        """Make the tracker for the first images. Raises DataError for one that is damaged."""
         for name in self._names:
             image = images[name].image
             if isinstance(image, DataError):
                 raise image
             self._size[name] = (image.shape[1], image.shape[0])
-            frame = self._given[name][self._start]
-            try:
-                first[name] = FirstMarkers(frame.target_id, frame.uv)
-            except DataError as error:
-                raise DataError(f'fluoroscope {name}, exposure {self._start}: {error}') from None
         request = self._request
         if len(self._names) == 1:
             self._single = MarkerTracker(request.options, first=first[self._names[0]])
@@ -360,6 +417,7 @@ class _Follower:
             request.options,
             first=first,
             clusters=request.clusters,
+            shapes=request.shapes,
         )
 
     def _correct(self, decision: Decision) -> None:
@@ -373,6 +431,8 @@ class _Follower:
 
     def outcome(self) -> MarkerOutcome:
         """Return all results. Raises DataError where following did not begin."""
+        if not self._begun and self._start is None:
+            raise DataError(f'the markers are in no exposure: {self._reason or "no images"}')
         if not self._begun:
             raise DataError(
                 f'the markers are given for exposure {self._start}, but there is no image of it '

@@ -21,6 +21,7 @@ shadow is the smaller eigenvalue of the Hessian, as in `detection`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -148,17 +149,22 @@ def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
         raise DataError(f'the image is empty: every pixel has the grey value {int(image.flat[0])}')
 
 
-def learn_look(image: np.ndarray, near: np.ndarray | None, count: int) -> MarkerLook:
+def learn_look(
+    image: np.ndarray,
+    near: np.ndarray | None,
+    count: int,
+    scales: Sequence[float] = SCALES,
+) -> MarkerLook:
     """Learn what markers look like, from an image and points (n, 2) near them.
 
-    Without points, the count strongest shadows of each scale decide. Raises DataError where there
-    is nothing round.
+    Without points, the count strongest shadows of each scale decide. scales are those that are
+    tried. Raises DataError where there is nothing round.
     """
     grey = image.astype(np.float32)
     around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
     top = float(np.iinfo(image.dtype).max)
     best: tuple[float, float, float, bool] | None = None
-    for scale in SCALES:
+    for scale in scales:
         for inverted, response in zip((False, True), _responses(grey, scale)):
             relative = response / np.maximum(top - around if inverted else around, 1e-3 * top)
             typical = _typical(relative, scale, near, count)

@@ -16,8 +16,7 @@
 
 The image points of both views are corrected and intersected (`reconstruction`). Two rays that do
 not meet, and a marker that is not where its rigid cluster says, reveal a wrong id. A marker that
-one view does not see is predicted from its cluster, whose pose is fitted to the others (Kabsch,
-"A solution for the best rotation to relate two sets of vectors", Acta Cryst. A32, 1976).
+one view does not see is predicted from its cluster, whose pose is fitted to the others.
 """
 
 from __future__ import annotations
@@ -34,6 +33,8 @@ from ..drift.clusters import Cluster
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.intersection import Intersector
+from .marker_geometry import fitted_pose, project_observed
+from .marker_ids import ClusterShape
 from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 
 AGREE = 4.0  # standardised epipolar distance up to which two rays belong together
@@ -129,7 +130,7 @@ class _Body:
         """Places (k, 3) of all members by those that are trusted (k,), None for too few."""
         use = trusted & np.isfinite(self.shape).all(axis=1)
         while np.count_nonzero(use) >= least:
-            rotation, shift = _fitted_pose(self.shape[use], xyz[use])
+            rotation, shift = fitted_pose(self.shape[use], xyz[use])
             found = self.shape @ rotation.T + shift
             error = np.where(use, np.linalg.norm(found - xyz, axis=1), 0.0)
             worst = int(np.argmax(error))
@@ -151,7 +152,7 @@ class _Body:
         use = trusted & known
         if np.count_nonzero(use) < MIN_MEMBERS:
             return
-        rotation, shift = _fitted_pose(xyz[use], self.shape[use])
+        rotation, shift = fitted_pose(xyz[use], self.shape[use])
         local = xyz @ rotation.T + shift
         near = np.linalg.norm(local - self.shape, axis=1) < RIGID_SIGMAS * RIGID_MM
         for row in np.flatnonzero(trusted & (near | ~known) & (self.count < LEARNED)):
@@ -173,6 +174,8 @@ class MarkerPair:
         Ids and places in the first images, of two fluoroscopes.
     clusters : sequence of Cluster
         Markers that are rigid together. Their shapes are learned from the images.
+    shapes : sequence of ClusterShape
+        Clusters whose shapes are known.
 
     Raises
     ------
@@ -188,6 +191,7 @@ class MarkerPair:
         *,
         first: Mapping[str, FirstMarkers],
         clusters: Sequence[Cluster] = (),
+        shapes: Sequence[ClusterShape] = (),
     ) -> None:
         names = [name for name in orientation.fluoroscopes if name in first]
         if len(names) != 2 or len(first) != 2:
@@ -205,6 +209,12 @@ class MarkerPair:
             for known in (np.intersect1d(c.target_id, self.target_id) for c in clusters)
             if len(known) >= MIN_MEMBERS
         ]
+        for shape in shapes:
+            known = np.isin(shape.target_id, self.target_id)
+            body = _Body(np.searchsorted(self.target_id, shape.target_id[known]))
+            body.shape[:] = shape.xyz_mm[known]
+            body.count[:] = LEARNED
+            self._bodies.append(body)
         n = len(self.target_id)
         self._xyz = np.full((n, 3), np.nan)
         self._velocity = np.zeros((n, 3))
@@ -281,18 +291,8 @@ class MarkerPair:
 
     def _project(self, view: int, xyz: np.ndarray) -> np.ndarray:
         """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm]."""
-        orientation = self._intersector.orientation
-        xp, yp, c = orientation.interior[view]
-        sensor = (xyz - orientation.position_mm[view]) @ orientation.rotation[view].T
-        ideal = sensor[:, :2] * (c / sensor[:, 2:]) + np.array([xp, yp])
-        observed = ideal
-        for _ in range(3):
-            u, v, _, _, _ = self.calibrations[self.names[view]].correct_arrays(
-                observed[:, 0].copy(), observed[:, 1].copy()
-            )
-            step = ideal - np.stack([u, v], axis=1)
-            observed = observed + np.where(np.isfinite(step), step, 0.0)
-        return observed
+        calibration = self.calibrations[self.names[view]]
+        return project_observed(self._intersector.orientation, view, calibration, xyz)
 
     def _exposure(self, views: Mapping[str, MarkerFrame]) -> _Exposure:
         """Correct and intersect the markers of an exposure."""
@@ -527,16 +527,6 @@ class MarkerPair:
         now[unknown] = (self._xyz + frames * self._velocity)[unknown]
         self._xyz = now
         self._frame = frame
-
-
-def _fitted_pose(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and shift (3,) that take points (k, 3) to others, by least squares."""
-    a = source.mean(axis=0)
-    b = target.mean(axis=0)
-    u, _, vt = np.linalg.svd((source - a).T @ (target - b))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    rotation = vt.T @ sign @ u.T
-    return rotation, b - rotation @ a
 
 
 def _revised(

@@ -242,7 +242,7 @@ class MarkerRadiography(Radiography):
         image = self._grey(detected(light, self.settings), rng)
         return MarkerImage(image, true, self.in_field(true, 6.0) & ~hidden)
 
-    def light(
+    def expected_light(
         self, frame: int, rows: np.ndarray, shift_mm: tuple[float, float, float] = (0.0, 0.0, 0.0)
     ) -> np.ndarray:
         """Return the light (h, w) that is expected, 1 in the open beam, of markers in rows (k,).

@@ -31,7 +31,9 @@ from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
 from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.drift.clusters import Cluster
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.calibration import save_calibration
+from fluoro_calib_ros.files.phantom import write_phantom
 from fluoro_calib_ros.files.rig_orientation import save_orientation
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.radiographs.marker_overlay import draw_markers
@@ -364,6 +366,24 @@ def test_the_command_follows_markers_of_one_and_of_two_fluoroscopes(folder, caps
         error = np.hypot(float(row['u']) - true[0], float(row['v']) - true[1])
         assert error < FAR_PX or row['doubtful'] == '1'
     assert len(list((folder / 'pictures').glob('*.png'))) == 18
+    write_phantom(
+        folder / 'shapes.csv',
+        Phantom(ids, MovingMarkers(SCENE, SEED).local_mm, np.full(len(ids), 0.05)),
+    )
+    words[2:4] = ['--cluster', 'two: ' + ' '.join(map(str, ids[4:]))]
+    assert run(*words, '--cluster-shapes', folder / 'shapes.csv') == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document['fluoroscopes']['b']['images'] >= 6
+    with open(folder / 'both.csv', newline='') as file:
+        again = {
+            (r['fluoroscope'], r['exposure'], r['target_id']): r for r in csv.DictReader(file)
+        }
+    same = [
+        abs(float(row['u']) - float(again[key]['u'])) < FAR_PX
+        for row in rows
+        if (key := (row['fluoroscope'], row['exposure'], row['target_id'])) in again
+    ]
+    assert len(same) > 0.5 * len(rows) and all(same)
     alone = ['extract', folder / 'images' / 'a', '--markers', folder / 'first.csv']
     assert run(*alone, '--fluoroscope', 'a', '--out', folder / 'a.csv') == 0
     assert 'fluoroscope a: 9 images' in capsys.readouterr().out

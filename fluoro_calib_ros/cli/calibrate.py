@@ -296,7 +296,7 @@ def _next_step(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> tu
     """Return the command that follows: it uses the calibration, or says what is wrong with it."""
     if outcome.validation is None:
         return 'validate', arguments.out
-    if outcome.validation.verdict == 'fail':
+    if outcome.validation.verdict != 'pass':
         return ()  # the verdict says what to do
     if outcome.orientation is None:
         return 'correct', 'POINTS.csv', '--calibration', arguments.out, '--out', 'corrected.csv'

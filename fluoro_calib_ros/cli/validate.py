@@ -97,7 +97,14 @@ def run(arguments: argparse.Namespace) -> None:
     request = read_request(arguments.directory, calibrations, frames, phantom)
     validation = validate(request, calibrations, print_step)
     write_validation(arguments.directory, validation)
-    print_result(arguments, validation_document(validation), verdict_text(validation))
+    passed = validation.verdict == 'pass'
+    following = ('reconstruct', 'MEASURED', '--calibration', arguments.directory)
+    print_result(
+        arguments,
+        validation_document(validation),
+        verdict_text(validation),
+        (*following, '--out', 'points.csv') if passed else (),
+    )
     if validation.verdict == 'fail':
         failed = [check for check in validation.checks if check.passed is False]
         more = f', and {len(failed) - 1} more checks failed' if len(failed) > 1 else ''

@@ -294,6 +294,7 @@ def run(exposures: int, steps: int, seconds: float, folder: Path) -> None:
         start = time.monotonic()
         for of_exposure in still:
             camera.publish(of_exposure)
+            camera.wait(lambda: False, 0.3)  # DDS keeps ten images
         camera.wait(lambda: min(camera.exposures.values()) >= exposures)
         print(f'{exposures} exposures extracted and collected in {time.monotonic() - start:.1f} s')
         compare(camera, frames, rig)

@@ -18,7 +18,7 @@ Radiographs of a virtual rig go through the nodes: extraction, calibration, corr
 reconstruction. First the observations and the calibration are compared with those of the jobs
 behind the commands extract and calibrate. Then the latency from two images to their points, and
 the rate, are measured: for a phantom in ever other poses, for one that moves slowly and is
-followed, and for one that is filmed at 30 Hz.
+followed, for one that is filmed at 30 Hz, and for 30 markers that are filmed so.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.demo.node_processes import NodeProcesses, isolate_ros_graph
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.phantom import write_phantom
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.jobs.calibration import run_calibration
@@ -59,6 +60,13 @@ from fluoro_calib_ros.nodes.messages.image import message_from_image
 from fluoro_calib_ros.nodes.runtime.qos import images_qos, latched_qos, observations_qos
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.exposures import phantom_poses
+from fluoro_calib_ros.simulation.marker_images import (
+    FIRST_ID,
+    MARKER_SETTINGS,
+    MarkerScene,
+    MarkerSequence,
+    MovingMarkers,
+)
 from fluoro_calib_ros.simulation.rig import Pose, VirtualRig, virtual_rig
 
 NAMES = ('a', 'b')
@@ -271,6 +279,54 @@ def measure_film(camera: Camera, images: Images, seconds: float, what: str) -> N
     )
 
 
+def measure_stream(
+    camera: Camera,
+    calibrated: Mapping[str, Any],
+    extraction: Mapping[str, Any],
+    shown: tuple[Images, float, str],
+) -> None:
+    """Start nodes with the saved calibrations and the shortest queue, and film.
+
+    Parameters
+    ----------
+    camera : Camera
+    calibrated : mapping
+        Parameters of the calibration node, whose folder has calibrations.
+    extraction : mapping
+        Parameters of the extraction node.
+    shown : (Images, float, str)
+        What is filmed, for how long [s], and its name.
+    """
+    folder = Path(calibrated['calibration_directory']).parent
+    saved = {'calibration_directory': calibrated['calibration_directory']}
+    with NodeProcesses(folder) as nodes:
+        nodes.start('extraction_node', {**extraction, 'queue_size': 1})
+        nodes.start('calibration_node', calibrated)
+        nodes.start('correction_node', saved)
+        nodes.start('reconstruction_node', saved)
+        camera.exposures.clear()
+        camera.wait(camera.ready)
+        camera.points.clear()
+        while not camera.points:
+            camera.publish(shown[0][0])
+            camera.wait(lambda: camera.points, 5)
+        measure_film(camera, *shown)
+
+
+def moving_markers(rig: VirtualRig, count: int) -> tuple[Images, dict[str, list[Frame]]]:
+    """Return radiographs of markers in motion, and where they are in the first ones."""
+    sequence = MarkerSequence(
+        rig, MovingMarkers(MarkerScene(hidden=0.0), SEED), MARKER_SETTINGS, count, SEED
+    )
+    taken = list(sequence)
+    first = {}
+    for name, view in taken[0].items():
+        ids = FIRST_ID + np.flatnonzero(view.seen)
+        size = (view.image.shape[1], view.image.shape[0])
+        first[name] = [Frame(name, 1, ids, view.uv[view.seen], size)]
+    return [{name: view.image for name, view in views.items()} for views in taken], first
+
+
 def run(exposures: int, steps: int, seconds: float, folder: Path) -> None:
     """Render, compare and measure."""
     rig = virtual_rig(SEED)
@@ -304,19 +360,12 @@ def run(exposures: int, steps: int, seconds: float, folder: Path) -> None:
         measure_one_by_one(camera, film, 'slow motion')
         extraction.terminate()
         extraction.wait()
-    with NodeProcesses(folder) as nodes:  # with the saved calibrations, and the shortest queue
-        saved = {'calibration_directory': folder / 'calibration'}
-        nodes.start('extraction_node', {**phantom, 'queue_size': 1})
-        nodes.start('calibration_node', {**calibrated, 'collect': 'request'})
-        nodes.start('correction_node', saved)
-        nodes.start('reconstruction_node', saved)
-        camera.exposures.clear()
-        camera.wait(camera.ready)
-        camera.points.clear()
-        while not camera.points:
-            camera.publish(film[0])
-            camera.wait(lambda: camera.points, 5)
-        measure_film(camera, film, seconds, 'slow motion')
+    calibrated['collect'] = 'request'
+    measure_stream(camera, calibrated, phantom, (film, seconds, 'slow motion'))
+    markers, first = moving_markers(rig, steps)
+    write_observations_csv(folder / 'markers.csv', first)
+    mode = {'mode': 'markers', 'markers': folder / 'markers.csv'}
+    measure_stream(camera, calibrated, mode, (markers, seconds, 'markers'))
     camera.destroy_node()
     rclpy.shutdown()
 

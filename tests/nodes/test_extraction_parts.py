@@ -14,6 +14,9 @@
 
 """What the extraction node is made of: numbers of images, the queue, the process."""
 
+import multiprocessing
+import os
+import signal
 import threading
 import time
 
@@ -94,7 +97,7 @@ class Fragile:
         return LiveObservations(expected=self.count)
 
 
-def test_a_failure_loses_one_image_and_closing_ends_the_one_in_work():
+def test_a_failure_loses_one_image_an_interrupt_none_and_closing_ends_the_one_in_work():
     process = extraction_process(Fragile)
 
     def extract(value):
@@ -103,6 +106,8 @@ def test_a_failure_loses_one_image_and_closing_ends_the_one_in_work():
     assert extract(0) == 1
     with pytest.raises(RuntimeError, match='one'):
         extract(1)
+    for child in multiprocessing.active_children():
+        os.kill(child.pid, signal.SIGINT)  # as a terminal sends it to all processes of a node
     assert extract(0) == 3
     with pytest.raises(RuntimeError, match='ended with status 3'):
         extract(2)

@@ -77,6 +77,7 @@ SHIFT_MM = 1.0
 FILM_HZ = 30.0
 FIRST_NS = 1_700_000_000_000_000_000
 EXPOSURE_NS = 500_000_000
+SETTLING_S = 2.0  # in which a node discovers the camera, too
 
 Images = Sequence[Mapping[str, np.ndarray]]
 
@@ -347,11 +348,12 @@ def run(exposures: int, steps: int, seconds: float, folder: Path) -> None:
         nodes.start('correction_node')
         nodes.start('reconstruction_node')
         camera.wait(camera.ready)
+        camera.wait(lambda: False, SETTLING_S)
         start = time.monotonic()
         for of_exposure in still:
             camera.publish(of_exposure)
             camera.wait(lambda: False, 0.3)  # DDS keeps ten images
-        camera.wait(lambda: min(camera.exposures.values()) >= exposures)
+        camera.wait(lambda: min(camera.exposures.values()) >= exposures, 120)
         print(f'{exposures} exposures extracted and collected in {time.monotonic() - start:.1f} s')
         compare(camera, frames, rig)
         camera.wait(lambda: camera.orientations)

@@ -180,6 +180,23 @@ class Camera(Node):
             self._images[name].publish(message_from_image(header, image))
         return self._stamp_ns
 
+    def show(self, images: Mapping[str, np.ndarray], number: int) -> None:
+        """Publish the images of an exposure until both are extracted.
+
+        A busy machine may lose images between writer and reader.
+        """
+        interval_ns = EXPOSURE_NS
+        missing = dict(images)
+        while missing:
+            self.publish(missing, interval_ns)
+            interval_ns = 0
+            self.wait(lambda: all((name, number) in self.observed for name in missing), 15)
+            missing = {
+                name: image
+                for name, image in images.items()
+                if (name, number) not in self.observed
+            }
+
 
 def rendered(rig: VirtualRig, poses: Sequence[Pose]) -> Images:
     """Take radiographs of the phantom in poses."""
@@ -350,15 +367,14 @@ def run(exposures: int, steps: int, seconds: float, folder: Path) -> None:
         camera.wait(camera.ready)
         camera.wait(lambda: False, SETTLING_S)
         start = time.monotonic()
-        for of_exposure in still:
-            camera.publish(of_exposure)
-            camera.wait(lambda: False, 0.3)  # DDS keeps ten images
+        for number, of_exposure in enumerate(still, 1):
+            camera.show(of_exposure, number)
         camera.wait(lambda: min(camera.exposures.values()) >= exposures, 120)
         print(f'{exposures} exposures extracted and collected in {time.monotonic() - start:.1f} s')
         compare(camera, frames, rig)
         camera.wait(lambda: camera.orientations)
         camera.wait(lambda: False, 3)  # the reconstruction takes the orientation
-        measure_one_by_one(camera, still, 'other poses')
+        measure_one_by_one(camera, still[:8], 'other poses')
         measure_one_by_one(camera, film, 'slow motion')
         extraction.terminate()
         extraction.wait()

@@ -28,7 +28,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from .adjustment import Adjustment
 from .collinearity import project_with_jacobian
@@ -163,8 +163,18 @@ def image_statistics(
     if noise.loss == 'gaussian':
         # Refer to the variance estimated without the image point, which contributes to it.
         value = value * (redundancy - 2) / np.maximum(redundancy - value, 1e-3 * redundancy)
-    critical = 2 * stats.f.isf(significance / count, 2, min(noise.nu, redundancy - 2))
+    critical = 2 * _f_limit(significance / count, min(noise.nu, redundancy - 2))
     return np.where(tested, value, np.nan), float(critical)
+
+
+def _f_limit(probability: float, freedom: float) -> float:
+    """Value that F of 2 and some degrees of freedom exceeds with a probability.
+
+    F of 2 and n exceeds x with the probability (1 + 2 x / n)^(-n / 2).
+    """
+    if not np.isfinite(freedom):
+        return -float(np.log(probability))
+    return float(freedom / 2 * np.expm1(-2 / freedom * np.log(probability)))
 
 
 def target_statistics(
@@ -192,7 +202,7 @@ def target_statistics(
     standardised = np.linalg.solve(covariance[testable], tested[..., None])[..., 0]
     value = np.full(n, np.nan)
     value[testable] = np.einsum('ni,ni->n', tested, standardised)
-    critical = stats.chi2.isf(significance / max(int(testable.sum()), 1), 3)
+    critical = special.chdtri(3, significance / max(int(testable.sum()), 1))
     return TargetTest(value, float(critical), np.where(testable[:, None], offset, 0.0), square)
 
 
@@ -262,7 +272,7 @@ def _intersect(
         residual = rays.residual - (a @ offset[p][..., None])[..., 0]
         square = np.einsum('ni,nij,nj->n', residual, rays.information, residual)
         weight = noise.weight(square) if noise.loss != 'gaussian' else weight
-    limit = stats.chi2.isf(CONTRADICTION_SIGNIFICANCE, np.maximum(2 * count, 1))
+    limit = special.chdtri(np.maximum(2 * count, 1), CONTRADICTION_SIGNIFICANCE)
     contradicting = np.bincount(p, square * weight, n) > limit
     offset[~good | contradicting] = np.nan
     return offset, covariance, square

@@ -24,7 +24,7 @@ from scipy.spatial import cKDTree
 from ..errors import DataError
 from .detection import Detections, detect_beads
 from .following import follow
-from .growth import Match, Seen, smoothed
+from .growth import Match, Seen, smoothed, supported
 from .matching import PhantomModel, match
 from .measurement import (
     FIRST_STEPS,
@@ -232,7 +232,8 @@ def _measured(
         view, _ = fit_view(view, model.xyz[bead], uv, 3)
         predicted = view.project(model.xyz) + smoothed(view, model.xyz, bead, uv)
     measured = (rows, beads, reasons, predicted)
-    return _checked(detections, found, view, measured, _Imaging(noise, profile))
+    extraction = _checked(detections, found, view, measured, _Imaging(noise, profile))
+    return _with_support(extraction, model, rows)
 
 
 def _checked(
@@ -269,6 +270,29 @@ def _checked(
         found,
         imaging.profile,
         imaging.noise,
+    )
+
+
+def _with_support(extraction: Extraction, model: PhantomModel, rows: np.ndarray) -> Extraction:
+    """Leave out beads of which most neighbours among the predicted ones (n,) are refused."""
+    good = np.isin(rows, extraction.bead)
+    alone = rows[good & ~supported(model.xyz[rows], good)]
+    if not len(alone):
+        return extraction
+    kept = ~np.isin(extraction.bead, alone)
+    refused = tuple(
+        Refusal(
+            int(extraction.bead[number]), extraction.uv[number], 'its neighbours are not found'
+        )
+        for number in np.flatnonzero(~kept)
+    )
+    return replace(
+        extraction,
+        bead=extraction.bead[kept],
+        uv=extraction.uv[kept],
+        sigma=extraction.sigma[kept],
+        overlapped=extraction.overlapped[kept],
+        refused=extraction.refused + refused,
     )
 
 

@@ -33,6 +33,9 @@ LAST_STEPS = 4
 LAST_TOLERANCE_PX = 2.5
 CELLS = 5  # regions across the image
 MIN_CELL = 5  # predicted beads of a region that is judged
+AMBIGUOUS_PX = 1.5  # by which another prediction must be farther
+SUPPORT = 12  # neighbours in space, and the share of them that must be found as well
+MIN_SUPPORT = 0.5
 
 
 @dataclass(frozen=True)
@@ -244,7 +247,14 @@ def _judged(
         seen.uv, distance_upper_bound=max(tolerance, 1.2 * seen.radius_px)
     )
     good = _good_cells(predicted[row], is_found, seen.field.shape)
-    kept = good[bead]
+    # A detection between two predictions may be either.
+    tree = cKDTree(predicted[row])
+    distance, _ = tree.query(seen.uv[detection], k=2)
+    sure = distance[:, 1] > distance[:, 0] + AMBIGUOUS_PX
+    matched = np.zeros(len(row), dtype=bool)
+    matched[bead[sure]] = True
+    good &= supported(xyz[row], matched)
+    kept = good[bead] & sure
     return Match(
         view,
         row[bead[kept]],
@@ -255,6 +265,20 @@ def _judged(
         scale,
         len(row),
     )
+
+
+def supported(xyz: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Return (n,) whether most neighbours in space of beads (n, 3) are good (n,).
+
+    Where a face is seen from its edge, a prediction that is off by one bead still finds something
+    now and then.
+    """
+    count = min(SUPPORT + 1, len(xyz))
+    _, near = cKDTree(xyz).query(xyz, k=count)
+    near = near.reshape(len(xyz), -1)
+    other = near != np.arange(len(xyz))[:, None]
+    share = np.sum(good[near] & other, axis=1) / np.maximum(other.sum(axis=1), 1)
+    return np.asarray(share >= MIN_SUPPORT)
 
 
 def _good_cells(uv: np.ndarray, found: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

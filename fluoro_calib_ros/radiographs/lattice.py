@@ -27,7 +27,6 @@ from itertools import product
 
 import cv2
 import numpy as np
-from scipy.signal import fftconvolve
 from scipy.spatial import cKDTree
 
 from .growth import Match, Seen, settle
@@ -193,7 +192,9 @@ def _shifts(image: np.ndarray, phantom: np.ndarray) -> list[tuple[np.ndarray, in
     other = phantom.min(axis=0)
     there = _raster(phantom - other)
     here = _raster(image - corner)
-    overlap = np.rint(fftconvolve(there, here[::-1, ::-1])).astype(int)
+    shape = tuple(np.array(there.shape) + here.shape - 1)
+    product = np.fft.rfft2(there, shape) * np.fft.rfft2(here[::-1, ::-1], shape)
+    overlap = np.rint(np.fft.irfft2(product, shape)).astype(int)
     best = np.argsort(-overlap, axis=None, kind='stable')[:SHIFTS]
     out = []
     for place in np.column_stack(np.unravel_index(best, overlap.shape)):

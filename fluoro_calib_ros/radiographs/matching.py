@@ -37,6 +37,7 @@ from .view import Lens, View, fit_view
 MIN_BEADS = 10
 MIN_FOUND = 0.72
 MIN_EXPLAINED = 0.4
+NEARLY_FOUND = 0.6
 # Shares found and explained at which the search ends. Where many beads overlap, fewer are found,
 # but nothing else is seen.
 SURE = ((0.85, 0.4), (0.75, 0.95))
@@ -44,15 +45,16 @@ SURE = ((0.85, 0.4), (0.75, 0.95))
 # beads. What is missed by chance is less.
 MARGIN = 0.06
 MARGIN_BEADS = 8
-# Levels of the search: neighbours of a bead in the phantom, in the image, beads tried, and limits
-# of the scale by the extent of what is seen. The first finds most poses. The second and third find
-# those that see all faces of a phantom from the edge, or other things around the phantom, the last
-# finds a small part of a phantom.
+# Levels of the search: neighbours of a bead in the phantom, in the image, beads tried (from, to),
+# and limits of the scale by the extent of what is seen. The first finds most poses, the second and
+# third find those that see all faces of a phantom from the edge. The others find a phantom with
+# other things around it, and a small part of a phantom.
 LEVELS = (
-    (8, 6, 8, (0.85, 1.4)),
-    (8, 6, 72, (0.6, 1.4)),
-    (14, 8, 12, (0.85, 1.4)),
-    (8, 6, 6, (0.7, 3.0)),
+    (8, 6, (0, 8), (0.85, 1.4)),
+    (8, 6, (8, 80), (0.85, 1.4)),
+    (14, 8, (0, 12), (0.85, 1.4)),
+    (8, 6, (0, 24), (0.6, 0.85)),
+    (8, 6, (0, 6), (1.4, 3.0)),
 )
 CENTRAL = 8  # beads of the middle that are tried first
 APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
@@ -160,6 +162,7 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
     best: Match | None = None
     agreed = 0
     for candidate in _candidates(seen, model, lens):
+        candidate = _improved(candidate, seen, model)
         agreed += best is not None and _same(candidate, best)
         if best is None or candidate.score > best.score:
             agreed = agreed if best is not None and _same(candidate, best) else 1
@@ -179,6 +182,14 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
 def is_sure(best: Match) -> bool:
     """Return whether a better match need not be searched for."""
     return any(best.found >= found and best.explained >= explained for found, explained in SURE)
+
+
+def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
+    """Return a match that is nearly evident after further steps, if they find more beads."""
+    if is_sure(one) or one.found < NEARLY_FOUND or one.explained < MIN_EXPLAINED:
+        return one
+    again = settle(one.view, model.xyz, seen)
+    return again if again is not None and again.score > one.score else one
 
 
 def _is_evident(best: Match) -> bool:
@@ -296,10 +307,9 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
     beads[~seen.field] = 2
     order = _seeds(seen)
-    done = 0
-    for triples, (_, neighbours, tried, limits) in zip(model.triples, LEVELS):
+    for triples, (_, neighbours, (first, last), limits) in zip(model.triples, LEVELS):
         scales = _scales(seen, model, limits)
-        for seed in order[done : done + tried]:
+        for seed in order[first:last]:
             _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
             around = around[around != seed]
             for pose in local_poses(seed, seen.uv, around, triples, beads, scales):
@@ -307,7 +317,6 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
                 found = grow(view, pose.bead, model.xyz, seen)
                 if found is not None:
                     yield found
-        done += tried
 
 
 def _seeds(seen: Seen) -> np.ndarray:

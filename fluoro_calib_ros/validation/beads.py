@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from .bead_intersection import Beads, distances, intersect, least_chi2_without_a_ray
 from .check import Check, Finding, judge, not_made
@@ -76,7 +76,7 @@ def compare_with_survey(
             not_made(name, '', f'check {name} could not be made, {reason}')
             for name in ('beads', 'distances')
         ]
-    limit = SD_FACTOR**2 * chi2.ppf(1 - FALSE_ALARM / count, 3)
+    limit = SD_FACTOR**2 * chdtri(3, FALSE_ALARM / count)
     square = beads.chi2
     suspects = np.flatnonzero(square > limit)
     if least_chi2 is not None and len(suspects):

@@ -24,7 +24,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from ..calibration.result import FluoroscopeCalibration
 from ..distortion.gauge import gauge_basis
@@ -75,7 +75,7 @@ class Comparison:
     @property
     def significant(self) -> np.ndarray:
         """Whether (n,) a difference exceeds its 99 % quantile."""
-        return self.size**2 > chi2.ppf(LEVEL, 2) * self.sd**2
+        return self.size**2 > chdtri(2, 1 - LEVEL) * self.sd**2
 
     @property
     def rms_px(self) -> float:
@@ -159,4 +159,4 @@ def _test(difference: np.ndarray, covariance: np.ndarray) -> tuple[float, float]
         return float('nan'), float('nan')
     part = difference[free]
     test = float(part @ np.linalg.solve(covariance[np.ix_(free, free)], part))
-    return test, float(chi2.ppf(LEVEL, int(free.sum())))
+    return test, float(chdtri(int(free.sum()), 1 - LEVEL))

@@ -29,7 +29,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import stats
+from scipy import special
 from scipy.spatial import cKDTree
 
 from ..calibration.calibrate import CalibrationResult
@@ -245,7 +245,7 @@ def _mean_and_limit(joins: Joins, same: np.ndarray) -> tuple[float, float]:
     scatter = sum(squares) / freedom
     sd = np.sqrt(scatter * sum(1 / joins.count[g].sum() for g in groups)) / len(groups)
     value = means[0] if len(groups) == 1 else (means[0] - means[1]) / 2
-    return value, stats.t.ppf(1 - FALSE_ALARM, freedom) * sd
+    return value, special.stdtrit(freedom, 1 - FALSE_ALARM) * sd
 
 
 def _cell_sums(
@@ -295,7 +295,7 @@ def _worst_cell(residuals: Residuals, image_size: tuple[int, int], part: np.ndar
     length = np.linalg.norm(means[0] if len(means) == 1 else means[0] - means[1], axis=1)
     worst = int(np.argmax(length / np.sqrt(variance)))
     chance = FALSE_ALARM / len(sums)  # Bonferroni over the cells
-    limit = np.sqrt(2 * variance[worst] * stats.f.ppf(1 - chance, 2, max(freedom.sum(), 1)))
+    limit = np.sqrt(2 * variance[worst] * special.fdtri(2, max(freedom.sum(), 1), 1 - chance))
     return CellTrend(float(length[worst]), float(limit), centres[keep][worst])
 
 

@@ -33,6 +33,8 @@ FIRST_SPEED_PX = 6.0  # standard deviation of the unknown first velocity [px a f
 FIRST_ACCELERATION_PX = 0.5
 MIN_ACCELERATION_PX = 0.05  # px a squared frame
 FORGET = 0.9  # share of the earlier squared innovations that is kept
+COMPARED = 5  # images before the motion of two markers is known to be alike
+STRANGE_PX = 0.4  # difference of velocities that is not strange [px a frame]
 LEADERS = 4  # markers whose changes of velocity an unseen one follows
 LED = 0.5  # share of the acceleration that they do not explain
 MAX_SD_PX = 60.0  # of a prediction
@@ -57,6 +59,8 @@ class Motion:
         Running mean of squared accelerations.
     unlike : (n, n) ndarray
         Running mean of squared differences of velocities.
+    together : (n, n) ndarray of int
+        Images in which they were compared.
     """
 
     uv: np.ndarray
@@ -64,6 +68,7 @@ class Motion:
     covariance: np.ndarray
     squared: np.ndarray
     unlike: np.ndarray
+    together: np.ndarray
 
     @classmethod
     def start(cls, uv: np.ndarray, sd_px: float) -> Motion:
@@ -75,7 +80,10 @@ class Motion:
         squared = np.full(n, FIRST_ACCELERATION_PX**2)
         unlike = np.full((n, n), FIRST_SPEED_PX**2)
         np.fill_diagonal(unlike, np.inf)
-        return cls(np.array(uv, dtype=float), np.zeros((n, 2)), covariance, squared, unlike)
+        together = np.zeros((n, n), dtype=int)
+        return cls(
+            np.array(uv, dtype=float), np.zeros((n, 2)), covariance, squared, unlike, together
+        )
 
     @property
     def variance(self) -> np.ndarray:
@@ -123,10 +131,11 @@ class Motion:
         update = FORGET * self.squared[rows] + (1 - FORGET) * seen
         self.squared[rows] = np.where(settled, update, self.squared[rows])
 
-    def lead(self, seen: np.ndarray, before: np.ndarray) -> np.ndarray:
+    def lead(self, seen: np.ndarray, before: np.ndarray, sure: np.ndarray) -> np.ndarray:
         """Let unseen markers follow those that move alike; returns (n,) which do.
 
-        seen (n,) were measured now, and had velocities before (n, 2).
+        seen (n,) were measured now, and had velocities before (n, 2). Which markers move alike is
+        learned from those that are sure (n,).
         """
         rows = np.flatnonzero(seen & self.settled)
         led = np.zeros(len(seen), dtype=bool)
@@ -135,7 +144,12 @@ class Motion:
         velocity = self.velocity[rows]
         difference = ((velocity[:, None] - velocity[None]) ** 2).sum(axis=2)
         both = np.ix_(rows, rows)
-        self.unlike[both] = FORGET * self.unlike[both] + (1 - FORGET) * difference
+        learned = sure[rows, None] & sure[rows]
+        self.together[both] += learned
+        share = learned * np.maximum(1 / np.maximum(self.together[both], 1), 1 - FORGET)
+        before_unlike = np.where(learned & (self.together[both] == 1), 0.0, self.unlike[both])
+        np.fill_diagonal(before_unlike, 0.0)
+        self.unlike[both] = (1 - share) * before_unlike + share * difference
         self.unlike[rows, rows] = np.inf
         change = velocity - before[rows]
         for row in np.flatnonzero(~seen & self.settled).tolist():
@@ -143,6 +157,23 @@ class Motion:
             self.velocity[row] += np.median(change[alike], axis=0)
             led[row] = True
         return led
+
+    def strangeness(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Compare velocities with those of the markers that moved alike so far.
+
+        Returns, for markers in rows (k,), the ratio (k,) of the squared difference to what it used
+        to be, and the velocities (k, 2) of the others. seen (n,) were measured now.
+        """
+        rows = np.flatnonzero(seen & self.settled)
+        if len(rows) <= LEADERS:
+            return np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, 2))
+        both = np.ix_(rows, rows)
+        unlike = np.where(self.together[both] < COMPARED, np.inf, self.unlike[both])
+        order = np.argsort(unlike, axis=1, kind='stable')[:, :LEADERS]
+        usual = np.take_along_axis(unlike, order, axis=1).mean(axis=1)
+        others = np.median(self.velocity[rows][order], axis=1)
+        squared = ((self.velocity[rows] - others) ** 2).sum(axis=1)
+        return rows, squared / (usual + STRANGE_PX**2), others
 
     def place(
         self, rows: np.ndarray, uv: np.ndarray, velocity: np.ndarray, sd_px: np.ndarray
@@ -175,6 +206,8 @@ class Motion:
             values[[one, other]] = values[[other, one]]
         self.unlike[[one, other]] = self.unlike[[other, one]]
         self.unlike[:, [one, other]] = self.unlike[:, [other, one]]
+        self.together[[one, other]] = self.together[[other, one]]
+        self.together[:, [one, other]] = self.together[:, [other, one]]
 
 
 def costs(uv: np.ndarray, variance: np.ndarray, found: np.ndarray) -> np.ndarray:

@@ -59,6 +59,11 @@ MAX_HALF = 48
 SAME_PLACE = 0.35  # of the radius, at which two markers are one shadow
 FALSE_SHADOWS = 0.02  # expected in the gate, from which a marker found again is doubtful
 OTHER_SHADOW = 'another shadow was as near to where it was expected'
+UNLIKE = 'it moves unlike the markers that it moved with'
+STRANGE = 7.0  # squared difference of velocities, over what it used to be
+STRANGE_FRAMES = 2
+SHARED_PX = 15.0  # way of the others since a doubt, after which a marker is no other shadow
+SHARED = 0.35  # if its own way differs by less than this share
 MIN_DENSITY = 2e-6  # of false shadows [1/px^2]
 MERGED_PX = 5.0  # between predictions, within which two markers are one shadow
 MERGED_FRAMES = 6  # for which neither of them is measured; then one is, with a doubt
@@ -207,6 +212,9 @@ class _Markers:
     depth_sd: np.ndarray
     unseen: np.ndarray  # images since a marker was measured
     since: np.ndarray  # image with which a doubt began
+    strange: np.ndarray  # images in which it moves unlike those that it moved with
+    shared: np.ndarray  # way (n, 2) of these, since a doubt
+    own: np.ndarray  # its own way (n, 2)
     partner: list[set[int]] = field(default_factory=list)  # rows it may be exchanged with
 
 
@@ -233,6 +241,7 @@ class MarkerTracker:
         self._size: tuple[int, int] | None = None
         self._gap = 1
         self._led: np.ndarray | None = None
+        self._velocity_before = np.zeros((0, 2))
         self._suggested: tuple[np.ndarray, ...] | None = None
 
     @property
@@ -405,6 +414,9 @@ class MarkerTracker:
             np.full(n, DEPTH_SD),
             unseen,
             np.zeros(n, dtype=int),
+            np.zeros(n, dtype=int),
+            np.zeros((n, 2)),
+            np.zeros((n, 2)),
             [set() for _ in range(n)],
         )
         self._look = look
@@ -464,6 +476,7 @@ class MarkerTracker:
         doubts = self._doubt(uv, sigma, measured, frame)
         doubts += self._doubt_shadows(uv, measured & assigned, free, frame)
         self._take(np.flatnonzero(measured), uv, sigma, depth, overlapped)
+        doubts += self._compare_motion(measured, frame)
         return self._result(frame, (uv, sigma, overlapped, measured), doubts, begin)
 
     def _search(self, image: np.ndarray, windows: LightWindows) -> Shadows:
@@ -648,15 +661,40 @@ class MarkerTracker:
     ) -> None:
         """Update what is known of the markers that were measured."""
         markers = self._known()
-        before = markers.motion.velocity.copy()
+        self._velocity_before = markers.motion.velocity.copy()
         markers.motion.update(rows, uv[rows], sigma[rows], self._gap)
         markers.unseen[rows] = 0
-        self._led = markers.motion.lead(markers.unseen == 0, before)
         free = rows[~overlapped[rows]]
         first = markers.depth_sd[free] > KNOWN_DEPTH_SD
         memory = np.where(first, 0.0, DEPTH_MEMORY)
         markers.depth[free] = memory * markers.depth[free] + (1 - memory) * depth[free]
         markers.depth_sd[free] = KNOWN_DEPTH_SD
+
+    def _compare_motion(self, measured: np.ndarray, frame: int) -> tuple[Doubt, ...]:
+        """Doubt markers that move unlike those they moved with, and confirm some that do not.
+
+        A shadow that is none of a marker, such as a screw, does not move with the bone. Markers
+        that may have been exchanged with another are left to the second view.
+        """
+        markers = self._known()
+        rows, ratio, others = markers.motion.strangeness(measured)
+        out = []
+        for row, value, velocity in zip(rows.tolist(), ratio.tolist(), others):
+            markers.strange[row] = markers.strange[row] + 1 if value > STRANGE else 0
+            markers.shared[row] += velocity * self._gap
+            markers.own[row] += markers.motion.velocity[row] * self._gap
+            way = float(np.linalg.norm(markers.shared[row]))
+            apart = float(np.linalg.norm(markers.own[row] - markers.shared[row]))
+            if markers.strange[row] == STRANGE_FRAMES and not markers.partner[row]:
+                self.doubt(int(markers.target_id[row]), frame)
+                out.append(Doubt(frame, (int(markers.target_id[row]),), UNLIKE))
+            elif way > SHARED_PX and apart < SHARED * way and markers.partner[row] == {row}:
+                markers.partner[row].clear()
+            if way > SHARED_PX or not markers.partner[row]:
+                markers.shared[row] = markers.own[row] = 0.0
+        sure = np.array([not partner for partner in markers.partner], dtype=bool)
+        self._led = markers.motion.lead(markers.unseen == 0, self._velocity_before, sure)
+        return tuple(out)
 
     def _result(
         self,

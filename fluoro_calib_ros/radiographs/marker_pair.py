@@ -375,6 +375,7 @@ class MarkerPair:
             out.append(Decision('exchanged', name, frame, since, ids))
             exchanged |= {one, two}
             self._wrong[view, [one, two]] = 0
+            self._agreed[view, [one, two]] = 0
         for row in suspects.tolist():
             number = int(self.target_id[row])
             began = tracker.doubted_since(number)

@@ -679,19 +679,23 @@ class MarkerTracker:
         markers = self._known()
         rows, ratio, others = markers.motion.strangeness(measured)
         out = []
-        for row, value, velocity in zip(rows.tolist(), ratio.tolist(), others):
-            markers.strange[row] = markers.strange[row] + 1 if value > STRANGE else 0
-            markers.shared[row] += velocity * self._gap
-            markers.own[row] += markers.motion.velocity[row] * self._gap
-            way = float(np.linalg.norm(markers.shared[row]))
-            apart = float(np.linalg.norm(markers.own[row] - markers.shared[row]))
-            if markers.strange[row] == STRANGE_FRAMES and not markers.partner[row]:
-                self.doubt(int(markers.target_id[row]), frame)
-                out.append(Doubt(frame, (int(markers.target_id[row]),), UNLIKE))
-            elif way > SHARED_PX and apart < SHARED * way and markers.partner[row] == {row}:
+        doubtful = np.array([bool(partner) for partner in markers.partner], dtype=bool)
+        strange = np.where(ratio > STRANGE, markers.strange[rows] + 1, 0)
+        markers.strange[rows] = strange
+        markers.shared[rows] += others * self._gap
+        markers.own[rows] += markers.motion.velocity[rows] * self._gap
+        way = np.linalg.norm(markers.shared[rows], axis=1)
+        apart = np.linalg.norm(markers.own[rows] - markers.shared[rows], axis=1)
+        far = way > SHARED_PX
+        for row in rows[(strange == STRANGE_FRAMES) & ~doubtful[rows]].tolist():
+            self.doubt(int(markers.target_id[row]), frame)
+            out.append(Doubt(frame, (int(markers.target_id[row]),), UNLIKE))
+        for row in rows[far & (apart < SHARED * way) & doubtful[rows]].tolist():
+            if markers.partner[row] == {row}:
                 markers.partner[row].clear()
-            if way > SHARED_PX or not markers.partner[row]:
-                markers.shared[row] = markers.own[row] = 0.0
+        anew = rows[far | ~doubtful[rows]]
+        markers.shared[anew] = 0.0
+        markers.own[anew] = 0.0
         sure = np.array([not partner for partner in markers.partner], dtype=bool)
         self._led = markers.motion.lead(markers.unseen == 0, self._velocity_before, sure)
         return tuple(out)

@@ -1,0 +1,42 @@
+"""A rig with its own fluoroscopes, live: all nodes, RViz, and a bag if wanted.
+
+ros2 launch fluoro_calib_ros rig.launch.py phantom:=/path/to/phantom.csv record:=/path/to/new_bag
+ros2 launch fluoro_calib_ros rig.launch.py --show-args
+
+All arguments of fluoro_calib.launch.py are passed on; rviz defaults to true.
+"""
+
+import os
+
+from ament_index_python.packages import get_package_share_directory
+from launch import LaunchDescription
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
+from launch.launch_description_sources import PythonLaunchDescriptionSource
+from launch.substitutions import LaunchConfiguration
+
+
+def generate_launch_description():
+    """Return the graph with RViz, and with a phantom that has to be given."""
+    share = get_package_share_directory('fluoro_calib_ros')
+    nodes = PythonLaunchDescriptionSource(os.path.join(share, 'launch', 'fluoro_calib.launch.py'))
+    return LaunchDescription(
+        [
+            DeclareLaunchArgument(
+                'phantom',
+                description='phantom.csv with the surveyed coordinates of the beads [mm]',
+            ),
+            DeclareLaunchArgument(
+                'rviz',
+                default_value='true',
+                choices=['true', 'false'],
+                description='false: without RViz',
+            ),
+            IncludeLaunchDescription(
+                nodes,
+                launch_arguments={
+                    'phantom': LaunchConfiguration('phantom'),
+                    'rviz': LaunchConfiguration('rviz'),
+                }.items(),
+            ),
+        ]
+    )

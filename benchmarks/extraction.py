@@ -285,6 +285,66 @@ def measure_points(count: int, kind: str, report: Callable[[str], None]) -> dict
     }
 
 
+def phantoms(rng: np.random.Generator) -> dict[str, np.ndarray]:
+    """Beads (n, 3) [mm] of phantoms that are regular or nearly so."""
+    axis = np.arange(4) * 40.0 - 60
+    cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    side = np.arange(21) * 10.0 - 100
+    grid = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
+    kept = np.sort(rng.permutation(len(grid))[25:])
+    bent = grid + np.append(rng.uniform(-1.5, 1.5, (len(grid), 2)), 0 * grid[:, :1], axis=1)
+    return {
+        'regular cube of 64 beads': cube,
+        'two regular layers of 32 beads': cube[np.abs(cube[:, 2]) < 30],
+        'cube of 64 beads, displaced by up to 0.5 mm': cube + rng.uniform(-0.5, 0.5, (64, 3)),
+        'cube of 64 beads, displaced by up to 6 mm': cube + rng.uniform(-6, 6, (64, 3)),
+        'regular flat grid of 441 beads': grid,
+        'flat grid of 416 of 441 beads': grid[kept],
+        'flat grid of 441 beads, displaced by up to 1.5 mm': bent,
+    }
+
+
+def measure_phantoms(count: int, report: Callable[[str], None]) -> dict[str, dict[str, Any]]:
+    """Match points of other phantoms: cubes from anywhere, flat grids within some 30 degrees."""
+    y, x = np.mgrid[:1024, :1024]
+    field = np.hypot(x - 511.5, y - 511.5) < 490
+    tables: dict[str, dict[str, Any]] = {}
+    for number in range(count):
+        rng = np.random.default_rng([number, 6])
+        fluoroscope = virtual_rig(FIRST_RIG + 3000 + number, rng.uniform(0.5, 1.2)).fluoroscopes[0]
+        for name, xyz in phantoms(rng).items():
+            rotation, shift = pose_of('any', rng, fluoroscope)
+            if 'flat' in name:
+                tilt = Rotation.from_rotvec(rng.normal(0, 0.25, 3)).as_matrix()
+                turn = Rotation.from_euler('z', rng.uniform(0, 2 * np.pi)).as_matrix()
+                rotation = fluoroscope.rotation.T @ tilt @ turn
+            true = fluoroscope.distortion.distort(
+                fluoroscope.ideal(xyz @ rotation.T + 0.25 * shift)
+            )
+            uv = seen_points(rng, true, field)
+            table = tables.setdefault(
+                name,
+                {'poses': 0, 'wrong, accepted': 0, 'refused': 0, 'ambiguous': 0, 'seconds': []},
+            )
+            model = PhantomModel.of(xyz)
+            start = time.process_time()
+            try:
+                found = match(Seen.of(uv, field, 2.6), model, Lens(SIZE, 4000.0))
+            except DataError as error:
+                table['ambiguous' if 'ambiguous' in str(error) else 'refused'] += 1
+            else:
+                away = np.linalg.norm(uv[found.detection] - true[found.bead], axis=1)
+                table['wrong, accepted'] += bool(np.mean(away > 4) > 0.05)
+            table['poses'] += 1
+            table['seconds'].append(round(time.process_time() - start, 1))
+        report(f'phantoms: {number + 1} of {count}')
+    for table in tables.values():
+        seconds = table.pop('seconds')
+        table['seconds of a core, median'] = float(np.median(seconds))
+        table['seconds of a core, largest'] = max(seconds)
+    return tables
+
+
 def measure_calibration(count: int, report: Callable[[str], None]) -> dict[str, Any]:
     """Calibrate from images and from true centres, and compare points in space."""
     rig = virtual_rig(FIRST_RIG + 9000)
@@ -346,6 +406,7 @@ def main() -> None:
     parser.add_argument('--sets', nargs='+', default=('clean', 'hard'), choices=('clean', 'hard'))
     parser.add_argument('--points', type=int, default=0, help='poses of each kind')
     parser.add_argument('--kinds', nargs='+', default=KINDS, choices=KINDS)
+    parser.add_argument('--phantoms', type=int, default=0, help='poses of each other phantom')
     parser.add_argument('--calibration', type=int, default=0, help='exposures')
     parser.add_argument('--picture', type=Path)
     arguments = parser.parse_args()
@@ -360,6 +421,8 @@ def main() -> None:
         for kind in arguments.kinds:
             tables[kind] = measure_points(arguments.points, kind, report)
             report(f'{kind}: {tables[kind]}')
+    if arguments.phantoms:
+        tables.update(measure_phantoms(arguments.phantoms, report))
     if arguments.images:
         for name in arguments.sets:
             tables[name] = measure_set(arguments.images, name == 'hard', report)

@@ -19,12 +19,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import rigs
+from scipy import stats
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.noise_estimation import adjust_and_estimate_noise
 from fluoro_calib_ros.photogrammetry.outliers import (
+    _f_limit,
     find_outliers,
     image_statistics,
     target_statistics,
@@ -111,3 +113,12 @@ def test_surveys_of_a_free_network_are_not_tested():
     network = replace(network, datum='inner')
     result, precise = adjusted(network, truth)
     assert not len(find_outliers(network, result, precise).target)
+
+
+def test_limits_of_the_f_distribution_are_those_of_scipy():
+    for freedom in (3.0, 5.0, 37.5, 1e5):
+        for probability in (0.3, 1e-3, 1e-8):
+            assert _f_limit(probability, freedom) == pytest.approx(
+                stats.f.isf(probability, 2, freedom), rel=1e-9
+            )
+    assert _f_limit(1e-3, np.inf) == pytest.approx(stats.chi2.isf(1e-3, 2) / 2)

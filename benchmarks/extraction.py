@@ -51,15 +51,15 @@ from fluoro_calib_ros.radiographs.growth import Seen
 from fluoro_calib_ros.radiographs.matching import PhantomModel, match
 from fluoro_calib_ros.radiographs.overlay import draw_overlay
 from fluoro_calib_ros.radiographs.view import Lens
-from fluoro_calib_ros.simulation.exposures import Detection, phantom_poses, simulate_exposures
+from fluoro_calib_ros.simulation.exposures import phantom_poses
 from fluoro_calib_ros.simulation.radiographs import CLEAN, HARD, RadiographSettings, Radiography
 from fluoro_calib_ros.simulation.rig import Pose, VirtualFluoroscope, VirtualRig, virtual_rig
-from fluoro_calib_ros.simulation.streams import StreamStart
 
 FIRST_RIG = 1000  # seeds below are those of development and tests
 IMAGES_OF_A_RIG = 5
 BOUND_IMAGES = 12  # of a set, for which the bound is computed
 FALSE_PX = 1.0
+UNSEEN = 8  # exposures that test a calibration
 PLAIN = 0.3  # of the noise, to which a plain background is a polynomial
 SIZE = (1024, 1024)
 KINDS = ('turntable', 'any', 'tube', 'other')  # of poses; other: of another phantom
@@ -346,9 +346,31 @@ def measure_phantoms(count: int, report: Callable[[str], None]) -> dict[str, dic
 
 
 def measure_calibration(count: int, report: Callable[[str], None]) -> dict[str, Any]:
-    """Calibrate from images and from true centres, and compare points in space."""
+    """Calibrate from images and from true centres, and compare points in space and sources.
+
+    Both calibrations are held while radiographs that they have not seen are adjusted, and while
+    the true centres of the same beads are.
+    """
     rig = virtual_rig(FIRST_RIG + 9000)
-    poses = phantom_poses(np.random.default_rng(91), count)
+    rng = np.random.default_rng(91)
+    seen = _extracted(rig, phantom_poses(rng, count), 1, report)
+    unseen_poses = phantom_poses(rng, UNSEEN)
+    unseen = _extracted(rig, unseen_poses, 1001, report)
+    out: dict[str, Any] = {}
+    for name, frames in (('from images', seen[0]), ('from true centres', seen[1])):
+        options = CalibrationOptions(model='local_linear')
+        outcome = run_calibration(CalibrationRequest(frames, rig.phantom, options, True))
+        for test_name, test in (('images', unseen[0]), ('true centres', unseen[1])):
+            errors = errors_in_space(test, outcome.calibrations, rig, unseen_poses)
+            out[f'calibrated {name}, tested on {test_name}'] = errors
+            report(f'calibrated {name}, tested on {test_name}: {errors}')
+    return out
+
+
+def _extracted(
+    rig: VirtualRig, poses: list[Pose], first: int, report: Callable[[str], None]
+) -> tuple[dict[str, list[Frame]], dict[str, list[Frame]]]:
+    """Frames of rendered radiographs, and the same with the true centres."""
     extracted: dict[str, list[Frame]] = {}
     ideal: dict[str, list[Frame]] = {}
     model = PhantomModel.of(rig.phantom.xyz_mm)
@@ -356,7 +378,7 @@ def measure_calibration(count: int, report: Callable[[str], None]) -> dict[str, 
         radiography = Radiography(fluoroscope, CLEAN)
         extracted[fluoroscope.name] = []
         ideal[fluoroscope.name] = []
-        for number, pose in enumerate(poses, 1):
+        for number, pose in enumerate(poses, first):
             image = radiography.image(rig.true_mm, pose, number)
             found: Extraction = extract_beads(image, model, Lens(SIZE, 4000.0))
             ids = rig.phantom.target_id[found.bead]
@@ -365,27 +387,26 @@ def measure_calibration(count: int, report: Callable[[str], None]) -> dict[str, 
             centres = radiography.centres(rig.true_mm, pose)[found.bead]
             ideal[fluoroscope.name].append(replace(frame, uv=centres))
             report(f'{fluoroscope.name} {number}: {len(ids)} beads')
-    out = {}
-    for name, frames in (('images', extracted), ('true centres', ideal)):
-        options = CalibrationOptions(model='local_linear')
-        outcome = run_calibration(CalibrationRequest(frames, rig.phantom, options, True))
-        out[name] = errors_in_space(outcome.calibrations, rig)
-        report(f'{name}: {out[name]}')
-    return out
+    return extracted, ideal
 
 
-def errors_in_space(calibrations: Any, rig: VirtualRig) -> dict[str, float]:
-    """RMSE of object points and sources [mm] in unseen exposures, adjusted with calibrations held.
-
-    The unseen image points have no noise, so that only the calibration makes a difference; the
-    object points are those of the truth.
-    """
-    detection = Detection(noise_px=0.0, false_matches=0.0, beads=(300, 360))
-    test = simulate_exposures(rig, 12, 92, detection, StreamStart(number=1001))
+def errors_in_space(
+    frames: dict[str, list[Frame]], calibrations: Any, rig: VirtualRig, poses: list[Pose]
+) -> dict[str, float]:
+    """RMSE of object points and sources [mm], adjusted with calibrations held."""
     phantom = Phantom(rig.phantom.target_id, rig.phantom.xyz_mm, rig.phantom.sd_mm)
-    result = adjust(test.frames, phantom, calibrations)
+    result = adjust(frames, phantom, calibrations)
     row = rig.phantom.index(result.targets.target_id)
-    return {'object points [mm]': rms(result.targets.xyz_mm - rig.true_mm[row])}
+    sources = []
+    for fluoroscope in rig.fluoroscopes:
+        exposures = result.fluoroscopes[fluoroscope.name].exposures
+        for exposure, (rotation, shift) in zip(exposures, poses):
+            true = rotation.T @ (fluoroscope.position_mm - shift)
+            sources.append(exposure.position_mm - true)
+    return {
+        'object points [mm]': round(rms(result.targets.xyz_mm - rig.true_mm[row]), 5),
+        'sources [mm]': round(rms(np.array(sources)), 4),
+    }
 
 
 def write_picture(path: Path) -> None:

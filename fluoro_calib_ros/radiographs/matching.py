@@ -35,11 +35,12 @@ from .pose_search import Triples, local_poses, nearby_map, triples_of
 from .view import Lens, View, fit_view
 
 MIN_BEADS = 10
-MIN_FOUND = 0.72
 MIN_EXPLAINED = 0.4
+# Shares found and explained from which a pose is accepted. Where many beads overlap, fewer are
+# found, but nothing else is seen.
+EVIDENT = ((0.72, MIN_EXPLAINED), (0.6, 0.85))
 NEARLY_FOUND = 0.6
-# Shares found and explained at which the search ends. Where many beads overlap, fewer are found,
-# but nothing else is seen.
+# The same at which the search ends.
 SURE = ((0.85, 0.4), (0.75, 0.95))
 # By how much the score of the best pose must exceed that of another one: as a share of it, and in
 # beads. What is missed by chance is less.
@@ -64,6 +65,7 @@ RIVAL_STEPS = 3
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
 SIZE_MARGIN = 10.0  # log-likelihood by which sizes must prefer a pose
 SIZE_TAIL = 6.0
+CLOSER = 2.0  # factor on the residuals of one pose from which another is the better one
 SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
 SYMMETRY_REACH = 0.3  # of the distance between neighbours
 SHIFTS = 6  # to neighbours, as candidates of symmetries
@@ -194,12 +196,13 @@ def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
 
 def _is_evident(best: Match) -> bool:
     """Return whether enough of what is predicted is found, and the reverse."""
-    return best.found >= MIN_FOUND and best.explained >= MIN_EXPLAINED
+    return any(best.found >= found and best.explained >= explained for found, explained in EVIDENT)
 
 
 def _check_evidence(best: Match) -> None:
     """Raise DataError where too few predicted beads are found, or the reverse."""
-    if best.found < MIN_FOUND or len(best.bead) < MIN_BEADS:
+    enough = best.explained < MIN_EXPLAINED or _is_evident(best)
+    if not enough or len(best.bead) < MIN_BEADS:
         raise DataError(
             f'the best pose of the phantom predicts {best.expected} beads in the image, of which '
             f'only {best.found:.0%} are found'
@@ -221,8 +224,9 @@ def _unambiguous(best: Match, seen: Seen, model: PhantomModel) -> Match:
     first, rivals = _climbed(best, seen, model)
     limit = first.score - max(MARGIN_BEADS, MARGIN * first.score)
     equal = [one for one in rivals if one.score > limit and not _same(one, first)]
-    if not equal:
-        return first
+    closest = min([first, *equal], key=lambda one: one.scale_px)
+    if all(one is closest or one.scale_px > CLOSER * closest.scale_px for one in [first, *equal]):
+        return closest
     by_size = _best_by_size([first, *equal], seen, model)
     if by_size is None:
         raise DataError(

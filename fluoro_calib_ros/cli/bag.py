@@ -76,6 +76,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='speed relative to the recording (default: 1)',
     )
     play.add_argument('--loop', action='store_true', help='play over and over')
+    play.add_argument(
+        '--start-offset',
+        type=number_in(0, 1e9),
+        default=0.0,
+        metavar='S',
+        help='begin so long after the first message [s]; latched messages before are given first',
+    )
+    play.add_argument(
+        '--start-paused',
+        action='store_true',
+        help='wait for the services player_node/pause (data: false) or player_node/step',
+    )
+    play.add_argument(
+        '--clock',
+        type=number_in(0, 1000),
+        default=0.0,
+        metavar='HZ',
+        help='publish the time of the recording on /clock at this rate (default: not at all)',
+    )
 
 
 def _add_action(actions: Any, name: str, text: str) -> argparse.ArgumentParser:
@@ -156,6 +175,9 @@ def _play(arguments: argparse.Namespace) -> None:
         'bag': str(arguments.source.absolute()),
         'rate': arguments.rate,
         'loop': arguments.loop,
+        'start_offset': float(arguments.start_offset),
+        'start_paused': arguments.start_paused,
+        'clock': float(arguments.clock),
     }
     if arguments.topics:
         parameters['topics'] = arguments.topics

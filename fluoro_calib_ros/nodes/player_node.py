@@ -23,8 +23,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import rclpy
+from rclpy.clock import Clock as NodeClock
+from rclpy.clock import ClockType
 from rclpy.exceptions import NameValidationException
 from rclpy.publisher import Publisher
+from rclpy.time import Time
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool, Trigger
 
 from ..bags.reader import TopicInfo, iterate_messages, topics_of
 from ..errors import DataError
@@ -35,7 +40,7 @@ from .runtime.main import run
 from .runtime.message_types import installed_type
 from .runtime.pace import Pace
 from .runtime.parameters import ParameterGroup, ParameterNode
-from .runtime.qos import observations_qos, qos_overrides, recorded_latched_qos
+from .runtime.qos import clock_qos, observations_qos, qos_overrides, recorded_latched_qos
 
 OBSERVATIONS = 'TargetObservations'
 # Message types of the other streams that the nodes process, each with one reader at least.
@@ -56,6 +61,24 @@ class PlayerParameters:
         minimum=0,
         maximum=100,
     )
+    start_offset: float = option(
+        0.0,
+        'time after the first message at which playing begins; latched messages before are given '
+        'first',
+        minimum=0.0,
+        maximum=1e9,
+        unit='s',
+    )
+    start_paused: bool = option(
+        False, 'whether to wait for the services ~/pause (data: false) or ~/step'
+    )
+    clock: float = option(
+        0.0,
+        'rate at which the time of the recording is published on /clock; 0: not at all',
+        minimum=0.0,
+        maximum=1000.0,
+        unit='Hz',
+    )
     strip_prefix: str = option('', 'prefix removed from recorded topics')
     topics: tuple[str, ...] = option(('',), 'topics to play; empty: all')
 
@@ -73,8 +96,12 @@ class PlayerNode(ParameterNode):
         if not self._settings.bag:
             raise StartError('parameter bag is not set: it names the bag to play')
         self._outputs = self._create_outputs(self._settings.bag)
-        self._pace = Pace(self._settings.rate)
+        self._pace = Pace(self._settings.rate, self._settings.start_paused)
+        self._start_ns: int | None = None  # of the recording, where playing begins
         _NODE.follow(self, self._use)
+        self.create_service(SetBool, '~/pause', self._on_pause)
+        self.create_service(Trigger, '~/step', self._on_step)
+        self._publish_clock()
         self.failed = False
         self._stopping = threading.Event()
         self._worker = threading.Thread(target=self._play, daemon=True)
@@ -84,6 +111,40 @@ class PlayerNode(ParameterNode):
         """Use other settings from now on."""
         self._settings = settings
         self._pace.change(settings.rate)
+
+    def _on_pause(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        """Pause, or go on."""
+        response.success = self._pace.paused != request.data
+        if request.data:
+            self._pace.pause()
+        else:
+            self._pace.resume()
+        state = 'paused' if request.data else 'playing'
+        response.message = state if response.success else f'already {state}'
+        return response
+
+    def _on_step(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Play one message during a pause."""
+        response.success = self._pace.paused
+        if response.success:
+            self._pace.step()
+        response.message = 'one message' if response.success else 'not paused: call ~/pause first'
+        return response
+
+    def _publish_clock(self) -> None:
+        """Publish the time of the recording at the rate of the parameter clock."""
+        if not self._settings.clock:
+            return
+        output = self.create_publisher(Clock, '/clock', clock_qos())
+
+        def publish() -> None:
+            if self._start_ns is not None:
+                now_ns = self._start_ns + round(self._pace.position_s * 1e9)
+                output.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
+
+        # Steady, because the node's own clock may be the one that is published.
+        steady = NodeClock(clock_type=ClockType.STEADY_TIME)
+        self.create_timer(1 / self._settings.clock, publish, clock=steady)
 
     def _create_outputs(self, bag: str) -> dict[str, Publisher]:
         """Return the publishers of the topics to play. Raises StartError."""
@@ -98,6 +159,7 @@ class PlayerNode(ParameterNode):
                 output = self._create_output(topic, info)
                 if output is not None:
                     outputs[topic] = output
+        self._latched = {output for topic, output in outputs.items() if is_latched(topics[topic])}
         if not outputs:
             raise StartError(
                 f'{bag}: there is nothing to play among its topics {", ".join(topics) or "(none)"}'
@@ -167,16 +229,28 @@ class PlayerNode(ParameterNode):
     def _play_once(self) -> None:
         """Publish every message at its time."""
         start = time.monotonic()
-        first_ns = None
+        start_ns = None
         count = 0
         for message in iterate_messages(self._settings.bag, list(self._outputs)):
-            if first_ns is None:
-                first_ns = message.log_time_ns
+            if start_ns is None:
+                start_ns = message.log_time_ns + round(self._settings.start_offset * 1e9)
+            output = self._outputs[message.topic]
+            if message.log_time_ns < start_ns:
+                if output in self._latched:
+                    output.publish(message.data)
+                continue
+            if not count:
                 self._pace.start()
-            if self._pace.wait((message.log_time_ns - first_ns) * 1e-9, self._stopping):
+                self._start_ns = start_ns
+            if self._pace.wait((message.log_time_ns - start_ns) * 1e-9, self._stopping):
                 return
-            self._outputs[message.topic].publish(message.data)
+            output.publish(message.data)
             count += 1
+        if not count:
+            raise DataError(
+                f'{self._settings.bag}: there is no message {self._settings.start_offset:g} s '
+                'after the first one (parameter start_offset)'
+            )
         self.get_logger().info(f'{count} messages played in {time.monotonic() - start:.1f} s')
 
     def stop(self) -> None:

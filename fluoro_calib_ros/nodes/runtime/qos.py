@@ -53,6 +53,13 @@ def recorded_latched_qos() -> QoSProfile:
     return _reliable(RECORDED_LATCHED_DEPTH, DurabilityPolicy.TRANSIENT_LOCAL)
 
 
+def clock_qos() -> QoSProfile:
+    """Profile of /clock, as rosbag2 has it."""
+    return QoSProfile(
+        history=HistoryPolicy.KEEP_LAST, depth=1, reliability=ReliabilityPolicy.BEST_EFFORT
+    )
+
+
 def services_qos() -> QoSProfile:
     """Profile of services: a burst of requests is queued, and every one of them is answered."""
     return _reliable(REQUEST_DEPTH)

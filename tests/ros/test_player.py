@@ -1,0 +1,79 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The player: begins later, waits for a step, pauses, and publishes the time of the recording."""
+
+from __future__ import annotations
+
+from rclpy.qos import QoSProfile, ReliabilityPolicy
+from ros_graph import BAGS
+from rosgraph_msgs.msg import Clock
+from std_srvs.srv import SetBool, Trigger
+
+from fluoro_calib_ros.bags.reader import iterate_messages
+
+TOPIC = '/a/target_observations'
+OFFSET_S = 0.5
+
+
+def test_player_steps_pauses_and_publishes_the_time(graph):
+    times = [m.log_time_ns for m in iterate_messages(BAGS / 'tracking', [TOPIC])]
+    begin_ns = times[0] + round(OFFSET_S * 1e9)
+    later = [time for time in times if time >= begin_ns]
+    client = graph.client
+    received = client.listen('a/target_observations')
+    clock: list[int] = []
+    client.create_subscription(
+        Clock,
+        '/clock',
+        lambda m: clock.append(m.clock.sec * 10**9 + m.clock.nanosec),
+        QoSProfile(depth=100, reliability=ReliabilityPolicy.BEST_EFFORT),
+    )
+    client.expect(Trigger, 'player_node/step')
+    client.expect(SetBool, 'player_node/pause')
+    player = graph.start(
+        'player_node',
+        {
+            'bag': BAGS / 'tracking',
+            'topics': f'[{TOPIC}]',
+            'start_offset': OFFSET_S,
+            'start_paused': True,
+            'clock': 100.0,
+        },
+        wait=False,
+    )
+    for count in (1, 2, 3):
+        assert client.call(Trigger, 'player_node/step').success
+        client.wait_until(lambda count=count: len(received) == count, what='a message')
+    # During the pause the time stands at the last message.
+    client.wait_until(lambda: clock and clock[-1] == later[2], what='the time of the message')
+    assert not client.call(SetBool, 'player_node/pause', data=True).success  # already paused
+    assert client.call(SetBool, 'player_node/pause', data=False).success
+    client.wait_until(lambda: len(received) > 10, what='messages')
+    assert not client.call(Trigger, 'player_node/step').success  # not paused
+    client.wait_until(lambda: not player.running, what='the end of the bag')
+    assert player.wait() == 0
+    client.wait_until(lambda: len(received) == len(later), what='all messages')
+    assert clock == sorted(clock)
+    assert begin_ns <= clock[0] and clock[-1] <= later[-1] + 10**9
+
+
+def test_offset_behind_the_end_is_told(graph):
+    player = graph.start(
+        'player_node',
+        {'bag': BAGS / 'tracking', 'start_offset': 1e6, 'wait_for_readers': 0},
+        wait=False,
+    )
+    assert player.wait() == 1
+    assert 'there is no message 1e+06 s after the first one' in player.log

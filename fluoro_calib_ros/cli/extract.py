@@ -68,6 +68,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         '--fluoroscope',
+        '--fluoroscopes',
+        dest='fluoroscope',
         required=True,
         type=names,
         metavar='NAME',

@@ -76,7 +76,7 @@ def extract(folder: Path, source: str, *more: str) -> None:
             str(folder / source),
             '--phantom',
             str(folder / 'phantom.csv'),
-            '--fluoroscope',
+            '--fluoroscopes',
             'a',
             '--out',
             str(folder / 'out.csv'),

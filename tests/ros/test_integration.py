@@ -15,11 +15,11 @@
 """What an integrator meets: saved calibrations, two nodes by mistake, remapped inputs, TF."""
 
 import os
+import select
 import shutil
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 from fluoro_calib_msgs.srv import Calibrate, LoadCalibration, Orient
 from ros_graph import BAGS, NAMES, ROOT, standing, value_of
@@ -197,16 +197,8 @@ if __name__ == '__main__':
     with subprocess.Popen(
         [sys.executable, script], cwd=ROOT, stdout=subprocess.PIPE, text=True
     ) as node:
-        worker = int(node.stdout.readline())
+        worker = os.pidfd_open(int(node.stdout.readline()))  # readable once it has ended
         os.kill(node.pid, signal.SIGKILL)
-        # The worker holds the other end of standard output: it ends with the worker.
-        node.stdout.read()
-    assert not _is_running(worker)
-
-
-def _is_running(pid):
-    try:
-        state = Path(f'/proc/{pid}/stat').read_text().rpartition(')')[2].split()[0]
-    except FileNotFoundError:
-        return False
-    return state != 'Z'
+        ended, _, _ = select.select([worker], [], [], 10)
+        os.close(worker)
+    assert ended

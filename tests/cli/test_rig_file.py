@@ -122,7 +122,6 @@ def test_source_is_the_first_argument_of_every_command():
 
 
 def test_completion_script_is_valid_bash(capsys):
-    pytest.importorskip('shtab')
     with pytest.raises(SystemExit) as ended:
         main(['--print-completion', 'bash'])
     script = capsys.readouterr().out

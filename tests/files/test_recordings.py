@@ -17,6 +17,7 @@
 import struct
 
 import numpy as np
+import pydicom
 import pytest
 
 from fluoro_calib_ros.errors import DataError
@@ -24,7 +25,6 @@ from fluoro_calib_ros.files.cine import read_cine_header
 from fluoro_calib_ros.files.image_reading import open_images
 from fluoro_calib_ros.jobs.image_sources import contains_images, open_sources
 
-pydicom = pytest.importorskip('pydicom')
 LITTLE = '1.2.840.10008.1.2.1'
 JPEG = '1.2.840.10008.1.2.4.50'
 

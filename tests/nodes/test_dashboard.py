@@ -19,6 +19,7 @@ from dataclasses import replace
 
 import pytest
 from rich.console import Console
+from textual.widgets import Static
 
 from fluoro_calib_ros.nodes.dashboard.state import (
     FluoroscopeState,
@@ -26,10 +27,6 @@ from fluoro_calib_ros.nodes.dashboard.state import (
     RateMeter,
     SessionState,
 )
-
-pytest.importorskip('textual')
-from textual.widgets import Static
-
 from fluoro_calib_ros.nodes.dashboard.view import Dashboard, session_text
 
 STATE = SessionState(

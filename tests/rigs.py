@@ -21,7 +21,9 @@ import numpy as np
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
 from fluoro_calib_ros.cli import main
+from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
 from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
@@ -161,3 +163,20 @@ def run(*arguments):
     except SystemExit as stop:
         return stop.code
     return 0
+
+
+def pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCalibration:
+    """Return a calibration for images of any size: a pincushion of some pixels."""
+    places = np.meshgrid(*(np.linspace(-0.5, s - 0.5, 12) for s in image_size))
+    uv = np.stack(places, axis=-1).reshape(-1, 2)
+    x = (uv - 0.5 * np.array(image_size)) / (max(image_size) / 2)
+    model = create_model(
+        'local_linear', 6, uv, 4 * x * (x**2).sum(axis=1, keepdims=True), 0.2, 0.0
+    )
+    return replace(
+        calibrated('a', 5, model='none').calibrations['a'],
+        fluoroscope=name,
+        model=model,
+        image_size=image_size,
+        train_exposure=np.zeros(len(uv), dtype=np.int64),
+    )

@@ -207,13 +207,24 @@ def add_fluoroscopes(parser: Parser, use: str = 'use') -> None:
     )
 
 
-def add_scheduler(parser: argparse._ActionsContainer) -> None:
+def add_workers(parser: argparse._ActionsContainer) -> None:
+    """Add --workers, a number of processes."""
+    parser.add_argument(
+        '--workers',
+        type=number_in(1, 1024, int),
+        default=0,
+        metavar='N',
+        help='processes (default: as many as there are cores)',
+    )
+
+
+def add_scheduler(parser: argparse._ActionsContainer, task: str = 'extract the images') -> None:
     """Add --scheduler, the address of a Dask cluster for images."""
     parser.add_argument(
         '--scheduler',
         metavar='tcp://HOST:PORT',
-        help='Dask scheduler whose workers extract the images, in place of processes of this '
-        'machine (needs: pip install fluoro_calib_ros[cluster])',
+        help=f'Dask scheduler whose workers {task}, in place of processes of this machine '
+        '(needs: pip install fluoro_calib_ros[cluster])',
     )
 
 

@@ -17,12 +17,18 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import DataError
-from .arguments import add_calibration, add_file_options, file_settings
+from .arguments import (
+    add_calibration,
+    add_file_options,
+    add_scheduler,
+    add_workers,
+    file_settings,
+)
 from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
@@ -67,6 +73,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default='linear',
         help='interpolation between the pixels of an image (default: linear)',
     )
+    folders = parser.add_argument_group('folders of images and videos')
+    folders.add_argument(
+        '--recursive', action='store_true', help='correct the folders in SOURCE, too'
+    )
+    folders.add_argument(
+        '--keep-going',
+        action='store_true',
+        help='pass over files that cannot be corrected, and name them; without it, one of them '
+        'ends the command and nothing is written',
+    )
+    add_workers(folders)
+    add_scheduler(folders, 'correct the files; they see the folders under the same names')
     add_file_options(parser)
 
 
@@ -126,8 +144,8 @@ def _correct_points(
 def _correct_images(
     arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
 ) -> None:
-    from ..files.image_files import correct_images
     from ..images.corrector import ImageCorrector
+    from ..jobs.image_correction import ImageCorrectionRequest, run_image_correction
 
     source = arguments.source
     if not source.exists():
@@ -138,26 +156,39 @@ def _correct_images(
             f'{", ".join(calibrations)}: choose one with --fluoroscope'
         )
     (calibration,) = calibrations.values()
-    corrector = ImageCorrector(calibration, arguments.interpolation)
+    request = ImageCorrectionRequest(
+        source,
+        arguments.out,
+        calibration,
+        arguments.interpolation,
+        arguments.workers,
+        arguments.scheduler,
+        arguments.recursive,
+        arguments.keep_going,
+    )
     with ProgressBar(source.name) as progress:
-        done = correct_images(source, arguments.out, corrector, progress)
+        done = run_image_correction(request, progress)
     if done.passed_over:
-        names = ', '.join(done.passed_over[:MAX_NAMES])
-        further = len(done.passed_over) - MAX_NAMES
-        names += f' and {further} more' if further > 0 else ''
-        print_note(f'{source}: files that are not images were skipped: {names}')
+        print_note(
+            f'{source}: files that are not images were skipped: {_some(done.passed_over, ", ")}'
+        )
+    if done.failed:
+        print_note(f'not corrected: {_some(done.failed, "; ")}')
+    corrector = ImageCorrector(calibration, arguments.interpolation)
     size = 'x'.join(map(str, calibration.image_size))
     empty = int((~corrector.mask).sum())
     document = {
         'out': str(arguments.out),
         'kind': done.kind,
         'images': done.images,
+        'files': done.files,
         'fluoroscope': calibration.fluoroscope,
         'calibration_id': calibration.calibration_id,
         'image_size': list(calibration.image_size),
         'interpolation': arguments.interpolation,
         'empty_pixels': empty,
         'passed_over': list(done.passed_over),
+        'failed': list(done.failed),
     }
     noun = 'image' if done.images == 1 else 'images'
     print_result(
@@ -166,3 +197,10 @@ def _correct_images(
         f'{done.images} {noun} of {size} px corrected with {calibration.calibration_id}, written '
         f'to {arguments.out}; {empty} pixels of each are empty, the original does not show them',
     )
+
+
+def _some(names: Sequence[str], separator: str) -> str:
+    """Return the first of some names, and how many there are further."""
+    further = len(names) - MAX_NAMES
+    text = separator.join(names[:MAX_NAMES])
+    return f'{text} and {further} more' if further > 0 else text

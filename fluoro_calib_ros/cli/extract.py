@@ -26,6 +26,7 @@ from .arguments import (
     add_option,
     add_phantom,
     add_scheduler,
+    add_workers,
     file_settings,
     names,
     number_in,
@@ -91,13 +92,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='DIR',
         help='folder for pictures of what was found, matched and refused',
     )
-    parser.add_argument(
-        '--workers',
-        type=number_in(1, 1024, int),
-        default=0,
-        metavar='N',
-        help='processes (default: as many as there are cores)',
-    )
+    add_workers(parser)
     add_scheduler(parser)
     parser.add_argument(
         '--regular-grid',

@@ -12,7 +12,7 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Correction of image files, stacks, folders of images and videos.
+"""Correction of image files, stacks and videos.
 
 Images are grey and keep their 8 or 16 bits; if the new file cannot hold them, an error is raised
 and nothing is written. Videos are written without loss (FFV1), except for MP4.
@@ -29,11 +29,8 @@ import numpy as np
 
 from ..errors import DataError
 from ..images.corrector import ImageCorrector
-from .access import make_folder
-from .atomic import sync_folder
-from .image_formats import IMAGE_SUFFIXES, listed, suffix_of
 from .image_reading import ImageSource, open_images
-from .image_writing import Progress, temporary_path, write_images
+from .image_writing import Progress, write_images
 
 
 @dataclass(frozen=True)
@@ -44,14 +41,19 @@ class CorrectedImages:
     ----------
     kind : {'image', 'stack', 'video', 'folder'}
     images : int
-        Number of images, pages or frames.
+        Number of images, pages and frames.
+    files : int
     passed_over : tuple of str
         Names of the files of a folder that are no images.
+    failed : tuple of str
+        What is wrong with the files of a folder that could not be corrected.
     """
 
     kind: str
     images: int
+    files: int = 1
     passed_over: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()
 
 
 def correct_images(
@@ -60,12 +62,11 @@ def correct_images(
     corrector: ImageCorrector,
     progress: Progress | None = None,
 ) -> CorrectedImages:
-    """Correct an image file, a stack, a folder of images or a video.
+    """Correct an image file, a stack or a video.
 
     Parameters
     ----------
     source, out : path
-        `out` is a folder if `source` is one, else a file.
     corrector : ImageCorrector
     progress : callable, optional
         Called after every image with the number of images that are done, and their total.
@@ -83,18 +84,20 @@ def correct_images(
     """
     source = Path(source)
     out = Path(out)
-    progress = progress or _no_progress
+    check_apart(source, out)
+    if out.is_dir():
+        raise DataError(f'{out}: this is a folder, but {source} is a file')
+    images = open_images(source)
+    written = write_images(out, _corrected(images, corrector), progress or _no_progress)
+    return CorrectedImages(images.kind, written)
+
+
+def check_apart(source: Path, out: Path) -> None:
+    """Raise DataError where the output is the source, or has no folder to be in."""
     if source.exists() and out.exists() and os.path.samefile(source, out):
         raise DataError(f'{out}: this is the source itself, corrected images need another name')
     if not out.absolute().parent.is_dir():
         raise DataError(f'{out}: cannot be written, there is no folder {out.absolute().parent}')
-    if source.is_dir():
-        return _correct_folder(source, out, corrector, progress)
-    if out.is_dir():
-        raise DataError(f'{out}: this is a folder, but {source} is a file')
-    images = open_images(source)
-    written = write_images(out, _corrected(images, corrector), progress)
-    return CorrectedImages(images.kind, written)
 
 
 def _no_progress(done: int, total: int) -> None:
@@ -119,30 +122,3 @@ def _corrected_images(
         if out is None or out.dtype != image.dtype:
             out = np.empty(corrector.shape, dtype=image.dtype)
         yield where, corrector.correct(image, out)
-
-
-def _correct_folder(
-    source: Path, out: Path, corrector: ImageCorrector, progress: Progress
-) -> CorrectedImages:
-    """Write all images into a temporary folder first, then move them to their place."""
-    files = sorted(path for path in source.iterdir() if path.is_file())
-    images = [path for path in files if suffix_of(path) in IMAGE_SUFFIXES]
-    if not images:
-        raise DataError(f'{source}: there are no images in this folder ({listed(IMAGE_SUFFIXES)})')
-    if out.exists() and not out.is_dir():
-        raise DataError(f'{out}: this is a file, but {source} is a folder')
-    with temporary_path(out) as temporary:
-        make_folder(temporary)
-        for number, path in enumerate(images, 1):
-            corrected = _corrected(open_images(path), corrector)
-            write_images(temporary / path.name, corrected, _no_progress)
-            progress(number, len(images))
-        make_folder(out)
-        for path in images:  # before any file is moved: all or nothing
-            if (out / path.name).is_dir():
-                raise DataError(f'{out / path.name}: cannot be written, this is a folder')
-        for path in images:
-            os.replace(temporary / path.name, out / path.name)
-        sync_folder(out)
-    passed_over = tuple(path.name for path in files if path not in images)
-    return CorrectedImages('folder', len(images), passed_over)

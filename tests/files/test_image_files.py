@@ -26,11 +26,11 @@ import numpy as np
 import pytest
 import rigs
 
-from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.files import tiff
 from fluoro_calib_ros.files.calibration import save_calibration
 from fluoro_calib_ros.files.image_files import correct_images
+from fluoro_calib_ros.files.image_folder import list_images
 from fluoro_calib_ros.files.image_formats import IMAGE_SUFFIXES, SUPPORTS_16_BIT_VIDEOS
 from fluoro_calib_ros.files.image_reading import ImageSource
 from fluoro_calib_ros.files.image_writing import write_video
@@ -53,21 +53,8 @@ def stack_of(count, dtype=np.uint8):
 
 
 def a_calibration(name):
-    """Calibration for small images: a pincushion of some pixels."""
-    uv = np.stack(np.meshgrid(*(np.linspace(-0.5, s - 0.5, 12) for s in SIZE)), axis=-1).reshape(
-        -1, 2
-    )
-    x = (uv - 0.5 * np.array(SIZE)) / 64
-    model = create_model(
-        'local_linear', 6, uv, 4 * x * (x**2).sum(axis=1, keepdims=True), 0.2, 0.0
-    )
-    return replace(
-        rigs.calibrated('a', 5, model='none').calibrations['a'],
-        fluoroscope=name,
-        model=model,
-        image_size=SIZE,
-        train_exposure=np.zeros(len(uv), dtype=np.int64),
-    )
+    """Calibration for small images."""
+    return rigs.pincushion(name, SIZE)
 
 
 @pytest.fixture(scope='module')
@@ -226,7 +213,8 @@ def test_folder(one, corrector, tmp_path, capfd):
     assert correct(source, one, out, '--json') == 0
     said = capfd.readouterr()
     got = json.loads(said.out)
-    assert got['kind'] == 'folder' and got['images'] == 4 and got['passed_over'] == ['readme.txt']
+    assert (got['kind'], got['files'], got['images']) == ('folder', 4, 5)
+    assert got['passed_over'] == ['readme.txt']
     assert 'skipped: readme.txt' in said.err
     assert sorted(os.listdir(out)) == ['0.png', '1.png', '2.png', 'note.txt', 'stack.tif']
     for n in range(3):
@@ -235,6 +223,81 @@ def test_folder(one, corrector, tmp_path, capfd):
         )
     assert tiff.count_pages(out / 'stack.tif') == 2
     assert sorted(os.listdir(tmp_path)) == ['in', 'out']
+
+
+def archive_of(folder):
+    """An archive of two trials: images, a stack and a video in folders of their own."""
+    for trial in ('trial_1', 'trial_2/raw'):
+        (folder / trial).mkdir(parents=True)
+        for n in range(2):
+            (folder / trial / f'{n}.png').write_bytes(encode(image_of(n), '.png'))
+        video_of(folder / trial / 'run.avi', stack_of(3))
+    (folder / 'trial_1' / 'notes.txt').write_text('x')
+    return folder
+
+
+def content_of(folder):
+    """Bytes of all files of a tree by their names."""
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob('*'))
+        if path.is_file()
+    }
+
+
+def test_archive_with_folders_on_two_processes(one, tmp_path, capfd):
+    """The folders in the folder, too; the same bytes with one process and with two."""
+    source = archive_of(tmp_path / 'in')
+    assert 'no images in this folder' in said(capfd, source, one, tmp_path / 'flat')
+    for workers in ('1', '2'):
+        out = tmp_path / f'out{workers}'
+        more = ('--recursive', '--workers', workers, '--json')
+        assert correct(source, one, out, *more) == 0
+        got = json.loads(capfd.readouterr().out)
+        assert (got['files'], got['images']) == (6, 10)
+        assert got['passed_over'] == [os.path.join('trial_1', 'notes.txt')]
+    first = content_of(tmp_path / 'out1')
+    assert first == content_of(tmp_path / 'out2')
+    assert set(first) == {name for name in content_of(source) if name.endswith(('png', 'avi'))}
+    assert 'this is inside of' in said(capfd, source, one, source / 'out', '--recursive')
+
+
+def test_folder_with_a_damaged_file_keeps_going_if_asked_to(one, tmp_path, capfd):
+    source = archive_of(tmp_path / 'in')
+    bad = source / 'trial_1' / '0.png'
+    bad.write_bytes(bad.read_bytes()[:100])
+    out = tmp_path / 'out'
+    one_process = ('--recursive', '--workers', '1')
+    assert str(bad) in said(capfd, source, one, out, *one_process)
+    assert not out.exists()
+    assert correct(source, one, out, *one_process, '--keep-going', '--json') == 0
+    told = capfd.readouterr()
+    got = json.loads(told.out)
+    assert got['files'] == 5 and len(got['failed']) == 1 and str(bad) in got['failed'][0]
+    assert f'not corrected: {bad}' in told.err
+    assert not (out / 'trial_1' / '0.png').exists() and (out / 'trial_1' / '1.png').exists()
+
+
+def test_folder_names_its_output_in_messages(one, tmp_path, capfd):
+    """Not the temporary folder."""
+    (tmp_path / 'in').mkdir()
+    for name in ('x.avi', 'x.AVI.png'):
+        (tmp_path / 'in' / name).write_bytes(encode(image_of(0, np.uint16), '.png'))
+    deep = tmp_path / 'in' / 'y.jpg'
+    deep.write_bytes(encode(image_of(0, np.uint16), '.png'))
+    (tmp_path / 'in' / 'x.avi').unlink()
+    text = said(capfd, tmp_path / 'in', one, tmp_path / 'out')
+    assert f'{tmp_path / "out" / "y.jpg"}: an image of 16 bits cannot be written' in text
+
+
+def test_recordings_of_a_folder_get_a_format_that_is_written(tmp_path):
+    """Cine files become videos and DICOM files stacks; two files of one name are refused."""
+    for name in ('a.cine', 'b.dcm', 'c.mkv'):
+        (tmp_path / name).write_bytes(b'x')
+    assert [str(path) for path in list_images(tmp_path).written] == ['a.avi', 'b.tif', 'c.mkv']
+    (tmp_path / 'a.avi').write_bytes(b'x')
+    with pytest.raises(DataError, match=r'a\.avi and a\.cine would both be written as a\.avi'):
+        list_images(tmp_path)
 
 
 @pytest.mark.parametrize(

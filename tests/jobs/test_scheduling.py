@@ -23,11 +23,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rigs
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.jobs import scheduling
 from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
+from fluoro_calib_ros.jobs.image_correction import (
+    ImageCorrectionRequest,
+    run_image_correction,
+)
 from fluoro_calib_ros.jobs.scheduling import LocalWorkers, open_workers
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.bead_images import bead_image
@@ -61,29 +66,60 @@ def request(images: Path, **settings) -> ExtractionRequest:
     return ExtractionRequest([images], phantom(), 'a', **settings)
 
 
+@pytest.fixture(scope='module')
+def cluster():
+    from distributed import LocalCluster
+
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as started:
+        yield started
+
+
+class Killer:
+    """Progress that kills a worker of a cluster after the second file."""
+
+    def __init__(self, cluster) -> None:
+        self.cluster = cluster
+        self.killed: list[int] = []
+
+    def __call__(self, done: int, total: int) -> None:
+        from distributed import Client
+
+        if done == 2:
+            with Client(self.cluster, set_as_default=False) as client:
+                self.killed.append(next(iter(client.run(os.getpid).values())))
+            os.kill(self.killed[0], signal.SIGKILL)
+
+
 @pytest.mark.long
-def test_a_killed_worker_of_a_cluster_loses_no_image(images):
-    from distributed import Client, LocalCluster
-
+def test_a_killed_worker_of_a_cluster_loses_no_image(images, cluster):
     expected = run_extraction(request(images, workers=1))
-    killed = []
-    with (
-        LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
-        Client(cluster, set_as_default=False) as client,
-    ):
-
-        def kill_one(done: int, total: int) -> None:
-            if done == 2:
-                killed.append(next(iter(client.run(os.getpid).values())))
-                os.kill(killed[0], signal.SIGKILL)
-
-        found = run_extraction(request(images, scheduler=cluster.scheduler_address), kill_one)
-    assert killed
+    killer = Killer(cluster)
+    found = run_extraction(request(images, scheduler=cluster.scheduler_address), killer)
+    assert killer.killed
     assert [r.exposure for r in found.results] == list(range(1, IMAGES + 1))
     assert [r.reason for r in found.refused] == [r.reason for r in expected.refused]
     for one, other in zip(found.frames, expected.frames):
         assert np.array_equal(one.target_id, other.target_id)
         assert np.array_equal(one.uv, other.uv)
+
+
+@pytest.mark.long
+def test_a_killed_worker_of_a_cluster_loses_no_corrected_image(images, cluster, tmp_path):
+    """The files are the same bytes; the damaged one is named with the place that looked."""
+    calibration = rigs.pincushion('a', (SIZE, SIZE))
+    outs = [tmp_path / 'here', tmp_path / 'cluster']
+    settings = {'keep_going': True, 'workers': 1}
+    run_image_correction(ImageCorrectionRequest(images, outs[0], calibration, **settings))
+    settings['scheduler'] = cluster.scheduler_address
+    killer = Killer(cluster)
+    done = run_image_correction(
+        ImageCorrectionRequest(images, outs[1], calibration, **settings), killer
+    )
+    assert killer.killed and done.files == IMAGES - 1
+    assert 'image_03.png' in done.failed[0] and 'worker of the cluster' in done.failed[0]
+    names = sorted(os.listdir(outs[0]))
+    assert sorted(os.listdir(outs[1])) == names and len(names) == IMAGES - 1
+    assert all((outs[0] / n).read_bytes() == (outs[1] / n).read_bytes() for n in names)
 
 
 def test_a_scheduler_that_is_not_there_is_told(monkeypatch):

@@ -1,0 +1,160 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The image correction job: a file, or all files of a folder, on all cores or a cluster."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+
+from ..calibration.result import FluoroscopeCalibration
+from ..errors import DataError
+from ..files.image_files import CorrectedImages, correct_images
+from ..files.image_folder import ImageFolder, folder_like, list_images
+from ..files.image_formats import VIDEO_SUFFIXES, suffix_of
+from ..files.image_writing import Progress
+from ..images.corrector import ImageCorrector
+from .scheduling import open_workers
+
+PER_PROCESS = 50  # images that are worth the start of a process
+
+
+@dataclass(frozen=True)
+class ImageCorrectionRequest:
+    """Images of one fluoroscope, and how to correct them.
+
+    Attributes
+    ----------
+    source, out : Path
+        `out` is a folder if `source` is one, else a file.
+    calibration : FluoroscopeCalibration
+    interpolation : {'linear', 'cubic'}
+    workers : int
+        Processes for the files of a folder; 0: as many as there are cores, and as are worth it.
+    scheduler : str or None
+        Address of a Dask scheduler, in place of processes. Its workers read and write the same
+        folders under the same names.
+    recursive : bool
+        Whether the folders in a folder belong to it.
+    keep_going : bool
+        Whether the other files of a folder are corrected where some cannot be.
+    """
+
+    source: Path
+    out: Path
+    calibration: FluoroscopeCalibration
+    interpolation: str = 'linear'
+    workers: int = 0
+    scheduler: str | None = None
+    recursive: bool = False
+    keep_going: bool = False
+
+
+@dataclass(frozen=True)
+class _Task:
+    """A file of a folder."""
+
+    source: Path
+    out: Path
+
+
+@dataclass(frozen=True)
+class _Done:
+    """What became of a file: a number of images, or what is wrong with it."""
+
+    images: int
+    problem: str = ''
+
+
+def run_image_correction(
+    request: ImageCorrectionRequest, progress: Progress | None = None
+) -> CorrectedImages:
+    """Correct an image file, a stack, a video, or all of them in a folder.
+
+    Parameters
+    ----------
+    request : ImageCorrectionRequest
+    progress : callable, optional
+        Called with what is done, and the total: images of a file, files of a folder.
+
+    Returns
+    -------
+    CorrectedImages
+
+    Raises
+    ------
+    DataError
+        If a source cannot be read, is damaged, or is no grey image of the size of the
+        calibration; if `out` cannot be written, or its format cannot hold the images; for
+        workers that are lost. `out` is left as it was.
+    """
+    if not request.source.is_dir():
+        corrector = ImageCorrector(request.calibration, request.interpolation)
+        return correct_images(request.source, request.out, corrector, progress)
+    folder = list_images(request.source, request.recursive)
+    with folder_like(request.out, folder) as temporary:
+        done = list(_corrected_files(request, folder, temporary, progress))
+        images = sum(one.images for one in done)
+        failed = tuple(one.problem for one in done if one.problem)
+        if not images:
+            raise DataError(f'none of {len(done)} files can be corrected, {failed[0]}')
+    return CorrectedImages('folder', images, len(done) - len(failed), folder.passed_over, failed)
+
+
+def _corrected_files(
+    request: ImageCorrectionRequest, folder: ImageFolder, out: Path, progress: Progress | None
+) -> Iterator[_Done]:
+    """Correct the files of a folder into another one. Raises DataError unless to keep going."""
+    # Paths that are the same for workers in other folders.
+    source = Path(os.path.abspath(folder.path))
+    tasks = [_Task(source / one, out / new) for one, new in zip(folder.files, folder.written)]
+    correct = partial(_correct_file, request.calibration, request.interpolation)
+    with open_workers(_count(request, folder), request.scheduler, len(tasks)) as workers:
+        for number, done in enumerate(workers.map(correct, tasks), 1):
+            problem = done.problem.replace(str(out), str(request.out))
+            if problem and request.scheduler is not None:
+                problem += ' (seen by a worker of the cluster)'
+            if problem and not request.keep_going:
+                raise DataError(problem)
+            yield replace(done, problem=problem)
+            if progress is not None:
+                progress(number, len(tasks))
+
+
+def _count(request: ImageCorrectionRequest, folder: ImageFolder) -> int:
+    """Return how many processes a folder is worth."""
+    if request.workers:
+        return request.workers
+    videos = sum(suffix_of(path) in VIDEO_SUFFIXES for path in folder.files)
+    worth = videos + (len(folder.files) - videos) // PER_PROCESS
+    return min(max(worth, 1), os.cpu_count() or 1)
+
+
+_correctors: dict[tuple[str, str], ImageCorrector] = {}  # the last one of this process
+
+
+def _correct_file(calibration: FluoroscopeCalibration, interpolation: str, task: _Task) -> _Done:
+    """Correct a file, in a worker."""
+    key = (calibration.calibration_id, interpolation)
+    if key not in _correctors:
+        _correctors.clear()
+        _correctors[key] = ImageCorrector(calibration, interpolation)
+    try:
+        return _Done(correct_images(task.source, task.out, _correctors[key]).images)
+    except DataError as error:
+        return _Done(0, str(error))

@@ -24,11 +24,19 @@ sourced.
 
 from __future__ import annotations
 
+import _signal  # built in, unlike the module signal, which takes as long as all of this
 import os
 import sys
-import tempfile
 
 MARK = '_ROS_WHEELS_BOOTSTRAP_COMPLETE'  # the wheels' own: set, their bootstrap does nothing
+IS_FIRST = os.environ.get(MARK) != sys.prefix
+
+# An interrupt before a program can handle it is to end it without a traceback: the first process
+# only starts the second one, and the nodes set handlers of their own.
+if _signal.getsignal(_signal.SIGINT) is _signal.default_int_handler and (
+    IS_FIRST or any(word.endswith('_node') for word in sys.orig_argv[1:2])
+):
+    _signal.signal(_signal.SIGINT, _signal.SIG_DFL)
 
 
 def environment(old: dict[str, str], prefix: str) -> dict[str, str]:
@@ -82,10 +90,12 @@ def environment(old: dict[str, str], prefix: str) -> dict[str, str]:
         )  # rcl refuses to start where it cannot write its log
         logs = [path for path in (home + '/.ros/log', home + '/.ros', home) if os.path.isdir(path)]
         if not logs or not os.access(logs[0], os.W_OK):
+            import tempfile  # rarely needed, and half of the time that all of this takes
+
             new['ROS_LOG_DIR'] = os.path.join(tempfile.gettempdir(), f'ros_log_{os.getuid()}')
     new[MARK] = prefix
     return new
 
 
-if os.environ.get(MARK) != sys.prefix:
+if IS_FIRST:
     os.execve(sys.executable, sys.orig_argv, environment(dict(os.environ), sys.prefix))

@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -131,8 +132,11 @@ def make_parser(command: str | None = None, rig: RigFile | None = None) -> argpa
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line.
 
-    Exit status 0: done, 1: failed for a reason in the data, 2: wrong usage.
+    Exit status 0: done, 1: failed for a reason in the data, 2: wrong usage; 130 and 143 after
+    SIGINT and SIGTERM, which leave no unfinished output and no process behind.
     """
+    if arguments is None:  # this process is the command
+        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     words = list(sys.argv[1:] if arguments is None else arguments)
     command = next((word for word in words if not word.startswith('-')), '')
     try:

@@ -29,6 +29,7 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from ..errors import DataError
+from .parent_watch import interrupts_blocked, watch_parent
 
 Task = TypeVar('Task')
 Result = TypeVar('Result')
@@ -78,7 +79,9 @@ class LocalWorkers:
         if count > 1:
             # A fork would copy the locks of other threads.
             context = multiprocessing.get_context('spawn')
-            self._executor = ProcessPoolExecutor(count, context)
+            self._executor = ProcessPoolExecutor(
+                count, context, initializer=watch_parent, initargs=(os.getpid(),)
+            )
 
     def __enter__(self) -> LocalWorkers:
         return self
@@ -94,10 +97,13 @@ class LocalWorkers:
                 yield _alone(function, task)
             return
         executor = self._executor
+
+        def submit(task: Task) -> Future[Result]:
+            with interrupts_blocked():  # the executor starts processes when it needs them
+                return executor.submit(_alone, function, task)
+
         try:
-            yield from _in_order(
-                lambda task: executor.submit(_alone, function, task), tasks, QUEUED * self._count
-            )
+            yield from _in_order(submit, tasks, QUEUED * self._count)
         except BrokenProcessPool:
             raise DataError(
                 'a worker process was ended from outside, perhaps for want of memory; start again '

@@ -28,7 +28,7 @@ from typing import Any
 import cv2
 from threadpoolctl import threadpool_limits
 
-from .parent_watch import end_with_parent, interrupts_blocked
+from .parent_watch import interrupts_blocked, watch_parent
 
 NICE = 5  # lower priority than the live nodes, higher than a calibration
 END_S = 1.0  # in which a process that has closed its connection ends
@@ -126,7 +126,7 @@ def _work(connection: Connection, make: Callable[[], Callable[..., Any]], parent
     """Answer calls until the caller has closed the connection or has died."""
     os.nice(NICE)
     cv2.setNumThreads(1)
-    threading.Thread(target=end_with_parent, args=(parent,), daemon=True).start()
+    watch_parent(parent)
     with suppress(EOFError, OSError), threadpool_limits(1):
         function = make()
         while True:

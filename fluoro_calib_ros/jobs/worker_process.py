@@ -18,12 +18,12 @@ from __future__ import annotations
 
 import multiprocessing
 import os
-import threading
+from contextlib import suppress
 from multiprocessing.connection import Connection
 
 from ..calibration.request import CalibrationRequest
 from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run_calibration
-from .parent_watch import end_with_parent, interrupts_blocked
+from .parent_watch import interrupts_blocked, watch_parent
 
 POLL_S = 0.05  # interval at which the caller may cancel [s]
 NICE = 10  # lower priority than the live nodes
@@ -95,16 +95,19 @@ def _work(
     or ('error', exception) at the end.
     """
     os.nice(NICE)
-    threading.Thread(target=end_with_parent, args=(parent,), daemon=True).start()
-    try:
-        outcome = run_calibration(
-            request,
-            validate=validate,
-            rig=rig,
-            progress=lambda *content: sender.send(('round', content)),
-        )
-        sender.send(('outcome', outcome.without_runs()))
-    except ValueError as error:  # DataError among them
-        sender.send(('error', error))
-    except Exception as error:
-        sender.send(('error', RuntimeError(repr(error))))
+    watch_parent(parent)
+    with suppress(BrokenPipeError):  # the parent has died; so does this process
+        try:
+            outcome = run_calibration(
+                request,
+                validate=validate,
+                rig=rig,
+                progress=lambda *content: sender.send(('round', content)),
+            )
+            sender.send(('outcome', outcome.without_runs()))
+        except BrokenPipeError:
+            raise
+        except ValueError as error:  # DataError among them
+            sender.send(('error', error))
+        except Exception as error:
+            sender.send(('error', RuntimeError(repr(error))))

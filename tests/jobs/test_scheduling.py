@@ -12,12 +12,15 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Images on a Dask cluster: the same results, also where a worker dies in mid-run."""
+"""Workers: the same results on a Dask cluster where one dies; none outlives its caller."""
 
 from __future__ import annotations
 
 import os
+import select
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -148,3 +151,33 @@ def test_results_keep_the_order_of_their_tasks_and_few_tasks_are_in_memory():
 def test_a_worker_that_dies_is_told():
     with LocalWorkers(2) as workers, pytest.raises(DataError, match='worker process was ended'):
         list(workers.map(os._exit, [1, 1]))
+
+
+CALLER = """
+import os, sys, threading
+sys.path.insert(0, {root!r})
+from fluoro_calib_ros.jobs.scheduling import LocalWorkers
+
+def work(_):
+    os.write(1, b'%d\\n' % os.getpid())  # in one piece, unlike print()
+    threading.Event().wait()
+
+if __name__ == '__main__':
+    with LocalWorkers(2) as workers:
+        list(workers.map(work, range(4)))
+"""
+
+
+@pytest.mark.parametrize('number', [signal.SIGKILL, signal.SIGTERM])
+def test_workers_end_with_their_caller(tmp_path, number):
+    """Neither signal lets the caller end them."""
+    script = tmp_path / 'caller.py'
+    script.write_text(CALLER.format(root=str(Path(__file__).parents[2])))
+    with subprocess.Popen(
+        [sys.executable, script], stdout=subprocess.PIPE, text=True, start_new_session=True
+    ) as caller:
+        workers = [os.pidfd_open(int(caller.stdout.readline())) for _ in range(2)]
+        caller.send_signal(number)
+        for worker in workers:  # readable once it has ended
+            assert select.select([worker], [], [], 30)[0]
+            os.close(worker)

@@ -12,11 +12,12 @@ from pathlib import Path
 
 from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
 
-from . import kills, signals
+from . import hosts, kills, signals
 
 KINDS = {
     'kills': kills.run,
     'signals': signals.run,
+    'hosts': hosts.run,
 }
 
 

@@ -29,6 +29,8 @@ class Process:
                 stdout=out,
                 stderr=out,
                 start_new_session=True,
+                # The sources beside this file, also where others are installed.
+                env={**os.environ, 'PYTHONPATH': f'{ROOT}:{os.environ.get("PYTHONPATH", "")}'},
             )
         self.pid = self._process.pid
 
@@ -98,13 +100,21 @@ def command(*arguments: object) -> list[object]:
 
 
 def node(
-    name: str, parameters: Mapping[str, object] | None = None, namespace: str = ''
+    name: str,
+    parameters: Mapping[str, object] | None = None,
+    remaps: Mapping[str, str] | None = None,
 ) -> list[object]:
     """Return the words that run a node as its console script does."""
-    code = f'import sys; from fluoro_calib_ros.entry_points import {name}; sys.exit({name}())'
-    words: list[object] = [sys.executable, '-c', code, '--ros-args']
+    script = Path(sys.prefix, 'bin', name)
+    words: list[object] = [sys.executable]
+    if script.exists():
+        words.append(script)
+    else:
+        code = f'import sys; from fluoro_calib_ros.entry_points import {name}; sys.exit({name}())'
+        words += ['-c', code]
+    words.append('--ros-args')
     for key, value in (parameters or {}).items():
         words += ['-p', f'{key}:={value}']
-    if namespace:
-        words += ['-r', f'__ns:={namespace}']
+    for key, new in (remaps or {}).items():
+        words += ['-r', f'{key}:={new}']
     return words

@@ -17,12 +17,16 @@
 from __future__ import annotations
 
 import os
+import pickle
 import signal
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnContext, SpawnProcess
+from typing import Any
 
 PARENT_POLL_S = 0.5  # interval at which a worker looks whether its caller is alive [s]
 
@@ -40,6 +44,27 @@ def interrupts_blocked() -> Iterator[None]:
         yield
     finally:
         signal.pthread_sigmask(signal.SIG_SETMASK, masked)
+
+
+def start_child(
+    context: SpawnContext, function: Callable[..., None], connection: Connection, *arguments: Any
+) -> SpawnProcess:
+    """Start function(connection, *arguments) in a process that ends with this one.
+
+    It watches this process before it reads any other module of the package, which takes seconds
+    on a busy machine.
+    """
+    content = pickle.dumps((function, arguments))
+    process = context.Process(target=_begin, daemon=True, args=(os.getpid(), connection, content))
+    with interrupts_blocked():
+        process.start()
+    return process
+
+
+def _begin(parent: int, connection: Connection, content: bytes) -> None:
+    watch_parent(parent)
+    function, arguments = pickle.loads(content)  # of this program, never of a file
+    function(connection, *arguments)
 
 
 def watch_parent(parent: int) -> None:

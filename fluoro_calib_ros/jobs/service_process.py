@@ -28,7 +28,7 @@ from typing import Any
 import cv2
 from threadpoolctl import threadpool_limits
 
-from .parent_watch import interrupts_blocked, watch_parent
+from .parent_watch import start_child
 
 NICE = 5  # lower priority than the live nodes, higher than a calibration
 END_S = 1.0  # in which a process that has closed its connection ends
@@ -62,11 +62,7 @@ class ServiceProcess:
                 return
             context = multiprocessing.get_context('spawn')  # a fork would copy locks of threads
             self._connection, other = context.Pipe()
-            self._process = context.Process(
-                target=_work, daemon=True, args=(other, self._make, os.getpid())
-            )
-            with interrupts_blocked():
-                self._process.start()
+            self._process = start_child(context, _work, other, self._make)
             other.close()
 
     def __call__(self, *arguments: Any) -> Any:
@@ -122,11 +118,10 @@ class ServiceProcess:
         return process.exitcode
 
 
-def _work(connection: Connection, make: Callable[[], Callable[..., Any]], parent: int) -> None:
+def _work(connection: Connection, make: Callable[[], Callable[..., Any]]) -> None:
     """Answer calls until the caller has closed the connection or has died."""
     os.nice(NICE)
     cv2.setNumThreads(1)
-    watch_parent(parent)
     with suppress(EOFError, OSError), threadpool_limits(1):
         function = make()
         while True:

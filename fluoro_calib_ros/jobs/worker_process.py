@@ -23,7 +23,7 @@ from multiprocessing.connection import Connection
 
 from ..calibration.request import CalibrationRequest
 from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run_calibration
-from .parent_watch import interrupts_blocked, watch_parent
+from .parent_watch import start_child
 
 POLL_S = 0.05  # interval at which the caller may cancel [s]
 NICE = 10  # lower priority than the live nodes
@@ -45,11 +45,7 @@ def run_in_worker_process(
     """
     context = multiprocessing.get_context('spawn')  # a fork would copy locks of other threads
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(
-        target=_work, daemon=True, args=(sender, request, validate, rig, os.getpid())
-    )
-    with interrupts_blocked():
-        process.start()
+    process = start_child(context, _work, sender, request, validate, rig)
     sender.close()
     try:
         return _outcome(receiver, progress, raise_if_cancelled)
@@ -87,15 +83,13 @@ def _work(
     request: CalibrationRequest,
     validate: bool,
     rig: Rig | None,
-    parent: int,
 ) -> None:
-    """Run the job in the worker process, which ends with its parent process.
+    """Run the job in the worker process.
 
     Sends ('round', arguments of progress) after every round, and ('outcome', CalibrationOutcome)
     or ('error', exception) at the end.
     """
     os.nice(NICE)
-    watch_parent(parent)
     with suppress(BrokenPipeError):  # the parent has died; so does this process
         try:
             outcome = run_calibration(

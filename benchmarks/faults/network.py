@@ -1,0 +1,246 @@
+"""Hosts of their own on one machine: network namespaces, joined by a switch of our own.
+
+Each host is a network namespace whose only link is a TAP device. The switch, a process, forwards
+the Ethernet frames between them, loses and delays them as told, and counts them. So nothing
+reaches another host but through the switch, whatever the kernel offers for traffic control.
+Needs the rights to make namespaces and TAP devices (root).
+"""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import heapq
+import itertools
+import multiprocessing
+import os
+import random
+import select
+import struct
+import subprocess
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+TUNSETIFF = 0x400454CA
+TUNSETCARRIER = 0x400454E2
+IFF_TAP = 0x0002
+IFF_NO_PI = 0x1000
+FRAME_BYTES = 65536
+PREFIX = 'fluoro'
+SUBNET = '10.77.0'
+
+
+@dataclass(frozen=True)
+class Quality:
+    """How the switch treats frames: share that is lost, and delay of the others [s]."""
+
+    loss: float = 0.0
+    delay_s: float = 0.0
+
+
+class Network:
+    """Hosts by name, as a context manager; only what it has made is removed.
+
+    profile: of Fast DDS, for all hosts. Raises OSError where namespaces or TAP devices cannot be
+    made.
+    """
+
+    def __init__(self, hosts: Sequence[str], seed: int = 1, profile: Path | None = None) -> None:
+        self.hosts = tuple(hosts)
+        self.profile = profile
+        self._seed = seed
+        self._made: list[str] = []
+        self._process: Any = None
+        self._pipe: Connection
+
+    def namespace(self, host: str) -> str:
+        """Return the name of the namespace of a host."""
+        return f'{PREFIX}_{os.getpid()}_{host}'
+
+    def __enter__(self) -> Network:
+        _remove_leftovers()
+        descriptors = []
+        try:
+            for number, host in enumerate(self.hosts):
+                descriptors.append(self._make(host, number + 1))
+            context = multiprocessing.get_context('fork')  # inherits the devices
+            self._pipe, other = context.Pipe()
+            self._process = context.Process(
+                target=_switch, args=(descriptors, other, self._seed, os.getpid()), daemon=True
+            )
+            self._process.start()
+            other.close()
+        except BaseException:
+            self._remove()
+            raise
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+        return self
+
+    def _make(self, host: str, number: int) -> int:
+        """Make a namespace with one link; returns the other end of the link."""
+        namespace = self.namespace(host)
+        _ip('netns', 'add', namespace)
+        self._made.append(namespace)
+        device = f'fl{os.getpid() % 10**6}_{number}'
+        descriptor = os.open('/dev/net/tun', os.O_RDWR | os.O_NONBLOCK)
+        try:
+            fcntl.ioctl(
+                descriptor, TUNSETIFF, struct.pack('16sH', device.encode(), IFF_TAP | IFF_NO_PI)
+            )
+            _ip('link', 'set', device, 'netns', namespace)
+            for words in (
+                ('link', 'set', device, 'name', 'eth0'),
+                ('address', 'add', f'{SUBNET}.{number}/24', 'dev', 'eth0'),
+                ('link', 'set', 'lo', 'up'),
+                ('link', 'set', 'eth0', 'up'),
+                ('route', 'add', 'default', 'dev', 'eth0'),
+            ):
+                _ip('-n', namespace, *words)
+        except BaseException:
+            os.close(descriptor)
+            raise
+        return descriptor
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._remove()
+
+    def _remove(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+            self._process.join()
+        for namespace in self._made:
+            with contextlib.suppress(OSError):
+                _ip('netns', 'delete', namespace)
+        self._made.clear()
+
+    def run_in(self, host: str, words: Sequence[object]) -> list[object]:
+        """Return the words that run a program on a host.
+
+        Processes of different hosts never share memory: only UDP is used.
+        """
+        variables = ['ROS_AUTOMATIC_DISCOVERY_RANGE=SUBNET', 'FASTDDS_BUILTIN_TRANSPORTS=UDPv4']
+        if self.profile is not None:
+            variables.append(f'FASTRTPS_DEFAULT_PROFILES_FILE={self.profile}')
+        return ['ip', 'netns', 'exec', self.namespace(host), 'env', *variables, *words]
+
+    def set_quality(self, quality: Quality) -> None:
+        """Lose and delay frames from now on."""
+        self._ask('quality', quality)
+
+    def cut_off(self, host: str, is_off: bool = True) -> None:
+        """Pull the cable of a host, or plug it in again."""
+        self._ask('carrier', (self.hosts.index(host), is_off))
+
+    def forwarded(self) -> Counter[tuple[str, str]]:
+        """Return how many frames went from a host to another one, by (from, to)."""
+        counts: Counter[tuple[int, int]] = self._ask('counts', None)
+        return Counter(
+            {(self.hosts[one], self.hosts[other]): n for (one, other), n in counts.items()}
+        )
+
+    def _ask(self, what: str, content: object) -> Any:
+        self._pipe.send((what, content))
+        return self._pipe.recv()
+
+
+def _remove_leftovers() -> None:
+    """Remove the namespaces of networks whose process was killed."""
+    folder = Path('/run/netns')
+    for path in folder.glob(f'{PREFIX}_*_*') if folder.is_dir() else ():
+        pid = path.name.split('_')[1]
+        if pid.isdigit() and not Path('/proc', pid).exists():
+            with contextlib.suppress(OSError):
+                _ip('netns', 'delete', path.name)
+
+
+def _ip(*words: str) -> None:
+    done = subprocess.run(['ip', *words], capture_output=True, text=True, check=False)
+    if done.returncode:
+        raise OSError(f'ip {" ".join(words)}: {done.stderr.strip()}')
+
+
+class _Switch:
+    """Forwards frames between devices."""
+
+    def __init__(self, devices: Sequence[int], seed: int) -> None:
+        self._devices = devices
+        self._rng = random.Random(seed)
+        self._quality = Quality()
+        self._off: set[int] = set()  # ports without cable
+        self._port_of: dict[bytes, int] = {}  # port by Ethernet address
+        self._waiting: list[tuple[float, int, int, int, bytes]] = []
+        self._numbers = itertools.count()
+        self._counts: Counter[tuple[int, int]] = Counter()
+
+    def run(self, pipe: Connection, parent: int) -> None:
+        """Forward frames, and answer the parent, until it has gone."""
+        ports = {device: port for port, device in enumerate(self._devices)}
+        while os.getppid() == parent:
+            timeout = 0.5
+            if self._waiting:
+                timeout = min(max(self._waiting[0][0] - time.monotonic(), 0.0), timeout)
+            sources: list[Any] = [*self._devices, pipe]
+            readable, _, _ = select.select(sources, [], [], timeout)
+            for source in readable:
+                if isinstance(source, int):
+                    self._receive(ports[source])
+                else:
+                    try:
+                        pipe.send(self._answer(*pipe.recv()))
+                    except EOFError:
+                        return
+            while self._waiting and self._waiting[0][0] <= time.monotonic():
+                _, _, source_port, port, frame = heapq.heappop(self._waiting)
+                self._deliver(source_port, port, frame)
+
+    def _receive(self, source: int) -> None:
+        """Take all frames of a port."""
+        while True:
+            try:
+                frame = os.read(self._devices[source], FRAME_BYTES)
+            except OSError:  # none is left, or the device is down
+                return
+            self._port_of[frame[6:12]] = source
+            known = self._port_of.get(frame[:6])
+            others = [known] if known is not None else range(len(self._devices))
+            for port in others:
+                if port != source and self._rng.random() >= self._quality.loss:
+                    due = time.monotonic() + self._quality.delay_s
+                    heapq.heappush(self._waiting, (due, next(self._numbers), source, port, frame))
+
+    def _deliver(self, source: int, port: int, frame: bytes) -> None:
+        if source in self._off or port in self._off:
+            return
+        with contextlib.suppress(OSError):  # its queue is full, or it is down
+            os.write(self._devices[port], frame)
+            self._counts[source, port] += 1
+
+    def _answer(self, what: str, content: Any) -> Any:
+        if what == 'quality':
+            self._quality = content
+        elif what == 'carrier':
+            port, is_off = content
+            (self._off.add if is_off else self._off.discard)(port)
+            fcntl.ioctl(self._devices[port], TUNSETCARRIER, struct.pack('i', not is_off))
+        return Counter(self._counts)
+
+
+def _switch(devices: Sequence[int], pipe: Connection, seed: int, parent: int) -> None:
+    try:
+        _Switch(devices, seed).run(pipe, parent)
+    except KeyboardInterrupt:
+        sys.exit(0)

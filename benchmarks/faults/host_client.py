@@ -4,7 +4,7 @@ Takes a command a line on standard input, and answers each with a line of JSON:
 
 state                    collected exposures, latched messages and diagnostics so far
 calibrate MODEL          what the service calibrate answers
-known NODE NODE          once players know the readers, and their services answer
+step NODE NODE           once players that were started paused have published a message each
 go NODE NODE             go on playing, of players that were started paused
 begin                    forget all messages of streams
 result                   messages of streams since then: numbers, gaps, latency
@@ -34,7 +34,7 @@ from fluoro_calib_msgs.msg import (
 from fluoro_calib_msgs.srv import Calibrate
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
-from std_srvs.srv import SetBool
+from std_srvs.srv import SetBool, Trigger
 
 from fluoro_calib_ros.nodes.messages.target_observations import decode_target_observations
 from fluoro_calib_ros.nodes.runtime.qos import latched_qos
@@ -73,7 +73,6 @@ class HostClient:
         )
         self._node.create_subscription(DiagnosticArray, '/diagnostics', self._on_diagnostics, 50)
         self._calibrate = self._node.create_client(Calibrate, 'calibrate')
-        self._players: list[Any] = []
         self._reader = self._listen()
 
     def _listen(self) -> StreamReader:
@@ -121,7 +120,7 @@ class HostClient:
         commands: dict[str, Callable[..., dict[str, Any]]] = {
             'state': self._state,
             'calibrate': self._run_calibration,
-            'known': self._known,
+            'step': self._step,
             'go': self._go,
             'begin': self._begin,
             'result': self._result,
@@ -143,20 +142,21 @@ class HostClient:
         self._wait(future.done)
         return {'success': future.result().success, 'message': future.result().message}
 
-    def _known(self, *players: str) -> dict[str, Any]:
+    def _step(self, *players: str) -> dict[str, Any]:
         for name in players:
-            client = self._node.create_client(SetBool, f'{name}/pause')
-            self._players.append(client)
-            self._wait(client.service_is_ready)
-            # It was paused before: a no that changes nothing.
-            future = client.call_async(SetBool.Request(data=True))
+            step = self._node.create_client(Trigger, f'{name}/step')
+            self._wait(step.service_is_ready)
+            future = step.call_async(Trigger.Request())
             self._wait(future.done)
+        # They have found their readers, and nothing holds them back now.
+        self._wait(lambda: len(self._came) == len(players))
         return {}
 
     def _go(self, *players: str) -> dict[str, Any]:
-        futures = [
-            c.call_async(SetBool.Request(data=False)) for c in self._players[-len(players) :]
-        ]
+        clients = [self._node.create_client(SetBool, f'{name}/pause') for name in players]
+        for client in clients:
+            self._wait(client.service_is_ready)
+        futures = [client.call_async(SetBool.Request(data=False)) for client in clients]
         for future in futures:
             self._wait(future.done)
         return {'success': all(future.result().success for future in futures)}

@@ -31,8 +31,9 @@ HOSTS = (*NAMES, 'calibration', 'tracking', 'late')
 CLIENT = [sys.executable, '-m', 'benchmarks.faults.host_client']
 WAIT_S = 90.0
 RATE_HZ = 250.0
+SLOW_HZ = 60.0
 PROFILE = ROOT / 'config' / 'lossy_links.xml'
-CUT_S = 12.0
+CUT_S = 60.0
 QUALITIES = (
     Quality(),
     Quality(loss=0.01),
@@ -169,15 +170,22 @@ def run(folder: Path, count: int, seed: int) -> str:
 
     count: duration of each stream [s].
     """
-    frames = simulate_tracking(
-        virtual_rig(1), float(count), RATE_HZ, seed, 0.25, StreamStart(10**18), clusters=5
-    ).frames
-    write_bag(folder / 'tracking', frames)
+    sent = _write_stream(folder / 'tracking', float(count), RATE_HZ, seed)
+    _write_stream(folder / 'long', CUT_S + 40.0, SLOW_HZ, seed)
     sections = []
     for profile in (None, PROFILE):
         with Network(HOSTS, seed, profile) as network, Hosts(network, folder) as hosts:
-            sections += _sections(hosts, count, len(frames['a']))
+            sections += _sections(hosts, count, sent)
     return '\n\n'.join(sections)
+
+
+def _write_stream(bag: Path, seconds: float, rate_hz: float, seed: int) -> int:
+    """Write a recording of moving markers; returns the number of exposures."""
+    start = StreamStart(10**18)
+    rig = virtual_rig(1)
+    frames = simulate_tracking(rig, seconds, rate_hz, seed, 0.25, start, clusters=5).frames
+    write_bag(bag, frames)
+    return len(frames['a'])
 
 
 def _sections(hosts: Hosts, seconds: int, sent: int) -> list[str]:
@@ -209,7 +217,8 @@ def _sections(hosts: Hosts, seconds: int, sent: int) -> list[str]:
         ),
         section(
             f'A host is cut off, {how}',
-            f'Its cable is pulled for {CUT_S:g} s during the stream, and plugged in again.',
+            f'Its cable is pulled for {CUT_S:g} s during a stream of {SLOW_HZ:g} Hz, and plugged '
+            'in again.',
             (
                 'host',
                 'told in the diagnostics after [s]',
@@ -255,7 +264,7 @@ def _streamed(hosts: Hosts, client: Client, quality: Quality, sent: int) -> list
     hosts.network.set_quality(Quality())  # discovery is measured elsewhere
     client.ask('begin')
     players = hosts.play(hosts.folder / 'tracking', 3, start_paused='true')
-    client.ask('known', *(f'player_{name}' for name in NAMES))
+    client.ask('step', *(f'player_{name}' for name in NAMES))
     hosts.network.set_quality(quality)
     client.ask('go', *(f'player_{name}' for name in NAMES))
     for player in players:
@@ -301,18 +310,19 @@ def _joined_late(hosts: Hosts, quality: Quality) -> list[str]:
 def _cut_off(hosts: Hosts, client: Client, host: str, seconds: float) -> list[str]:
     """Cut a host off during a stream; returns a row of the report."""
     hosts.network.set_quality(Quality())
-    players = hosts.play(hosts.folder / 'tracking', 3, loop='true')
     client.ask('begin')
+    players = hosts.play(hosts.folder / 'long', 3, start_paused='true')
+    names = [f'player_{name}' for name in NAMES]
+    client.ask('step', *names)
+    client.ask('go', *names)
     client.wait(lambda state: state['came'].get('points', 0) > 100, 'points')
+    client.wait(lambda state: not _stalls(state), 'diagnostics without a stall')
     hosts.network.cut_off(host)
     began = time.monotonic()
     client.ask('begin')
     told = '-'
     if host in NAMES:
-        client.wait(
-            lambda state: any('no frame for' in m for m in state['diagnostics'].values()),
-            'the diagnostics',
-        )
+        client.wait(_stalls, 'the diagnostics')
         told = f'{time.monotonic() - began:.1f}'
     time.sleep(max(0.0, seconds - (time.monotonic() - began)))
     meanwhile = client.ask('state')['came'].get('points', 0)
@@ -323,3 +333,7 @@ def _cut_off(hosts: Hosts, client: Client, host: str, seconds: float) -> list[st
         player.send(signal.SIGINT)
         player.wait()
     return [host, told, str(meanwhile), f'{back:.1f}']
+
+
+def _stalls(state: dict[str, Any]) -> bool:
+    return any('no frame for' in message for message in state['diagnostics'].values())

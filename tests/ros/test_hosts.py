@@ -1,0 +1,52 @@
+"""The graph on several hosts, each a network namespace with an address of its own."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from ros_graph import BAGS, NAMES
+
+sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
+from benchmarks.faults.hosts import HOSTS, Hosts
+from benchmarks.faults.network import Network, Quality
+
+LOSSY = Quality(loss=0.02, delay_s=0.005)
+
+
+@pytest.fixture
+def network(ros):
+    """Hosts of their own; what they exchange passes through a switch that counts."""
+    try:
+        network = Network(HOSTS).__enter__()
+    except OSError as error:
+        pytest.skip(f'network namespaces cannot be made here: {error}')
+    yield network
+    network.__exit__(None, None, None)
+
+
+def test_graph_on_several_hosts(network, tmp_path):
+    """It calibrates, corrects and reconstructs; over bad links and after a cut, too."""
+    with Hosts(network, tmp_path) as hosts:
+        client = hosts.start_graph(BAGS / 'phantom.csv')
+        hosts.play(BAGS / 'calibration', readers=3, rate=10.0)
+        client.wait(lambda s: [s['exposures'].get(n) for n in NAMES] == [15, 15], '15 exposures')
+        assert network.forwarded()['a', 'calibration'] >= 15
+        assert client.ask('calibrate', 'none')['success']
+        client.wait(lambda s: len(s['calibrations']) == 2 and s['orientation'], 'calibrations')
+
+        network.set_quality(LOSSY)
+        late = hosts.start_client('late')
+        ids = client.ask('state')['calibrations']
+        late.wait(lambda s: s['calibrations'] == ids and s['orientation'], 'latched messages')
+
+        hosts.play(BAGS / 'tracking', readers=3, rate=0.1)
+        client.wait(lambda s: s['came'].get('points', 0) > 10, 'points')
+        network.cut_off('a')
+        client.wait(
+            lambda s: any('no frame for' in m for m in s['diagnostics'].values()), 'the stall'
+        )
+        client.ask('begin')
+        assert not client.ask('state')['came'].get('a')
+        network.cut_off('a', False)
+        client.wait(lambda s: s['came'].get('points', 0) > 10, 'points again')
+        assert 'Traceback' not in ''.join(p.read_text() for p in tmp_path.glob('*.log'))

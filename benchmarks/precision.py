@@ -45,12 +45,16 @@ MARGIN_PX = 8.0  # of the grid from the edge of the image
 
 
 def truth_in_gauge(
-    fluoroscope: VirtualFluoroscope, uv: np.ndarray, interior: np.ndarray
+    fluoroscope: VirtualFluoroscope,
+    uv: np.ndarray,
+    interior: np.ndarray,
+    fitted: np.ndarray | float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray, Callable[[np.ndarray], np.ndarray]]:
     """True interior orientation, sensor rotation and correction in the gauge of a calibration.
 
     uv (n, 2) are the image points over which its correction is orthogonal to the gauge, interior
-    (3,) is its interior orientation [px].
+    (3,) is its interior orientation [px]. Where it is not orthogonal, fitted (n, 2) are its
+    corrections of these points [px]: the true ones get the same part in the gauge.
     """
 
     def camera(k: np.ndarray) -> np.ndarray:
@@ -64,7 +68,7 @@ def truth_in_gauge(
         return pixels - turned[:, :2] / turned[:, 2:]
 
     found = least_squares(
-        lambda x: gauge_coefficients(uv, correction(x, uv), interior),
+        lambda x: gauge_coefficients(uv, correction(x, uv) - fitted, interior),
         np.concatenate([interior, np.zeros(3)]),
         x_scale=[1, 1, 1, 1e-3, 1e-3, 1e-3],
         xtol=1e-14,

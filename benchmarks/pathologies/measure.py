@@ -139,18 +139,21 @@ def claims(scene, result):
     name = NAMES[0]
     camera = scene.cameras[0]
     run = result.runs[name]
-    uv = run.measured.network.uv
+    # A regression is orthogonal to the gauge over the image points it is fitted to, not all.
+    uv = run.measured.network.uv[run.trained]
+    model = result.calibrations[name].model
     known = {id(uv): camera.distortion.correction(uv)}  # what the fit of the gauge asks again
 
     def correction(pixels):
         return known[id(pixels)] if id(pixels) in known else camera.distortion.correction(pixels)
 
     truth = Truth(camera.interior, correction)
-    _, _, true = truth_in_gauge(truth, uv, run.after.parameters.interior[0])
+    interior = run.after.parameters.interior[0]
+    _, _, true = truth_in_gauge(truth, uv, interior, model.predict(uv))
     side = scene.case.side
     axis = np.linspace(0, side - 1, GRID)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    found = result.calibrations[name].model.evaluate(grid)
+    found = model.evaluate(grid)
     inside = ~found.outside
     error = (found.duv - true(grid))[inside]
     sd = found.sd[inside, None]

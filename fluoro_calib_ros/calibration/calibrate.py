@@ -22,6 +22,7 @@ from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 
 import numpy as np
+from scipy.linalg import block_diag
 from threadpoolctl import threadpool_limits
 
 from ..distortion.base import CorrectionModel
@@ -115,11 +116,22 @@ class FluoroscopeResult:
 
 @dataclass(frozen=True)
 class Targets:
-    """Object points: target_id (n,), xyz_mm (n, 3), covariance (n, 3, 3) [mm^2]."""
+    """Object points.
+
+    Attributes
+    ----------
+    target_id : (n,) ndarray
+    xyz_mm : (n, 3) ndarray
+    covariance : (n, 3, 3) ndarray
+        [mm^2]
+    joint_covariance : (3n, 3n) ndarray or None
+        Of all object points with each other [mm^2]; None where they are too many.
+    """
 
     target_id: np.ndarray
     xyz_mm: np.ndarray
     covariance: np.ndarray
+    joint_covariance: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -447,7 +459,9 @@ def adjust_with_calibrations(
 
 
 def _targets(measured: Measured, adjustment: Adjustment, precise: Precision) -> Targets:
-    return Targets(measured.target_id, adjustment.parameters.points_mm, precise.points)
+    return Targets(
+        measured.target_id, adjustment.parameters.points_mm, precise.points, precise.joint_points
+    )
 
 
 def combined_targets(parts: Sequence[Targets], phantom: Phantom, weighted: bool = True) -> Targets:
@@ -462,20 +476,60 @@ def combined_targets(parts: Sequence[Targets], phantom: Phantom, weighted: bool 
     target_id = np.unique(np.concatenate([p.target_id for p in parts]))
     row = phantom.index(target_id)
     survey = np.eye(3) / phantom.sd_mm[row, None, None] ** 2
-    information = np.zeros((len(row), 3, 3))
-    right = np.zeros((len(row), 3))
     seen = np.zeros(len(row))
+    for part in parts:
+        seen[np.searchsorted(target_id, part.target_id)] += 1
+    further = ((seen - 1) * weighted)[:, None, None] * survey
+    joint = [part.joint_covariance for part in parts if part.joint_covariance is not None]
+    if weighted and len(joint) == len(parts):
+        return _combined_jointly(parts, joint, further, phantom)
+    information = -further
+    right = -(further @ phantom.xyz_mm[row, :, None])[..., 0]
     for part in parts:
         at = np.searchsorted(target_id, part.target_id)
         own = np.linalg.inv(part.covariance)
         information[at] += own
         right[at] += (own @ part.xyz_mm[..., None])[..., 0]
-        seen[at] += 1
-    further = (seen - 1) * weighted
-    information -= further[:, None, None] * survey
-    right -= further[:, None] * (survey @ phantom.xyz_mm[row, :, None])[..., 0]
     covariance = np.linalg.inv(information)
     return Targets(target_id, (covariance @ right[..., None])[..., 0], covariance)
+
+
+def _combined_jointly(
+    parts: Sequence[Targets],
+    joint: Sequence[np.ndarray],
+    further: np.ndarray,
+    phantom: Phantom,
+) -> Targets:
+    """Return one set of object points from their joint covariances.
+
+    The errors of few beads have much in common: the datum, which is the same survey in every
+    part. Information of single beads would count it once a part.
+
+    Parameters
+    ----------
+    parts : sequence of Targets
+    joint : sequence of ndarray
+        Their joint covariances [mm^2].
+    further : (n, 3, 3) ndarray
+        Information of the survey that is subtracted.
+    phantom : Phantom
+
+    Returns
+    -------
+    Targets
+    """
+    target_id = np.unique(np.concatenate([p.target_id for p in parts]))
+    n = len(target_id)
+    information = -block_diag(*further)
+    right = information @ phantom.xyz_mm[phantom.index(target_id)].ravel()
+    for part, covariance in zip(parts, joint):
+        at = 3 * np.searchsorted(target_id, part.target_id)[:, None] + np.arange(3)
+        own = np.linalg.inv(covariance)
+        information[np.ix_(at.ravel(), at.ravel())] += own
+        right[at.ravel()] += own @ part.xyz_mm.ravel()
+    found = np.linalg.inv(information)
+    blocks = found.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+    return Targets(target_id, (found @ right).reshape(n, 3), blocks, found)
 
 
 def _rows_of(measured: Measured, f: int) -> np.ndarray:

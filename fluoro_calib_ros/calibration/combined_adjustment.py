@@ -29,7 +29,7 @@ import numpy as np
 
 from ..distortion.base import CorrectionModel
 from ..distortion.estimation import AdjustedTerms, require_training
-from ..distortion.misfit import FittedPoints, misfit_over_image
+from ..distortion.misfit import FittedPoints, sd_with_misfit
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
 from ..photogrammetry.elimination import factorize
@@ -128,8 +128,13 @@ def _models(
         rows = network.rows(f)
         rows = rows[after.inliers[rows]]
         series = terms.fitted_series(f, after, precise)
-        points = FittedPoints(network.uv[rows], after.residuals[rows], network.exposure[rows])
-        sd = np.hypot(series.sd, misfit_over_image(points, series))
+        points = FittedPoints(
+            network.uv[rows],
+            after.residuals[rows],
+            network.exposure[rows],
+            precise.redundancy[rows].mean(axis=1),
+        )
+        sd = sd_with_misfit(points, series, terms.sd_left_out(f))
         models[name] = model_type(0, network.uv[rows], values[rows], series=replace(series, sd=sd))
     return models
 

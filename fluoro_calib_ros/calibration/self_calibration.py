@@ -20,8 +20,8 @@ How a model is obtained is up to the model: by regression of the residuals betwe
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,8 @@ from ..distortion.estimation import (
     RegressionStep,
     TrainingPoints,
 )
+from ..distortion.gauge import GaugeKind
+from ..distortion.none import NoCorrection
 from ..distortion.registry import model_source
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment
@@ -41,6 +43,7 @@ from .constraints import gauges_of, interiors_to_estimate, with_constraints
 from .diagnostics import raise_if_undetermined, undetermined_unknowns
 from .initial_network import Measured
 from .model_choice import START_MODEL, better_model
+from .model_errors import with_errors_by
 from .options import AUTO, CalibrationOptions
 from .robust_adjustment import adjusted_with_precision, start_noise
 from .rounds import Round, SelfCalibration
@@ -53,6 +56,9 @@ def self_calibrate(
     raise_if_cancelled: Callable[[], None] | None = None,
 ) -> SelfCalibration:
     """Self-calibrate the fluoroscopes of a network.
+
+    The standard deviations of models other than collocation hold their difference from it (see
+    `model_errors`), so it is calibrated, too.
 
     Parameters
     ----------
@@ -77,28 +83,116 @@ def self_calibrate(
     network = replace(measured.network, interior_free=interiors_to_estimate(measured, options))
     measured = with_constraints(replace(measured, network=network), options)
     before = _adjusted_without_correction(measured, options, raise_if_cancelled)
-    automatic = options.model == AUTO
-    source = model_source(START_MODEL if automatic else options.model)
-    gauges = gauges_of(measured, options)
-    problem = AdjustmentProblem(measured.network, measured.image_size, before, gauges)
-    terms = source.adjusted_terms(problem)
-    steps = _regression_steps(measured, options, source, terms)
-    if steps is not None:
-        regressions = Regressions(measured, steps)
+    job = _Job(measured, before, gauges_of(measured, options), options, raise_if_cancelled)
+    if options.model == AUTO:
+        run, terms = job.by_adjustment(START_MODEL, progress)
+        better = better_model(run, terms)
+        if better is None:
+            return run
+        return with_errors_by(run, job.by_model(model_source(better), progress), job.gauges)
+    source = model_source(options.model)
+    run = job.by_model(source, progress)
+    if source.kind in (START_MODEL, NoCorrection.kind):
+        return run
+    try:
+        reference, _ = job.by_adjustment(START_MODEL, None)
+    except DataError:  # what its own residuals show has to do
+        return run
+    return with_errors_by(reference, run, job.gauges)
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A network that is calibrated with one model or more.
+
+    Attributes
+    ----------
+    measured : Measured
+    before : Adjustment
+        Without correction.
+    gauges : sequence of GaugeKind
+    options : CalibrationOptions
+    raise_if_cancelled : callable or None
+    """
+
+    measured: Measured
+    before: Adjustment
+    gauges: Sequence[GaugeKind]
+    options: CalibrationOptions
+    raise_if_cancelled: Callable[[], None] | None
+
+    @property
+    def problem(self) -> AdjustmentProblem:
+        """What terms in the adjustment are made for."""
+        measured = self.measured
+        return AdjustmentProblem(measured.network, measured.image_size, self.before, self.gauges)
+
+    def by_model(
+        self, source: ModelSource, progress: Callable[[Round], None] | None
+    ) -> SelfCalibration:
+        """Self-calibrate with a model in the way it asks for."""
+        terms = source.adjusted_terms(self.problem)
+        steps = self._regression_steps(source, terms)
+        if steps is None:
+            return self._by_terms(source, terms, progress)
         return calibrate_by_regression(
-            measured, before, options, terms, regressions, progress, raise_if_cancelled
+            self.measured,
+            self.before,
+            self.options,
+            terms,
+            Regressions(self.measured, steps),
+            progress,
+            self.raise_if_cancelled,
         )
-    if terms is None:
-        raise TypeError(f'the correction model {source.kind} has neither terms nor a regression')
-    run = calibrate_by_adjustment(
-        measured, before, source, terms, options.max_iterations, progress, raise_if_cancelled
-    )
-    if not automatic:
-        return run
-    better = better_model(run, terms)
-    if better is None:
-        return run
-    return self_calibrate(measured, replace(options, model=better), progress, raise_if_cancelled)
+
+    def by_adjustment(
+        self, kind: str, progress: Callable[[Round], None] | None
+    ) -> tuple[SelfCalibration, AdjustedTerms]:
+        """Self-calibrate with a model in the adjustment; return its terms, too."""
+        source = model_source(kind)
+        terms = source.adjusted_terms(self.problem)
+        return self._by_terms(source, terms, progress), terms
+
+    def _by_terms(
+        self,
+        source: ModelSource,
+        terms: AdjustedTerms | None,
+        progress: Callable[[Round], None] | None,
+    ) -> SelfCalibration:
+        if terms is None or not (isinstance(source, type) and issubclass(source, CorrectionModel)):
+            raise TypeError(
+                f'the correction model {source.kind} has neither terms nor a regression'
+            )
+        return calibrate_by_adjustment(
+            self.measured,
+            self.before,
+            source,
+            terms,
+            self.options.max_iterations,
+            progress,
+            self.raise_if_cancelled,
+        )
+
+    def _regression_steps(
+        self, source: ModelSource, terms: AdjustedTerms | None
+    ) -> dict[str, RegressionStep[CorrectionModel]] | None:
+        """The regression step of every fluoroscope; None for a model that needs none."""
+        network = self.measured.network
+        steps = {}
+        for f, name in enumerate(self.measured.fluoroscopes):
+            rows = network.rows(f)
+            points = TrainingPoints(
+                network.uv[rows],
+                network.exposure[rows],
+                self.measured.image_size[f],
+                self.gauges[f],
+                None if terms is None else terms.values[f],
+            )
+            step = source.regression(points, self.options.k)
+            if step is None:
+                return None
+            steps[name] = step
+        return steps
 
 
 def _adjusted_without_correction(
@@ -119,28 +213,3 @@ def _adjusted_without_correction(
         raise DataError(undetermined_unknowns(measured) or str(error)) from None
     raise_if_undetermined(measured, before, precise)
     return before
-
-
-def _regression_steps(
-    measured: Measured,
-    options: CalibrationOptions,
-    source: ModelSource,
-    terms: AdjustedTerms | None,
-) -> dict[str, RegressionStep[CorrectionModel]] | None:
-    """The regression step of every fluoroscope; None for a model that needs none."""
-    network = measured.network
-    steps = {}
-    for f, name in enumerate(measured.fluoroscopes):
-        rows = network.rows(f)
-        points = TrainingPoints(
-            network.uv[rows],
-            network.exposure[rows],
-            measured.image_size[f],
-            gauges_of(measured, options)[f],
-            None if terms is None else terms.values[f],
-        )
-        step = source.regression(points, options.k)
-        if step is None:
-            return None
-        steps[name] = step
-    return steps

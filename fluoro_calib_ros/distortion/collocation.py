@@ -145,11 +145,11 @@ class CollocationTerms(AdjustedTerms):
         """
         functions = self.functions[f]
         own = slice(2 * len(functions))
-        sd = np.hypot(sd_over_image(functions, covariance[own, own]), self._sd_beyond(f))
+        sd = sd_over_image(functions, covariance[own, own])
         return Series(functions, coefficients[own].reshape(2, -1), sd)
 
-    def _sd_beyond(self, f: int) -> float:
-        """Standard deviation [px] of the part of the signal that the series leaves out."""
+    def sd_left_out(self, f: int) -> float:
+        """Standard deviation [px] of the signal beyond the sines of fluoroscope f."""
         functions = self.functions[f]
         return self.priors[f].signal.sd_beyond(functions.highest) if functions.modes else 0.0
 

@@ -125,6 +125,10 @@ class AdjustedTerms(ABC):
         Returns whether nothing changed, and the coefficients with which to continue.
         """
 
+    def sd_left_out(self, f: int) -> float:
+        """Standard deviation [px] of what the series of fluoroscope f leaves out by design."""
+        return 0.0
+
     def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
         """Return the series of fluoroscope f that an adjustment has estimated."""
         coefficients = adjustment.parameters.additional[f]

@@ -14,10 +14,12 @@
 
 """What a correction model cannot follow, seen in its residuals.
 
-Residuals of neighbouring image points of different exposures have independent noise. Their mean
-product is therefore the square of the error that all exposures have in common, less the variance
-of the correction, which makes residuals of neighbours opposite (joins in the sense of Moran,
-Biometrika 37, 1950). The square is part of the variance of the correction.
+Residuals of neighbouring image points of different exposures have independent noise (joins in the
+sense of Moran, Biometrika 37, 1950). Their mean product is therefore the square of the error that
+all exposures have in common, less the variance of the correction, which makes residuals of
+neighbours opposite. Of both, a residual shows the part that its redundancy number says (Foerstner
+and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6): orientations and object points
+absorb the rest. The square is part of the variance of the correction.
 """
 
 from __future__ import annotations
@@ -26,8 +28,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
+from scipy.special import log_ndtr
 
-from .series import SD_GRID, Series, sd_grid_pixels
+from .series import Series, sd_grid_pixels
 
 NEIGHBOURS = 5  # of an image point, those of its own exposure not counted
 POINTS = 60  # image points about a node of the grid
@@ -35,72 +38,127 @@ POINTS = 60  # image points about a node of the grid
 # of the nodes.
 SIGNIFICANT = 4.0
 SIGNIFICANT_LOCAL = 4.5
+FAR = 30.0  # standard deviations below zero
+MIN_EXPOSURES = 3  # whose scatter is the standard error of a mean product
 
 
 @dataclass(frozen=True)
 class FittedPoints:
     """Inliers of one fluoroscope.
 
-    uv (n, 2) [px], residuals (n, 2) [px] with the correction, exposure (n,).
+    uv (n, 2) [px], residuals (n, 2) [px] with the correction, exposure (n,), redundancy (n,):
+    redundancy number of a coordinate, 1 where they do not matter.
     """
 
     uv: np.ndarray
     residuals: np.ndarray
     exposure: np.ndarray
+    redundancy: np.ndarray | float = 1.0
 
 
-def neighbour_products(points: FittedPoints) -> np.ndarray:
-    """Mean products (n,) [px^2] of a coordinate of each residual with those of its neighbours.
+@dataclass(frozen=True)
+class _Products:
+    """Products of the residuals of n image points with those of their neighbours.
 
-    NaN where all neighbours are of the same exposure.
+    uv (n, 2) [px]; value (n,): mean product of a coordinate [px^2]; shown (n,): mean product of
+    the redundancy numbers, the part of a common error that the products show; exposure (n,).
     """
+
+    uv: np.ndarray
+    value: np.ndarray
+    shown: np.ndarray
+    exposure: np.ndarray
+
+    def mean_of_all(self) -> tuple[float, float]:
+        """Mean product, and its standard error from the scatter between exposures."""
+        _, place = np.unique(self.exposure, return_inverse=True)
+        number = np.bincount(place)
+        if len(number) < MIN_EXPOSURES:
+            return 0.0, np.inf
+        means = np.bincount(place, self.value) / number
+        mean = np.average(means, weights=number)
+        variance = np.average((means - mean) ** 2, weights=number) / (len(means) - 1)
+        return float(mean), float(np.sqrt(variance))
+
+    def is_significant(self) -> bool:
+        """Whether the mean product is above zero."""
+        mean, error = self.mean_of_all()
+        return mean > SIGNIFICANT * error
+
+
+def _products(points: FittedPoints) -> _Products:
+    """Products of the image points that have neighbours of other exposures."""
     count = min(NEIGHBOURS + 1, len(points.uv))
     _, near = cKDTree(points.uv).query(points.uv, k=np.arange(2, count + 1))
     other = points.exposure[near] != points.exposure[:, None]
     r = points.residuals
-    products = np.einsum('na,nka->nk', r, r[near]) / 2
+    redundancy = np.broadcast_to(points.redundancy, len(r))
     number = other.sum(axis=1)
-    with np.errstate(invalid='ignore'):
-        return np.where(other, products, 0.0).sum(axis=1) / np.where(number, number, np.nan)
+    usable = number > 0
+
+    def mean(of_pairs: np.ndarray) -> np.ndarray:
+        return np.where(other, of_pairs, 0.0).sum(axis=1)[usable] / number[usable]
+
+    return _Products(
+        points.uv[usable],
+        mean(np.einsum('na,nka->nk', r, r[near]) / 2),
+        mean(redundancy[:, None] * redundancy[near]),
+        points.exposure[usable],
+    )
 
 
 def has_common_error(points: FittedPoints) -> bool:
     """Whether residuals show an error that all exposures have in common."""
-    products = neighbour_products(points)
-    usable = np.isfinite(products)
-    return _is_significant(products[usable], points.exposure[usable])
+    return _products(points).is_significant()
 
 
-def misfit_over_image(points: FittedPoints, series: Series) -> np.ndarray:
-    """Standard deviations (33, 33) [px] of what a series cannot follow, on its grid.
+def sd_with_misfit(points: FittedPoints, series: Series, left_out_px: float) -> np.ndarray:
+    """Standard deviations (33, 33) [px] of a series with what it cannot follow, on its grid.
 
-    Zeros where the residuals do not show a common error.
+    Parameters
+    ----------
+    points : FittedPoints
+    series : Series
+        With the standard deviations of its coefficients alone.
+    left_out_px : float
+        Standard deviation of what the series leaves out, by its covariance function.
+
+    Returns
+    -------
+    (33, 33) ndarray
     """
-    out = np.zeros((SD_GRID, SD_GRID))
-    products = neighbour_products(points)
-    usable = np.isfinite(products)
-    if usable.sum() < 2 * POINTS:
-        return out
-    uv = points.uv[usable]
-    products = products[usable]
-    everywhere = _is_significant(products, points.exposure[usable])
+    products = _products(points)
+    variance = series.sd**2
+    if len(products.uv) < 2 * POINTS:
+        return np.sqrt(variance + left_out_px**2)
+    left_out = _variance_left_out(products, series, left_out_px**2)
     pixels = sd_grid_pixels(series.functions.image_size)
-    _, near = cKDTree(uv).query(pixels, k=POINTS)
-    mean = products[near].mean(axis=1)
+    _, near = cKDTree(products.uv).query(pixels, k=POINTS)
+    mean = products.value[near].mean(axis=1)
     # Each product occurs twice among the points about a node.
-    error = products[near].std(axis=1) * np.sqrt(2 / POINTS)
-    shown = mean > SIGNIFICANT_LOCAL * error
-    square = np.maximum(mean.reshape(out.shape) + series.sd**2, 0.0)
-    return np.where((shown | everywhere).reshape(out.shape), np.sqrt(square), 0.0)
+    error = products.value[near].std(axis=1) * np.sqrt(2 / POINTS)
+    shown = (mean > SIGNIFICANT_LOCAL * error) | products.is_significant()
+    common = mean / products.shown[near].mean(axis=1) + variance.ravel()
+    found = np.where(shown, np.maximum(common, left_out), left_out)
+    return np.sqrt(variance + found.reshape(variance.shape))
 
 
-def _is_significant(products: np.ndarray, exposure: np.ndarray) -> bool:
-    """Whether the mean of products (n,) is above zero, by its scatter between exposures (n,)."""
-    _, place = np.unique(exposure, return_inverse=True)
-    number = np.bincount(place)
-    means = np.bincount(place, products) / number
-    if len(means) < 3:
-        return False
-    mean = np.average(means, weights=number)
-    variance = np.average((means - mean) ** 2, weights=number) / (len(means) - 1)
-    return bool(mean > SIGNIFICANT * np.sqrt(variance))
+def _variance_left_out(products: _Products, series: Series, expected: float) -> float:
+    """Variance [px^2] of what a series leaves out, by its covariance function and the residuals.
+
+    The covariance function was estimated from the functions that the series has; beyond them it
+    is an extrapolation. As the variance that it expects is uncertain and positive, it is given an
+    exponential prior; that which the residuals show has a Gaussian error. The posterior is a
+    truncated Gaussian, of which this is the mean.
+    """
+    mean, error = products.mean_of_all()
+    if not expected > 0 or not 0 < error < np.inf:
+        return expected
+    part = float(products.shown.mean())
+    error /= part
+    found = mean / part + float(np.mean(series.sd_at(products.uv) ** 2))
+    at = found / error - error / expected
+    if at < -FAR:  # the tail is exponential
+        return float(-error / at)
+    density = np.exp(-(at**2) / 2 - log_ndtr(at)) / np.sqrt(2 * np.pi)
+    return float(error * (at + density))

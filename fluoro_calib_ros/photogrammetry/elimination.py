@@ -176,6 +176,8 @@ class CovarianceBlocks:
         pe(e, p): blocks (k, 3, 6) of object points p (k,) with exposures e (k,).
     between : callable
         between(e, f): blocks (k, 6, 6) of exposures e (k,) with exposures f (k,).
+    points_between : callable
+        points_between(p, q): blocks (k, 3, 3) of object points p (k,) with object points q (k,).
     """
 
     ee: np.ndarray
@@ -185,6 +187,7 @@ class CovarianceBlocks:
     pg: np.ndarray
     pe: Callable[[np.ndarray, np.ndarray], np.ndarray]
     between: Callable[[np.ndarray, np.ndarray], np.ndarray]
+    points_between: Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 class Elimination(ABC):
@@ -310,6 +313,12 @@ class EliminatePoints(Elimination):
         rows = self.layout.block_rows
         ee, gg, eg = self._split_rest(covariance)
         pairs, pg = self._split_border(covariance.border)
+
+        def points_between(p: np.ndarray, q: np.ndarray) -> np.ndarray:
+            same = (p == q)[:, None, None]
+            held = np.where(same, covariance.conditional[p], 0.0)
+            return held - covariance.border[p] @ covariance.gain[q].transpose(0, 2, 1)
+
         return CovarianceBlocks(
             ee,
             covariance.blocks,
@@ -318,6 +327,7 @@ class EliminatePoints(Elimination):
             pg,
             lambda e, p: pairs[p, :, e, :],
             lambda e, f: covariance.rest[rows[e][:, :, None], rows[f][:, None, :]],
+            points_between,
         )
 
 
@@ -407,6 +417,7 @@ class EliminateExposures(Elimination):
         pairs, eg = self._split_border(border)
         cell = self.cell
         place = self.place
+        rows = self.layout.block_rows
         shape = (self.n_cells, self.n_places, EXTERIOR_SIZE)
         blocks = covariance.blocks.reshape(*shape, *shape[1:])
         conditional = covariance.conditional.reshape(*shape, *shape[1:])
@@ -425,6 +436,7 @@ class EliminateExposures(Elimination):
             pg,
             lambda e, p: pairs[e, :, p, :].transpose(0, 2, 1),
             between,
+            lambda p, q: covariance.rest[rows[p][:, :, None], rows[q][:, None, :]],
         )
 
     def _of_exposures(self, values: np.ndarray) -> np.ndarray:

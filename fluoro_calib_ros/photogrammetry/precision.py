@@ -20,6 +20,7 @@ C_r = C_l - A C_x A^T (Foerstner and Wrobel, "Photogrammetric Computer Vision", 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -38,6 +39,9 @@ from .unknowns import Parameters, UnknownVector
 MIN_WEIGHT = 1e-9
 # Image points handled at once, to limit memory.
 CHUNK = 5_000
+# Object points up to which their covariances with each other are kept. The more there are, the
+# less these matter: what all have in common is the datum.
+MAX_JOINT_POINTS = 150
 
 
 @dataclass(frozen=True)
@@ -71,6 +75,8 @@ class Precision:
         Of all global unknowns.
     exterior_global : (m, 6, G) ndarray
         Of the exposures with the global unknowns.
+    joint_points : (3n, 3n) ndarray or None
+        Of all object points with each other; None where they are too many.
     """
 
     interior: np.ndarray
@@ -84,6 +90,7 @@ class Precision:
     relative_redundancy: tuple[np.ndarray, ...]
     all_global: np.ndarray
     exterior_global: np.ndarray
+    joint_points: np.ndarray | None = None
 
 
 def covariance_blocks(matrix: FactorizedNormalMatrix) -> CovarianceBlocks:
@@ -113,6 +120,7 @@ def _in_datum(
         s.transform(blocks.pg, s.points, s.globals) * free,
         lambda e, p: s.transform(blocks.pe(e, p), points(p), exteriors(e)),
         lambda e, f: s.transform(blocks.between(e, f), exteriors(e), exteriors(f)),
+        lambda p, q: s.transform(blocks.points_between(p, q), points(p), points(q)),
     )
 
 
@@ -280,6 +288,65 @@ def precision(
         relative_redundancy=_relative_redundancy(network, adjustment.parameters, weighted),
         all_global=fisher.gg,
         exterior_global=fisher.eg,
+        joint_points=(
+            joint_covariance(fisher).points if network.n_points <= MAX_JOINT_POINTS else None
+        ),
+    )
+
+
+@dataclass(frozen=True)
+class JointCovariance:
+    """Covariances of all unknowns with each other.
+
+    Attributes
+    ----------
+    exteriors : (6m, 6m) ndarray
+    points : (3n, 3n) ndarray
+    points_exteriors : (3n, 6m) ndarray
+    globals, exteriors_globals, points_globals : (G, G), (6m, G) and (3n, G) ndarray
+    """
+
+    exteriors: np.ndarray
+    points: np.ndarray
+    points_exteriors: np.ndarray
+    globals: np.ndarray
+    exteriors_globals: np.ndarray
+    points_globals: np.ndarray
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """All of them: exposures, object points, global unknowns."""
+        return np.block(
+            [
+                [self.exteriors, self.points_exteriors.T, self.exteriors_globals],
+                [self.points_exteriors, self.points, self.points_globals],
+                [self.exteriors_globals.T, self.points_globals.T, self.globals],
+            ]
+        )
+
+
+def joint_covariance(blocks: CovarianceBlocks) -> JointCovariance:
+    """Covariances of all unknowns with each other, from blocks of an inverse normal matrix."""
+    m = len(blocks.ee)
+    n = len(blocks.pp)
+
+    def assembled(
+        of_pairs: Callable[[np.ndarray, np.ndarray], np.ndarray], rows: int, columns: int
+    ) -> np.ndarray:
+        i, j = (a.ravel() for a in np.indices((rows, columns)))
+        found = of_pairs(i, j)
+        height, width = found.shape[1:]
+        found = found.reshape(rows, columns, height, width).transpose(0, 2, 1, 3)
+        return found.reshape(rows * height, columns * width)
+
+    size = len(blocks.gg)
+    return JointCovariance(
+        assembled(blocks.between, m, m),
+        assembled(blocks.points_between, n, n),
+        assembled(lambda p, e: blocks.pe(e, p), n, m),
+        blocks.gg,
+        blocks.eg.reshape(-1, size),
+        blocks.pg.reshape(-1, size),
     )
 
 

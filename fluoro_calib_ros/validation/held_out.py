@@ -33,6 +33,9 @@ MARGIN = (
     0.13  # over the expectation, with GOOD_EXPOSURES; it grows as the root of their number falls
 )
 EXPOSURE_LIMIT = 1.6  # times the expectation
+# Robust standard deviations of the logarithms over all exposures that an exposure may stand out
+# by: where the noise differs from exposure to exposure, much of it in one is no fault of that one.
+EXPOSURE_SCATTER = 3.5
 MIN_NOISE = 0.05  # part of the squared residuals in sample that is noise, whatever the trend
 
 
@@ -139,7 +142,7 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
     worst = int(np.argmax(ratio))
     exposures = Finding(
         ratio[worst],
-        EXPOSURE_LIMIT,
+        exposure_limit(ratio),
         '1',
         f'fluoroscope {name}: exposure {number[worst]} fits the calibration of the others worst, '
         f'with {ratio[worst]:.2f} times the expected residuals',
@@ -149,6 +152,17 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
         judge('held_out', name, held_out, common.is_significant),
         judge('exposures', name, exposures, common.is_significant),
     ]
+
+
+def exposure_limit(ratio: np.ndarray) -> float:
+    """Limit of the residuals of an exposure over their expectation.
+
+    ratio (m,): of all exposures; half of them or fewer are at fault. The scatter of their
+    logarithms is the median absolute deviation, times 1.4826 (Huber, "Robust Statistics", 1981).
+    """
+    size = np.log(ratio)
+    scatter = 1.4826 * np.median(np.abs(size - np.median(size)))
+    return float(max(EXPOSURE_LIMIT, np.exp(EXPOSURE_SCATTER * scatter)))
 
 
 HELD_OUT = Subject(check_held_out, steps=FOLDS)

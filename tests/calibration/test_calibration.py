@@ -734,6 +734,36 @@ def test_combined_targets_equal_one_estimation():
     assert combined_targets(parts[:1], phantom) is parts[0]
 
 
+def test_combined_targets_count_the_datum_once():
+    """What the beads of a small phantom have in common is the survey, in both estimates."""
+    rng = np.random.default_rng(6)
+    n = 5
+    phantom = replace(
+        PHANTOM,
+        target_id=PHANTOM.target_id[:n],
+        xyz_mm=PHANTOM.xyz_mm[:n],
+        sd_mm=np.full(n, 0.1),
+    )
+    # Images that show differences of the beads, but not their common shift.
+    between = 1e4 * (np.eye(3 * n) - np.kron(np.ones((n, n)), np.eye(3)) / n)
+    survey = 100.0 * np.eye(3 * n)
+    seen = [phantom.xyz_mm + rng.normal(0, 0.01, (n, 3)) for _ in range(2)]
+    parts = []
+    for xyz_mm in seen:
+        joint = np.linalg.inv(survey + between)
+        mean = joint @ (survey @ phantom.xyz_mm.ravel() + between @ xyz_mm.ravel())
+        blocks = joint.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+        parts.append(Targets(phantom.target_id, mean.reshape(n, 3), blocks, joint))
+    both = combined_targets(parts, phantom)
+    truth = np.linalg.inv(survey + 2 * between)
+    np.testing.assert_allclose(both.joint_covariance, truth, rtol=1e-8)
+    # The common shift is as uncertain as the mean of the survey.
+    mean = np.kron(np.ones(n) / n, np.eye(3))
+    np.testing.assert_allclose(mean @ truth @ mean.T, 0.01 / n * np.eye(3), atol=1e-12)
+    right = survey @ phantom.xyz_mm.ravel() + between @ (seen[0] + seen[1]).ravel()
+    np.testing.assert_allclose(both.xyz_mm.ravel(), truth @ right, rtol=1e-10)
+
+
 # ---- Anderson acceleration
 
 

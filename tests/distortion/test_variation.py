@@ -25,7 +25,7 @@ from fluoro_calib_ros.distortion.exposure_terms import (
     without_exposure_terms,
 )
 from fluoro_calib_ros.distortion.gauge import gauge_basis
-from fluoro_calib_ros.distortion.misfit import FittedPoints, misfit_over_image
+from fluoro_calib_ros.distortion.misfit import FittedPoints, sd_with_misfit
 from fluoro_calib_ros.distortion.series import SD_GRID, Functions, Series
 
 SIZE = (800, 600)
@@ -92,11 +92,28 @@ def test_what_a_series_cannot_follow_is_part_of_its_standard_deviation():
     functions = Functions(SIZE, 1)
     series = Series(functions, np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
     noise = rng.normal(0, NOISE, uv.shape)
-    flat = misfit_over_image(FittedPoints(uv, noise, exposure), series)
-    assert (flat == 0).mean() > 0.98
+    flat = sd_with_misfit(FittedPoints(uv, noise, exposure), series, 0.0)
+    assert (flat == 0.02).mean() > 0.98
     dent = 1.5 * np.exp(-np.sum((uv - [600, 150]) ** 2, axis=1) / (2 * 50**2))
-    found = misfit_over_image(FittedPoints(uv, noise + dent[:, None], exposure), series)
     row = round(150 / SIZE[1] * (SD_GRID - 1))
     column = round(600 / SIZE[0] * (SD_GRID - 1))
+    found = sd_with_misfit(FittedPoints(uv, noise + dent[:, None], exposure), series, 0.0)
     assert 0.7 < found[row, column] < 1.6
     assert np.median(found) < 0.1
+    # Orientations and object points have absorbed half of noise and dent.
+    half = FittedPoints(uv, (noise + dent[:, None]) / 2, exposure, np.full(len(uv), 0.5))
+    np.testing.assert_allclose(sd_with_misfit(half, series, 0.0), found, rtol=0.02)
+
+
+def test_residuals_bound_the_variance_beyond_a_series():
+    """A covariance function that expects too much is corrected, one that expects little is not."""
+    uv, exposure, rng = image_points(4, 200)
+    series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.zeros((SD_GRID, SD_GRID)))
+    noise = rng.normal(0, NOISE, uv.shape)
+    points = FittedPoints(uv, noise, exposure)
+    assert np.median(sd_with_misfit(points, series, 0.005)) == pytest.approx(0.005, rel=0.2)
+    assert np.median(sd_with_misfit(points, series, 1.0)) < 0.2 * NOISE
+    ripples = 0.2 * np.sin(uv / 15)
+    rippled = FittedPoints(uv, noise + ripples, exposure)
+    shown = np.median(sd_with_misfit(rippled, series, 1.0))
+    assert 0.5 * 0.14 < shown < 1.5 * 0.14

@@ -208,6 +208,8 @@ def test_covariances_equal_the_dense_inverse(shape, loss, free):
     honest = np.linalg.inv(
         rigs.dense_normal_matrix(network, result, result.noise.information_factor(result.q))
     )
+    points = slice(6 * m, 6 * m + 3 * n)
+    np.testing.assert_allclose(precise.joint_points, honest[points, points], rtol=1e-5, atol=1e-9)
     for j in range(m):
         part = slice(6 * j, 6 * j + 6)
         np.testing.assert_allclose(precise.exterior[j], honest[part, part], rtol=1e-5, atol=1e-9)

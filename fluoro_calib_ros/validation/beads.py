@@ -24,6 +24,7 @@ from scipy.special import chdtri
 from .bead_intersection import Beads, distances, intersect, least_chi2_without_a_ray
 from .check import Check, Finding, judge, not_made
 from .evidence import Evidence, Subject
+from .faces import displaced_layer
 
 MIN_BEADS = 10  # for distances
 MAX_NAMED = 5  # beads in a sentence
@@ -89,7 +90,10 @@ def compare_with_survey(
         f'bead {beads.target_id[worst]} lies {size[worst]:.2f} mm from its survey, the worst of '
         f'{count}'
     )
-    if len(wrong) and not has_trend:
+    layer = displaced_layer(beads) if len(wrong) else None
+    if layer is not None:
+        sentence = layer.sentence()
+    elif len(wrong) and not has_trend:
         sentence = _wrong_beads(beads.target_id[wrong], size[wrong])
     finding = Finding(
         size[worst],

@@ -57,6 +57,7 @@ from fluoro_calib_ros.nodes.runtime.stream_reader import FaultHandlers, StreamRe
 NAMES = ('a', 'b')
 DEPTH = 5000  # what is lost is not lost here
 ANSWER_S = 120.0
+REPEAT_S = 2.0  # after which a request that is not answered is sent again
 
 
 class HostClient:
@@ -158,22 +159,33 @@ class HostClient:
 
     def _step(self, *players: str) -> dict[str, Any]:
         for name in players:
-            step = self._node.create_client(Trigger, f'{name}/step')
-            self._wait(step.service_is_ready)
-            future = step.call_async(Trigger.Request())
-            self._wait(future.done)
+            self._call(self._node.create_client(Trigger, f'{name}/step'), Trigger.Request())
         # They have found their readers, and nothing holds them back now.
-        self._wait(lambda: len(self._came) == len(players))
+        self._wait(lambda: len(self._came) >= len(players))
         return {}
 
     def _go(self, *players: str) -> dict[str, Any]:
         clients = [self._node.create_client(SetBool, f'{name}/pause') for name in players]
-        for client in clients:
-            self._wait(client.service_is_ready)
+        for client in clients:  # they are paused: this only makes sure that they answer
+            self._call(client, SetBool.Request(data=True))
         futures = [client.call_async(SetBool.Request(data=False)) for client in clients]
-        for future in futures:
-            self._wait(future.done)
-        return {'success': all(future.result().success for future in futures)}
+        self._wait(lambda: all(future.done() for future in futures))
+        return {}
+
+    def _call(self, client: Any, request: Any) -> Any:
+        """Return the answer of a service, asked again where the server did not know us yet."""
+        futures: list[Any] = []
+        asked = 0.0
+
+        def answered() -> bool:
+            nonlocal asked
+            if client.service_is_ready() and time.monotonic() > asked + REPEAT_S:
+                asked = time.monotonic()
+                futures.append(client.call_async(request))
+            return any(future.done() for future in futures)
+
+        self._wait(answered)
+        return next(future.result() for future in futures if future.done())
 
     def _begin(self) -> dict[str, Any]:
         self._came = {}

@@ -44,8 +44,7 @@ NAMES = ('a', 'b')
 HOSTS = (*NAMES, 'calibration', 'tracking', 'late')
 CLIENT = [sys.executable, '-m', 'benchmarks.faults.host_client']
 WAIT_S = 90.0
-RATE_HZ = 250.0
-SLOW_HZ = 60.0
+RATE_HZ = 120.0
 PROFILE = ROOT / 'config' / 'lossy_links.xml'
 CUT_S = 60.0
 QUALITIES = (
@@ -185,7 +184,7 @@ def run(folder: Path, count: int, seed: int) -> str:
     count: duration of each stream [s].
     """
     sent = _write_stream(folder / 'tracking', float(count), RATE_HZ, seed)
-    _write_stream(folder / 'long', CUT_S + 40.0, SLOW_HZ, seed)
+    _write_stream(folder / 'long', CUT_S + 40.0, RATE_HZ, seed)
     sections = []
     for profile in (None, PROFILE):
         with Network(HOSTS, seed, profile) as network, Hosts(network, folder) as hosts:
@@ -231,7 +230,7 @@ def _sections(hosts: Hosts, seconds: int, sent: int) -> list[str]:
         ),
         section(
             f'A host is cut off, {how}',
-            f'Its cable is pulled for {CUT_S:g} s during a stream of {SLOW_HZ:g} Hz, and plugged '
+            f'Its cable is pulled for {CUT_S:g} s during a stream of {RATE_HZ:g} Hz, and plugged '
             'in again.',
             (
                 'host',
@@ -261,6 +260,10 @@ def _calibrated(hosts: Hosts, client: Client) -> str:
         raise SystemExit(answer['message'])
     client.wait(lambda state: len(state['calibrations']) == 2, 'the calibrations')
     client.wait(lambda state: state['orientation'], 'the orientation')
+    client.wait(
+        lambda state: not any('no calibration' in m for m in state['diagnostics'].values()),
+        'the correction node',
+    )
     return f'All 15 exposures arrived: {answer["message"]}.'
 
 

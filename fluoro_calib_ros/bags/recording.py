@@ -87,7 +87,8 @@ class Recording:
 
     put() never waits: where the disk is slower than the messages, they wait in a queue of limited
     size, and what does not fit is dropped and counted. Every flush_period the open chunk is
-    closed and flushed to disk, so that a crash or a power failure costs no more.
+    closed and flushed to disk, so that a crash or a power failure costs no more. Where the disk
+    is full, what was not flushed counts as dropped.
     """
 
     def __init__(self, path: PathLike, options: RecordingOptions | None = None) -> None:
@@ -95,6 +96,7 @@ class Recording:
         self.options = options or RecordingOptions()
         self.counts: Counter[str] = Counter()
         self.dropped: Counter[str] = Counter()
+        self._unflushed: Counter[str] = Counter()  # written, but perhaps not yet on disk
         self.fault = ''  # why nothing is written any more
         self.waiting_bytes = 0
         self.most_waiting_bytes = 0
@@ -146,7 +148,7 @@ class Recording:
         try:
             self._writer.__exit__(None, None, None)
         except DataError as error:
-            self.fault = self.fault or str(error)
+            self._fail(self.fault or str(error), [])
 
     def _run(self) -> None:
         flushed = time.monotonic()
@@ -161,14 +163,9 @@ class Recording:
             try:
                 for number, item in enumerate(items):
                     self._write(item)
-                    # A part of each period is left for the flush itself.
-                    if time.monotonic() - flushed > 0.5 * self.options.flush_period:
-                        self._writer.flush(to_disk=True)
-                        flushed = time.monotonic()
                     items[number] = None  # type: ignore[call-overload]  # frees its memory
-                if time.monotonic() - flushed > 0.5 * self.options.flush_period:
-                    self._writer.flush(to_disk=True)
-                    flushed = time.monotonic()
+                    flushed = self._flush_if_due(flushed)
+                flushed = self._flush_if_due(flushed)
             except DataError as error:
                 self._fail(str(error), [item for item in items if item is not None])
             except Exception as error:  # a bug must not end the recording silently
@@ -177,10 +174,22 @@ class Recording:
                     [item for item in items if item is not None],
                 )
 
+    def _flush_if_due(self, flushed: float) -> float:
+        """Flush what is written to disk once in a period; returns when this was last done."""
+        # A part of each period is left for the flush itself.
+        if time.monotonic() - flushed <= 0.5 * self.options.flush_period:
+            return flushed
+        self._writer.flush(to_disk=True)
+        self._unflushed.clear()
+        return time.monotonic()
+
     def _fail(self, fault: str, items: list[_Message | TopicToRecord]) -> None:
         """Count what can no longer be written as dropped."""
         with self._condition:
             self.fault = fault
+            self.counts -= self._unflushed  # what an open chunk holds
+            self.dropped += self._unflushed
+            self._unflushed.clear()
             for item in (*items, *self._queue):
                 if isinstance(item, _Message):
                     self.dropped[item.topic] += 1
@@ -202,6 +211,7 @@ class Recording:
                     self._write_message(latched._replace(received_ns=item.received_ns))
         self._write_message(item)
         self.counts[item.topic] += 1
+        self._unflushed[item.topic] += 1
         if item.topic in self._latched:
             self._latched[item.topic].append(item)
         with self._condition:

@@ -73,13 +73,17 @@ def test_latched_messages_are_in_every_file(tmp_path, monkeypatch):
         assert bag.message_count == 63 + 2 * (len(files) - 1)
 
 
-def wait_until_written(recording, count):
-    done = threading.Event()
+def wait_until(condition):
+    pause = threading.Event()
     for _ in range(1000):
-        if recording.counts.total() >= count:
+        if condition():
             return
-        done.wait(0.01)
-    raise AssertionError('nothing is written')
+        pause.wait(0.01)
+    raise AssertionError('waited 10 s')
+
+
+def wait_until_written(recording, count):
+    wait_until(lambda: recording.counts.total() >= count)
 
 
 def test_open_chunk_is_on_disk_within_the_flush_period(tmp_path, monkeypatch):
@@ -130,20 +134,18 @@ def test_full_disk_ends_the_recording_and_says_so(tmp_path, monkeypatch):
     recording = started(tmp_path / 'bag', flush_period=0.05)
     recording.put('/stream', text('kept'), START, START)
     wait_until_written(recording, 1)
+    wait_until(lambda: not recording._unflushed)
 
     def full(*_):
         raise OSError(28, 'No space left on device')
 
     monkeypatch.setattr(writer_module.Writer, 'add_message', full)
     recording.put('/stream', text('lost'), START, START)
-    for _ in range(1000):
-        if recording.fault:
-            break
-        threading.Event().wait(0.01)
+    wait_until(lambda: recording.fault)
     assert not recording.put('/stream', text('lost, too'), START, START)
     recording.stop()
     assert 'no space left on device' in recording.fault
-    assert recording.dropped == {'/stream': 2}
+    assert recording.dropped == {'/stream': 2} and recording.counts == {'/stream': 1}
     monkeypatch.undo()
     assert recover_bag(tmp_path / 'bag', tmp_path / 'out').counts == {'/stream': 1}
 

@@ -2,12 +2,14 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test oldest lint docs bench online endurance validation precision convergence pathologies real-data bags clean
+.PHONY: help setup demo test oldest lint docs fuzz audit bench online endurance validation precision convergence pathologies real-data bags clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
 # processes that run tests
 WORKERS ?= 2
+# of fuzzing, for each target
+SECONDS ?= 600
 OLDEST_PYTHON ?= python3.12
 
 help:
@@ -16,6 +18,8 @@ help:
 	@echo 'make oldest       run the tests that need no ROS with the oldest supported versions of all packages'
 	@echo 'make lint         run ruff, mypy and the import contracts (also part of the tests)'
 	@echo 'make docs         build the documentation and the API reference in docs/_build/html'
+	@echo 'make fuzz         fuzz every reader with atheris, SECONDS=600 each: docs/security.md'
+	@echo 'make audit        compare requirements.lock with known vulnerabilities (needs pypi.org or osv.dev)'
 	@echo 'make setup        create or update .venv: packages, ROS 2 and messages; demo, test, ... run it first'
 	@echo 'make bench        run the benchmarks and write docs/performance.md'
 	@echo 'make online       benchmark the nodes at lab rates against relays, points in space and images (10 min)'
@@ -58,6 +62,15 @@ docs: setup
 	@$(RUN) -m sphinx -W --keep-going -q -b html docs docs/_build/html
 	@echo 'docs/_build/html/index.html'
 
+# atheris is no part of the lock: it is there for Linux and some Pythons only.
+fuzz: setup
+	@$(RUN) -c 'import importlib.util, sys; sys.path.insert(0, ".fuzz/packages"); sys.exit(importlib.util.find_spec("atheris") is None)' \
+	    || $(RUN) -m pip install --quiet --target .fuzz/packages atheris==3.0.0
+	@PYTHONPATH=.fuzz/packages $(RUN) -m fuzz all $(SECONDS) $(ARGS)
+
+audit: setup
+	@sh tools/audit.sh
+
 bench: setup
 	@$(RUN) -m benchmarks $(ARGS)
 
@@ -88,5 +101,5 @@ bags: setup
 	@.venv/bin/fluoro-calib simulate --out bags $(ARGS)
 
 clean:
-	rm -rf .venv .oldest .build demo_result .pytest_cache .mypy_cache .ruff_cache docs/_build *.egg-info
+	rm -rf .venv .oldest .fuzz .audit .build demo_result .pytest_cache .mypy_cache .ruff_cache docs/_build *.egg-info
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

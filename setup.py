@@ -58,7 +58,7 @@ setup(
         'completion': ['shtab'],
         'foxglove': ['foxglove-sdk'],
         'watch': ['textual'],
-        'test': ['pytest', 'pytest-timeout', 'pytest-xdist'],
+        'test': ['hypothesis', 'pytest', 'pytest-timeout', 'pytest-xdist'],
     },
     zip_safe=False,
     url='https://arxiv.org/abs/1810.00138',

@@ -66,6 +66,8 @@ def channels_of_bag(source: PathLike) -> list[ChannelInfo]:
     with _opened(source) as bag:
         for number, connection in enumerate(bag.connections, 1):
             text = connection.msgdef.data
+            if not all(isinstance(v, str) for v in (connection.topic, connection.msgtype, text)):
+                raise DataError(f'{source}: the bag is damaged, the name of a topic is no text')
             metadata = {'topic_type_hash': connection.digest or ''}
             profiles = getattr(connection.ext, 'offered_qos_profiles', '')
             metadata['offered_qos_profiles'] = (

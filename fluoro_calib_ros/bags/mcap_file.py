@@ -33,6 +33,7 @@ from mcap.summary import Summary
 
 from ..errors import DataError
 from ..files.access import check_regular_file, os_error_reason
+from ..limits import MAX_CHUNK
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER_SIZE = 1 + 8 + 8 + 8 + 4  # bytes: opcode, length, two offsets, CRC
@@ -40,7 +41,6 @@ FOOTER_OPCODE = 2
 CHUNK_OPCODE = 6
 DATA_END_OPCODE = 15
 CHUNK_HEAD = 100  # bytes that contain sizes and compression of a chunk
-MAX_CHUNK = 2**29  # bytes of a chunk without compression
 _RECORD = struct.Struct('<BQ')  # opcode and length
 MAX_CAUSE = 120  # characters
 

@@ -27,14 +27,13 @@ from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.strays import without_strays
 from ..files.access import check_safe_name
+from ..limits import MAX_OBSERVATIONS
 from .definitions import TARGET_OBSERVATIONS, fields_of, from_cdr, type_hash, typestore
 from .foreign import channels_of_bag, is_foreign, messages_of_bag
 from .frames import fluoroscope_of_topic, frame_from_message
 from .mcap_file import BagMessage, ChannelInfo, channels_of_file, messages_of_file
 from .qos import parse_profiles
 from .storage import PathLike, storage_files
-
-MAX_OBSERVATIONS = 4 * 2**20  # bytes of a message: 150,000 image points
 
 
 class TopicInfo(NamedTuple):

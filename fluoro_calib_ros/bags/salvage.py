@@ -41,9 +41,9 @@ from mcap.records import Channel, MessageIndex, Schema, Statistics
 
 from ..errors import DataError
 from ..files.access import check_regular_file, os_error_reason
+from ..limits import MAX_CHUNK
 
 MAGIC = b'\x89MCAP0\r\n'
-MAX_CHUNK = 2**29  # bytes of a chunk without compression
 _HEAD = struct.Struct('<BQ')  # of a record: opcode and length
 _CHUNK = struct.Struct('<QQQI')  # of a chunk: first and last time, size, checksum
 _MESSAGE = struct.Struct('<HIQQ')  # of a message: channel, sequence, log and publish time

@@ -67,7 +67,7 @@ def orientation_of_known(
         max(calibration.stamp_ns for calibration in used),
         min(calibration.exposures for calibration in used),
         tuple(c.frame_id or f'{name}_optical' for name, c in zip(names, used)),
-    )
+    ).rounded()
 
 
 def _mean_rotation(figures: FluoroscopeResult) -> np.ndarray:

@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..distortion.registry import neighbour_models, selectable_models
 from ..distortion.user_regressor import is_regressor, regressor_name
+from ..limits import MAX_NEIGHBOURS
 from ..options import option, validate_options
 from ..photogrammetry.datum import DATUMS
 from ..photogrammetry.noise import LOSSES
@@ -83,7 +84,10 @@ class CalibrationOptions:
     )
     loss: str = option('student_t', 'noise model of the image points', choices=LOSSES)
     k: int | None = option(
-        None, 'neighbours of knn, local_linear or hybrid; by default chosen', minimum=1
+        None,
+        'neighbours of knn, local_linear or hybrid; by default chosen',
+        minimum=1,
+        maximum=MAX_NEIGHBOURS,
     )
     max_iterations: int = option(60, 'largest number of rounds', minimum=1, maximum=10000)
     tolerance: float = option(1e-4, 'relative change of F and G at which the rounds end')

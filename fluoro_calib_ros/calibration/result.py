@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -85,8 +85,10 @@ class FluoroscopeCalibration:
         SHA-256 of observations and phantom.
     seconds : float
         Time the calibration took; NaN where it was read from a file.
+    short_id : bool
+        Whether the id is made as by earlier versions, of what determines a correction only.
     calibration_id : str
-        Follows from the content.
+        Digest of the content.
     """
 
     fluoroscope: str
@@ -112,6 +114,7 @@ class FluoroscopeCalibration:
     frame_id: str
     source_digest: str
     seconds: float = field(default=np.nan, compare=False)
+    short_id: bool = field(default=False, compare=False, repr=False)
     calibration_id: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -130,7 +133,43 @@ class FluoroscopeCalibration:
                 np.concatenate([[degree, modes], coefficients.ravel(), sd.ravel()]).tobytes()
             )
         digest.update(f'{self.fluoroscope}/{self.model.kind}/{self.source_digest}'.encode())
+        if not self.short_id:
+            self._add_details(digest)
         object.__setattr__(self, 'calibration_id', f'{self.fluoroscope}-{digest.hexdigest()[:16]}')
+
+    def _add_details(self, digest: hashlib._Hash) -> None:
+        """Add what does not change a correction to a digest."""
+        for array in (
+            self.interior_covariance,
+            self.train_exposure,
+            self.rmse_before,
+            self.rmse_after,
+            [self.nu, self.cost_adjustment, self.cost_regression],
+        ):
+            values = np.ascontiguousarray(array, dtype=float)
+            digest.update(np.where(np.isnan(values), np.nan, values).tobytes())
+        words = (
+            self.interior_estimated,
+            self.exposures,
+            self.observations,
+            self.inliers,
+            self.iterations,
+            self.converged,
+            self.stamp_ns,
+        )
+        digest.update('/'.join(str(int(word)) for word in words).encode())
+        digest.update(f'/{self.frame_id}'.encode(errors='surrogatepass'))
+
+    def with_id(self, identity: str) -> FluoroscopeCalibration | None:
+        """Return the calibration with an id that its content has, None where it is of another.
+
+        Earlier versions made the id of what determines a correction only.
+        """
+        for short in (False, True):
+            other = replace(self, short_id=short)
+            if other.calibration_id == identity:
+                return other
+        return None
 
     @cached_property
     def grid(self) -> CorrectionGrid:

@@ -537,4 +537,4 @@ def _orientation(
         origin.stamp_ns,
         origin.exposures,
         tuple(c.frame_id or f'{name}_optical' for name, c in zip(names, used)),
-    )
+    ).rounded()

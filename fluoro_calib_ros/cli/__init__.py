@@ -22,7 +22,7 @@ import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from ..errors import DataError
+from ..errors import DataError, printable, shortened
 from . import (
     adjust,
     bag,
@@ -151,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except (DataError, OSError) as error:
         known = command if command in [module.NAME for module in COMMANDS] else ''
         program = styled(f'fluoro-calib {known}'.rstrip() + ':', 'red', sys.stderr)
-        print(f'{program} {error}', file=sys.stderr)
+        print(f'{program} {printable(shortened(str(error)))}', file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)

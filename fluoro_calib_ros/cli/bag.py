@@ -25,6 +25,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from ..errors import printable
 from ..options import declared
 from .arguments import add_option, names, number_in
 from .output import print_result
@@ -141,7 +142,7 @@ def _recover(arguments: argparse.Namespace) -> None:
     elif not recovery.damages:
         lines.append('nothing is lost')
     lines += [f'left out: {topic}: {reason}' for topic, reason in recovery.skipped.items()]
-    print_result(arguments, document, '\n'.join(lines))
+    print_result(arguments, document, '\n'.join(map(printable, lines)))
 
 
 def _info(arguments: argparse.Namespace) -> None:
@@ -205,7 +206,7 @@ def _info_text(report: BagReport, faults: list[str]) -> str:
         rate = f', {1e9 / each.interval_ns:.1f} Hz' if each.interval_ns > 0 else ''
         lines.append(f'  {topic} [{each.type}]: {len(each.log_ns)} messages{rate}')
     lines += [f'fault: {fault}' for fault in faults] or ['no faults found']
-    return '\n'.join(lines)
+    return '\n'.join(map(printable, lines))
 
 
 def _topic_document(topic: TopicReport) -> dict[str, Any]:

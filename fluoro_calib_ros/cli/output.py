@@ -25,6 +25,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
+from ..errors import printable
+
 if TYPE_CHECKING:
     from pathlib import Path
 
@@ -72,7 +74,7 @@ def print_result(
 
 def print_note(text: str) -> None:
     """Print a note on standard error."""
-    print(styled(text, 'yellow', sys.stderr), file=sys.stderr)
+    print(styled(printable(text), 'yellow', sys.stderr), file=sys.stderr)
 
 
 def print_notes(texts: Iterable[str]) -> None:

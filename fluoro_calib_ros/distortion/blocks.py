@@ -30,6 +30,7 @@ from scipy.spatial import cKDTree
 BLOCK = 200  # pixels of a block
 MAX_BLOCK_PX = 64.0  # its largest side, for pixels that are far apart
 BLOCKS_PER_QUERY = 32
+MAX_FOUND = 5_000_000  # candidates of a query, to bound the memory
 
 
 def blocks_with_candidates(
@@ -40,8 +41,10 @@ def blocks_with_candidates(
     tree holds the training points. Yields the rows of the pixels and of the training points.
     """
     blocks = _blocks(uv)
-    for start in range(0, len(blocks), BLOCKS_PER_QUERY):
-        some = blocks[start : start + BLOCKS_PER_QUERY]
+    # Where many training points coincide, each block has all of them as candidates.
+    per_query = int(np.clip(MAX_FOUND // tree.n, 1, BLOCKS_PER_QUERY))
+    for start in range(0, len(blocks), per_query):
+        some = blocks[start : start + per_query]
         low = np.array([np.min(uv[block], axis=0) for block in some])
         high = np.array([np.max(uv[block], axis=0) for block in some])
         centre = (low + high) / 2

@@ -29,6 +29,7 @@ from .neighbours import Neighbourhoods
 from .trend import Trend, least_squares_map
 
 WEIGHTS_CHUNK = 2_000_000  # weights computed at once, to bound the memory
+MAX_CANDIDATES = 50  # for each neighbour; more are never found among distinct points
 
 
 class NeighbourSmoother(CorrectionModel):
@@ -110,6 +111,10 @@ class NeighbourSmoother(CorrectionModel):
         out = np.zeros((3, len(uv)))
         norm2 = np.zeros(len(uv))
         for block, near in blocks_with_candidates(self.tree, uv, self.k):
+            if len(near) > MAX_CANDIDATES * (self.k + 1):  # coincident training points
+                predicted, norm2[block] = self._local_part(uv[block])
+                out[:2, block] = predicted.T
+                continue
             weights = self.weights_of_candidates(self.train_uv[near], uv[block], self.k)
             for axis, remainder in enumerate(self.remainder[near].T):
                 out[axis, block] = np.einsum('nk,k->n', weights, remainder)
@@ -129,6 +134,11 @@ class NeighbourSmoother(CorrectionModel):
     def _predict_with_norm(self, uv: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
         """Corrections (n, 2) [px] and the squared norms (n,) of their weights."""
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
+        duv, norm2 = self._local_part(uv)
+        return duv + self._global_part(uv), norm2
+
+    def _local_part(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the neighbours add to the global part (n, 2) [px], and the norms as above."""
         duv = np.zeros_like(uv)
         norm2 = np.zeros(len(uv))
         size = max(1, WEIGHTS_CHUNK // self.k)
@@ -138,4 +148,4 @@ class NeighbourSmoother(CorrectionModel):
             weights = self.weights(Neighbourhoods(self.tree.data[index], uv[part]), self.k)
             duv[part] = np.einsum('nk,nkc->nc', weights, self.remainder[index])
             norm2[part] = np.einsum('nk,nk->n', weights, weights)
-        return duv + self._global_part(uv), norm2
+        return duv, norm2

@@ -37,6 +37,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame, points_on_image
 from ..exposures.names import Names, number_names, safe_names, without_trivial
 from ..files.access import os_error_reason
+from ..limits import MAX_FILE
 from . import xmalab_frame
 from .base import Format, Sample
 from .camera_files import check_matrix, check_rotation
@@ -45,7 +46,6 @@ from .labels import default_name, named_targets
 from .text import Row, table_of
 
 DOCUMENT = 'project.xml'
-MAX_BYTES = 256 * 2**20  # of a file in the archive
 _SEEN = 0  # a marker is seen where its status is above
 _INLIER = 1
 NO_POINT = -1.0
@@ -119,7 +119,7 @@ class _Project:
         info = self._members.get(posixpath.normpath(name.replace('\\', '/')))
         if info is None:
             raise DataError(f'{self._path}: the project does not contain {name}')
-        if info.file_size > MAX_BYTES:
+        if info.file_size > MAX_FILE:
             raise DataError(f'{self._path}: {name} is too large, {info.file_size} bytes')
         try:
             return self._archive.read(info)

@@ -21,11 +21,9 @@ import re
 import stat
 
 from ..errors import DataError
+from ..limits import MAX_FILE, MAX_NAME
 
-_SAFE_NAME = re.compile(r'[A-Za-z0-9_-]{1,100}')
-
-# Largest file that is read as a whole [bytes]: some five million image points.
-MAX_FILE = 256 * 2**20
+_SAFE_NAME = re.compile(rf'[A-Za-z0-9_-]{{1,{MAX_NAME}}}')
 
 PathLike = str | os.PathLike[str]
 
@@ -99,7 +97,7 @@ def check_safe_name(name: str, where: object) -> None:
     if not _SAFE_NAME.fullmatch(str(name)):
         raise DataError(
             f'{where}: the fluoroscope is called {name!r}, but a name consists of letters, '
-            f'digits, _ and -, at most 100 of them'
+            f'digits, _ and -, at most {MAX_NAME} of them'
         )
 
 

@@ -22,7 +22,10 @@ bytes.
 from __future__ import annotations
 
 import io
+import math
+import re
 import struct
+import sys
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -32,11 +35,22 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError
-from .access import MAX_FILE, PathLike, read_bytes
+from ..limits import MAX_FILE
+from .access import PathLike, read_bytes
 from .atomic import atomic_file
 
 _DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same arrays give the same bytes
 _UNIX = 3  # system of every member, for the same reason
+# The beginning of an .npy file, versions 1 to 3, of plain numbers or text (numpy.lib.format).
+# numpy evaluates it as Python, which raises almost anything for a crafted one.
+_HEADER = re.compile(
+    rb'\x93NUMPY[\x01\x02\x03]\0(.{2}|.{4})\{'
+    rb"'descr': '([<>|=]?(?:b1|[iu][1248]|f[248]|U[0-9]{1,6}))', "
+    rb"'fortran_order': (True|False), "
+    rb"'shape': \(((?:[0-9]{1,18}, ?)*(?:[0-9]{1,18})?)\), ?\} *\n",
+    re.DOTALL,
+)
+_SURROGATES = 0xD800 >> 11
 _DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?')}
 
 
@@ -50,6 +64,10 @@ class ArraySpec:
     shape : tuple
         A letter stands for any length.
     minimum : float or None
+    maximum : float or None
+        Of the absolute value, where it is finite.
+    longest : int or None
+        Of the lengths that are letters.
     allowed : {'', 'inf', 'nan'}
         Value that a float array may have besides finite ones.
     """
@@ -58,6 +76,8 @@ class ArraySpec:
     shape: tuple[int | str, ...] = ()
     minimum: float | None = None
     allowed: str = ''
+    maximum: float | None = None
+    longest: int | None = None
 
 
 @dataclass(frozen=True)
@@ -206,14 +226,41 @@ def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> i
 
 
 def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndarray:
-    content = archive.read(f'{name}.npy')
+    """Return an array of an archive. Raises DataError unless it is one of plain numbers or text.
+
+    The header is compared with the size of the member before anything is made of it.
+    """
+    info = archive.getinfo(f'{name}.npy')
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise DataError(f'{path}: the array {name} is compressed in a way that numpy does not use')
+    content = archive.read(info)
+    match = _HEADER.match(content)
+    if match is None:
+        raise _no_plain_array(path, name)
+    length, descr, order, shape_text = match.groups()
+    offset = match.end(1) + int.from_bytes(length, 'little')
+    dtype = np.dtype(descr.decode())
+    shape = tuple(int(number) for number in shape_text.split(b',') if number.strip())
+    # The product of Python integers does not overflow.
+    if not dtype.itemsize or math.prod(shape) * dtype.itemsize != len(content) - offset:
+        raise _no_plain_array(path, name)
     try:
-        return np.lib.format.read_array(io.BytesIO(content), allow_pickle=False)
-    except (ValueError, EOFError, MemoryError, OverflowError, TypeError, SyntaxError):
-        raise DataError(
-            f'{path}: the array {name} does not contain plain numbers or text, and nothing else '
-            f'is read'
-        ) from None
+        array = np.frombuffer(content, dtype, offset=offset)
+        array = array.reshape(shape, order='F' if order == b'True' else 'C')
+    except ValueError:
+        raise _no_plain_array(path, name) from None
+    if dtype.kind == 'U':
+        codes = np.frombuffer(content, np.dtype('u4').newbyteorder(dtype.byteorder), offset=offset)
+        if ((codes > sys.maxunicode) | ((codes >> 11) == _SURROGATES)).any():  # no characters
+            raise _no_plain_array(path, name)
+    return array.astype(dtype.newbyteorder('='))  # a copy that can be written to
+
+
+def _no_plain_array(path: PathLike, name: str) -> DataError:
+    return DataError(
+        f'{path}: the array {name} does not contain plain numbers or text, and nothing else is '
+        'read'
+    )
 
 
 def _validate(where: object, name: str, array: np.ndarray, spec: ArraySpec) -> None:
@@ -231,6 +278,11 @@ def _validate(where: object, name: str, array: np.ndarray, spec: ArraySpec) -> N
     ):
         shape = ', '.join(map(str, spec.shape))
         raise DataError(f'{where}: the array {name} has shape {array.shape}, not ({shape})')
+    if spec.longest is not None and max(array.shape, default=0) > spec.longest:
+        raise DataError(
+            f'{where}: the array {name} has shape {array.shape}, lengths above {spec.longest} are '
+            'not read'
+        )
     if spec.dtype == 'float':
         valid = np.isfinite(array)
         if spec.allowed == 'inf':
@@ -246,3 +298,5 @@ def _validate(where: object, name: str, array: np.ndarray, spec: ArraySpec) -> N
         raise DataError(
             f'{where}: the array {name} holds {array.min()}, which is below {spec.minimum}'
         )
+    if spec.maximum is not None and (np.abs(array[np.isfinite(array)]) > spec.maximum).any():
+        raise DataError(f'{where}: the array {name} holds a value beyond {spec.maximum:g}')

@@ -18,14 +18,25 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..calibration.result import FluoroscopeCalibration
 from ..distortion.registry import model_from_arrays
-from ..distortion.series import packed
+from ..distortion.series import MAX_DEGREE, MAX_MODES, packed
 from ..errors import DataError
+from ..limits import (
+    MAX_COINCIDENT,
+    MAX_IMAGE_SIDE,
+    MAX_NEIGHBOURS,
+    MAX_PIXELS,
+    MAX_PRINCIPAL_DISTANCE_PX,
+    MAX_PX,
+    MAX_TRAINING_POINTS,
+    MEGABYTE,
+)
 from .access import PathLike, check_safe_name, make_folder, os_error_reason
 from .arrays import ArraySpec, Layout, read_arrays, to_arrays, to_values, write_arrays
 
@@ -34,23 +45,23 @@ SUFFIX = '.calibration.npz'
 ARRAYS = {
     'fluoroscope': ArraySpec('text'),
     'calibration_id': ArraySpec('text'),
-    'image_size': ArraySpec('int', (2,), minimum=1),
-    'interior': ArraySpec('float', (3,)),
-    'interior_covariance': ArraySpec('float', (3, 3)),
+    'image_size': ArraySpec('int', (2,), minimum=1, maximum=MAX_IMAGE_SIDE),
+    'interior': ArraySpec('float', (3,), maximum=MAX_PRINCIPAL_DISTANCE_PX),
+    'interior_covariance': ArraySpec('float', (3, 3), maximum=MAX_PRINCIPAL_DISTANCE_PX**2),
     'interior_estimated': ArraySpec('bool'),
     'model_kind': ArraySpec('text'),
-    'model_k': ArraySpec('int', minimum=0),
-    'train_uv': ArraySpec('float', ('N', 2)),
-    'train_duv': ArraySpec('float', ('N', 2)),
-    'train_exposure': ArraySpec('int', ('N',), minimum=0),
-    'noise_px': ArraySpec('float', minimum=0),
-    'bias_px': ArraySpec('float', minimum=0),
-    'series_degree': ArraySpec('int', minimum=-1),
-    'series_modes': ArraySpec('int', minimum=0),
-    'series_coefficients': ArraySpec('float', (2, 'M')),
-    'series_sd': ArraySpec('float', ('S', 'S'), minimum=0),
-    'image_sd': ArraySpec('float', minimum=0),
-    'sigma0': ArraySpec('float', minimum=0),
+    'model_k': ArraySpec('int', minimum=0, maximum=MAX_NEIGHBOURS),
+    'train_uv': ArraySpec('float', ('N', 2), maximum=MAX_PX, longest=MAX_TRAINING_POINTS),
+    'train_duv': ArraySpec('float', ('N', 2), maximum=MAX_PX, longest=MAX_TRAINING_POINTS),
+    'train_exposure': ArraySpec('int', ('N',), minimum=0, longest=MAX_TRAINING_POINTS),
+    'noise_px': ArraySpec('float', minimum=0, maximum=MAX_PX),
+    'bias_px': ArraySpec('float', minimum=0, maximum=MAX_PX),
+    'series_degree': ArraySpec('int', minimum=-1, maximum=MAX_DEGREE),
+    'series_modes': ArraySpec('int', minimum=0, maximum=MAX_MODES),
+    'series_coefficients': ArraySpec('float', (2, 'M'), maximum=MAX_PX),
+    'series_sd': ArraySpec('float', ('S', 'S'), minimum=0, maximum=MAX_PX),
+    'image_sd': ArraySpec('float', minimum=0, maximum=MAX_PX),
+    'sigma0': ArraySpec('float', minimum=0, maximum=MAX_PX),
     'nu': ArraySpec('float', minimum=0, allowed='inf'),
     'exposures': ArraySpec('int', minimum=0),
     'observations': ArraySpec('int', minimum=0),
@@ -65,6 +76,7 @@ ARRAYS = {
     'frame_id': ArraySpec('text'),
     'source_digest': ArraySpec('text'),
 }
+COINCIDENT_PX = 1e-3
 _SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
 # Array of the file: entry of CorrectionModel.to_arrays.
 _MODEL_ENTRIES = {
@@ -116,8 +128,23 @@ def validated_arrays(where: object, calibration: FluoroscopeCalibration) -> dict
     if not len(calibration.train_exposure):
         values['train_exposure'] = np.zeros(0, dtype=np.int64)  # an empty list would be float
     arrays = to_arrays(where, LAYOUT, values)
-    _check_lengths(where, arrays)
+    _check_content(where, arrays)
     return arrays
+
+
+def check_model_content(
+    where: object, content: Mapping[str, Any], image_size: tuple[int, int]
+) -> None:
+    """Raise DataError for the content of a model that no file could have, before it is made.
+
+    content: as `CorrectionModel.to_arrays` gives it; where begins the message.
+    """
+    values = {name: content[entry] for name, entry in _MODEL_ENTRIES.items()}
+    values['image_size'] = image_size
+    layout = replace(LAYOUT, arrays={name: ARRAYS[name] for name in values})
+    arrays = to_arrays(where, layout, values)
+    arrays['train_exposure'] = arrays['train_uv']  # of equal length, as was checked
+    _check_content(where, arrays)
 
 
 def load_calibration(path: PathLike) -> FluoroscopeCalibration:
@@ -127,7 +154,7 @@ def load_calibration(path: PathLike) -> FluoroscopeCalibration:
     layout that is not known.
     """
     arrays = read_arrays(path, LAYOUT)
-    _check_lengths(path, arrays)
+    _check_content(path, arrays)
     values = to_values(arrays)
     identity = values.pop('calibration_id')
     width, height = values['image_size'].tolist()
@@ -136,10 +163,10 @@ def load_calibration(path: PathLike) -> FluoroscopeCalibration:
     content = {entry: values.pop(name) for name, entry in _MODEL_ENTRIES.items()}
     try:
         model = model_from_arrays(content, values['image_size'])
-        calibration = FluoroscopeCalibration(model=model, **values)
+        calibration = FluoroscopeCalibration(model=model, **values).with_id(identity)
     except ValueError as error:
         raise DataError(f'{path}: {error}') from None
-    if calibration.calibration_id != identity:
+    if calibration is None:
         raise DataError(
             f'{path}: the content does not belong to its calibration_id {identity}, '
             f'the file was changed'
@@ -178,9 +205,32 @@ def load_calibrations(directory: PathLike) -> dict[str, FluoroscopeCalibration]:
     return out
 
 
-def _check_lengths(where: object, arrays: Mapping[str, Any]) -> None:
-    """Raise DataError for training arrays of different lengths."""
+def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
+    """Raise DataError for training arrays of different lengths, and for impossible sizes."""
     lengths = {name: len(arrays[name]) for name in ('train_uv', 'train_duv', 'train_exposure')}
     if len(set(lengths.values())) > 1:
         listed = ', '.join(f'{name} {length}' for name, length in lengths.items())
         raise DataError(f'{where}: the training arrays differ in length ({listed})')
+    if _largest_heap(arrays['train_uv']) > MAX_COINCIDENT:
+        raise DataError(
+            f'{where}: more than {MAX_COINCIDENT} training points lie on one place of the image'
+        )
+    c = arrays['interior'][2] if 'interior' in arrays else 1.0
+    if c <= 0:
+        raise DataError(f'{where}: the principal distance is {c:g} px')
+    width, height = arrays['image_size'].tolist()
+    if width * height > MAX_PIXELS:
+        raise DataError(
+            f'{where}: the images have {width} x {height} px, those of more than '
+            f'{MAX_PIXELS // MEGABYTE} megapixels are not read'
+        )
+
+
+def _largest_heap(uv: np.ndarray) -> int:
+    """Return the largest number of points (n, 2) in one cell: no search tree can divide them."""
+    if not len(uv):
+        return 0
+    column, row = np.floor(uv / COINCIDENT_PX).astype(np.int64).T
+    keys = np.sort(column * 2**32 + row)
+    ends = np.flatnonzero(np.diff(keys, append=keys[-1] + 1))
+    return int(np.diff(ends, prepend=-1).max())

@@ -96,7 +96,7 @@ def read_request(
         were not made from.
     """
     directory = Path(directory)
-    options, joint, distance = _read_options(directory / OPTIONS)
+    options, joint, distance = read_options(directory / OPTIONS)
     where: object = 'the source'
     if frames is None:
         where = directory / OBSERVATIONS
@@ -153,7 +153,7 @@ def _read_frames(
     return frames
 
 
-def _read_options(path: Path) -> tuple[CalibrationOptions, bool, float | None]:
+def read_options(path: Path) -> tuple[CalibrationOptions, bool, float | None]:
     """Read the options of a calibration, whether it was joint, and its principal distance [px]."""
     document = read_json(_require_file(path))
     if document.get('format_version') != VERSION:

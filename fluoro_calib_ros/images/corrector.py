@@ -32,6 +32,7 @@ from ..calibration.result import FluoroscopeCalibration
 from ..distortion.grid import CorrectionGrid
 from ..distortion.status import CorrectionStatus
 from ..errors import DataError
+from ..limits import MAX_IMAGE_SIDE
 
 INTERPOLATIONS = {'linear': cv2.INTER_LINEAR, 'cubic': cv2.INTER_CUBIC}
 LIMIT_PX = 0.01  # largest difference between a pixel and its corrected source
@@ -43,7 +44,6 @@ HALF_STEPS = 60
 ROWS = 16
 NOWHERE = -10_000.0  # source of a pixel without one: far off any image
 SHARPNESS = -0.75  # of OpenCV's cubic convolution
-MAX_PX = 32_000  # longer side of an image: OpenCV holds whole pixels in 16 bits
 
 
 class ImageCorrector:
@@ -86,10 +86,10 @@ class ImageCorrector:
             raise DataError(
                 f'the interpolation is one of {", ".join(INTERPOLATIONS)}, not {interpolation!r}'
             )
-        if max(calibration.image_size) > MAX_PX:
+        if max(calibration.image_size) > MAX_IMAGE_SIDE:
             raise DataError(
                 f'an image of {_size_text(calibration.image_size)} px is too large, its sides may '
-                f'have {MAX_PX} px'
+                f'have {MAX_IMAGE_SIDE} px'
             )
         self.calibration_id = calibration.calibration_id
         self.image_size = tuple(calibration.image_size)

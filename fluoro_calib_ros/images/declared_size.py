@@ -27,8 +27,8 @@ import re
 import tifffile
 
 from ..errors import DataError
+from ..limits import MAX_PIXELS
 
-MAX_PIXELS = 64 * 2**20  # 8192 x 8192
 PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 TIFF_SIGNATURES = (b'II*\0', b'MM\0*', b'II+\0', b'MM\0+')
 # Headers of a JPEG frame: SOF0 to SOF15 without DHT, JPG and DAC.

@@ -22,6 +22,8 @@ and again until it has started, which on a busy machine costs so much time that 
 
 from __future__ import annotations
 
+import itertools
+import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -68,6 +70,7 @@ from ..jobs.result_folder import (
 )
 from ..jobs.sources import read_survey
 from ..jobs.worker_process import run_in_worker_process
+from ..limits import CollectLimits
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..validation.check import Validation
@@ -161,7 +164,8 @@ _PAIRING = ParameterGroup(
 _CALIBRATION = ParameterGroup(
     CalibrationOptions, {name: name for name in _OF_REQUESTS}, settable=_OF_REQUESTS
 )
-PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION)
+_LIMITS = ParameterGroup(CollectLimits)
+PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION, _LIMITS)
 
 
 class Cancelled(Exception):
@@ -194,6 +198,7 @@ class CalibrationNode(StreamNode):
         self._still = _STILL.declare(self)
         self._pairing = _PAIRING.declare(self)
         self._options = _CALIBRATION.declare(self)
+        self._limits = _LIMITS.declare(self)
         self.autostart = self._settings.autostart
         self._names = self._settings.fluoroscopes
         self._read_files()
@@ -224,7 +229,9 @@ class CalibrationNode(StreamNode):
     # -- parameters
 
     def _collect_options(self) -> CollectOptions:
-        return CollectOptions(self._settings.collect, self._still, self._pairing)
+        return CollectOptions(
+            self._settings.collect, self._still, self._pairing, self._limits.max_exposures
+        )
 
     def _capture_settings(self) -> CaptureSettings:
         return CaptureSettings(
@@ -340,6 +347,7 @@ class CalibrationNode(StreamNode):
                 self._on_undecodable,
                 self._on_lost_frame,
                 self.fail,
+                self._on_too_large,
             )
         )
         for name in self._names:
@@ -349,6 +357,7 @@ class CalibrationNode(StreamNode):
                 partial(self._on_frame, name),
                 observations_qos(),
                 decode_target_observations,
+                self._limits.max_bytes,
             )
 
     def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
@@ -416,6 +425,9 @@ class CalibrationNode(StreamNode):
     def _on_undecodable(self, topic: str) -> None:
         self._exposures.refuse_undecodable(topic)
 
+    def _on_too_large(self, topic: str, size: int) -> None:
+        self._exposures.refuse_too_large(topic, size)
+
     def _on_lost_frame(self, topic: str, error: Exception) -> None:
         self._exposures.streams[topic.partition('/')[0]].refusals.fail(topic, error)
 
@@ -430,6 +442,11 @@ class CalibrationNode(StreamNode):
             check_timeout(timeout)
             if not self.readers:
                 raise DataError(NOT_ACTIVE)
+            if self._requests >= self._limits.max_waiting:
+                raise DataError(
+                    f'{self._requests} requests wait for their answers, as many as max_waiting '
+                    'allows'
+                )
         except ValueError as error:  # DataError among them
             response.message = str(error)
             return response
@@ -486,6 +503,7 @@ class CalibrationNode(StreamNode):
             directory = self._directory_of(request)
             if not calibrations:
                 raise DataError('there is no calibration to save')
+            self._check_folders(directory)
             save_calibrations(directory, calibrations, self._orientation.present)
         except (DataError, OSError) as error:
             response.message = f'not saved: {error}'
@@ -528,6 +546,21 @@ class CalibrationNode(StreamNode):
                 'parameter any_directory allows it'
             )
         return directory
+
+    def _check_folders(self, directory: Path) -> None:
+        """Raise DataError where peers have made as many folders as they may."""
+        limit = self._limits.max_folders
+        base = self._directory.resolve()
+        target = directory.resolve()
+        if target.exists() or not target.is_relative_to(base):
+            return
+        new = sum(not path.exists() for path in (target, *target.parents))
+        # The first one is the base itself.
+        present = sum(1 for _ in itertools.islice(os.walk(base), limit + 2)) - 1
+        if max(present, 0) + new > limit:
+            raise DataError(
+                f'{directory}: {self._directory} has as many folders as max_folders allows'
+            )
 
     def _load(
         self, directory: Path

@@ -154,6 +154,7 @@ class CorrectingNode(StreamNode):
             lambda topic: self._count_undecodable(self.stream_of(topic), topic),
             lambda topic, error: self.stream_of(topic).refusals.fail(topic, error),
             self.fail,
+            lambda topic, size: self._count_too_large(self.stream_of(topic), topic, size),
         )
 
     def stream_of(self, topic: str) -> Any:
@@ -176,6 +177,11 @@ class CorrectingNode(StreamNode):
     def _count_undecodable(stream: Stream, topic: str) -> None:
         stream.received += 1
         stream.refusals.refuse_undecodable(topic)
+
+    @staticmethod
+    def _count_too_large(stream: Stream, topic: str, size: int) -> None:
+        stream.received += 1
+        stream.refusals.refuse_too_large(topic, size)
 
     def _values(self, stream: Stream) -> dict[str, object]:
         return {

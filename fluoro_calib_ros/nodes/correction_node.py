@@ -26,6 +26,7 @@ from sensor_msgs.msg import CameraInfo
 
 from ..calibration.result import FluoroscopeCalibration
 from ..distortion.status import CorrectionStatus
+from ..limits import StreamLimits
 from .correcting_node import CorrectingNode, Stream
 from .frame_validation import OBSERVED_REFUSALS, FrameValidator
 from .messages.camera_info import message_of_corrected_stream
@@ -40,7 +41,8 @@ from .runtime.refusals import Refused
 # An integer: comparing an array with an enum member takes longer than the rest of the node.
 INVALID = int(CorrectionStatus.INVALID)
 _NODE = ParameterGroup(CalibratedParameters)
-PARAMETERS = (_NODE,)
+_LIMITS = ParameterGroup(StreamLimits)
+PARAMETERS = (_NODE, _LIMITS)
 
 
 class _ObservationStream(Stream):
@@ -63,6 +65,7 @@ class CorrectionNode(CorrectingNode):
 
     def __init__(self) -> None:
         super().__init__('correction_node')
+        self._limits = _LIMITS.declare(self)
         self.use_parameters(_NODE.declare(self))
 
     def make_stream(self, name: str) -> _ObservationStream:
@@ -91,6 +94,7 @@ class CorrectionNode(CorrectingNode):
                 partial(self._on_frame, name),
                 observations_qos(),
                 decode_target_observations,
+                self._limits.max_bytes,
             )
 
     def prepare(self, calibration: FluoroscopeCalibration) -> FluoroscopeCalibration:

@@ -21,7 +21,6 @@ from dataclasses import dataclass, replace
 
 from fluoro_calib_msgs.srv import Reset
 from rclpy.client import Client
-from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.publisher import Publisher
 
 from ..drift.clusters import Cluster, parse_clusters
@@ -32,6 +31,7 @@ from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from .messages.drift_status import ALARM, message_from_drift_state
 from .runtime.diagnostics import ERROR, OK, WARN, Status
+from .runtime.logging import Logger
 
 LEVELS = (OK, WARN, ERROR)  # of the diagnostics, by the level of a DriftState
 
@@ -82,7 +82,7 @@ class DriftMonitor:
         names: Sequence[str],
         parameters: DriftParameters,
         options: DriftOptions,
-        logger: RcutilsLogger,
+        logger: Logger,
     ) -> None:
         self._names = tuple(names)
         self._parameters = parameters

@@ -22,7 +22,6 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rclpy.impl.rcutils_logger import RcutilsLogger
 from rclpy.task import Future
 
 from ..calibration.initial_network import MIN_TARGETS_OF_EXPOSURE
@@ -32,8 +31,9 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.pairing import CompletePairer, PairingOptions
 from ..exposures.phantom import Phantom
 from ..exposures.readiness import Readiness, readiness
+from ..limits import CollectLimits
 from .messages.target_observations import ObservedFrame, frame_from_observed
-from .runtime.logging import RateLimitedLogger
+from .runtime.logging import Logger, RateLimitedLogger
 from .runtime.refusals import RefusalLog
 
 
@@ -47,11 +47,14 @@ class CollectOptions:
         'still': whenever the phantom stands still in a new pose; 'request': only for a capture.
     still : StillOptions
     pairing : PairingOptions
+    max_exposures : int
+        More are refused until a reset.
     """
 
     mode: str
     still: StillOptions
     pairing: PairingOptions
+    max_exposures: int = CollectLimits.max_exposures
 
 
 @dataclass(frozen=True)
@@ -114,7 +117,7 @@ class ExposureInput:
         Called with every pair of frames of the phantom, in the thread of the streams.
     on_captured : callable
         Called in that thread after the Future of a capture has got its result.
-    logger : RcutilsLogger
+    logger : Logger
         Logger of the node.
     """
 
@@ -125,7 +128,7 @@ class ExposureInput:
         options: CollectOptions,
         on_pair: Callable[[Mapping[str, Frame]], None],
         on_captured: Callable[[], None],
-        logger: RcutilsLogger,
+        logger: Logger,
     ) -> None:
         self._names = tuple(names)
         self._phantom = phantom
@@ -133,8 +136,10 @@ class ExposureInput:
         self._on_pair = on_pair
         self._on_captured = on_captured
         self._logger = logger
-        limited_logger = RateLimitedLogger(logger)
-        self.streams = {name: ObservationStream(name, limited_logger) for name in self._names}
+        self._limited_logger = RateLimitedLogger(logger)
+        self.streams = {
+            name: ObservationStream(name, self._limited_logger) for name in self._names
+        }
         self._captures: deque[Future] = deque()  # one for every capture that waits for its pair
         self.capture_refusal = ''  # why the last pair was not captured
         self._lock = threading.Lock()
@@ -232,6 +237,12 @@ class ExposureInput:
         stream.received += 1
         stream.refusals.refuse_undecodable(topic)
 
+    def refuse_too_large(self, topic: str, size: int) -> None:
+        """Count a message on <fluoroscope>/<...> that has more bytes than are read."""
+        stream = self.streams[topic.partition('/')[0]]
+        stream.received += 1
+        stream.refusals.refuse_too_large(topic, size)
+
     def _validated(
         self, stream: ObservationStream, observed: ObservedFrame, phantom: Phantom
     ) -> Frame | None:
@@ -261,6 +272,9 @@ class ExposureInput:
         """Collect a pair for the oldest capture, or because the phantom stands still."""
         self._on_pair(pair)
         collector = self._collector
+        if len(collector.exposures) >= self._options.max_exposures:
+            self._refuse_full(len(collector.exposures))
+            return
         if self._captures:
             refusal = self.capture_refusal = collector.add(pair)
             if not refusal:
@@ -279,6 +293,13 @@ class ExposureInput:
             return
         if not refusal:
             self._log_collected(pair)
+
+    def _refuse_full(self, exposures: int) -> None:
+        """Refuse further exposures: each new one is compared with all."""
+        self.capture_refusal = (
+            f'{exposures} exposures are collected, as many as max_exposures allows: reset first'
+        )
+        self._limited_logger.warning(self.capture_refusal)
 
     def _log_collected(self, pair: Mapping[str, Frame]) -> None:
         counts = ', '.join(

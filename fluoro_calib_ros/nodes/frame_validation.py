@@ -27,11 +27,12 @@ from ..exposures.frame import (
 )
 from .messages.corrected_observations import CorrectedFrame
 from .messages.target_observations import ObservedFrame
-from .runtime.refusals import Refused
+from .runtime.refusals import TOO_LARGE, Refused
 
 # Kinds of refusals.
 OBSERVED_REFUSALS = (
     'undecodable',
+    TOO_LARGE,
     'lengths',
     'image size',
     'frame id',
@@ -39,7 +40,7 @@ OBSERVED_REFUSALS = (
     'sigma',
 )
 CORRECTED_ARRAYS = ('u', 'v', 'sigma', 'correction_sd', 'status')
-CORRECTED_REFUSALS = ('undecodable', 'lengths', 'repeated target', 'sigma')
+CORRECTED_REFUSALS = ('undecodable', TOO_LARGE, 'lengths', 'repeated target', 'sigma')
 
 
 class FrameValidator:

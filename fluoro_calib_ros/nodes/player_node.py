@@ -36,6 +36,7 @@ from ..errors import DataError
 from ..options import option
 from .runtime.discovery import wait_for_readers, wait_until_acknowledged
 from .runtime.errors import StartError, one_line
+from .runtime.logging import Trace
 from .runtime.main import run
 from .runtime.message_types import installed_type
 from .runtime.pace import Pace
@@ -220,7 +221,7 @@ class PlayerNode(ParameterNode):
             self.failed = True
         except Exception:
             if rclpy.ok():  # else the node has been ended between two messages
-                self.get_logger().fatal(traceback.format_exc())
+                self.get_logger().fatal(Trace(traceback.format_exc()))
                 self.failed = True
         finally:
             if rclpy.ok():

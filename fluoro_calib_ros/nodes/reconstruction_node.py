@@ -41,6 +41,7 @@ from ..drift.rig_watch import RigDriftWatch
 from ..errors import DataError
 from ..exposures.pairing import PairingOptions, exposure_pairer
 from ..files.rig_orientation import load_orientation, orientation_path
+from ..limits import StreamLimits
 from ..options import option
 from ..photogrammetry import rig_orientation
 from ..reconstruction.correspondence import CorrectedView
@@ -140,7 +141,8 @@ _DRIFT_OPTIONS = ParameterGroup(
     {'warn_interval_h': 'drift_warn_interval', 'error_interval_h': 'drift_error_interval'},
     settable=('drift_warn_interval', 'drift_error_interval'),
 )
-PARAMETERS = (_NODE, _PAIRING, _DRIFT, _DRIFT_OPTIONS)
+_LIMITS = ParameterGroup(StreamLimits)
+PARAMETERS = (_NODE, _PAIRING, _DRIFT, _DRIFT_OPTIONS, _LIMITS)
 
 
 @dataclass(frozen=True)
@@ -168,6 +170,7 @@ class ReconstructionNode(StreamNode):
     def __init__(self) -> None:
         super().__init__('reconstruction_node')
         self._settings = _NODE.declare(self)
+        self._limits = _LIMITS.declare(self)
         self._pairing = _PAIRING.declare(self)
         self.autostart = self._settings.autostart
         self._names = self._settings.fluoroscopes
@@ -277,6 +280,7 @@ class ReconstructionNode(StreamNode):
                 self._on_undecodable,
                 self._refusals.fail,
                 self.fail,
+                self._on_too_large,
             )
         )
         for name in self._names:
@@ -286,6 +290,7 @@ class ReconstructionNode(StreamNode):
                 partial(self._on_view, name),
                 observations_qos(),
                 decode_corrected_observations,
+                self._limits.max_bytes,
             )
 
     # -- orientation
@@ -338,6 +343,10 @@ class ReconstructionNode(StreamNode):
     def _on_undecodable(self, topic: str) -> None:
         self._received[topic.partition('/')[0]] += 1
         self._refusals.refuse_undecodable(topic)
+
+    def _on_too_large(self, topic: str, size: int) -> None:
+        self._received[topic.partition('/')[0]] += 1
+        self._refusals.refuse_too_large(topic, size)
 
     def _on_view(self, name: str, frame: CorrectedFrame, info: Mapping[str, int]) -> None:
         """Pair a corrected frame, and reconstruct the exposures that are complete by it."""

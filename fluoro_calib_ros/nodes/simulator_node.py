@@ -47,6 +47,7 @@ from .messages.image import message_from_image
 from .messages.target_observations import message_from_frame, set_number_and_stamp
 from .runtime.discovery import wait_for_readers, wait_until_acknowledged
 from .runtime.errors import StartError
+from .runtime.logging import Trace
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, RigParameters
 from .runtime.qos import images_qos, observations_qos, qos_overrides
@@ -198,7 +199,7 @@ class SimulatorNode(ParameterNode):
             rclpy.try_shutdown()
         except Exception:
             if not self._stopping.is_set():  # else the node has been ended between two messages
-                self.get_logger().fatal(traceback.format_exc())
+                self.get_logger().fatal(Trace(traceback.format_exc()))
                 self.failed = True
                 rclpy.try_shutdown()
         finally:

@@ -46,6 +46,7 @@ MIN_VARIANCE = 1e-12  # [px^2], for exact observations
 START_DAMPING = 1e-4
 MIN_DAMPING = 1e-12
 MAX_DAMPING = 1e10
+MIN_EXTENT_MM = 1e-3
 DAMPING_FACTOR = 10
 # Relative increase of the cost that rounding errors can cause.
 ROUNDING = 1e-9
@@ -157,6 +158,8 @@ def robust_dlt(xyz: np.ndarray, uv: np.ndarray, seed: int = 0) -> np.ndarray:
             f'{len(xyz)} targets are too few for a resection, {MIN_TARGETS} are needed'
         )
     extent = np.linalg.svd(xyz - xyz.mean(axis=0), compute_uv=False)
+    if not extent[0] > MIN_EXTENT_MM:
+        raise DataError('all targets lie in one place')
     if extent[2] < MIN_FLATNESS * extent[0]:
         raise DataError(
             'all targets lie in one plane, from which the principal distance cannot be found'

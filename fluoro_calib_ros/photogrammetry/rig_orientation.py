@@ -29,7 +29,7 @@ from numpy.typing import ArrayLike
 
 from ..errors import DataError
 from .collinearity import project_with_jacobian
-from .rotations import cross_matrix
+from .rotations import cross_matrix, matrix_from_quaternion, quaternion_from_matrix
 
 ORIENTATION_SIZE = 9  # unknowns of a fluoroscope: T [mm], w [rad], xp, yp, c [px]
 SOURCES = ('capture', 'joint calibration')
@@ -37,6 +37,11 @@ SOURCES = ('capture', 'joint calibration')
 ORTHOGONALITY_TOLERANCE = 1e-6
 # Largest asymmetry of the correlation matrix, and its most negative eigenvalue.
 CORRELATION_TOLERANCE = 1e-6
+MAX_VALUE = 1e15  # of a position [mm], an interior orientation [px] or a covariance
+# What `rounded` keeps: far coarser than a rounding error, far finer than a standard deviation.
+DIGITS = 40  # binary, of positions and covariances
+QUATERNION_STEP = 2.0**-44
+LARGE_COMPONENT = 0.43  # of a unit quaternion; one of four is always larger
 
 
 @dataclass(frozen=True)
@@ -143,6 +148,8 @@ class RigOrientation:
             raise DataError(
                 f'rig orientation: {name} holds {value[~finite][0]}, which is not a finite number'
             )
+        if (np.abs(value) > MAX_VALUE).any():
+            raise DataError(f'rig orientation: {name} holds a value above {MAX_VALUE:g}')
         value.setflags(write=False)
         return value
 
@@ -208,6 +215,20 @@ class RigOrientation:
             covariance=self.covariance[np.ix_(rows, rows)],
             calibration_ids=tuple(self.calibration_ids[i] for i in indices),
             optical_frame_ids=tuple(self.optical_frame_ids[i] for i in indices),
+        )
+
+    def rounded(self) -> RigOrientation:
+        """Return the orientation with values that survive a change of units.
+
+        A message has metres and quaternions, so its values differ from these in the last bits. As
+        they are rounded to coarser steps, far below any standard deviation, both sides find the
+        same values again, and the same id. Rounding again changes nothing.
+        """
+        return replace(
+            self,
+            rotation=_rounded_rotation(self.rotation),
+            position_mm=_to_digits(self.position_mm),
+            covariance=_to_digits(self.covariance),
         )
 
     def check_calibrations(self, calibration_ids: Mapping[str, str]) -> None:
@@ -289,6 +310,8 @@ def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> n
 
 def _check_orientation(names: Sequence[str], interior: np.ndarray, rotation: np.ndarray) -> None:
     """Raise DataError for a negative principal distance or an invalid rotation matrix."""
+    large = (np.abs(rotation) > 1 + ORTHOGONALITY_TOLERANCE).any(axis=(1, 2))
+    rotation = np.where(large[:, None, None], 0.0, rotation)  # no overflow; refused below
     product = rotation @ rotation.transpose(0, 2, 1)
     errors = np.max(np.abs(product - np.eye(3)), axis=(1, 2))
     signs = np.linalg.det(rotation)
@@ -301,6 +324,32 @@ def _check_orientation(names: Sequence[str], interior: np.ndarray, rotation: np.
             raise DataError(
                 f'rig orientation: the rotation of fluoroscope {name} is not a rotation matrix'
             )
+
+
+def _to_steps(values: np.ndarray, step: float) -> np.ndarray:
+    """Round to multiples of a step, which is a power of two."""
+    return np.round(values / step) * step + 0.0  # + 0.0: no negative zero
+
+
+def _to_digits(values: np.ndarray) -> np.ndarray:
+    """Round to DIGITS binary digits."""
+    mantissa, exponent = np.frexp(values)
+    return np.ldexp(_to_steps(mantissa, 2.0**-DIGITS), exponent)
+
+
+def _rounded_rotation(rotation: np.ndarray) -> np.ndarray:
+    """Round the quaternions of rotation matrices (F, 3, 3) to QUATERNION_STEP.
+
+    The first component that is large follows from the other three, so that the norm is one.
+    """
+    q = quaternion_from_matrix(rotation)
+    rows = np.arange(len(q))
+    large = np.argmax(np.abs(q) > LARGE_COMPONENT, axis=1)
+    q = np.where(q[rows, large] < 0, -1.0, 1.0)[:, None] * q
+    q = _to_steps(q, QUATERNION_STEP)
+    q[rows, large] = 0.0
+    q[rows, large] = np.sqrt(1.0 - (q[:, 0] ** 2 + q[:, 1] ** 2 + q[:, 2] ** 2 + q[:, 3] ** 2))
+    return matrix_from_quaternion(q)
 
 
 def _check_covariance(covariance: np.ndarray) -> None:

@@ -64,9 +64,9 @@ def read_header(data: bytes) -> tuple[int, int, str, int]:
 
 
 def read_string(data: bytes, start: int, length: int) -> tuple[str, int]:
-    """Read a string of a length, with its terminating zero; returns the next aligned offset."""
+    """Read a string of a length, up to its first zero; returns the next aligned offset."""
     end = start + length
-    return data[start:end].rstrip(b'\0').decode(errors='replace'), end + -end % 4
+    return data[start:end].partition(b'\0')[0].decode(errors='replace'), end + -end % 4
 
 
 def read_float64_sequence(data: bytes, start: int) -> tuple[np.ndarray, int]:

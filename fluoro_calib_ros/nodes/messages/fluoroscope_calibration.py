@@ -26,7 +26,7 @@ from ...distortion.base import CorrectionModel
 from ...distortion.registry import model_from_arrays
 from ...distortion.series import SD_GRID
 from ...errors import DataError
-from ...files.calibration import validated_arrays
+from ...files.calibration import check_model_content, validated_arrays
 from .fields import (
     float64_field,
     nanoseconds_from_stamp,
@@ -92,8 +92,8 @@ def calibration_from_message(
         stamp_ns=nanoseconds_from_stamp(message.header.stamp),
         frame_id=message.header.frame_id,
         **{name: getattr(message, name) for name in SAME_NAME},
-    )
-    if calibration.calibration_id != message.calibration_id:
+    ).with_id(message.calibration_id)
+    if calibration is None:
         raise DataError(f'{where}: its content does not match its id {message.calibration_id}')
     validated_arrays(where, calibration)
     return calibration
@@ -137,7 +137,11 @@ def _model_of(message: FluoroscopeCalibration, where: str) -> CorrectionModel:
             'bias_px': message.model_bias,
             **_series_content(message),
         }
-        return model_from_arrays(content, (message.image_width, message.image_height))
+        size = (message.image_width, message.image_height)
+        check_model_content(where, content, size)
+        return model_from_arrays(content, size)
+    except DataError:
+        raise
     except ValueError as error:
         raise DataError(f'{where}: {error}') from None
 

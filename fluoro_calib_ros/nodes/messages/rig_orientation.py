@@ -20,6 +20,7 @@ import numpy as np
 from fluoro_calib_msgs.msg import RigOrientation
 
 from ...errors import DataError
+from ...limits import MAX_FLUOROSCOPES
 from ...photogrammetry import rig_orientation as rig
 from ...photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from .fields import float64_field, nanoseconds_from_stamp, stamp_from_nanoseconds
@@ -31,7 +32,8 @@ MIN_QUATERNION_NORM = 0.5  # below, a quaternion is damaged and not only rounded
 
 
 def message_from_orientation(orientation: rig.RigOrientation) -> RigOrientation:
-    """Return the message of an orientation."""
+    """Return the message of an orientation, whose id is the digest of the rounded values."""
+    orientation = orientation.rounded()
     message = RigOrientation()
     message.header.stamp = stamp_from_nanoseconds(orientation.stamp_ns)
     message.header.frame_id = orientation.frame_id
@@ -55,11 +57,15 @@ def message_from_orientation(orientation: rig.RigOrientation) -> RigOrientation:
 
 
 def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
-    """Return the orientation of a message, except for rounding.
+    """Return the orientation of a message, equal to the one that was sent after rounding.
 
-    Raises DataError where the message holds no valid orientation.
+    Raises DataError where the message holds no valid orientation, or not the one its id says.
     """
     count = len(message.fluoroscope)
+    if count > MAX_FLUOROSCOPES:
+        raise DataError(
+            f'rig orientation: {count} fluoroscopes, more than {MAX_FLUOROSCOPES} are not read'
+        )
     columns = {
         name: np.array(getattr(message, name)) for name in (*_INTERIOR, *_POSITION, *_ATTITUDE)
     }
@@ -76,7 +82,9 @@ def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
     norm = np.linalg.norm(attitude, axis=1)
     if not np.isfinite(attitude).all() or not (norm > MIN_QUATERNION_NORM).all():
         raise DataError('rig orientation: an attitude is not a unit quaternion')
-    return rig.RigOrientation(
+    if not np.isfinite(covariance).all():
+        raise DataError('rig orientation: its covariance is not finite')
+    orientation = rig.RigOrientation(
         tuple(message.fluoroscope),
         np.stack([columns[name] for name in _INTERIOR], axis=1),
         matrix_from_quaternion(attitude).transpose(0, 2, 1),
@@ -88,7 +96,12 @@ def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
         nanoseconds_from_stamp(message.header.stamp),
         message.exposures,
         tuple(message.optical_frame_id),
-    )
+    ).rounded()
+    if orientation.orientation_id != message.orientation_id:
+        raise DataError(
+            f'rig orientation: its content does not match its id {message.orientation_id}'
+        )
+    return orientation
 
 
 def description_of(message: RigOrientation) -> str:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from rclpy.exceptions import NameValidationException, ParameterException
 
-from ...errors import DataError
+from ...errors import DataError, printable
 
 MAX_LENGTH = 1000  # of an error message in one line
 
@@ -33,4 +33,4 @@ USER_ERRORS = (ParameterException, NameValidationException, RuntimeError, DataEr
 
 def one_line(error: BaseException) -> str:
     """Return the message of an exception in one line, or its type where it has none."""
-    return ' '.join(str(error).split())[:MAX_LENGTH] or type(error).__name__
+    return printable(' '.join(str(error).split())[:MAX_LENGTH]) or type(error).__name__

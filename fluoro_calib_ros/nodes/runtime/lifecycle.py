@@ -30,7 +30,7 @@ from rclpy.qos import QoSProfile
 from .diagnostics import DiagnosticsPublisher, Status
 from .discovery import best_effort_message
 from .errors import USER_ERRORS, StartError, one_line
-from .logging import RateLimitedLogger
+from .logging import RateLimitedLogger, Trace
 from .parameters import ParameterNode
 from .qos import qos_overrides
 from .refusals import RefusalLog
@@ -77,7 +77,7 @@ class ManagedNode(ParameterNode, LifecycleNode):
 
     def fail(self, text: str) -> None:
         """Log a fatal fault of the node itself and end it with exit status 1."""
-        self.get_logger().fatal(text)
+        self.get_logger().fatal(Trace(text))
         self.failed = True
         rclpy.try_shutdown()
 
@@ -124,7 +124,7 @@ class ManagedNode(ParameterNode, LifecycleNode):
             function()
         except Exception as error:
             is_user_error = isinstance(error, USER_ERRORS)
-            self._fault = one_line(error) if is_user_error else traceback.format_exc()
+            self._fault = one_line(error) if is_user_error else Trace(traceback.format_exc())
             if not self._starting:  # else it is logged by the main loop
                 self.get_logger().error(self._fault)
             undo()

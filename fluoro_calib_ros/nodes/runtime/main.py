@@ -35,6 +35,7 @@ from rclpy.signals import SignalHandlerOptions
 
 from .errors import USER_ERRORS, StartError, one_line
 from .guard import guard_services
+from .logging import log_line
 from .node_help import asks_for_help, help_text
 from .parameters import unknown_parameters
 
@@ -82,7 +83,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
             executor.shutdown()
         code = int(getattr(node, 'failed', False))
     except (StartError, ParameterException) as error:
-        rclpy.logging.get_logger('fluoro_calib').fatal(str(error))
+        rclpy.logging.get_logger('fluoro_calib').fatal(log_line(str(error)))
         code = 1
     finally:
         if node is not None:

@@ -35,9 +35,11 @@ from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from ...errors import DataError
+from ...errors import DataError, printable, shortened
+from ...limits import MAX_TEXT
 from ...options import Option, declared, option
 from .errors import StartError
+from .logging import PrintableLogger
 
 MAX_TIMEOUT_S = 86400.0  # longest time that a request may ask a node to wait
 MAX_INTEGER = 2**63 - 1
@@ -83,7 +85,14 @@ class CalibratedParameters(ManagedParameters):
 
 
 class ParameterNode(Node):
-    """Node that says what to do where one tries to set a parameter that is read-only."""
+    """Node that says what to do where one tries to set a parameter that is read-only.
+
+    Texts of its peers stay in their lines of its log.
+    """
+
+    def get_logger(self) -> Any:
+        """Return the logger, for any text."""
+        return PrintableLogger(super().get_logger())
 
     def set_parameters_atomically(
         self, parameter_list: Sequence[Parameter]
@@ -96,6 +105,13 @@ class ParameterNode(Node):
                     successful=False,
                     reason=f'parameter {name} is read when the node starts: set it in the '
                     f'parameter file or with -p {name}:=VALUE, and start the node again',
+                )
+            text = str(parameter.value)
+            if len(text) > MAX_TEXT or not text.isprintable():
+                return SetParametersResult(
+                    successful=False,
+                    reason=f'parameter {printable(shortened(name))}: a value is printable text of '
+                    f'at most {MAX_TEXT} characters',
                 )
         return super().set_parameters_atomically(parameter_list)
 

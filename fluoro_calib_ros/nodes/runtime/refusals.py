@@ -23,10 +23,11 @@ from collections.abc import Iterable
 from ...errors import DataError
 from .diagnostics import ERROR, WARN
 from .errors import one_line
-from .logging import RateLimitedLogger
+from .logging import RateLimitedLogger, Trace
 
 # Names in a message may have any length, and error messages go into log and diagnostics.
 MAX_LENGTH = 500
+TOO_LARGE = 'too large'
 
 
 class Refused(DataError):
@@ -79,6 +80,17 @@ class RefusalLog:
             )
         )
 
+    def refuse_too_large(self, topic: str, size: int) -> None:
+        """Count a message of so many bytes, more than are read, on <fluoroscope>/<...>."""
+        fluoroscope = topic.partition('/')[0]
+        self.refuse(
+            Refused(
+                TOO_LARGE,
+                f'fluoroscope {fluoroscope}: a message on {topic} has {size} bytes, more than '
+                'the parameter max_points allows',
+            )
+        )
+
     def note(self, text: str) -> None:
         """Log a fault that does not lead to a refusal."""
         self.last_fault = text
@@ -90,7 +102,9 @@ class RefusalLog:
         self._last_failure = f'topic {topic}: {type(error).__name__}: {one_line(error)}'
         self.last_fault = self._last_failure
         trace = ''.join(traceback.format_exception(error))
-        self._logger.error(f'{self._item} lost by an internal error, topic {topic}\n{trace}')
+        self._logger.error(
+            Trace(f'{self._item} lost by an internal error, topic {topic}\n{trace}')
+        )
 
     def values(self, kinds: Iterable[str]) -> dict[str, object]:
         """Return the counts for the diagnostics."""

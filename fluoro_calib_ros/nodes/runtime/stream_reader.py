@@ -48,6 +48,7 @@ from rclpy.qos import (
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
+from ...limits import MAX_MESSAGE
 from .discovery import needs_best_effort
 from .qos import incompatible_qos_message, qos_overrides
 
@@ -84,11 +85,15 @@ class FaultHandlers:
         Called with topic and exception where a callback raises: that message is lost.
     reader_error : callable
         Called with a traceback where the thread itself fails and ends.
+    too_large : callable or None
+        Called with the topic of a message that is too large, and its size [bytes]; None:
+        undecodable is called.
     """
 
     undecodable: Callable[[str], None]
     callback_error: Callable[[str, Exception], None]
     reader_error: Callable[[str], None]
+    too_large: Callable[[str, int], None] | None = None
 
 
 class StreamReader:
@@ -100,6 +105,7 @@ class StreamReader:
         self._group = _ReaderGroup()
         # (topic, Subscription, decode, callback)
         self._routes: list[tuple[str, Subscription, Callable, Callable]] = []
+        self._max_bytes: dict[str, int] = {}  # by topic
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -110,6 +116,7 @@ class StreamReader:
         callback: Callable[[Any, dict], None],
         qos: QoSProfile,
         decode: Callable[[bytes], Any] | None = None,
+        max_bytes: int = MAX_MESSAGE,
     ) -> None:
         """Subscribe to a topic, also while messages are being received.
 
@@ -124,6 +131,8 @@ class StreamReader:
         qos : QoSProfile
         decode : callable, optional
             Makes the message from its bytes, or raises ValueError; by default that of ROS.
+        max_bytes : int, optional
+            Larger messages are dropped before they are decoded.
         """
         subscription = self._node.create_subscription(
             kind,
@@ -134,6 +143,7 @@ class StreamReader:
             qos_overriding_options=qos_overrides(),
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         )
+        self._max_bytes[topic] = max_bytes
         decode = decode or (lambda data: deserialize_message(data, kind))
         self._routes.append((topic, subscription, decode, callback))
 
@@ -246,6 +256,13 @@ class StreamReader:
             for pointer in wait_set.get_ready_entities('subscription'):
                 self._drain(*routes[pointer])
 
+    def _drop(self, topic: str, size: int) -> None:
+        """Count a message that is too large."""
+        if self._faults.too_large is None:
+            self._faults.undecodable(topic)
+        else:
+            self._faults.too_large(topic, size)
+
     def _drain(
         self, topic: str, kind: type, handle: Any, decode: Callable, callback: Callable
     ) -> None:
@@ -258,6 +275,9 @@ class StreamReader:
             if received is None:
                 return
             data, info = received
+            if len(data) > self._max_bytes[topic]:
+                self._drop(topic, len(data))
+                continue
             try:
                 message = decode(data)
             except DECODING_ERRORS:

@@ -1,0 +1,185 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Valid files from which the fuzzer starts: small, and made from a virtual rig."""
+
+from __future__ import annotations
+
+import functools
+import io
+import tempfile
+import zipfile
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from fluoro_calib_ros.bags.definitions import known_definition
+from fluoro_calib_ros.bags.frames import message_from_frame
+from fluoro_calib_ros.bags.writer import BagWriter
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
+from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+
+SEPARATOR = b'\n--- '  # before the name of a member of a flattened archive
+TARGETS = 6
+
+
+@functools.cache
+def rig() -> VirtualRig:
+    """Return the virtual rig of all seeds."""
+    return virtual_rig(1)
+
+
+@functools.cache
+def frames() -> dict[str, list[Frame]]:
+    """Return two exposures of few targets of each fluoroscope."""
+    simulated = simulate_exposures(rig(), 2, 1).frames
+    return {
+        name: [
+            replace(
+                f,
+                target_id=f.target_id[:TARGETS],
+                uv=f.uv[:TARGETS],
+                sigma=None if f.sigma is None else f.sigma[:TARGETS],
+            )
+            for f in of_one
+        ]
+        for name, of_one in simulated.items()
+    }
+
+
+def written(*writers: Callable[[Path], object]) -> list[bytes]:
+    """Return the content of the file that each writer makes at the path that it is given."""
+    contents = []
+    for write in writers:
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / 'file'
+            write(path)
+            contents.append(path.read_bytes())
+    return contents
+
+
+def flattened(content: bytes) -> bytes:
+    """Return a ZIP archive as its members one behind the other, each after its name.
+
+    Without checksums and compression, a change of a byte is a change of the content.
+    """
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        return b''.join(
+            SEPARATOR + name.encode() + b'\n' + archive.read(name) for name in archive.namelist()
+        )
+
+
+def archive_of(flat: bytes) -> bytes:
+    """Return the ZIP archive of a flattened one."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, 'w') as archive:
+        for member in flat.split(SEPARATOR)[1:]:
+            name, _, content = member.partition(b'\n')
+            archive.writestr(zipfile.ZipInfo(name.decode('latin-1') or 'x'), content)
+    return buffer.getvalue()
+
+
+def bag_content(storage: str = 'mcap') -> bytes:
+    """Return a bag file of the frames, without compression and checksums."""
+    from mcap.writer import CompressionType, Writer
+
+    from fluoro_calib_ros.bags.definitions import TARGET_OBSERVATIONS, to_cdr
+    from fluoro_calib_ros.bags.qos import PROFILES, to_yaml
+
+    buffer = io.BytesIO()
+    writer = Writer(
+        buffer,
+        compression=CompressionType.NONE,
+        enable_crcs=False,
+        enable_data_crcs=False,
+    )
+    writer.start('ros2', 'fuzz')
+    definition = known_definition(TARGET_OBSERVATIONS)
+    schema = writer.register_schema(TARGET_OBSERVATIONS, 'ros2msg', definition.text.encode())
+    for name, of_one in frames().items():
+        channel = writer.register_channel(
+            f'/{name}/target_observations',
+            'cdr',
+            schema,
+            {
+                'offered_qos_profiles': to_yaml([PROFILES['observations']]),
+                'topic_type_hash': definition.type_hash,
+            },
+        )
+        for frame in of_one:
+            data = to_cdr(message_from_frame(frame), TARGET_OBSERVATIONS)
+            writer.add_message(channel, frame.stamp_ns, data, frame.stamp_ns)
+    writer.finish()
+    return buffer.getvalue()
+
+
+def bag_folder(path: Path) -> None:
+    """Write the frames as a bag folder."""
+    with BagWriter(path) as bag:
+        for of_one in frames().values():
+            for frame in of_one:
+                bag.write_frame(frame)
+
+
+def images() -> list[np.ndarray]:
+    """Return small grey images of 8 and of 16 bits."""
+    ramp = np.add.outer(np.arange(12), np.arange(16))
+    return [(8 * ramp).astype(np.uint8), (2000 * ramp).astype(np.uint16)]
+
+
+def encoded_images(suffix: str) -> Sequence[bytes]:
+    """Return the images as files with this ending."""
+    return [cv2.imencode(suffix, image)[1].tobytes() for image in images()]
+
+
+def in_folder(write: Callable[[Path], object], name: str = '*') -> bytes:
+    """Return the content of the one file of this name that a function writes into a folder."""
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder) / 'out'
+        write(out)
+        return next(out.glob(name)).read_bytes()
+
+
+@functools.cache
+def calibration(model: str = 'knn') -> FluoroscopeCalibration:
+    """Return the calibration of a fluoroscope from a few exposures."""
+    exposures = simulate_exposures(rig(), 5, 1).frames
+    request = CalibrationOptions(model=model, k=5 if model == 'knn' else None, max_iterations=2)
+    result = calibrate({'a': exposures['a']}, rig().phantom, request)
+    return result.calibrations['a']
+
+
+def orientation() -> RigOrientation:
+    """Return the orientation of a rig of two fluoroscopes."""
+    return RigOrientation(
+        ('a', 'b'),
+        np.array([[511.5, 511.5, 4000.0]] * 2),
+        np.array([np.eye(3)] * 2),
+        np.array([[0.0, 0, -1000], [0, 1000, 0]]),
+        np.eye(18) * 1e-6,
+        'phantom',
+        'joint calibration',
+        ('id_a', 'id_b'),
+        10**18,
+        3,
+        ('a_optical', 'b_optical'),
+    )

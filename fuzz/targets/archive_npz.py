@@ -1,0 +1,41 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The calibration file as it is: a ZIP archive, also with compressed members."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+
+from fluoro_calib_ros.files.calibration import load_calibration, save_calibration
+
+from ..harness import Target
+from ..seeds import calibration, in_folder
+
+
+def _seeds() -> list[bytes]:
+    content = in_folder(lambda folder: save_calibration(folder, calibration()))
+    seeds = [content]
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        for kind in (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+            buffer = io.BytesIO()
+            with zipfile.ZipFile(buffer, 'w', kind) as packed:
+                for name in archive.namelist():
+                    packed.writestr(name, archive.read(name))
+            seeds.append(buffer.getvalue())
+    return seeds
+
+
+TARGET = Target('archive_npz', 'a.calibration.npz', load_calibration, _seeds)

@@ -1,0 +1,49 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""A bag file of MCAP: read, inspected and recovered."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+from fluoro_calib_ros.bags.images import image_topics
+from fluoro_calib_ros.bags.inspection import inspect_bag
+from fluoro_calib_ros.bags.reader import iterate_messages, read_frames
+from fluoro_calib_ros.bags.recovery import recover_bag
+
+from ..harness import Target, both
+from ..seeds import bag_content
+
+
+def _read(path: Path) -> None:
+    out = path.parent / 'recovered'
+
+    def recovered() -> None:
+        try:
+            recover_bag(path, out)
+        finally:
+            shutil.rmtree(out, ignore_errors=True)
+
+    both(
+        lambda: read_frames(path),
+        lambda: sum(1 for _ in iterate_messages(path)),
+        lambda: inspect_bag(path).faults,
+        lambda: image_topics(path),
+        recovered,
+    )
+
+
+TARGET = Target('bag_mcap', 'bag.mcap', _read, lambda: [bag_content()])

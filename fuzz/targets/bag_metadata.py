@@ -1,0 +1,66 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""metadata.yaml of a bag folder, QoS profiles in it, and the expected numbers of messages."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import yaml
+
+from fluoro_calib_ros.bags.foreign import is_foreign
+from fluoro_calib_ros.bags.qos import parse_profiles
+from fluoro_calib_ros.bags.reader import topics_of
+from fluoro_calib_ros.bags.recovery import Salvage
+from fluoro_calib_ros.bags.storage import storage_files
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.files.access import read_text
+
+from ..harness import Target, both
+from ..seeds import bag_content, bag_folder, in_folder
+
+
+def _read(path: Path) -> None:
+    storage = path.parent / 'bag_0.mcap'
+    if not storage.exists():
+        storage.write_bytes(bag_content())
+
+    def profiles() -> None:
+        try:
+            text = read_text(path)
+        except DataError:
+            return
+        for each in parse_profiles(text):
+            parse_profiles([each])
+
+    both(
+        lambda: is_foreign(path.parent),
+        lambda: storage_files(path.parent),
+        lambda: topics_of(path.parent),
+        lambda: Salvage(path.parent).expected,
+        profiles,
+    )
+
+
+def _seeds() -> list[bytes]:
+    content = in_folder(bag_folder, 'metadata.yaml')
+    information = yaml.safe_load(content)['rosbag2_bagfile_information']
+    profiles = information['topics_with_message_count'][0]['topic_metadata'][
+        'offered_qos_profiles'
+    ]
+    return [content, yaml.safe_dump(profiles).encode(), content.replace(b'mcap', b'sqlite3', 1)]
+
+
+TARGET = Target('bag_metadata', 'metadata.yaml', _read, _seeds)

@@ -1,0 +1,77 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Text files of other programs, of every format that is recognised or written."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exchange import registry
+from fluoro_calib_ros.exchange.content import (
+    Bodies,
+    Camera,
+    Content,
+    FileSettings,
+    points_without_precision,
+)
+
+from ..harness import Target, both
+from ..seeds import frames, rig
+
+SETTINGS = FileSettings(image_size=(1024, 1024), units='mm', rate_hz=100.0)
+# These have targets of their own; C3D is read in another process.
+KINDS = tuple(
+    kind
+    for kind in registry.kinds(lambda f: f.read is not None)
+    if kind not in ('observations', 'phantom', 'known_orientation', 'c3d', 'xmalab_project')
+)
+
+
+def _read(path: Path) -> None:
+    both(
+        lambda: registry.read(path, SETTINGS),
+        *(lambda kind=kind: registry.read(path, SETTINGS, kind) for kind in KINDS),
+    )
+
+
+def _seeds() -> list[bytes]:
+    matrix = np.array([[4000.0, 0, 500], [0, 4000, 380], [0, 0, 1]])
+    camera = Camera('a', matrix, (1024, 1024), np.eye(3), np.array([0.0, 0, 1000]))
+    content = Content(
+        observations=frames(),
+        survey=rig().phantom,
+        cameras=(camera,),
+        points=points_without_precision(
+            np.array([1, 2]), np.array([1, 2]), np.arange(12.0).reshape(2, 2, 3), 100.0
+        ),
+        bodies=Bodies(('f',), np.array([1]), np.eye(3)[None, None], np.ones((1, 1, 3))),
+        grids={'a': np.arange(8.0).reshape(2, 4)},
+    )
+    seeds = []
+    for kind in registry.kinds(lambda f: f.write is not None):
+        with tempfile.TemporaryDirectory() as folder:
+            try:
+                done = registry.write(Path(folder) / 'file', kind, content, SETTINGS)
+            except DataError:
+                continue
+            seeds += [Path(path).read_bytes() for path in done.paths]
+    return [seed for seed in seeds if len(seed) < 20_000]
+
+
+TARGET = Target('exchange', 'file.csv', _read, _seeds)

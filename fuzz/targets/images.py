@@ -1,0 +1,53 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Image files: PNG, TIFF, JPEG and others, stacks too."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import tifffile
+
+from fluoro_calib_ros.files.image_reading import open_images
+
+from ..harness import Target, both
+from ..seeds import encoded_images, images
+
+ENDINGS = ('.png', '.tif')
+
+
+def _read(path: Path) -> None:
+    def with_ending(ending: str) -> None:
+        other = path.with_suffix(ending)
+        other.write_bytes(path.read_bytes())
+        for _ in open_images(other).images:
+            pass
+
+    both(*(lambda ending=ending: with_ending(ending) for ending in ENDINGS))
+
+
+def _seeds() -> list[bytes]:
+    stack = io.BytesIO()
+    tifffile.imwrite(stack, [images()[0]] * 3, photometric='minisblack')
+    found = [
+        one
+        for ending in ('.png', '.tif', '.jpg', '.bmp', '.pgm')
+        for one in encoded_images(ending)
+    ]
+    return [*found, stack.getvalue()]
+
+
+TARGET = Target('images', 'image', _read, _seeds)

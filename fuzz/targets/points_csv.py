@@ -1,0 +1,48 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Image points to be corrected, as CSV, and their correction."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
+from fluoro_calib_ros.files.image_points import correct_points, read_points, write_points
+
+from ..harness import Target
+from ..seeds import calibration
+
+
+@functools.cache
+def _calibrations() -> dict[str, FluoroscopeCalibration]:
+    return {'a': calibration()}
+
+
+def _read(path: Path) -> None:
+    points = read_points(path)
+    corrected = correct_points(points, _calibrations())
+    write_points(path.with_suffix('.out.csv'), points, corrected)
+
+
+TARGET = Target(
+    'points_csv',
+    'points.csv',
+    _read,
+    lambda: [
+        b'fluoroscope,u,v,sigma,trial\na,500.5,400.25,0.3,x\na,,nan,,y\n',
+        b'u;v\n1,5;2,5\n3,5;4,5\n',
+    ],
+)

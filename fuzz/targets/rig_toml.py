@@ -1,0 +1,46 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""rig.toml, and a calibration of Anipose, which is TOML, too."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from fluoro_calib_ros.exchange import registry
+from fluoro_calib_ros.exchange.content import FileSettings
+from fluoro_calib_ros.files.rig_file import read_rig_file
+
+from ..harness import Target, both
+
+SETTINGS = FileSettings(image_size=(1024, 1024), units='mm')
+
+
+def _read(path: Path) -> None:
+    both(lambda: read_rig_file(path), lambda: registry.read(path, SETTINGS, 'anipose'))
+
+
+TARGET = Target(
+    'rig_toml',
+    'rig.toml',
+    _read,
+    lambda: [
+        b'fluoroscopes = ["a", "b"]\nimage_size = [1024, 1024]\nphantom = "p.csv"\n'
+        b'calibration = "result"\n',
+        b'[cam_0]\nname = "a"\nsize = [1024, 768]\n'
+        b'matrix = [[900.0, 0.0, 500.0], [0.0, 900.0, 400.0], [0.0, 0.0, 1.0]]\n'
+        b'distortions = [0.0, 0.0, 0.0, 0.0, 0.0]\nrotation = [0.1, 0.2, 0.3]\n'
+        b'translation = [1.0, 2.0, 900.0]\n[metadata]\nadjusted = false\n',
+    ],
+)

@@ -1,0 +1,106 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""The targets of `make fuzz`, with hypothesis: every reader gives a result or one sentence.
+
+Few examples a target, the same ones on every run. Hours of it: `make fuzz SECONDS=3600`.
+"""
+
+import importlib.util
+import re
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from fuzz.__main__ import NAMES, load
+from fuzz.harness import check
+
+TOKENS = [
+    *(b'nan', b'inf', b'-1', b'0', b'1e308', b'1e-308', b'-1e300', b'9' * 30, b'1_0', b'', b'\n'),
+    *(
+        b'\0',
+        b'"',
+        b"'",
+        b'[' * 200,
+        b'{',
+        b'(' * 50,
+        b'&a',
+        b'*a',
+        b'x' * 2000,
+        b'\xff\xfe',
+        b';',
+    ),
+    *(b',', b'null', b'true', b'\x1b[2J', '\u2028'.encode(), b'\xff\xff\xff\xff', b'\0\0\0\x80'),
+    *(b'\xff' * 8, b'\0' * 8, b'\0\0\0\0\0\0\xf0\x7f', b'\0\0\0\0\0\0\xf8\x7f'),
+]
+WORD = re.compile(rb'[-+.\w]+')
+EXAMPLES = {'exchange': 12, 'bag_mcap': 20, 'bag_metadata': 20, 'numbers': 8}  # the slow ones
+
+
+@st.composite
+def damaged(draw, seeds):
+    """A seed with some words, or some bytes anywhere, replaced, doubled, or cut off."""
+    content = bytearray(draw(st.sampled_from(seeds)))
+    for _ in range(draw(st.integers(1, 4))):
+        kind = draw(st.sampled_from(['word', 'bytes', 'double', 'cut', 'bit']))
+        at = draw(st.integers(0, max(len(content) - 1, 0)))
+        length = draw(st.integers(0, 40))
+        if kind == 'word':
+            match = WORD.search(content, at)
+            if match:
+                content[match.start() : match.end()] = draw(st.sampled_from(TOKENS))
+        elif kind == 'bytes':
+            content[at : at + length] = draw(st.sampled_from(TOKENS) | st.binary(max_size=16))
+        elif kind == 'double':
+            content[at:at] = content[at : at + length]
+        elif kind == 'bit' and content:
+            content[at] ^= 1 << draw(st.integers(0, 7))
+        elif kind == 'cut' and draw(st.booleans()):
+            del content[at:]
+    return bytes(content)
+
+
+@pytest.mark.parametrize('name', NAMES)
+def test_reader_gives_a_result_or_one_sentence(name, tmp_path):
+    if name == 'wire' and importlib.util.find_spec('rclpy') is None:
+        pytest.skip('there is no ROS')
+    target = load(name)
+    seeds = list(target.seeds())
+
+    @settings(
+        max_examples=EXAMPLES.get(name, 60),
+        derandomize=True,
+        database=None,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+    )
+    @given(damaged(seeds))
+    def property_holds(data):
+        check(target, data, tmp_path)
+
+    property_holds()
+
+
+# Targets whose readers take different kinds of files: each seed is refused by one of them.
+SEVERAL_KINDS = ('bag_metadata', 'exchange', 'images', 'numbers', 'phantom_csv', 'rig_toml')
+
+
+@pytest.mark.parametrize('name', [name for name in NAMES if name not in SEVERAL_KINDS])
+def test_first_seed_is_accepted(name, tmp_path):
+    """Else the fuzzer would begin with what is refused at once."""
+    if name == 'wire' and importlib.util.find_spec('rclpy') is None:
+        pytest.skip('there is no ROS')
+    target = load(name)
+    assert check(target, target.seeds()[0], tmp_path)

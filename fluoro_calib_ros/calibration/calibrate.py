@@ -30,6 +30,7 @@ from ..exposures.frame import validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import project_with_jacobian
+from ..photogrammetry.held_precision import precision_with_held_interiors
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.precision import Precision, geometric_redundancy
 from ..photogrammetry.rotations import quaternion_from_matrix
@@ -387,6 +388,9 @@ def adjust_with_calibrations(
 ) -> CalibrationResult:
     """Adjust frames with calibrations held: interior orientations and corrections do not change.
 
+    Covariances hold the uncertainty of both: that of the interior orientation is common to all
+    exposures, that of the correction is part of the noise of every image point.
+
     Parameters
     ----------
     frames : mapping of str to sequence of Frame
@@ -400,8 +404,9 @@ def adjust_with_calibrations(
     known : mapping of str to KnownOrientation, optional
         Orientations that are known beforehand, by fluoroscope.
     starts : StartValues, optional
-        Of an earlier adjustment of the frames. The residuals without correction are then not
-        computed again, their RMSE is NaN.
+        Of an earlier adjustment of the frames, for its residuals: the residuals without correction
+        are then not computed again, their RMSE is NaN, and covariances are without the
+        uncertainty of the interior orientations.
 
     Returns
     -------
@@ -431,6 +436,8 @@ def adjust_with_calibrations(
         )
         before = None
         if starts is None:
+            held = np.stack([calibrations[name].interior_covariance for name in frames])
+            precise = precision_with_held_interiors(network, after, correction, precise, held)
             before, _ = adjusted_with_precision(
                 network,
                 after.parameters,

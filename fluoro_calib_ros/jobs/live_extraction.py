@@ -29,6 +29,7 @@ from ..errors import DataError
 from ..exposures.phantom import Phantom
 from ..radiographs.assumptions import assumed_lens, may_be_found, shared_lens
 from ..radiographs.extraction import Extraction, Nearby, extract_beads
+from ..radiographs.following import moved_on
 from ..radiographs.matching import PhantomModel
 from ..radiographs.overlay import draw_overlay
 from ..radiographs.view import Lens, View
@@ -130,22 +131,25 @@ class PhantomFollower:
         self._lens: Lens | None = None
         self._views: deque[View] = deque(maxlen=VIEWS)
         self._near: Nearby | None = None
+        # Numbers and views of the last two exposures that were solved.
+        self._track: deque[tuple[int, View]] = deque(maxlen=2)
 
     def extract(self, image: np.ndarray, number: int, overlay: bool = False) -> LiveObservations:
-        """Return what is found in an image (h, w) of uint8 or uint16, whatever its number."""
+        """Return what is found in an image (h, w) of uint8 or uint16."""
         start = time.perf_counter()
         extraction: Extraction | None = None
         try:
-            extraction = self._extraction(image)
+            extraction = self._extraction(image, number)
             result = self._observed(extraction)
             self._near = extraction.nearby
+            self._track.append((number, extraction.view))
             self._views.append(extraction.view)
         except DataError as error:
             result = LiveObservations(reason=str(error))
         picture = draw_overlay(image, extraction, result.reason) if overlay else None
         return replace(result, picture=picture, seconds=time.perf_counter() - start)
 
-    def _extraction(self, image: np.ndarray) -> Extraction:
+    def _extraction(self, image: np.ndarray, number: int) -> Extraction:
         """Extract the beads, if need be with the distortion of the images before.
 
         Raises DataError.
@@ -154,14 +158,26 @@ class PhantomFollower:
         if self._lens is None or self._lens.image_size != size:
             self._lens = assumed_lens(size, self._distance)
             self._views.clear()
+            self._track.clear()
             self._near = None
         try:
-            return extract_beads(image, self._model, self._lens, self._near)
+            return extract_beads(image, self._model, self._lens, self._nearby(number))
         except DataError as error:
             shared = shared_lens(self._lens, list(self._views))
             if shared is None or not may_be_found(str(error)):
                 raise
             return extract_beads(image, self._model, shared)
+
+    def _nearby(self, number: int) -> Nearby | None:
+        """Return the exposure before, with the pose to which the phantom should have moved."""
+        if self._near is None or len(self._track) < 2:
+            return self._near
+        (first, before), (last, view) = self._track
+        if not first < last < number:
+            return self._near
+        centre = self._model.xyz.mean(axis=0)
+        ahead = moved_on(before, view, centre, (number - last) / (last - first))
+        return replace(self._near, ahead=ahead)
 
     def _observed(self, extraction: Extraction) -> LiveObservations:
         return LiveObservations(

@@ -121,6 +121,8 @@ class Nearby:
         Of a bead.
     inverted : bool
         Beads are bright.
+    ahead : View or None
+        The pose to which the phantom should have moved since.
     """
 
     view: View
@@ -129,6 +131,7 @@ class Nearby:
     noise: Noise
     radius_px: float
     inverted: bool
+    ahead: View | None = None
 
 
 def extract_beads(
@@ -172,7 +175,7 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
         if image.shape != near.view.lens.image_size[::-1]:
             return None
         seen = _seen(detections)
-        found = follow(seen, model, near.view, near.scale_px)
+        found = follow(seen, model, near.view, near.scale_px, near.ahead)
         if found is None:
             return None
         imaging = _Imaging(near.noise, near.profile)

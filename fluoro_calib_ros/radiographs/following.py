@@ -23,16 +23,27 @@ import cv2
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .growth import Match, Seen, grow, settle
-from .matching import MIN_BEADS, PhantomModel, is_sure
+from ..errors import DataError
+from ..photogrammetry.rotations import matrix_from_vector, rotation_angle, vector_from_matrix
+from .growth import Match, Seen, grow, settle, start_view
+from .matching import LEVELS, MIN_BEADS, PhantomModel, is_sure, seeds_of, unambiguous
+from .pose_search import LocalPose, local_poses, nearby_map
 from .view import View
 
 REACH = 0.1  # of the image, by which a phantom may move between exposures
+# Of the exposures between which images were left out.
+FAR_REACH = 0.25  # of the image
+FAR_TURN_RAD = np.deg2rad(35)
+FAR_SCALES = (0.8, 1.25)  # factors
+FAR_SEEDS = 6  # beads of the image from which the pose is searched for
+FAR_POSES = 3  # of each
 SCATTER_FACTOR = 1.5  # on the residuals of the exposure before
 SCATTER_PX = 0.1
 
 
-def follow(seen: Seen, model: PhantomModel, near: View, scale_px: float) -> Match | None:
+def follow(
+    seen: Seen, model: PhantomModel, near: View, scale_px: float, ahead: View | None = None
+) -> Match | None:
     """Match what was found in an image from a pose nearby.
 
     Parameters
@@ -42,6 +53,8 @@ def follow(seen: Seen, model: PhantomModel, near: View, scale_px: float) -> Matc
     near : View
     scale_px : float
         Robust standard deviation of the residuals of the image nearby [px].
+    ahead : View, optional
+        The pose to which the phantom should have moved.
 
     Returns
     -------
@@ -51,28 +64,124 @@ def follow(seen: Seen, model: PhantomModel, near: View, scale_px: float) -> Matc
     if len(seen.uv) < MIN_BEADS:
         return None
     limit = SCATTER_FACTOR * scale_px + SCATTER_PX
-    for found in _moved(seen, model.xyz, near):
-        # Residuals as small as before: a phantom that was turned by nearly a symmetry of its own
-        # would have larger ones.
-        if found is not None and is_sure(found) and found.scale_px < limit:
-            return found if len(found.bead) >= MIN_BEADS else None
+    expected = settle(near, model.xyz, seen)
+    if _fits(expected, limit):
+        return expected
+    for found in _elsewhere(seen, model, near, ahead):
+        if found is None or not _fits(found, limit):
+            continue
+        try:
+            # A grid may have gone by a step of its pattern.
+            found = unambiguous(found, seen, model, FAR_TURN_RAD)
+        except DataError:
+            return None
+        return found if _fits(found, limit) else None
     return None
 
 
-def _moved(seen: Seen, xyz: np.ndarray, near: View) -> Iterator[Match | None]:
-    """Yield the matches from a pose nearby: as it is, and shifted over the image."""
-    yield settle(near, xyz, seen)
+def _fits(found: Match | None, limit_px: float) -> bool:
+    """Return whether a match is sure, with residuals as small as before.
+
+    A phantom that was turned by nearly a symmetry of its own would have larger ones.
+    """
+    return (
+        found is not None
+        and is_sure(found)
+        and found.scale_px < limit_px
+        and len(found.bead) >= MIN_BEADS
+    )
+
+
+def moved_on(before: View, last: View, centre_mm: np.ndarray, factor: float) -> View | None:
+    """Return the view after a further motion like that from one view to the next.
+
+    Parameters
+    ----------
+    before, last : View
+    centre_mm : (3,) ndarray
+        Of the phantom, which moves on a straight line while it turns about a fixed axis.
+    factor : float
+        On the motion.
+
+    Returns
+    -------
+    View or None
+        None where the motion is not small.
+    """
+    turn = vector_from_matrix(last.rotation @ before.rotation.T)
+    if factor * np.linalg.norm(turn) > FAR_TURN_RAD:
+        return None
+    rotation = matrix_from_vector(factor * turn) @ last.rotation
+    first, second = (view.rotation @ (centre_mm - view.position) for view in (before, last))
+    sensor = second + factor * (second - first)
+    return replace(last, rotation=rotation, position=centre_mm - rotation.T @ sensor)
+
+
+def _elsewhere(
+    seen: Seen, model: PhantomModel, near: View, ahead: View | None
+) -> Iterator[Match | None]:
+    """Yield the matches from a pose that is moved on, shifted over the image, or searched for."""
+    if ahead is not None:
+        yield settle(ahead, model.xyz, seen)
+    yield _over_the_image(seen, model.xyz, near)
+    yield from _far(seen, model, near)
+
+
+def _over_the_image(seen: Seen, xyz: np.ndarray, near: View) -> Match | None:
+    """Return the match of a pose nearby that is shifted, None where there is none."""
     predicted = near.project(xyz)
     row = np.flatnonzero(seen.in_field(predicted))
-    if len(row) < MIN_BEADS:
-        return
-    shift = _shift(predicted[row], seen)
+    shift = _shift(predicted[row], seen) if len(row) >= MIN_BEADS else None
     if shift is None:
-        return
-    sensor = np.append(shift, 0) * np.median(near.depth(xyz)) / near.principal_distance_px
-    view = replace(near, position=near.position - near.rotation.T @ sensor)
+        return None
+    view = _shifted(near, shift, float(np.median(near.depth(xyz))))
     from_middle = np.linalg.norm(predicted[row] - predicted[row].mean(axis=0), axis=1)
-    yield grow(view, int(row[np.argmin(from_middle)]), xyz, seen)
+    return grow(view, int(row[np.argmin(from_middle)]), xyz, seen)
+
+
+def _far(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | None]:
+    """Yield the matches of poses that are some way off, by triples of beads seen nearby."""
+    predicted = near.project(model.xyz)
+    with np.errstate(invalid='ignore'):
+        size = np.array(seen.field.shape[::-1])
+        seen_before = (np.abs(predicted - size / 2) < (0.5 + FAR_REACH) * size).all(axis=1)
+    if not seen_before.any():
+        return
+    beads = nearby_map(seen.uv, near.lens.image_size, seen.tolerance_px)
+    beads[~seen.field] = 2
+    scale = near.principal_distance_px / float(np.median(near.depth(model.xyz[seen_before])))
+    scales = (FAR_SCALES[0] * scale, FAR_SCALES[1] * scale)
+    neighbours = LEVELS[0][1]
+    reach = FAR_REACH * max(seen.field.shape)
+    for seed in seeds_of(seen)[:FAR_SEEDS]:
+        _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
+        around = around[around != seed]
+        with np.errstate(invalid='ignore'):
+            close = np.linalg.norm(predicted - seen.uv[seed], axis=1) < reach
+        triples = model.triples[0].of_beads(close)
+        poses = local_poses(int(seed), seen.uv, around, triples, beads, scales)
+        turned = [_turned(pose, near, model.xyz) for pose in poses]
+        started = [(pose, view) for pose, view in zip(poses, turned) if view is not None]
+        for pose, view in started[:FAR_POSES]:
+            yield grow(view, pose.bead, model.xyz, seen)
+
+
+def _turned(pose: LocalPose, near: View, xyz: np.ndarray) -> View | None:
+    """Return a view nearby in the pose of a bead, None where it is turned too far."""
+    c = near.principal_distance_px
+    start = start_view(pose, replace(near.lens, principal_distance_px=c), xyz)
+    if rotation_angle(start.rotation @ near.rotation.T) > FAR_TURN_RAD:
+        return None
+    view = replace(near, rotation=start.rotation, position=start.position)
+    bead = xyz[[pose.bead]]
+    # The bead is seen with the distortion of the fluoroscope, which is known by now.
+    return _shifted(view, pose.uv - view.project(bead)[0], float(view.depth(bead)[0]))
+
+
+def _shifted(view: View, shift: np.ndarray, depth_mm: float) -> View:
+    """Return a view that sees points at a depth shifted by (2,) [px]."""
+    sensor = np.append(shift, 0) * depth_mm / view.principal_distance_px
+    return replace(view, position=view.position - view.rotation.T @ sensor)
 
 
 def _shift(predicted: np.ndarray, seen: Seen) -> np.ndarray | None:

@@ -21,7 +21,7 @@ fits nearly as well.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations, product
 
@@ -29,6 +29,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..errors import DataError
+from ..photogrammetry.rotations import rotation_angle
 from .growth import Match, Seen, grow, settle, start_view
 from .lattice import FlatGrid, grid_matches
 from .pose_search import Triples, local_poses, nearby_map, triples_of
@@ -88,6 +89,11 @@ class Symmetry:
     rotation: np.ndarray
     shift: np.ndarray
     row: np.ndarray
+
+    @property
+    def turn_rad(self) -> float:
+        """Angle of the rotation."""
+        return float(rotation_angle(self.rotation))
 
     def turned(self, view: View) -> View:
         """Return the view that sees the moved phantom as this view sees the phantom."""
@@ -176,7 +182,7 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
     if best is None:
         raise DataError('no pose of the phantom fits the beads in the image')
     _check_evidence(best)
-    best = _unambiguous(best, seen, model)
+    best = unambiguous(best, seen, model)
     _check_evidence(best)
     return best
 
@@ -214,14 +220,15 @@ def _check_evidence(best: Match) -> None:
         )
 
 
-def _unambiguous(best: Match, seen: Seen, model: PhantomModel) -> Match:
+def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = np.pi) -> Match:
     """Return the best of a match and what the symmetries of the phantom make of it.
 
-    Raises DataError where another one fits nearly as well, unless the phantom is regular.
+    Those that turn it by more than an angle do not count. Raises DataError where another one fits
+    nearly as well, unless the phantom is regular.
     """
     if model.regular:
         return best
-    first, rivals = _climbed(best, seen, model)
+    first, rivals = _climbed(best, seen, model, turn_rad)
     limit = first.score - max(MARGIN_BEADS, MARGIN * first.score)
     equal = [one for one in rivals if one.score > limit and not _same(one, first)]
     closest = min([first, *equal], key=lambda one: one.scale_px)
@@ -263,13 +270,16 @@ def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Matc
     return matches[order[-1]]
 
 
-def _climbed(best: Match, seen: Seen, model: PhantomModel) -> tuple[Match, list[Match]]:
+def _climbed(
+    best: Match, seen: Seen, model: PhantomModel, turn_rad: float = np.pi
+) -> tuple[Match, list[Match]]:
     """Return the best match that symmetries of the phantom lead to, and those from it.
 
     On a nearly regular phantom the search finds poses that are several steps of its pattern off.
     """
+    symmetries = [one for one in model.symmetries if one.turn_rad <= turn_rad]
     for _ in range(CLIMBS):
-        rivals = list(_alternatives(best, seen, model))
+        rivals = list(_alternatives(best, seen, model, symmetries))
         better = max(rivals, key=lambda one: one.score, default=best)
         if better.score <= best.score:
             break
@@ -277,9 +287,11 @@ def _climbed(best: Match, seen: Seen, model: PhantomModel) -> tuple[Match, list[
     return best, rivals
 
 
-def _alternatives(best: Match, seen: Seen, model: PhantomModel) -> Iterator[Match]:
+def _alternatives(
+    best: Match, seen: Seen, model: PhantomModel, symmetries: Sequence[Symmetry]
+) -> Iterator[Match]:
     """Yield the matches of the phantom moved by its symmetries, where they fit at all."""
-    for symmetry in model.symmetries:
+    for symmetry in symmetries:
         other = symmetry.row[best.bead]
         known = other >= 0
         if np.count_nonzero(known) < MIN_BEADS:
@@ -310,7 +322,7 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
         yield from grid_matches(model.grid, model.xyz, seen, lens)
     beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
     beads[~seen.field] = 2
-    order = _seeds(seen)
+    order = seeds_of(seen)
     for triples, (_, neighbours, (first, last), limits) in zip(model.triples, LEVELS):
         scales = _scales(seen, model, limits)
         for seed in order[first:last]:
@@ -323,7 +335,7 @@ def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
                     yield found
 
 
-def _seeds(seen: Seen) -> np.ndarray:
+def seeds_of(seen: Seen) -> np.ndarray:
     """Rows of beads to begin with: some of the middle, then those that stand apart, at random.
 
     Distortion is least in the middle. Where faces are seen from the edge, beads of several faces

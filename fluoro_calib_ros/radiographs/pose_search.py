@@ -24,7 +24,7 @@ places.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 
 import cv2
 import numpy as np
@@ -68,6 +68,11 @@ class Triples:
     first_voter: np.ndarray
     sides: np.ndarray
     planar: np.ndarray
+
+    def of_beads(self, chosen: np.ndarray) -> Triples:
+        """Return the triples whose first bead is one of those that are chosen (n,)."""
+        row = np.flatnonzero(chosen[self.bead[:, 0]])
+        return Triples(*(getattr(self, part.name)[row] for part in fields(self)))
 
 
 @dataclass(frozen=True)

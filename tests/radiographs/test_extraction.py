@@ -28,7 +28,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.radiographs.detection import detect_beads
 from fluoro_calib_ros.radiographs.extraction import Extraction, extract_beads
-from fluoro_calib_ros.radiographs.following import follow
+from fluoro_calib_ros.radiographs.following import follow, moved_on
 from fluoro_calib_ros.radiographs.growth import Seen
 from fluoro_calib_ros.radiographs.matching import PhantomModel, match
 from fluoro_calib_ros.radiographs.measurement import estimate_noise, measure_beads
@@ -241,6 +241,53 @@ def test_a_pose_nearby_is_followed(shift_mm):
     followed = follow(seen, model, moved, 0.1)
     assert np.array_equal(np.sort(followed.bead), np.sort(found.bead))
     assert np.allclose(followed.view.position, found.view.position, atol=0.1)
+
+
+@pytest.mark.parametrize('degrees', [8, 25])
+def test_a_pose_far_off_is_followed(degrees):
+    """As between exposures of a film of which most are left out."""
+    xyz = small_phantom(1)
+    seen = seen_of(xyz)
+    model = PhantomModel.of(xyz)
+    found = match(seen, model, LENS)
+    turn = matrix_from_vector(np.deg2rad(degrees) * np.array([0.6, 0.0, 0.8]))
+    rotation = turn @ found.view.rotation
+    position = rotation.T @ (found.view.rotation @ found.view.position) + [9.0, -4.0, 20.0]
+    moved = replace(found.view, rotation=rotation, position=position)
+    followed = follow(seen, model, moved, 0.1)
+    assert np.array_equal(np.sort(followed.bead), np.sort(found.bead))
+    assert np.allclose(followed.view.position, found.view.position, atol=0.1)
+
+
+def test_a_motion_goes_on():
+    """A phantom that turns and moves evenly is where it is expected to be."""
+    turn = np.array([0.02, -0.03, 0.01])
+    centre = np.array([5.0, 6.0, 7.0])
+
+    def view(number: int) -> View:
+        rotation = matrix_from_vector(number * turn) @ matrix_from_vector([0.3, 0.2, 0.1])
+        sensor = np.array([10.0, -20.0, 1000.0]) + number * np.array([2.0, 1.0, -3.0])
+        return View(LENS, rotation, centre - rotation.T @ sensor, 4000.0, np.zeros((2, 2)), 1)
+
+    ahead = moved_on(view(0), view(2), centre, 2.5)
+    assert np.allclose(ahead.rotation, view(7).rotation)
+    assert np.allclose(ahead.position, view(7).position)
+    assert moved_on(view(0), view(2), centre, 30.0) is None  # too far to be trusted
+
+
+def test_a_grid_is_not_followed_by_a_step_of_its_pattern():
+    """A regular grid looks alike in several places: none of them is guessed."""
+    side = np.arange(15) * 10.0 - 70
+    xyz = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
+    rotation = matrix_from_vector([0.1, 0.2, 0.0])
+    view = View(LENS, rotation, -rotation.T @ [0.0, 0.0, 800.0], 4000.0, np.zeros((2, 2)), 1)
+    uv = view.project(xyz)
+    seen = Seen.of(uv, np.ones((1024, 1024), bool), 3.0)
+    step = replace(view, position=view.position + rotation.T @ [14.0, 0.0, 0.0])
+    followed = follow(seen, PhantomModel.of(xyz), step, 0.1)
+    assert followed is None or np.allclose(
+        view.project(xyz[followed.bead]), uv[followed.detection]
+    )
 
 
 def test_another_phantom_is_not_followed():

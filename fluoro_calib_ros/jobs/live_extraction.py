@@ -29,7 +29,7 @@ from ..errors import DataError
 from ..exposures.phantom import Phantom
 from ..radiographs.assumptions import assumed_lens, may_be_found, shared_lens
 from ..radiographs.extraction import Extraction, Nearby, extract_beads
-from ..radiographs.following import moved_on
+from ..radiographs.following import Far, moved_on
 from ..radiographs.matching import PhantomModel
 from ..radiographs.overlay import draw_overlay
 from ..radiographs.view import Lens, View
@@ -169,15 +169,22 @@ class PhantomFollower:
             return extract_beads(image, self._model, shared)
 
     def _nearby(self, number: int) -> Nearby | None:
-        """Return the exposure before, with the pose to which the phantom should have moved."""
-        if self._near is None or len(self._track) < 2:
+        """Return the exposure before, and where the phantom may be after those left out.
+
+        Without exposures left out, observations are those of `run_extraction`, to the bit, unless
+        the phantom has hardly moved.
+        """
+        if self._near is None:
+            return None
+        last, view = self._track[-1]
+        if number <= last + 1:
             return self._near
-        (first, before), (last, view) = self._track
-        if not first < last < number:
-            return self._near
-        centre = self._model.xyz.mean(axis=0)
-        ahead = moved_on(before, view, centre, (number - last) / (last - first))
-        return replace(self._near, ahead=ahead)
+        first, before = self._track[0]
+        ahead: View | None = None
+        if first < last:
+            centre = self._model.xyz.mean(axis=0)
+            ahead = moved_on(before, view, centre, (number - last) / (last - first))
+        return replace(self._near, far=Far(ahead))
 
     def _observed(self, extraction: Extraction) -> LiveObservations:
         return LiveObservations(

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from .detection import Detections, detect_beads
-from .following import follow
+from .following import Far, follow
 from .growth import Match, Seen, smoothed, supported
 from .matching import PhantomModel, match
 from .measurement import (
@@ -121,8 +121,8 @@ class Nearby:
         Of a bead.
     inverted : bool
         Beads are bright.
-    ahead : View or None
-        The pose to which the phantom should have moved since.
+    far : Far or None
+        For images that were left out since.
     """
 
     view: View
@@ -131,7 +131,7 @@ class Nearby:
     noise: Noise
     radius_px: float
     inverted: bool
-    ahead: View | None = None
+    far: Far | None = None
 
 
 def extract_beads(
@@ -175,7 +175,7 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
         if image.shape != near.view.lens.image_size[::-1]:
             return None
         seen = _seen(detections)
-        found = follow(seen, model, near.view, near.scale_px, near.ahead)
+        found = follow(seen, model, near.view, near.scale_px, near.far)
         if found is None:
             return None
         imaging = _Imaging(near.noise, near.profile)

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -41,8 +41,21 @@ SCATTER_FACTOR = 1.5  # on the residuals of the exposure before
 SCATTER_PX = 0.1
 
 
+@dataclass(frozen=True)
+class Far:
+    """Images were left out since the exposure nearby.
+
+    Attributes
+    ----------
+    ahead : View or None
+        The pose to which the phantom should have moved since.
+    """
+
+    ahead: View | None = None
+
+
 def follow(
-    seen: Seen, model: PhantomModel, near: View, scale_px: float, ahead: View | None = None
+    seen: Seen, model: PhantomModel, near: View, scale_px: float, far: Far | None = None
 ) -> Match | None:
     """Match what was found in an image from a pose nearby.
 
@@ -53,8 +66,8 @@ def follow(
     near : View
     scale_px : float
         Robust standard deviation of the residuals of the image nearby [px].
-    ahead : View, optional
-        The pose to which the phantom should have moved.
+    far : Far, optional
+        Where images were left out in between: the pose is searched for farther away.
 
     Returns
     -------
@@ -67,7 +80,7 @@ def follow(
     expected = settle(near, model.xyz, seen)
     if _fits(expected, limit):
         return expected
-    for found in _elsewhere(seen, model, near, ahead):
+    for found in _elsewhere(seen, model, near, far):
         if found is None or not _fits(found, limit):
             continue
         try:
@@ -118,13 +131,14 @@ def moved_on(before: View, last: View, centre_mm: np.ndarray, factor: float) -> 
 
 
 def _elsewhere(
-    seen: Seen, model: PhantomModel, near: View, ahead: View | None
+    seen: Seen, model: PhantomModel, near: View, far: Far | None
 ) -> Iterator[Match | None]:
     """Yield the matches from a pose that is moved on, shifted over the image, or searched for."""
-    if ahead is not None:
-        yield settle(ahead, model.xyz, seen)
+    if far is not None and far.ahead is not None:
+        yield settle(far.ahead, model.xyz, seen)
     yield _over_the_image(seen, model.xyz, near)
-    yield from _far(seen, model, near)
+    if far is not None:
+        yield from _farther(seen, model, near)
 
 
 def _over_the_image(seen: Seen, xyz: np.ndarray, near: View) -> Match | None:
@@ -139,7 +153,7 @@ def _over_the_image(seen: Seen, xyz: np.ndarray, near: View) -> Match | None:
     return grow(view, int(row[np.argmin(from_middle)]), xyz, seen)
 
 
-def _far(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | None]:
+def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | None]:
     """Yield the matches of poses that are some way off, by triples of beads seen nearby."""
     predicted = near.project(model.xyz)
     with np.errstate(invalid='ignore'):

@@ -28,7 +28,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.radiographs.detection import detect_beads
 from fluoro_calib_ros.radiographs.extraction import Extraction, extract_beads
-from fluoro_calib_ros.radiographs.following import follow, moved_on
+from fluoro_calib_ros.radiographs.following import Far, follow, moved_on
 from fluoro_calib_ros.radiographs.growth import Seen
 from fluoro_calib_ros.radiographs.matching import PhantomModel, match
 from fluoro_calib_ros.radiographs.measurement import estimate_noise, measure_beads
@@ -254,7 +254,7 @@ def test_a_pose_far_off_is_followed(degrees):
     rotation = turn @ found.view.rotation
     position = rotation.T @ (found.view.rotation @ found.view.position) + [9.0, -4.0, 20.0]
     moved = replace(found.view, rotation=rotation, position=position)
-    followed = follow(seen, model, moved, 0.1)
+    followed = follow(seen, model, moved, 0.1, Far())
     assert np.array_equal(np.sort(followed.bead), np.sort(found.bead))
     assert np.allclose(followed.view.position, found.view.position, atol=0.1)
 
@@ -284,7 +284,7 @@ def test_a_grid_is_not_followed_by_a_step_of_its_pattern():
     uv = view.project(xyz)
     seen = Seen.of(uv, np.ones((1024, 1024), bool), 3.0)
     step = replace(view, position=view.position + rotation.T @ [14.0, 0.0, 0.0])
-    followed = follow(seen, PhantomModel.of(xyz), step, 0.1)
+    followed = follow(seen, PhantomModel.of(xyz), step, 0.1, Far())
     assert followed is None or np.allclose(
         view.project(xyz[followed.bead]), uv[followed.detection]
     )

@@ -39,6 +39,7 @@ from .profile import Profile
 from .view import Lens, View, fit_view
 
 MAX_SIGMA_PX = 0.3
+MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
 MAX_MISFIT = 5.0
 DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for that of a typical one
 RESIDUAL_SIGMAS = 4.5  # from the prediction by neighbours
@@ -246,7 +247,7 @@ def _checked(
     measured: tuple[np.ndarray, Beads, list[str], np.ndarray],
     imaging: _Imaging,
 ) -> Extraction:
-    """Leave out beads that are not where their neighbours say."""
+    """Leave out beads that are not where their neighbours say, or measured badly."""
     rows, beads, reasons, predicted = measured
     residual = np.linalg.norm(beads.uv - predicted[rows], axis=1)
     good = np.array([not reason for reason in reasons], dtype=bool)
@@ -257,6 +258,11 @@ def _checked(
     for number in np.flatnonzero(far):
         reasons[number] = f'{residual[number]:.2f} px from where its neighbours say'
     good &= ~far
+    usual = float(np.median(beads.sigma[good]))
+    vague = good & (beads.sigma > MAX_SIGMAS * usual)
+    for number in np.flatnonzero(vague):
+        reasons[number] = f'sigma {beads.sigma[number]:.2f} px, that of most is {usual:.2f} px'
+    good &= ~vague
     refused = tuple(
         Refusal(int(rows[number]), predicted[rows[number]], reasons[number])
         for number in np.flatnonzero(~good)

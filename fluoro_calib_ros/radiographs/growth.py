@@ -158,11 +158,13 @@ def grow(view: View, start: int, xyz: np.ndarray, seen: Seen) -> Match | None:
     farthest = float(distance.max())
     while True:
         for _ in range(2):
-            predicted = view.project(xyz)
-            row = np.flatnonzero((distance <= radius) & seen.in_field(predicted))
+            row = np.flatnonzero(distance <= radius)
+            predicted = view.project(xyz[row])
+            inside = seen.in_field(predicted)
+            row = row[inside]
             if len(row) < 4:
                 return None
-            bead, detection = pairs(predicted[row], seen, seen.tolerance_px)
+            bead, detection = pairs(predicted[inside], seen, seen.tolerance_px)
             if len(bead) < max(4, MIN_SHARE * len(row)):
                 return None
             view, _ = fit_view(view, xyz[row[bead]], seen.uv[detection], 1, 0.3)

@@ -24,7 +24,7 @@ places.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -33,7 +33,9 @@ from scipy.spatial import cKDTree
 MIN_SINE = 0.3  # of the angle between the sides of a triple of the phantom
 MIN_IMAGE_SINE = 0.2  # of the angle between the sides of three beads in the image
 VOTERS = 18  # neighbours that vote
-FIRST_VOTERS = 6  # of them, which select the poses that the others vote on
+# The nearest of them, which select the poses that the others vote on: one of the first few must be
+# found, and the share FIRST_VOTE of all.
+FIRST_VOTERS = (3, 6)
 MAX_POSES = 6000  # poses that all voters vote on
 FIRST_VOTE = 0.5
 MIN_VOTE = 0.55
@@ -50,12 +52,11 @@ class Triples:
     Attributes
     ----------
     bead : (t, 3) ndarray of int
-    products : (t, 3) ndarray
-        Squares of both sides and their product [mm^2].
-    voter : (t, 3, VOTERS) ndarray of float32
-        Neighbours of the first bead in the axes of both sides and their cross product.
-    first_voter : (t, 3, FIRST_VOTERS) ndarray of float32
-        The nearest of them.
+    products : (4, t) ndarray
+        Squares of both sides, their product [mm^2], and the determinant of these [mm^4].
+    voter : (VOTERS, 3, t) ndarray of float32
+        Neighbours of the first bead, the nearest first, in the axes of both sides and their cross
+        product.
     sides : (t, 2, 3) ndarray
         From the first bead [mm].
     planar : (t,) ndarray of bool
@@ -65,14 +66,19 @@ class Triples:
     bead: np.ndarray
     products: np.ndarray
     voter: np.ndarray
-    first_voter: np.ndarray
     sides: np.ndarray
     planar: np.ndarray
 
     def of_beads(self, chosen: np.ndarray) -> Triples:
         """Return the triples whose first bead is one of those that are chosen (n,)."""
         row = np.flatnonzero(chosen[self.bead[:, 0]])
-        return Triples(*(getattr(self, part.name)[row] for part in fields(self)))
+        return Triples(
+            self.bead[row],
+            self.products[:, row],
+            self.voter[..., row],
+            self.sides[row],
+            self.planar[row],
+        )
 
 
 @dataclass(frozen=True)
@@ -116,9 +122,12 @@ def triples_of(xyz: np.ndarray, neighbours: int) -> Triples:
     )
     a = xyz[bead[:, 1]] - xyz[bead[:, 0]]
     b = xyz[bead[:, 2]] - xyz[bead[:, 0]]
-    products = np.stack([np.sum(a * a, 1), np.sum(b * b, 1), np.sum(a * b, 1)], axis=1)
-    area = products[:, 0] * products[:, 1] - products[:, 2] ** 2
-    good = area > MIN_SINE**2 * products[:, 0] * products[:, 1]
+    aa = np.sum(a * a, axis=1)
+    bb = np.sum(b * b, axis=1)
+    ab = np.sum(a * b, axis=1)
+    products = np.stack([aa, bb, ab, aa * bb - ab**2])
+    good = products[3] > MIN_SINE**2 * aa * bb
+    products = np.ascontiguousarray(products[:, good])
     bead = bead[good]
     a = a[good]
     b = b[good]
@@ -127,12 +136,10 @@ def triples_of(xyz: np.ndarray, neighbours: int) -> Triples:
     offsets = xyz[others] - xyz[bead[:, 0], None]
     coordinates = axes @ np.swapaxes(offsets, 1, 2)
     height_mm = np.abs(coordinates[:, 2]) * np.linalg.norm(np.cross(a, b), axis=1)[:, None]
-    spacing = np.sqrt(np.minimum(products[good, 0], products[good, 1]))
+    spacing = np.sqrt(np.minimum(products[0], products[1]))
     planar = height_mm.max(axis=1) < FLAT * spacing
-    voter = coordinates.astype(np.float32)
-    first_voter = np.ascontiguousarray(voter[:, :, :FIRST_VOTERS])
-    sides = np.stack([a, b], axis=1)
-    return Triples(bead, products[good], voter, first_voter, sides, planar)
+    voter = np.ascontiguousarray(coordinates.astype(np.float32).transpose(2, 1, 0))
+    return Triples(bead, products, voter, np.stack([a, b], axis=1), planar)
 
 
 def nearby_map(uv: np.ndarray, image_size: tuple[int, int], reach_px: float) -> np.ndarray:
@@ -195,14 +202,15 @@ def _best(
 ) -> list[LocalPose]:
     """Return the poses with the most votes of the solutions of several triples of an image."""
     triple, axes, scale = (np.concatenate(values) for values in zip(*parts))
-    votes = _votes(centre, axes, triples.first_voter[triple], found)
-    kept = np.flatnonzero(votes >= FIRST_VOTE)
+    # A frame of pixels around the image stands for all that is off it.
+    field = np.pad(found, 1, constant_values=2)
+    kept, votes = _elected(centre, axes, triple, triples.voter, field)
     if len(kept) > MAX_POSES:
-        kept = kept[np.argsort(-votes[kept], kind='stable')[:MAX_POSES]]
+        kept = kept[np.argsort(-votes, kind='stable')[:MAX_POSES]]
     axes = axes[kept]
     triple = triple[kept]
     scale = scale[kept]
-    votes = _votes(centre, axes, triples.voter[triple], found)
+    votes = _votes(*_hits(centre, axes, triple, triples.voter, field), len(triples.voter))
     out: list[LocalPose] = []
     seen: set[tuple[int, ...]] = set()
     for row in np.argsort(-votes, kind='stable'):
@@ -236,8 +244,7 @@ def _solutions(
     nothing = np.zeros(0, dtype=int), np.zeros((0, 3, 2), np.float32), np.zeros(0)
     if area <= MIN_IMAGE_SINE**2 * pp * qq:
         return nothing
-    A, B, C = triples.products.T
-    a = A * B - C * C
+    A, B, C, a = triples.products
     half = 0.5 * (A * qq + B * pp) - C * pq
     squared = (half + np.sqrt(np.maximum(half * half - a * area, 0))) / a
     row = np.flatnonzero((squared > scales[0] ** 2) & (squared < scales[1] ** 2))
@@ -262,28 +269,58 @@ def _solutions(
     )
 
 
-def _votes(
-    centre: np.ndarray, axes: np.ndarray, voters: np.ndarray, found: np.ndarray
-) -> np.ndarray:
-    """Shares (m,) of voters (m, 3, k) that are found, for images of the axes (m, 3, 2)."""
-    height, width = found.shape
-    images = axes[:, :, :, None]
-    # One product after the other: numpy multiplies many small matrices slowly.
-    u, v = (
-        voters[:, 0] * images[:, 0, k]
-        + voters[:, 1] * images[:, 1, k]
-        + voters[:, 2] * images[:, 2, k]
-        + centre[k]
-        for k in (0, 1)
-    )
-    # A frame of pixels around the image stands for all that is off it.
-    column = np.clip(np.rint(u), -1, width).astype(np.int32) % (width + 1)
-    row = np.clip(np.rint(v), -1, height).astype(np.int32) % (height + 1)
-    value = np.pad(found, ((0, 1), (0, 1)), constant_values=2)[row, column]
-    hits = np.count_nonzero(value == 1, axis=1)
-    inside = np.count_nonzero(value < 2, axis=1)
-    # A pose that puts its voters off the image must not win by the rest of them.
-    return hits / np.maximum(inside, 0.6 * voters.shape[2])
+def _elected(
+    centre: np.ndarray,
+    axes: np.ndarray,
+    triple: np.ndarray,
+    voter: np.ndarray,
+    field: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (k,) of the solutions that the nearest voters elect, and their votes."""
+    some, nearest = FIRST_VOTERS
+    hits, inside = _hits(centre, axes, triple, voter[:some], field)
+    row = np.flatnonzero(hits)
+    more = _hits(centre, axes[row], triple[row], voter[some:nearest], field)
+    votes = _votes(hits[row] + more[0], inside[row] + more[1], nearest)
+    elected = votes >= FIRST_VOTE
+    return row[elected], votes[elected]
+
+
+def _hits(
+    centre: np.ndarray,
+    axes: np.ndarray,
+    triple: np.ndarray,
+    voters: np.ndarray,
+    field: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (m,) of voters (k, 3, t) that are found, and that are in the field of view.
+
+    axes (m, 3, 2) are the images of the axes of triples (m,), field the map with its frame.
+    """
+    hits = np.zeros(len(triple), dtype=np.int8)
+    inside = np.zeros(len(triple), dtype=np.int8)
+    height, width = field.shape
+    flat = field.ravel()
+    # Voter after voter, coordinate after coordinate: numpy is slow with many small matrices.
+    a, b, c = np.ascontiguousarray(axes.transpose(1, 2, 0))
+    for voter in voters:
+        x, y, z = (values[triple] for values in voter)
+        column, row = (
+            np.clip(x * a[k] + y * b[k] + z * c[k] + (centre[k] + 1.5), 0, size - 1)
+            for k, size in enumerate((width, height))
+        )
+        value = flat[row.astype(np.int32) * width + column.astype(np.int32)]
+        hits += value == 1
+        inside += value < 2
+    return hits, inside
+
+
+def _votes(hits: np.ndarray, inside: np.ndarray, voters: int) -> np.ndarray:
+    """Shares (m,) of the voters that are found.
+
+    A pose that puts its voters off the image must not win by the rest of them.
+    """
+    return hits / np.maximum(inside, 0.6 * voters)
 
 
 def _rotation(sides: np.ndarray, axes: np.ndarray, scale: float) -> np.ndarray:

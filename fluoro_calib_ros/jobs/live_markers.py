@@ -12,20 +12,32 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Markers in motion, followed in the stream of one fluoroscope."""
+"""Markers in motion, followed in the stream of one fluoroscope, or of two that help each other."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
+from ..calibration.result import FluoroscopeCalibration
+from ..drift.clusters import Cluster
 from ..errors import DataError
+from ..photogrammetry.rig_orientation import RigOrientation
 from ..radiographs.marker_overlay import draw_markers
+from ..radiographs.marker_pair import Decision, MarkerPair
 from ..radiographs.markers import Doubt, FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from ..radiographs.overlay import draw_overlay
 from .live_extraction import LiveObservations
+from .service_process import ServiceProcess
+
+DECIDED = {
+    'exchanged': 'were exchanged, which is undone from now on',
+    'dropped': 'is not what was followed, and is searched for',
+}
 
 
 @dataclass(frozen=True)
@@ -58,6 +70,104 @@ class MarkerFollower:
             result = LiveObservations(reason=str(error))
             picture = draw_overlay(image, None, str(error)) if overlay else None
         return replace(result, picture=picture, seconds=time.perf_counter() - start)
+
+
+@dataclass(frozen=True)
+class PairSettings:
+    """What a PairFollower is made of.
+
+    Attributes
+    ----------
+    first : mapping of str to FirstMarkers
+        Ids and places in the first images of two fluoroscopes.
+    calibrations : mapping of str to FluoroscopeCalibration
+    orientation : RigOrientation
+    clusters : tuple of Cluster
+    options : MarkerOptions
+    """
+
+    first: Mapping[str, FirstMarkers]
+    calibrations: Mapping[str, FluoroscopeCalibration]
+    orientation: RigOrientation
+    clusters: tuple[Cluster, ...] = ()
+    options: MarkerOptions = field(default_factory=MarkerOptions)
+
+    def __call__(self) -> PairFollower:
+        """Return a new PairFollower. Raises DataError as MarkerPair."""
+        return PairFollower(self)
+
+
+class PairFollower:
+    """Follows markers in both views, from the first exposure on that shows them in both."""
+
+    def __init__(self, settings: PairSettings) -> None:
+        self._pair = MarkerPair(
+            settings.calibrations,
+            settings.orientation,
+            settings.options,
+            first=settings.first,
+            clusters=settings.clusters,
+        )
+        self._begun = False
+
+    def extract(
+        self, images: Mapping[str, np.ndarray], number: int, overlays: Collection[str] = ()
+    ) -> dict[str, LiveObservations]:
+        """Return the markers that are seen in the images of an exposure, by fluoroscope.
+
+        overlays names the fluoroscopes whose pictures are wanted. Never raises DataError.
+        """
+        start = time.perf_counter()
+        results = self._results(images, number, overlays)
+        seconds = (time.perf_counter() - start) / max(len(results), 1)
+        return {name: replace(result, seconds=seconds) for name, result in results.items()}
+
+    def _results(
+        self, images: Mapping[str, np.ndarray], number: int, overlays: Collection[str]
+    ) -> dict[str, LiveObservations]:
+        if not self._begun and len(images) < len(self._pair.names):
+            return {name: LiveObservations(reason='the other view is missing') for name in images}
+        try:
+            exposure = self._pair.update(images, number)
+        except DataError as error:
+            reason = str(error)
+            return {
+                name: LiveObservations(
+                    reason=reason,
+                    picture=draw_overlay(image, None, reason) if name in overlays else None,
+                )
+                for name, image in images.items()
+            }
+        self._begun = True
+        out = {}
+        for name, image in images.items():
+            found = exposure.views[name]
+            result = _observed(found, len(self._pair.trackers[name].target_id))
+            decided = [d for d in exposure.decisions if d.fluoroscope == name]
+            notes = [result.note, *(_decision_text(d) for d in decided if d.kind in DECIDED)]
+            picture = draw_markers(image, found) if name in overlays else None
+            note = '; '.join(note for note in notes if note)
+            out[name] = replace(result, note=note, picture=picture)
+        return out
+
+
+def pair_process(settings: PairSettings) -> ServiceProcess:
+    """Return a process that follows two views together; it is called as `extract`."""
+    return ServiceProcess(partial(_extract_pair_of, settings), 'the extraction')
+
+
+def _extract_pair_of(settings: PairSettings) -> Callable[..., dict[str, LiveObservations]]:
+    return settings().extract
+
+
+def _decision_text(decision: Decision) -> str:
+    """Return what was decided, in words."""
+    several = len(decision.target_id) > 1
+    markers = ' and '.join(map(str, decision.target_id))
+    return (
+        f'{"markers" if several else "marker"} {markers}, since exposure {decision.since}: '
+        f'{DECIDED[decision.kind]}'
+    )
 
 
 def _observed(found: MarkerFrame, expected: int) -> LiveObservations:

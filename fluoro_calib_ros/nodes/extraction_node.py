@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -32,19 +32,22 @@ from fluoro_calib_msgs.msg import TargetObservations
 from rclpy.publisher import Publisher
 from sensor_msgs.msg import CompressedImage, Image
 
+from ..drift.clusters import Cluster, parse_clusters
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.numbering import ExposureNumbers
 from ..exposures.pairing import PairingOptions
+from ..files.rig_orientation import load_orientation, orientation_path
 from ..jobs.live_extraction import (
     LiveObservations,
     MakeExtractor,
     PhantomSettings,
     extraction_process,
 )
-from ..jobs.live_markers import MarkerSettings
+from ..jobs.live_markers import MarkerSettings, PairSettings, pair_process
+from ..jobs.reconstruction import check_orientation
 from ..jobs.service_process import ServiceProcess
-from ..jobs.sources import read_source, read_survey
+from ..jobs.sources import read_calibrations, read_source, read_survey
 from ..options import option
 from ..radiographs.markers import FirstMarkers, MarkerOptions
 from .image_node import INPUTS
@@ -70,6 +73,7 @@ from .runtime.stream_reader import FaultHandlers
 
 OVERLAY = 'image_overlay'
 MODES = ('phantom', 'markers')
+PATIENCE_S = 0.1  # with the other view of an exposure
 LARGEST_PX = 2**14  # of an image, for points whose image is not known yet
 
 
@@ -90,6 +94,17 @@ class ExtractionParameters(ManagedParameters):
         'image, as for fluoro-calib extract --markers; until an image shows them there, the node '
         'waits',
     )
+    calibration_directory: str = option(
+        '',
+        'for the mode markers: folder with the calibrations and the orientation of both '
+        'fluoroscopes, whose views then decide together on ids that may have been exchanged; '
+        'empty: each view by itself',
+    )
+    clusters: tuple[str, ...] = option(
+        ('',),
+        "for the mode markers and two views: rigid clusters, each a text such as 'tibia: 1001 "
+        "1002 1003 1004'",
+    )
     principal_distance: float = option(
         0.0,
         'principal distance, to some 10 %; 0: four times the width of the image, to 25 %',
@@ -107,6 +122,16 @@ class ExtractionParameters(ManagedParameters):
         minimum=1,
         maximum=10000,
     )
+
+    def __post_init__(self) -> None:
+        try:
+            self.rigid_clusters()
+        except ValueError as error:
+            raise ValueError(f'clusters: {error}') from None
+
+    def rigid_clusters(self) -> tuple[Cluster, ...]:
+        """Return the clusters. Raises ValueError for a text that declares none."""
+        return parse_clusters([text for text in self.clusters if text])
 
 
 _NODE = ParameterGroup(ExtractionParameters)
@@ -192,42 +217,72 @@ class ExtractionNode(StreamNode):
         self.autostart = self._settings.autostart
         self.names = self._settings.fluoroscopes
         self._inputs = INPUTS[self._settings.inputs]
-        self._make = self._extractors(_FOLLOWING.declare(self))
+        self._make: Mapping[str, MakeExtractor] = {}
+        self._pair: PairSettings | None = None
+        self._prepare(_FOLLOWING.declare(self))
         self._threads: list[threading.Thread] = []
         self._processes: list[ServiceProcess] = []
         self._queue: ExposureQueue[_Task] = ExposureQueue(self.names, self._settings.queue_size)
         use_single_thread()
         self.reset()
 
-    def _extractors(self, following: MarkerOptions) -> Mapping[str, MakeExtractor]:
-        """Return what makes the extractor of each fluoroscope. Raises StartError."""
+    def _prepare(self, following: MarkerOptions) -> None:
+        """Read what the extractors are made of. Raises StartError."""
         mode = self._settings.mode
         path = self._settings.phantom if mode == 'phantom' else self._settings.markers
         if not path:
             example = 'phantom.csv' if mode == 'phantom' else 'with the markers'
             raise StartError(f'parameter {mode} is not set: it names the file {example}')
         try:
-            if mode == 'markers':
-                return self._marker_followers(expand_path(path), following)
-            survey = read_survey(expand_path(path))
+            if mode == 'phantom':
+                self._make = self._bead_extractors(expand_path(path))
+                return
+            first = self._first_markers(expand_path(path))
+            if self._settings.calibration_directory:
+                self._pair = self._pair_settings(first, following)
+            else:
+                self._make = {name: MarkerSettings(of, following) for name, of in first.items()}
         except DataError as error:
             raise StartError(str(error)) from None
+
+    def _bead_extractors(self, path: Path) -> Mapping[str, MakeExtractor]:
+        """Return what makes the extractor of each fluoroscope. Raises DataError."""
+        survey = read_survey(path)
         for note in survey.notes:
             self.get_logger().warning(note)
         make = PhantomSettings(survey.phantom, self._settings.principal_distance or None)
         return dict.fromkeys(self.names, make)
 
-    def _marker_followers(
-        self, path: Path, following: MarkerOptions
-    ) -> Mapping[str, MakeExtractor]:
-        """Return what makes the follower of each fluoroscope. Raises DataError."""
+    def _first_markers(self, path: Path) -> dict[str, FirstMarkers]:
+        """Return ids and first places of the markers of each fluoroscope. Raises DataError."""
         size = (LARGEST_PX, LARGEST_PX)
         recording = read_source(path, image_size=size, fluoroscopes=self.names)
-        followers = {}
+        out = {}
         for name, frames in recording.frames.items():
             first = min(frames, key=lambda frame: frame.number)
-            followers[name] = MarkerSettings(FirstMarkers(first.target_id, first.uv), following)
-        return followers
+            out[name] = FirstMarkers(first.target_id, first.uv)
+        return out
+
+    def _pair_settings(
+        self, first: Mapping[str, FirstMarkers], following: MarkerOptions
+    ) -> PairSettings:
+        """Read what two views need to be followed together. Raises DataError."""
+        folder = expand_path(self._settings.calibration_directory)
+        if len(self.names) != 2:
+            raise DataError(
+                f'calibration_directory: two fluoroscopes are followed together, not '
+                f'{len(self.names)} ({", ".join(self.names)})'
+            )
+        settings = PairSettings(
+            first,
+            read_calibrations(folder, self.names),
+            load_orientation(orientation_path(folder)).subset(self.names),
+            self._settings.rigid_clusters(),
+            following,
+        )
+        check_orientation(settings.orientation, settings.calibrations)
+        settings()  # refuses what does not belong together before the node starts
+        return settings
 
     # -- lifecycle
 
@@ -264,16 +319,28 @@ class ExtractionNode(StreamNode):
     def activate(self) -> None:
         """Start the processes that extract, then the stream reader."""
         self._queue = ExposureQueue(self.names, self._settings.queue_size)
-        for name in self.names:
-            process = extraction_process(self._make[name])
-            process.start()
-            thread = threading.Thread(
-                target=self._serve, args=(name, self._queue, process), name=name, daemon=True
-            )
-            thread.start()
-            self._processes.append(process)
-            self._threads.append(thread)
+        if self._pair is not None:
+            self._start_worker(self._serve_pair, 'pair', pair_process(self._pair))
+        else:
+            for name in self.names:
+                serve = partial(self._serve, name)
+                self._start_worker(serve, name, extraction_process(self._make[name]))
         super().activate()
+
+    def _start_worker(
+        self,
+        serve: Callable[[ExposureQueue[_Task], ServiceProcess], None],
+        name: str,
+        process: ServiceProcess,
+    ) -> None:
+        """Start a process and the thread that gives it images."""
+        process.start()
+        thread = threading.Thread(
+            target=serve, args=(self._queue, process), name=name, daemon=True
+        )
+        thread.start()
+        self._processes.append(process)
+        self._threads.append(thread)
 
     def deactivate(self) -> None:
         """Stop receiving and extracting; what is waiting is lost."""
@@ -307,14 +374,16 @@ class ExtractionNode(StreamNode):
         for loser in self._queue.put(name, number, task):
             self.streams[loser].shed += 1
 
-    # -- the threads of the fluoroscopes
+    # -- the threads that extract
 
     def _serve(self, name: str, queue: ExposureQueue[_Task], process: ServiceProcess) -> None:
         """Extract the images of a fluoroscope until the queue is closed."""
         stream = self.streams[name]
         while (task := queue.get(name)) is not None:
             try:
-                self._extract(stream, task, process)
+                image = stream.decoded(task.message)
+                found = process(image, task.number, self._is_overlay_wanted(name))
+                self._finish(stream, task, image, found)
             except Refused as error:
                 stream.refusals.refuse(error)
             except Exception as error:  # this image is lost, the next ones are not
@@ -322,12 +391,36 @@ class ExtractionNode(StreamNode):
                     return  # the process has been ended
                 stream.refusals.fail(f'{name}/{self._inputs[0][1]}', error)
 
-    def _extract(self, stream: _ImageStream, task: _Task, process: ServiceProcess) -> None:
-        """Extract an image and publish its observations. Raises Refused and RuntimeError."""
+    def _serve_pair(self, queue: ExposureQueue[_Task], process: ServiceProcess) -> None:
+        """Extract the images of both fluoroscopes, exposure by exposure."""
+        while (exposure := queue.get_exposure(PATIENCE_S)) is not None:
+            number, tasks = exposure
+            try:
+                images = {}
+                for name, task in tasks.items():
+                    try:
+                        images[name] = self.streams[name].decoded(task.message)
+                    except Refused as error:
+                        self.streams[name].refusals.refuse(error)
+                if not images:
+                    continue
+                wanted = [name for name in images if self._is_overlay_wanted(name)]
+                for name, found in process(images, number, wanted).items():
+                    self._finish(self.streams[name], tasks[name], images[name], found)
+            except Exception as error:  # this exposure is lost, the next ones are not
+                if queue.closed:
+                    return  # the process has been ended
+                for name in tasks:
+                    self.streams[name].refusals.fail(f'{name}/{self._inputs[0][1]}', error)
+
+    def _is_overlay_wanted(self, name: str) -> bool:
+        return bool(self._overlays[name].get_subscription_count())
+
+    def _finish(
+        self, stream: _ImageStream, task: _Task, image: np.ndarray, found: LiveObservations
+    ) -> None:
+        """Publish what was found in an image, and count it."""
         message = task.message
-        image = stream.decoded(message)
-        overlay = self._overlays[stream.name]
-        found = process(image, task.number, bool(overlay.get_subscription_count()))
         if not found.reason:
             self._publish(stream, task, found, (image.shape[1], image.shape[0]))
         else:
@@ -340,7 +433,7 @@ class ExtractionNode(StreamNode):
         stream.last = found
         stream.seconds += found.seconds
         if found.picture is not None:
-            overlay.publish(
+            self._overlays[stream.name].publish(
                 message_from_image(message.header, np.ascontiguousarray(found.picture))
             )
 

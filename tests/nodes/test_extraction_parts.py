@@ -69,6 +69,18 @@ def test_a_queue_whose_exposures_are_all_begun_sheds_the_oldest_item():
     assert queue.get('b') == 2
 
 
+def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
+    queue = ExposureQueue('ab', 4)
+    for name, number in (('a', 1), ('b', 1), ('a', 2), ('b', 3)):
+        queue.put(name, number, (name, number))
+    forever = 600.0  # what is lost is not waited for
+    assert queue.get_exposure(forever) == (1, {'a': ('a', 1), 'b': ('b', 1)})
+    assert queue.get_exposure(forever) == (2, {'a': ('a', 2)})  # b is at 3
+    assert queue.get_exposure(0.0) == (3, {'b': ('b', 3)})  # of which a may still come
+    queue.close()
+    assert queue.get_exposure(forever) is None
+
+
 def test_closing_a_queue_ends_the_wait():
     queue = ExposureQueue('a', 1)
     found = []

@@ -35,6 +35,7 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.calibration import save_calibration
 from fluoro_calib_ros.files.phantom import write_phantom
 from fluoro_calib_ros.files.rig_orientation import save_orientation
+from fluoro_calib_ros.jobs.live_markers import PairSettings
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.radiographs.marker_overlay import draw_markers
 from fluoro_calib_ros.radiographs.marker_pair import Decision, MarkerPair, PairFrame, revise
@@ -155,11 +156,16 @@ def followed(name: str) -> tuple[MarkerFrame, ...]:
     return tuple(tracker.update(of[name].image, n) for n, of in enumerate(images, 1))
 
 
+def followed_clusters() -> tuple[Cluster, Cluster]:
+    ids, _ = sequence()
+    return Cluster('one', tuple(ids[:4])), Cluster('two', tuple(ids[4:]))
+
+
 @cache
 def followed_in_both() -> tuple[PairFrame, ...]:
-    ids, images = sequence()
+    _, images = sequence()
     calibrations, orientation = calibration()
-    clusters = [Cluster('one', tuple(ids[:4])), Cluster('two', tuple(ids[4:]))]
+    clusters = followed_clusters()
     first = {name: given(name) for name in 'ab'}
     pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, clusters=clusters)
     return tuple(
@@ -265,6 +271,32 @@ def test_markers_are_found_again_after_images_without_any():
     away = np.linalg.norm(found.uv - images[-1]['a'].uv[row], axis=1)
     assert np.count_nonzero(away < FAR_PX) >= len(ids) - 3
     assert found.doubtful[away > FAR_PX].all()
+
+
+def test_two_views_live_are_followed_as_in_a_recording():
+    """Beginning with the first exposure that shows both views; one may be missing later."""
+    _, images = sequence()
+    calibrations, orientation = calibration()
+    first = {name: given(name) for name in 'ab'}
+    clusters = followed_clusters()
+    live = PairSettings(first, calibrations, orientation, clusters, OPTIONS)()
+    pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, clusters=clusters)
+    alone = live.extract({'a': images[0]['a'].image}, 1)
+    assert alone['a'].reason == 'the other view is missing'
+    for number, of in enumerate(images[:4], 2):
+        seen = {name: image.image for name, image in of.items()}
+        if number == 4:
+            del seen['b']
+        found = live.extract(seen, number, ['a'])
+        expected = pair.update(seen, number)
+        assert set(found) == set(seen)
+        for name, result in found.items():
+            assert not result.reason
+            assert np.array_equal(result.target_id, expected.views[name].target_id)
+            assert np.array_equal(result.uv, expected.views[name].uv)
+            assert (result.picture is None) == (name == 'b')
+    small = live.extract({name: np.zeros((8, 8), np.uint8) for name in 'ab'}, 9)
+    assert 'px' in small['a'].reason and not len(small['a'].target_id)
 
 
 def test_what_cannot_be_followed_is_said():

@@ -142,7 +142,7 @@ def observed(rig):
 
 
 @pytest.fixture(scope='module')
-def by_command(rig):
+def frames_by_command(rig):
     """Frames of the command extract by fluoroscope."""
     out = {}
     for name in NAMES:
@@ -156,10 +156,10 @@ def by_command(rig):
     return out
 
 
-def test_observations_are_those_of_the_command(observed, by_command):
+def test_observations_are_those_of_the_command(observed, frames_by_command):
     for name in NAMES:
-        assert len(by_command[name]) == POSES
-        for frame in by_command[name]:
+        assert len(frames_by_command[name]) == POSES
+        for frame in frames_by_command[name]:
             message = observed[name][frame.number]
             assert list(message.target_id) == frame.target_id.tolist()
             assert np.abs(np.column_stack([message.u, message.v]) - frame.uv).max() < 1e-3
@@ -168,18 +168,18 @@ def test_observations_are_those_of_the_command(observed, by_command):
             assert message.header == raw(picture(name, 1), frame.number, name).header
 
 
-def test_calibration_is_that_of_the_command(rig, observed, by_command):
+def test_calibration_is_that_of_the_command(rig, observed, frames_by_command):
     """The calibration node has collected the exposures, without any change."""
     rig.wait_for_status(lambda s: s.exposures == POSES, what='the exposures')
     answer = rig.call(Calibrate, 'calibrate')
     assert answer.success, answer.message
     options = CalibrationOptions(model=MODEL)
     for f, name in enumerate(NAMES):
-        request = CalibrationRequest({name: by_command[name]}, rig.phantom, options)
+        request = CalibrationRequest({name: frames_by_command[name]}, rig.phantom, options)
         calibration = run_calibration(request).calibrations[name]
         live = [answer.xp[f], answer.yp[f], answer.c[f]]
         assert np.abs(calibration.interior - live).max() < 1e-2
-        assert answer.observations[f] == sum(len(f.target_id) for f in by_command[name])
+        assert answer.observations[f] == sum(len(f.target_id) for f in frames_by_command[name])
 
 
 BAD = {  # number of the image, publisher, message, key of the diagnostics, what is said
@@ -312,6 +312,43 @@ def test_markers_of_the_simulator_are_followed(graph):
     error = [np.hypot(u - true[i][0], v - true[i][1]) for i, u, v in zip(*columns(found[0]))]
     assert np.median(error) < 0.1 and max(error) < 1.0
     assert node.running and 'Traceback' not in node.log
+
+
+def test_markers_are_followed_in_both_views_together(graph, calibrated):
+    """With the calibrations of both fluoroscopes; a missing view of an exposure is no obstacle."""
+    rate = 0.5
+    tracking = simulate_tracking(virtual_rig(1), 6.0, rate, 1, 0.0)
+    markers = graph.directory / 'markers.csv'
+    write_observations_csv(markers, {name: tracking.frames[name][:1] for name in NAMES})
+    found = {name: graph.client.listen(f'{name}/target_observations') for name in NAMES}
+    together = {'mode': 'markers', 'markers': markers, 'calibration_directory': calibrated}
+    node = graph.start('extraction_node', together)
+    scene = {'scene': 'markers', 'images': 'clean', 'rate': rate, 'frames': 2, 'noise': 0.0}
+    simulator = graph.start('simulator_node', {**scene, 'wait_for_readers': 1}, wait=False)
+    graph.client.wait_until(lambda: all(found.values()), what='the markers of both views')
+    assert simulator.wait() == 0, simulator.log
+    for name in NAMES:
+        true = dict(zip(tracking.marker_id.tolist(), tracking.frames[name][0].uv))
+        seen = found[name][0]
+        assert set(seen.target_id) <= set(true) and len(seen.target_id) > 20
+        error = [np.hypot(u - true[i][0], v - true[i][1]) for i, u, v in zip(*columns(seen))]
+        assert np.median(error) < 0.1 and max(error) < 1.0
+    assert node.running and 'Traceback' not in node.log
+
+
+def test_views_that_cannot_be_followed_together_are_refused(graph, calibrated):
+    tracking = simulate_tracking(virtual_rig(1), 2.0, 1.0, 1, 0.0)
+    markers = graph.directory / 'markers.csv'
+    write_observations_csv(markers, {name: tracking.frames[name][:1] for name in NAMES})
+    together = {'mode': 'markers', 'markers': markers, 'calibration_directory': calibrated}
+    for more, sentence in (
+        ({'fluoroscopes': '[a]'}, 'two fluoroscopes are followed together, not 1'),
+        ({'calibration_directory': graph.directory / 'nothing'}, 'nothing'),
+        ({'clusters': '[tibia]'}, 'does not declare a cluster'),
+    ):
+        node = graph.start('extraction_node', {**together, **more}, wait=False)
+        assert node.wait() == 1
+        assert sentence in node.log and 'Traceback' not in node.log
 
 
 def columns(message):

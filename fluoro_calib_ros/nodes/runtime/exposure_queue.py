@@ -65,6 +65,22 @@ class ExposureQueue(Generic[T]):
             self._begun.append(number)
             return item
 
+    def get_exposure(self, patience_s: float) -> tuple[int, dict[str, T]] | None:
+        """Wait for the items of an exposure, the lowest number that waits; None once it is closed.
+
+        Items of other fluoroscopes are waited for while they may still come, at most so long.
+        """
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or any(self._waiting.values()))
+            self._changed.wait_for(self._is_complete, patience_s)
+            if self._closed:
+                return None
+            number = self._lowest()
+            self._begun.append(number)
+            return number, {
+                name: items.pop(number) for name, items in self._waiting.items() if number in items
+            }
+
     @property
     def closed(self) -> bool:
         """Whether the queue is closed."""
@@ -79,6 +95,18 @@ class ExposureQueue(Generic[T]):
         with self._changed:
             self._closed = True
             self._changed.notify_all()
+
+    def _lowest(self) -> int:
+        """Return the lowest number that waits."""
+        return min(number for items in self._waiting.values() for number in items)
+
+    def _is_complete(self) -> bool:
+        """Return whether the lowest exposure that waits has all items that it will have."""
+        if self._closed:
+            return True
+        number = self._lowest()
+        # A fluoroscope with a later exposure has lost this one.
+        return all(number in items or items for items in self._waiting.values())
 
     def _shed_one(self, full: OrderedDict[int, T]) -> list[str]:
         """Remove an exposure; returns the fluoroscopes that have lost an item."""

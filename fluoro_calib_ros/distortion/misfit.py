@@ -149,7 +149,8 @@ def _variance_left_out(products: _Products, series: Series, expected: float) -> 
     The covariance function was estimated from the functions that the series has; beyond them it
     is an extrapolation. As the variance that it expects is uncertain and positive, it is given an
     exponential prior; that which the residuals show has a Gaussian error. The posterior is a
-    truncated Gaussian, of which this is the mean.
+    truncated Gaussian, of which this is the mean; what exceeds the expectation may also be what
+    exposures differ, and is left to the test of significance.
     """
     mean, error = products.mean_of_all()
     if not expected > 0 or not 0 < error < np.inf:
@@ -161,4 +162,4 @@ def _variance_left_out(products: _Products, series: Series, expected: float) -> 
     if at < -FAR:  # the tail is exponential
         return float(-error / at)
     density = np.exp(-(at**2) / 2 - log_ndtr(at)) / np.sqrt(2 * np.pi)
-    return float(error * (at + density))
+    return min(float(error * (at + density)), expected)

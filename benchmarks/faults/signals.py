@@ -22,14 +22,16 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping
 from contextlib import ExitStack
+from dataclasses import dataclass
 from pathlib import Path
 
 from ..timing import section
 from .processes import ROOT, Process, node
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-LONGEST_S = 3.0  # after the start of a process; it is ready after a third of it
-READY = 'handlers'
+START_S = 3.0  # within which a process is interrupted during its start
+RUNNING_S = 2.0  # within which it is interrupted after it
+PHASES = ('start', 'running')
 PHANTOM = {'phantom': ROOT / 'bags' / 'phantom.csv'}
 
 
@@ -56,26 +58,27 @@ def nodes_under_test(folder: Path) -> dict[str, Callable[[int], Mapping[str, obj
 def run(folder: Path, count: int, seed: int) -> str:
     """Interrupt every node `count` times with each signal; returns the section of the report."""
     (folder / 'calibrated').mkdir()
-    tests = nodes_under_test(folder)
     rows = []
     with ExitStack() as stack:
         # A stream for the nodes to be in the middle of.
         feed = node('simulator_node', {'scene': 'markers', 'rate': 60.0})
         stack.enter_context(Process(feed, folder / 'feed.log'))
-        for name, parameters in tests.items():
+        for name, parameters in nodes_under_test(folder).items():
             for number in SIGNALS:
-                rng = random.Random(f'{seed} {name} {number}')
-                rows.append(_row(name, number, parameters, rng, count, folder))
+                for phase in PHASES:
+                    test = _Test(folder, name, number, phase)
+                    rows.append(test.row(parameters, count, seed))
     return section(
         'Interrupts',
-        f'Every node was interrupted {count} times with each signal, at moments between 0 and '
-        f'{LONGEST_S:g} s after the start of its process, at which it is ready after 1 to 2 s. '
-        'Status 0: the node was running; by signal: Python was still importing; with traceback: '
-        'Python itself had not yet read the first line of the package. The last column is the '
-        'longest time to the end.',
+        f'Every node was interrupted {count} times with each signal in each phase. Start: within '
+        f'{START_S:g} s after the start of its process. Running: within {RUNNING_S:g} s after it '
+        'has begun to handle signals, which is before it joins the graph. By signal: Python was '
+        'still importing. With traceback: Python had not yet read a line of the package. The last '
+        'column is the longest time to the end.',
         (
             'node',
             'signal',
+            'phase',
             'status 0',
             'by signal',
             'other status',
@@ -87,57 +90,54 @@ def run(folder: Path, count: int, seed: int) -> str:
     )
 
 
-def _row(
-    name: str,
-    number: signal.Signals,
-    parameters: Callable[[int], Mapping[str, object]],
-    rng: random.Random,
-    count: int,
-    folder: Path,
-) -> list[str]:
-    found: Counter[str] = Counter()
-    longest = 0.0
-    for run_number in range(count):
-        label = f'{number.name}_{run_number}'
-        moment = rng.uniform(0.0, LONGEST_S)
-        status, output, left, seconds = interrupted(
-            node(name, parameters(hash_of(name, number, run_number))),
-            number,
-            moment,
-            folder / f'{name}_{label}.log',
-        )
-        longest = max(longest, seconds)
-        kind = {0: 'clean', -number: 'by signal'}.get(status, 'other')
-        found[kind] += 1
-        found['traceback'] += 'Traceback' in output
-        found['left'] += left
-        if kind == 'other' or 'Traceback' in output or left:
-            print(f'{name} {number.name} after {moment:.3f} s: status {status}, {left} left')
-            print('    ' + output[-800:].replace('\n', '\n    '), flush=True)
-    return [
-        name,
-        number.name,
-        *(str(found[key]) for key in ('clean', 'by signal', 'other', 'traceback', 'left')),
-        f'{longest:.1f}',
-    ]
+@dataclass(frozen=True)
+class _Test:
+    """Interrupts of a node with one signal in one phase."""
+
+    folder: Path
+    name: str
+    number: signal.Signals
+    phase: str
+
+    def row(
+        self, parameters: Callable[[int], Mapping[str, object]], count: int, seed: int
+    ) -> list[str]:
+        """Interrupt the node `count` times; returns a row of the report."""
+        rng = random.Random(f'{seed} {self.name} {self.number} {self.phase}')
+        found: Counter[str] = Counter()
+        longest = 0.0
+        for run_number in range(count):
+            label = f'{self.name}_{self.number.name}_{self.phase}_{run_number}'
+            # A number of its own for every run, for the folders of the recorder.
+            unique = (run_number * 100 + self.number) * 2 + PHASES.index(self.phase)
+            words = node(self.name, parameters(unique))
+            with Process(words, self.folder / f'{label}.log') as process:
+                if self.phase == 'running':
+                    while process.running and not catches(process.pid, signal.SIGTERM):
+                        time.sleep(0.01)
+                time.sleep(rng.uniform(0.0, RUNNING_S if self.phase == 'running' else START_S))
+                began = time.monotonic()
+                process.send(self.number)
+                status = process.wait(60.0)
+                longest = max(longest, time.monotonic() - began)
+                left = len(process.left())
+                output = process.output
+            kind = {0: 'clean', -self.number: 'by signal'}.get(status, 'other')
+            found[kind] += 1
+            found['traceback'] += 'Traceback' in output
+            found['left'] += left
+            if kind == 'other' or 'Traceback' in output or left:
+                print(f'{label}: status {status}, {left} left')
+                print('    ' + output[-800:].replace('\n', '\n    '), flush=True)
+        numbers = (str(found[k]) for k in ('clean', 'by signal', 'other', 'traceback', 'left'))
+        return [self.name, self.number.name, self.phase, *numbers, f'{longest:.1f}']
 
 
-def hash_of(name: str, number: int, run_number: int) -> int:
-    """Return a number of its own for every run of a node."""
-    return run_number * 100 + number
-
-
-def interrupted(
-    words: list[object], number: int, moment: float, log: Path
-) -> tuple[int, str, int, float]:
-    """Send a signal to a process some seconds after its start.
-
-    Returns exit status, output, number of processes that are left and the time to the end [s].
-    """
-    with Process(words, log) as process:
-        time.sleep(moment)
-        began = time.monotonic()
-        process.send(number)
-        status = process.wait(60.0)
-        seconds = time.monotonic() - began
-        return status, process.output, len(process.left()), seconds
+def catches(pid: int, number: int) -> bool:
+    """Return whether a process handles a signal."""
+    try:
+        lines = Path('/proc', str(pid), 'status').read_text().splitlines()
+    except OSError:
+        return False
+    mask = next(int(line.split()[1], 16) for line in lines if line.startswith('SigCgt'))
+    return bool(mask >> (number - 1) & 1)

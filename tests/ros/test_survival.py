@@ -52,16 +52,24 @@ class Rig:
         self.client.wait_until(lambda: len(self.points) == before + COUNT, what='all points')
 
     def wait_until_reconstructed(self):
-        """Publish pairs until points come again: from nodes that have just been started."""
+        """Publish pairs until points come again, and wait for those of the last pair.
+
+        The first ones are lost where nodes have just been started.
+        """
         before = len(self.points)
-        pairs = itertools.cycle(self._pairs)
+        numbers = itertools.count(max(self.points[-1].frame_number, 10**6) + 1)
 
-        def reconstructed():
-            for frame in next(pairs):
-                self.client.publish(frame)
-            return len(self.points) > before
+        def publish():
+            number = next(numbers)
+            for frame in self._pairs[0]:
+                self.client.publish(replace(frame, number=number))
+            return number
 
-        self.client.wait_until(reconstructed, what='points')
+        self.client.wait_until(lambda: publish() and len(self.points) > before, what='points')
+        last = publish()
+        self.client.wait_until(
+            lambda: self.points[-1].frame_number == last, what='the last points'
+        )
 
     def is_clean(self):
         return all(n.running and 'Traceback' not in n.log for n in self.nodes.values())

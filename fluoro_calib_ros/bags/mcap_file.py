@@ -33,7 +33,7 @@ from mcap.summary import Summary
 
 from ..errors import DataError
 from ..files.access import check_regular_file, os_error_reason
-from ..limits import MAX_CHUNK
+from ..limits import MAX_CHUNK, MAX_TOPICS
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER_SIZE = 1 + 8 + 8 + 8 + 4  # bytes: opcode, length, two offsets, CRC
@@ -96,6 +96,11 @@ def channels_of_file(path: str) -> list[ChannelInfo]:
             schemas = scan.schemas
             channels = scan.channels
             counts = scan.counts
+        if len(channels) > MAX_TOPICS:
+            raise DataError(
+                f'{path}: the bag has {len(channels)} channels, more than {MAX_TOPICS} are not '
+                'read'
+            )
         return [
             ChannelInfo(channel, schemas.get(channel.schema_id), counts.get(number, 0))
             for number, channel in channels.items()

@@ -25,6 +25,7 @@ import zstandard
 from mcap.writer import CompressionType, Writer
 from rigs import calibrated, rig, run
 
+from fluoro_calib_ros import limits
 from fluoro_calib_ros.bags import reader as reader_module
 from fluoro_calib_ros.bags.reader import iterate_messages, read_frames
 from fluoro_calib_ros.errors import DataError
@@ -106,6 +107,83 @@ def test_giant_message_is_not_decoded(tmp_path, monkeypatch):
     write_bag(tmp_path / 'bag', simulate_exposures(rig(), 1, 1).frames)
     monkeypatch.setattr(reader_module, 'MAX_OBSERVATIONS', 100)
     assert 'more than 100 are not read' in refused(read_frames, tmp_path / 'bag')
+
+
+def test_bag_of_very_many_channels_is_not_read(tmp_path):
+    buffer = io.BytesIO()
+    writer = Writer(buffer)
+    writer.start('ros2', 'x')
+    schema = writer.register_schema('std_msgs/msg/String', 'ros2msg', b'string data')
+    for number in range(limits.MAX_TOPICS + 1):
+        writer.register_channel(f'/t{number}', 'cdr', schema)
+    writer.finish()
+    (tmp_path / 'many.mcap').write_bytes(buffer.getvalue())
+    assert 'the bag has 2001 channels' in refused(read_frames, tmp_path / 'many.mcap')
+
+
+def changed_calibration(folder, compression=zipfile.ZIP_STORED, **members):
+    """The file of a calibration with other members."""
+    path = save_calibration(folder, calibrated('a', 5, model='none').calibrations['a'])
+    with zipfile.ZipFile(path) as archive:
+        content = {name: archive.read(name) for name in archive.namelist()}
+    content.update({f'{name}.npy': data for name, data in members.items()})
+    with zipfile.ZipFile(path, 'w', compression) as archive:
+        for name, data in content.items():
+            archive.writestr(name, data)
+    return path
+
+
+def array_file(value):
+    buffer = io.BytesIO()
+    np.save(buffer, value)
+    return buffer.getvalue()
+
+
+def header(text):
+    return b'\x93NUMPY\1\0' + len(text).to_bytes(2, 'little') + text
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(
+    'members, sentence',
+    [
+        ({'noise_px': header(b'((((\n')}, 'noise_px does not contain plain numbers'),
+        ({'noise_px': header(b'(' * 60_000 + b'\n')}, 'noise_px does not contain plain numbers'),
+        ({'noise_px': array_file(1e308)}, 'noise_px holds a value beyond 1e+06'),
+        ({'train_uv': array_file(np.full((9, 2), 1e308))}, 'train_uv holds a value beyond'),
+        ({'image_size': array_file(np.array([2**32, 1]))}, 'image_size holds a value beyond'),
+        ({'image_size': array_file(np.array([32000, 32000]))}, 'more than 64 megapixels'),
+        ({'interior': array_file(np.array([1.0, 1.0, 0.0]))}, 'the principal distance is 0 px'),
+        ({'frame_id': array_file(np.array([2**31 - 1], 'u4').view('<U1')[0:1])}, 'frame_id'),
+    ],
+)
+def test_crafted_array_is_refused(tmp_path, members, sentence):
+    """In one sentence: numpy evaluates a header, and numbers this large overflow later."""
+    assert sentence in refused(load_calibration, changed_calibration(tmp_path, **members))
+
+
+def test_compression_that_numpy_does_not_write_is_refused(tmp_path):
+    """A damaged LZMA member raised an exception of its own, and may claim 4 GB of dictionary."""
+    path = changed_calibration(tmp_path, zipfile.ZIP_LZMA)
+    assert 'compressed in a way that numpy does not use' in refused(load_calibration, path)
+
+
+def test_training_points_on_one_place_are_refused(tmp_path):
+    """No search tree divides them: each of 16,000 nodes of the grid would visit all."""
+    count = limits.MAX_COINCIDENT + 1
+    path = changed_calibration(
+        tmp_path,
+        train_uv=array_file(np.full((count, 2), 500.0)),
+        train_duv=array_file(np.zeros((count, 2))),
+        train_exposure=array_file(np.zeros(count, np.int64)),
+    )
+    assert 'training points lie on one place' in refused(load_calibration, path)
+
+
+def test_message_of_an_error_is_one_short_line():
+    error = DataError('a\n[FATAL] forged\x1b[2J ' + 'x' * 10**6 + ' the cause')
+    assert str(error).isprintable() and len(str(error)) < 1000
+    assert str(error).startswith('a\\n[FATAL]') and str(error).endswith(' the cause')
 
 
 @pytest.mark.parametrize('what', ['source', 'phantom', 'calibration', 'known'])

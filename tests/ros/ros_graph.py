@@ -149,6 +149,10 @@ class Process:
         return self.path.read_text(errors='replace')
 
     @property
+    def pid(self):
+        return self._process.pid
+
+    @property
     def running(self):
         return self._process.poll() is None
 
@@ -158,6 +162,10 @@ class Process:
 
     def interrupt(self):
         self._process.send_signal(signal.SIGINT)
+
+    def kill(self):
+        self._process.kill()
+        return self.wait()
 
     def abort(self):
         """End the process so that it prints where its threads are."""

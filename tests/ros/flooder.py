@@ -1,0 +1,53 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Publishes observations of fluoroscope a until it is ended: 10,000 messages a second.
+
+Every hundredth has 100,000 points, the others none of the calibrated fluoroscope.
+"""
+
+import itertools
+import sys
+import time
+
+import rclpy
+from fluoro_calib_msgs.msg import TargetObservations
+from rclpy.serialization import serialize_message
+
+from fluoro_calib_ros.nodes.messages.fields import float64_field, uint32_field
+from fluoro_calib_ros.nodes.runtime.qos import observations_qos
+
+POINTS = 100_000
+PERIOD_S = 1e-4
+LARGE = 100
+
+
+def main():
+    rclpy.init()
+    node = rclpy.create_node('flooder', namespace=sys.argv[1])
+    output = node.create_publisher(TargetObservations, 'a/target_observations', observations_qos())
+    small = TargetObservations(image_width=7, image_height=7)
+    large = TargetObservations(image_width=1024, image_height=1024)
+    large.target_id = uint32_field(range(POINTS))
+    large.u = large.v = float64_field([512.0] * POINTS)
+    contents = [bytes(serialize_message(message)) for message in (small, large)]
+    start = time.monotonic()
+    for number in itertools.count():
+        while time.monotonic() < start + number * PERIOD_S:
+            pass
+        output.publish(contents[number % LARGE == 0])
+
+
+if __name__ == '__main__':
+    main()

@@ -2,7 +2,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test oldest lint docs fuzz audit bench online endurance validation precision convergence pathologies real-data bags clean
+.PHONY: help setup demo test oldest lint docs fuzz audit bench online endurance validation precision convergence pathologies real-data bags bag-readers faults clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
@@ -30,6 +30,8 @@ help:
 	@echo 'make pathologies  calibrate rigs unlike the virtual rig: docs/pathologies.md (30 min)'
 	@echo 'make real-data    calibrate public data of real cameras: docs/real_data.md (downloads 4 MB, 30 min)'
 	@echo 'make bags         regenerate the bags in bags/'
+	@echo 'make bag-readers  read bags of all kinds with mcap, rosbags and the npm packages of Foxglove (needs npm)'
+	@echo 'make faults       kill, interrupt and cut off programs, damage bags, join hosts: docs/reliability.md (2 h)'
 	@echo 'make clean        delete .venv, .build and caches'
 	@echo
 	@echo 'PYTHON=python3.12 make setup        selects the Python version (3.10 to 3.13)'
@@ -99,6 +101,13 @@ real-data: setup
 
 bags: setup
 	@.venv/bin/fluoro-calib simulate --out bags $(ARGS)
+
+bag-readers: setup
+	@cd tools/bag_readers && npm install --no-audit --no-fund --silent
+	@$(RUN) tools/bag_readers/read_bags.py $(ARGS)
+
+faults: setup
+	@$(RUN) -m benchmarks.faults $(ARGS)
 
 clean:
 	rm -rf .venv .oldest .fuzz .audit .build demo_result .pytest_cache .mypy_cache .ruff_cache docs/_build *.egg-info

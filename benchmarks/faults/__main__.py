@@ -26,10 +26,11 @@ from pathlib import Path
 
 from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
 
-from . import hosts, kills, signals
+from . import damage, hosts, kills, signals
 
 KINDS = {
     'kills': kills.run,
+    'damage': damage.run,
     'signals': signals.run,
     'hosts': hosts.run,
 }

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from datetime import datetime, timezone
 
 import numpy as np
@@ -49,6 +49,7 @@ from .held_calibration import (
     too_few_rays_for_noise,
 )
 from .initial_network import MIN_EXPOSURES, Frames, Measured, StartValues, measured_network
+from .joint_precision import SolvedNetwork
 from .options import CalibrationOptions
 from .request import CalibrationRequest
 from .result import FluoroscopeCalibration, digest_of_sources
@@ -165,6 +166,8 @@ class CalibrationResult:
         Of all image points; None where they were not kept.
     created : str
         Date and time of the end (UTC, ISO 8601).
+    solved : dict of str to SolvedNetwork
+        What the covariance matrix of all unknowns is computed from, by the names of the history.
     """
 
     fluoroscopes: dict[str, FluoroscopeResult]
@@ -181,6 +184,7 @@ class CalibrationResult:
     statistics: tuple[AdjustmentStatistics, ...] = ()
     residuals: ResidualTable | None = None
     created: str = ''
+    solved: dict[str, SolvedNetwork] = field(default_factory=dict)
 
 
 def calibrate(
@@ -284,7 +288,14 @@ def calibrate_request(
             ]
         ),
         _now(),
+        {label: _solved(run) for label, run in runs.items()},
     )
+
+
+def _solved(run: SelfCalibration) -> SolvedNetwork:
+    """Network and adjustment of a self-calibration."""
+    estimated = run.measured.network.additional_correction(run.after.parameters)
+    return SolvedNetwork(run.measured, run.after, run.correction - estimated)
 
 
 def _now() -> str:
@@ -435,8 +446,9 @@ def adjust_with_calibrations(
             noise_held=too_few_rays_for_noise(network),
         )
         before = None
+        solved = replace(measured, network=network)
+        held = np.stack([calibrations[name].interior_covariance for name in frames])
         if starts is None:
-            held = np.stack([calibrations[name].interior_covariance for name in frames])
             precise = precision_with_held_interiors(network, after, correction, precise, held)
             before, _ = adjusted_with_precision(
                 network,
@@ -459,9 +471,10 @@ def adjust_with_calibrations(
         measured.left_out,
         after.converged,
         time.perf_counter() - began,
-        statistics=(statistics_of(replace(measured, network=network), after, precise),),
+        statistics=(statistics_of(solved, after, precise),),
         residuals=residuals_of_adjustment(measured, after, precise, correction),
         created=_now(),
+        solved={'+'.join(frames): SolvedNetwork(solved, after, correction, held)},
     )
 
 

@@ -29,7 +29,7 @@ import numpy as np
 
 from ..distortion.base import CorrectionModel
 from ..distortion.estimation import AdjustedTerms, require_training
-from ..distortion.misfit import FittedPoints, sd_with_misfit
+from ..distortion.misfit import FittedPoints, sd_of_rejected, sd_with_misfit
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
 from ..photogrammetry.elimination import factorize
@@ -124,17 +124,24 @@ def _models(
     network = measured.network
     values = after.residuals + network.additional_correction(after.parameters)
     models = {}
-    for f, name in enumerate(measured.fluoroscopes):
-        rows = network.rows(f)
-        rows = rows[after.inliers[rows]]
-        series = terms.fitted_series(f, after, precise)
-        points = FittedPoints(
+
+    def points(rows: np.ndarray) -> FittedPoints:
+        return FittedPoints(
             network.uv[rows],
             after.residuals[rows],
             network.exposure[rows],
             precise.redundancy[rows].mean(axis=1),
         )
-        sd = sd_with_misfit(points, series, terms.sd_left_out(f))
+
+    for f, name in enumerate(measured.fluoroscopes):
+        rows = network.rows(f)
+        rejected = points(rows[~after.inliers[rows]])
+        rows = rows[after.inliers[rows]]
+        series = terms.fitted_series(f, after, precise)
+        sd = np.hypot(
+            sd_with_misfit(points(rows), series, terms.sd_left_out(f)),
+            sd_of_rejected(points(rows), rejected, series),
+        )
         models[name] = model_type(0, network.uv[rows], values[rows], series=replace(series, sd=sd))
     return models
 

@@ -23,6 +23,7 @@ from ..options import declared
 from .arguments import (
     add_bag_options,
     add_calibration,
+    add_covariance,
     add_option,
     add_phantom,
     add_source,
@@ -49,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
     )
+    add_covariance(parser)
     add_calibration(parser)
     add_option(parser, declared(CalibrationOptions)['loss'])
 
@@ -80,7 +82,7 @@ def run(arguments: argparse.Namespace) -> None:
     frames = recording.frames
     calibrations = select_calibrations(calibrations, frames, arguments.calibration)
     result = adjust(frames, survey.phantom, calibrations, arguments.loss)
-    save_result(arguments.out, result)
+    save_result(arguments.out, result, covariance=arguments.covariance)
     for sentence in result.left_out:
         print_note(f'not used: {sentence}')
     print_result(arguments, result_document(result), summary_table(result))

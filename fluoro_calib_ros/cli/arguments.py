@@ -251,6 +251,15 @@ def add_calibration(parser: Parser) -> None:
     )
 
 
+def add_covariance(parser: Parser) -> None:
+    """Add --covariance."""
+    parser.add_argument(
+        '--covariance',
+        action='store_true',
+        help='write the covariance matrix of all unknowns, too (*.covariance.npz)',
+    )
+
+
 def add_result_folder(parser: argparse.ArgumentParser) -> None:
     """Add DIR, which --calibration and a rig.toml give as well; see `result_folder`."""
     parser.add_argument(

@@ -26,6 +26,7 @@ from ..options import Option, declared
 from .arguments import (
     add_bag_options,
     add_collect,
+    add_covariance,
     add_option,
     add_phantom,
     add_scheduler,
@@ -90,6 +91,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     result.add_argument(
         '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
     )
+    add_covariance(result)
 
 
 def _add_adjustment(parser: argparse.ArgumentParser) -> None:
@@ -187,7 +189,7 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Self-calibrate and write the result folder. Raises DataError."""
     from ..jobs.calibration import run_calibration
-    from ..jobs.result_folder import check_result_folder, save_outcome
+    from ..jobs.result_folder import check_result_folder, save_outcome, write_covariances
 
     inputs = (arguments.source, arguments.phantom, *arguments.known_orientation)
     check_result_folder(arguments.out, inputs)
@@ -204,6 +206,8 @@ def run(arguments: argparse.Namespace) -> None:
             from ..report.figures import write_figures
 
             write_figures(outcome.result, folder / 'figures')
+        if arguments.covariance:
+            write_covariances(folder, outcome.result)
 
     save_outcome(arguments.out, outcome, write_more=write_more)
     _print(arguments, outcome)

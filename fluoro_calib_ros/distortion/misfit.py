@@ -20,6 +20,9 @@ all exposures have in common, less the variance of the correction, which makes r
 neighbours opposite. Of both, a residual shows the part that its redundancy number says (Foerstner
 and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6): orientations and object points
 absorb the rest. The square is part of the variance of the correction.
+
+Where the error is large, its image points are rejected like gross errors. False matches differ
+from each other, but these agree.
 """
 
 from __future__ import annotations
@@ -30,7 +33,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import log_ndtr
 
-from .series import Series, sd_grid_pixels
+from .series import SD_GRID, Series, sd_grid_pixels
 
 NEIGHBOURS = 5  # of an image point, those of its own exposure not counted
 POINTS = 60  # image points about a node of the grid
@@ -39,6 +42,13 @@ POINTS = 60  # image points about a node of the grid
 SIGNIFICANT = 4.0
 SIGNIFICANT_LOCAL = 4.5
 FAR = 30.0  # standard deviations below zero
+# Rejected image points agree within so many standard deviations of an inlier, over so many times
+# the typical distance of an inlier from the next, with so many others; larger residuals than so
+# many standard deviations are no error of a correction.
+AGREE_SD = 5.0
+AGREE_REACH = 3.0
+AGREE_WITH = 2
+LARGEST_SD = 40.0
 MIN_EXPOSURES = 3  # whose scatter is the standard error of a mean product
 
 
@@ -141,6 +151,35 @@ def sd_with_misfit(points: FittedPoints, series: Series, left_out_px: float) -> 
     common = mean / products.shown[near].mean(axis=1) + variance.ravel()
     found = np.where(shown, np.maximum(common, left_out), left_out)
     return np.sqrt(variance + found.reshape(variance.shape))
+
+
+def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series) -> np.ndarray:
+    """Standard deviations (33, 33) [px] on the grid of a series where rejected points agree.
+
+    They are the largest RMS residual of those nearby, and zero where there are none.
+    """
+    out = np.zeros(series.sd.size)
+    noise = float(np.sqrt(np.mean(inliers.residuals**2)))
+    distance, _ = cKDTree(inliers.uv).query(inliers.uv, k=[2])
+    reach = AGREE_REACH * float(np.median(distance))
+    size = np.linalg.norm(rejected.residuals, axis=1)
+    possible = np.flatnonzero(size < LARGEST_SD * noise)
+    if len(possible) <= AGREE_WITH:
+        return out.reshape(series.sd.shape)
+    uv = rejected.uv[possible]
+    i, j = cKDTree(uv).query_pairs(reach, output_type='ndarray').T
+    r = rejected.residuals[possible]
+    agree = np.linalg.norm(r[i] - r[j], axis=1) < AGREE_SD * noise
+    agree &= rejected.exposure[possible[i]] != rejected.exposure[possible[j]]
+    number = np.bincount(np.concatenate([i[agree], j[agree]]), minlength=len(possible))
+    found = np.flatnonzero(number >= AGREE_WITH)
+    pixels = sd_grid_pixels(series.functions.image_size)
+    # Every one of them reaches the nodes about it.
+    cell = np.linalg.norm(np.asarray(series.functions.image_size) / (SD_GRID - 1))
+    for row in found:
+        near = np.linalg.norm(pixels - uv[row], axis=1) < max(reach, cell)
+        out[near] = np.maximum(out[near], size[possible[row]] / np.sqrt(2))
+    return out.reshape(series.sd.shape)
 
 
 def _variance_left_out(products: _Products, series: Series, expected: float) -> float:

@@ -104,7 +104,7 @@ class CalibrationOutcome:
 
     def without_runs(self) -> CalibrationOutcome:
         """Return the outcome without the networks behind it, which only the figures need."""
-        return replace(self, result=replace(self.result, runs={}))
+        return replace(self, result=replace(self.result, runs={}, solved={}))
 
 
 def run_calibration(

@@ -32,6 +32,8 @@ from ..files.calibration_request import (
     PHANTOM,
     write_request,
 )
+from ..files.covariance import SUFFIX as COVARIANCE
+from ..files.covariance import write_covariance
 from ..files.folder import FolderKind, check_output_folder, replaced_folder
 from ..files.json_file import write_json
 from ..files.result_document import result_document
@@ -63,7 +65,9 @@ _OWN = (
 
 def _is_own(name: str) -> bool:
     """Return whether an entry belongs to a result, or is what a killed run left of a file."""
-    return name in _OWN or (name.startswith('.') and name.endswith('.tmp'))
+    if name in _OWN or name.endswith(COVARIANCE):
+        return True
+    return name.startswith('.') and name.endswith('.tmp')
 
 
 def _marks(name: str) -> bool:
@@ -120,15 +124,30 @@ def save_outcome(
 
 
 def save_result(
-    directory: str | os.PathLike[str], result: CalibrationResult, doubts: Sequence[str] = ()
+    directory: str | os.PathLike[str],
+    result: CalibrationResult,
+    doubts: Sequence[str] = (),
+    covariance: bool = False,
 ) -> None:
     """Write calibrations and result.json of a calibration or adjustment as a result folder.
 
-    doubts are the reasons why a forced calibration cannot be right. An earlier folder is replaced
-    as a whole and kept as DIRECTORY.previous. Raises DataError.
+    doubts are the reasons why a forced calibration cannot be right; covariance: whether to write
+    the covariance matrix of all unknowns, too. An earlier folder is replaced as a whole and kept
+    as DIRECTORY.previous. Raises DataError.
     """
     with replaced_folder(directory, RESULT_FOLDER) as folder:
         _write_result(folder, result, doubts)
+        if covariance:
+            write_covariances(folder, result)
+
+
+def write_covariances(folder: Path, result: CalibrationResult) -> None:
+    """Write the covariance matrix of all unknowns of every adjustment of a result into a folder.
+
+    Raises DataError.
+    """
+    for label, solved in result.solved.items():
+        write_covariance(folder / f'{label}{COVARIANCE}', solved.joint_precision())
 
 
 def save_calibrations(

@@ -30,7 +30,7 @@ import numpy as np
 from .adjustment import Adjustment
 from .elimination import factorize
 from .network import Network
-from .normal_equations import normal_equations
+from .normal_equations import NormalEquations, normal_equations
 from .precision import MAX_JOINT_POINTS, Precision, covariance_blocks, joint_covariance
 
 MIN_SD_PX = 1e-6  # of an interior orientation that is held
@@ -67,6 +67,28 @@ def precision_with_held_interiors(
     numpy.linalg.LinAlgError
         Where the network does not determine the unknowns.
     """
+    free, equations = equations_with_held_interiors(network, adjustment, correction, covariances)
+    blocks = covariance_blocks(factorize(free, equations))
+    return replace(
+        precise,
+        interior=np.stack([blocks.gg[own, own] for own in free.layout.interiors]),
+        exterior=blocks.ee,
+        points=blocks.pp,
+        all_global=blocks.gg,
+        exterior_global=blocks.eg,
+        joint_points=(
+            joint_covariance(blocks).points if network.n_points <= MAX_JOINT_POINTS else None
+        ),
+    )
+
+
+def equations_with_held_interiors(
+    network: Network, adjustment: Adjustment, correction: np.ndarray, covariances: np.ndarray
+) -> tuple[Network, NormalEquations]:
+    """Network and normal equations whose inverse holds the uncertainty of held interiors.
+
+    See `precision_with_held_interiors` for the arguments.
+    """
     free = replace(network, interior_free=np.ones(network.n_fluoroscopes, dtype=bool))
     factor = adjustment.noise.information_factor(adjustment.q)
     equations = normal_equations(free, adjustment.parameters, correction, adjustment.noise, factor)
@@ -79,15 +101,4 @@ def precision_with_held_interiors(
     size = len(prior)
     last = schur[-size:, -size:]
     absorbed = with_prior.gg - last @ last.T
-    blocks = covariance_blocks(factorize(free, replace(equations, gg=prior + absorbed)))
-    return replace(
-        precise,
-        interior=np.stack([blocks.gg[own, own] for own in free.layout.interiors]),
-        exterior=blocks.ee,
-        points=blocks.pp,
-        all_global=blocks.gg,
-        exterior_global=blocks.eg,
-        joint_points=(
-            joint_covariance(blocks).points if network.n_points <= MAX_JOINT_POINTS else None
-        ),
-    )
+    return free, replace(equations, gg=prior + absorbed)

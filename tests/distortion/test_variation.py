@@ -25,7 +25,7 @@ from fluoro_calib_ros.distortion.exposure_terms import (
     without_exposure_terms,
 )
 from fluoro_calib_ros.distortion.gauge import gauge_basis
-from fluoro_calib_ros.distortion.misfit import FittedPoints, sd_with_misfit
+from fluoro_calib_ros.distortion.misfit import FittedPoints, sd_of_rejected, sd_with_misfit
 from fluoro_calib_ros.distortion.series import SD_GRID, Functions, Series
 
 SIZE = (800, 600)
@@ -117,3 +117,21 @@ def test_residuals_bound_the_variance_beyond_a_series():
     rippled = FittedPoints(uv, noise + ripples, exposure)
     shown = np.median(sd_with_misfit(rippled, series, 1.0))
     assert 0.5 * 0.14 < shown < 1.5 * 0.14
+
+
+def test_rejected_points_that_agree_are_an_error_of_the_correction():
+    """Those of a dent are, false matches are not."""
+    uv, exposure, rng = image_points(5, 200)
+    series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
+    inliers = FittedPoints(uv, rng.normal(0, NOISE, uv.shape), exposure)
+    false = rng.permutation(len(uv))[: len(uv) // 5]
+    wrong = rng.normal(0, 20.0, (len(false), 2))
+    nothing = sd_of_rejected(inliers, FittedPoints(uv[false], wrong, exposure[false]), series)
+    assert (nothing > 0).mean() < 0.02
+    dent = np.flatnonzero(np.linalg.norm(uv - [600, 150], axis=1) < 40)
+    residuals = np.array([1.5, -1.0]) + rng.normal(0, NOISE, (len(dent), 2))
+    found = sd_of_rejected(inliers, FittedPoints(uv[dent], residuals, exposure[dent]), series)
+    row = round(150 / SIZE[1] * (SD_GRID - 1))
+    column = round(600 / SIZE[0] * (SD_GRID - 1))
+    assert 1.0 < found[row, column] < 2.0
+    assert (found > 0).mean() < 0.05

@@ -1,0 +1,119 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Covariance matrix of all unknowns of an adjustment, computed on request."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.diagnosis import global_names
+from ..photogrammetry.elimination import factorize
+from ..photogrammetry.held_precision import equations_with_held_interiors
+from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.precision import covariance_blocks, joint_covariance
+from .initial_network import Measured
+
+# Position of the source in the frame of the phantom, rotation about the axes of the sensor.
+EXTERIOR = ('x', 'y', 'z', 'turn x', 'turn y', 'turn z')
+
+
+@dataclass(frozen=True)
+class JointPrecision:
+    """Covariance matrix of all unknowns of an adjustment.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the unknowns: x, y, z of the source [mm] and its turns about the axes of the sensor
+        [rad] of each exposure; x, y, z [mm] of each target; xp, yp, c [px] of each fluoroscope;
+        relative orientations and coefficients of the correction, where they were estimated.
+    values : (u,) ndarray
+        NaN for rotations, which have no value.
+    covariance : (u, u) ndarray
+        Zeros for what was held.
+    """
+
+    names: tuple[str, ...]
+    values: np.ndarray
+    covariance: np.ndarray
+
+
+@dataclass(frozen=True)
+class SolvedNetwork:
+    """A network and its adjustment.
+
+    Attributes
+    ----------
+    measured : Measured
+    adjustment : Adjustment
+    correction : (N, 2) ndarray
+        Correction that was held [px].
+    held : (F, 3, 3) ndarray or None
+        Covariances of interior orientations that were held [px^2].
+    """
+
+    measured: Measured
+    adjustment: Adjustment
+    correction: np.ndarray
+    held: np.ndarray | None = None
+
+    def joint_precision(self) -> JointPrecision:
+        """Covariance matrix of all unknowns.
+
+        Raises numpy.linalg.LinAlgError where the network does not determine them.
+        """
+        network = self.measured.network
+        parameters = self.adjustment.parameters
+        noise = self.adjustment.noise
+        if self.held is not None:
+            network, equations = equations_with_held_interiors(
+                network, self.adjustment, self.correction, self.held
+            )
+        else:
+            factor = noise.information_factor(self.adjustment.q)
+            equations = normal_equations(network, parameters, self.correction, noise, factor)
+        blocks = covariance_blocks(factorize(network, equations))
+        angles = np.full((network.n_exposures, 3), np.nan)
+        others = [p.ravel() for p in parameters.additional if p is not None]
+        relative = [np.append(p.translation_mm, angles[0]) for p in parameters.relative]
+        return JointPrecision(
+            (*self._exterior_names(), *self._target_names(), *self._global_names()),
+            np.concatenate(
+                [
+                    np.hstack([parameters.position_mm, angles]).ravel(),
+                    parameters.points_mm.ravel(),
+                    parameters.interior.ravel(),
+                    *relative,
+                    *others,
+                ]
+            ),
+            joint_covariance(blocks).matrix,
+        )
+
+    def _exterior_names(self) -> list[str]:
+        return [
+            f'exposure {frame.number} of {frame.fluoroscope}: {part}'
+            for frame in self.measured.frames
+            for part in EXTERIOR
+        ]
+
+    def _target_names(self) -> list[str]:
+        return [f'target {number}: {part}' for number in self.measured.target_id for part in 'xyz']
+
+    def _global_names(self) -> list[str]:
+        return global_names(self.measured.network, self.measured.fluoroscopes)

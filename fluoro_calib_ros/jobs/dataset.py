@@ -33,11 +33,15 @@ from ..files.phantom import write_phantom
 from ..images.codec import encode
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..simulation.exposures import SimulatedExposures
+from ..simulation.marker_images import MarkerImage, MarkerSequence, MovingMarkers
 from ..simulation.radiographs import RadiographSettings, Radiography
 from ..simulation.rig import VirtualFluoroscope, VirtualRig
 from ..simulation.tracking import SimulatedTracking
 
 IMAGES = 'images'  # folder of radiographs, a folder for each fluoroscope
+MARKER_IMAGES = 'marker_images'  # the same of moving markers
+FIRST_MARKERS = 'first_markers.csv'  # where they are in the first image, to some pixel
+CLUSTERS = 'clusters.txt'  # markers that are rigid together, a line for each cluster
 TRUTH = 'truth'  # folder of what a data set was made with
 TRUE_SD_MM = 1e-6  # the file of the true coordinates has to contain a standard deviation
 
@@ -111,6 +115,68 @@ def write_radiographs(
             if progress is not None:
                 progress(done, total)
     write_text(directory / TRUTH / 'images.csv', '\n'.join(lines) + '\n')
+
+
+def write_marker_radiographs(
+    directory: PathLike,
+    sequence: MarkerSequence,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Write radiographs of moving markers as marker_images/FLUOROSCOPE/NUMBER.png.
+
+    first_markers.csv contains the markers of the first images, to the nearest pixel, as a person
+    would point at them; clusters.txt the rigid clusters, truth/marker_images.csv the true centres
+    of all markers with 1 for those that are seen, truth/marker_images_points.csv their points in
+    space [mm]. progress is called as by `write_radiographs`. Raises DataError.
+    """
+    directory = Path(directory)
+    markers = sequence.markers
+    names = [fluoroscope.name for fluoroscope in sequence.rig.fluoroscopes]
+    for name in names:
+        make_folder(directory / MARKER_IMAGES / name)
+    lines = ['fluoroscope,exposure,target_id,u,v,seen']
+    points = ['exposure,target_id,x_mm,y_mm,z_mm']
+    for number, views in enumerate(sequence, 1):
+        for name, view in views.items():
+            path = directory / MARKER_IMAGES / name / f'{number:04d}.png'
+            write_bytes(path, encode(view.image, '.png'))
+            lines += [
+                f'{name},{number},{target},{u:.4f},{v:.4f},{int(seen)}'
+                for target, (u, v), seen in zip(markers.target_id, view.uv, view.seen)
+            ]
+        points += [
+            f'{number},{target},{x:.6f},{y:.6f},{z:.6f}'
+            for target, (x, y, z) in zip(markers.target_id, markers.points_mm(number))
+        ]
+        if number == 1:
+            write_observations_csv(directory / FIRST_MARKERS, _first_markers(views, markers))
+        if progress is not None:
+            progress(number * len(names), sequence.frames * len(names))
+    write_text(directory / TRUTH / 'marker_images.csv', '\n'.join(lines) + '\n')
+    write_text(directory / TRUTH / 'marker_images_points.csv', '\n'.join(points) + '\n')
+    clusters = [
+        f'cluster_{number + 1}: {" ".join(map(str, markers.target_id[markers.cluster == number]))}'
+        for number in range(markers.scene.clusters)
+    ]
+    write_text(directory / CLUSTERS, '\n'.join(clusters) + '\n')
+
+
+def _first_markers(
+    views: Mapping[str, MarkerImage], markers: MovingMarkers
+) -> dict[str, list[Frame]]:
+    """Return the markers that are seen in the images of an exposure, to the nearest pixel."""
+    return {
+        name: [
+            Frame(
+                name,
+                1,
+                markers.target_id[view.seen],
+                np.rint(view.uv[view.seen]),
+                (view.image.shape[1], view.image.shape[0]),
+            )
+        ]
+        for name, view in views.items()
+    }
 
 
 def write_tracking(directory: PathLike, tracking: SimulatedTracking) -> None:

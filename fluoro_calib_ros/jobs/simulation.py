@@ -24,14 +24,25 @@ from pathlib import Path
 from ..files.folder import FolderKind, replaced_folder
 from ..options import option, validate_options
 from ..simulation.exposures import Detection, simulate_exposures
+from ..simulation.marker_images import (
+    HARD_MARKER_SETTINGS,
+    MARKER_SETTINGS,
+    MarkerScene,
+    MarkerSequence,
+    MovingMarkers,
+)
 from ..simulation.radiographs import CLEAN, HARD
 from ..simulation.rig import virtual_rig
 from ..simulation.streams import START_NS, StreamStart
 from ..simulation.tracking import simulate_tracking
 from .dataset import (
+    CLUSTERS,
+    FIRST_MARKERS,
     IMAGES,
+    MARKER_IMAGES,
     TRUTH,
     write_exposures,
+    write_marker_radiographs,
     write_radiographs,
     write_rig,
     write_tracking,
@@ -46,6 +57,9 @@ _PARTS = (
     'tracking',
     'phantom.csv',
     IMAGES,
+    MARKER_IMAGES,
+    FIRST_MARKERS,
+    CLUSTERS,
     TRUTH,
 )
 
@@ -90,6 +104,13 @@ class SimulationOptions:
         'radiographs of the exposures of the phantom, clean or with clutter and little dose',
         choices=('none', 'clean', 'hard'),
     )
+    marker_images: int = option(
+        0,
+        'radiographs of moving markers with each fluoroscope, in bones and with the clutter of '
+        'the images',
+        minimum=0,
+        maximum=100000,
+    )
 
     def __post_init__(self) -> None:
         validate_options(self)
@@ -125,6 +146,11 @@ def _write(
     settings = {'clean': CLEAN, 'hard': HARD}.get(options.images)
     if settings is not None:
         write_radiographs(directory, rig, calibration, settings, progress)
+    if options.marker_images:
+        moving = MovingMarkers(MarkerScene(), options.seed)
+        taken = MARKER_SETTINGS if options.images != 'hard' else HARD_MARKER_SETTINGS
+        sequence = MarkerSequence(rig, moving, taken, options.marker_images, options.seed)
+        write_marker_radiographs(directory, sequence, progress)
     # Each part has its own seed, so that its size does not change the others.
     if options.test_exposures:
         test = simulate_exposures(

@@ -249,3 +249,25 @@ def test_images_of_a_bag_are_read(folder):
     assert np.abs(frame.uv - uv[frame.target_id - 1]).max() < 1.0
     with pytest.raises(DataError, match="fluoroscope 'c', only of a, b"):
         open_sources([folder / 'bag'], 'c')
+
+
+def test_rendered_markers_are_followed(tmp_path, capsys):
+    """`simulate --marker-images` gives images, first places and the truth for `extract`."""
+    rig = tmp_path / 'rig'
+    options = ('--exposures', '1', '--seconds', '0', '--marker-images', '2')
+    assert not main(['simulate', '--out', str(rig), *options])
+    command = ['extract', str(rig / 'marker_images' / 'a'), '--fluoroscope', 'a']
+    files = ['--markers', str(rig / 'first_markers.csv'), '--out', str(tmp_path / 'out.csv')]
+    assert not main([*command, *files, '--json'])
+    with open(rig / 'truth' / 'marker_images.csv') as file:
+        rows = [row for row in csv.DictReader(file) if row['fluoroscope'] == 'a']
+    true = {(row['exposure'], row['target_id']): row for row in rows}
+    with open(tmp_path / 'out.csv') as file:
+        found = list(csv.DictReader(file))
+    seen = sum(row['seen'] == '1' for row in rows)
+    assert len(found) > 0.9 * seen > 30
+    for row in found:
+        truth = true[row['exposure'], row['target_id']]
+        assert np.hypot(*(float(row[k]) - float(truth[k]) for k in 'uv')) < 1.0
+    clusters = (rig / 'clusters.txt').read_text().splitlines()
+    assert clusters[0].startswith('cluster_1: 1001 ')

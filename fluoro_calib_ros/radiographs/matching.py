@@ -41,6 +41,7 @@ MIN_EXPLAINED = 0.4
 # found, but nothing else is seen.
 EVIDENT = ((0.72, MIN_EXPLAINED), (0.6, 0.85))
 NEARLY_FOUND = 0.6
+SETTLINGS = 6  # of a match that is nearly evident
 # The same at which the search ends.
 SURE = ((0.85, 0.4), (0.75, 0.95))
 # By how much the score of the best pose must exceed that of another one: as a share of it, and in
@@ -193,11 +194,18 @@ def is_sure(best: Match) -> bool:
 
 
 def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
-    """Return a match that is nearly evident after further steps, if they find more beads."""
-    if is_sure(one) or one.found < NEARLY_FOUND or one.explained < MIN_EXPLAINED:
-        return one
-    again = settle(one.view, model.xyz, seen)
-    return again if again is not None and again.score > one.score else one
+    """Return a match that is nearly evident after further steps, while they find more beads.
+
+    Where faces are seen from the edge, a pose reaches the far side of the phantom only by and by.
+    """
+    for _ in range(SETTLINGS):
+        if is_sure(one) or one.found < NEARLY_FOUND or one.explained < MIN_EXPLAINED:
+            break
+        again = settle(one.view, model.xyz, seen)
+        if again is None or again.score <= one.score:
+            break
+        one = again
+    return one
 
 
 def _is_evident(best: Match) -> bool:

@@ -18,7 +18,11 @@ import json
 import os
 import random
 import signal
+import subprocess
+import sys
+import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,6 +40,7 @@ from fluoro_calib_ros.jobs.result_folder import save_calibrations, save_outcome
 from fluoro_calib_ros.jobs.simulation import SimulationOptions, simulate
 
 KILLS = 25
+ROOT = Path(__file__).parents[2]
 KIND = FolderKind('a test folder', lambda name: name.startswith('own'), lambda n: n == 'own.txt')
 
 
@@ -125,6 +130,19 @@ def test_killed_simulation_leaves_a_whole_data_set(tmp_path):
 
 def contents(path):
     return {str(p.relative_to(path)): p.read_bytes() for p in path.rglob('*') if p.is_file()}
+
+
+def test_terminated_command_leaves_nothing_unfinished(tmp_path):
+    """SIGTERM, as service managers send it."""
+    words = ['simulate', '--out', str(tmp_path / 'rig'), '--exposures', '5000']
+    process = subprocess.Popen([sys.executable, '-m', 'fluoro_calib_ros.cli', *words], cwd=ROOT)
+    pause = threading.Event()
+    while not os.listdir(tmp_path):
+        assert process.poll() is None
+        pause.wait(0.01)
+    process.terminate()
+    assert process.wait(60) == 143
+    assert not os.listdir(tmp_path)
 
 
 def test_previous_folder_and_files_of_the_user_are_kept(tmp_path, outcomes):

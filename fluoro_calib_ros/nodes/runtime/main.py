@@ -25,14 +25,17 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
+from itertools import pairwise
 
 import rclpy
-from rclpy._rclpy_pybind11 import RCLError
+from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
+from ...errors import DataError
+from ...files.access import check_regular_file
 from .errors import USER_ERRORS, StartError, one_line
 from .guard import guard_services
 from .logging import log_line
@@ -117,10 +120,19 @@ def _spin(executor: SingleThreadedExecutor, node: Node, ended: threading.Event) 
 
 
 def _init(args: Sequence[str] | None) -> None:
+    """Initialise ROS. Raises StartError for invalid arguments."""
+    words = sys.argv if args is None else args
     try:
+        for option, path in pairwise(words):
+            if option == '--params-file':
+                check_regular_file(path)  # rcl would wait for a pipe, deaf to interrupts
         rclpy.init(args=args, signal_handler_options=SignalHandlerOptions.NO)
     except RCLError as error:  # invalid arguments after --ros-args
         raise StartError(str(error).partition(', at /')[0]) from None
+    except UnknownROSArgsError as error:
+        raise StartError(f'unknown arguments after --ros-args: {one_line(error)}') from None
+    except DataError as error:
+        raise StartError(str(error)) from None
 
 
 def _make(make_node: Callable[[], Node]) -> Node:

@@ -1,0 +1,262 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parts of the nodes against hostile peers: ids of messages, lines of the log, limits."""
+
+import os
+import sys
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import rigs
+from scipy.spatial.transform import Rotation
+
+from fluoro_calib_ros import limits
+from fluoro_calib_ros.distortion.registry import create_model
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.nodes.calibration_node import CalibrationNode
+from fluoro_calib_ros.nodes.exposure_input import CollectOptions, ExposureInput
+from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
+    calibration_from_message,
+    message_from_calibration,
+)
+from fluoro_calib_ros.nodes.messages.rig_orientation import (
+    message_from_orientation,
+    orientation_from_message,
+)
+from fluoro_calib_ros.nodes.messages.target_observations import decode_target_observations
+from fluoro_calib_ros.nodes.runtime.logging import MAX_LINE, PrintableLogger, RateLimitedLogger
+from fluoro_calib_ros.nodes.runtime.main import run
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
+
+FORGED = 'a\n[FATAL] forged\x1b[2J'
+SPECIAL = [
+    np.eye(3),
+    *(
+        Rotation.from_euler('xyz', angles, degrees=True).as_matrix()
+        for angles in ([90, 0, 0], [0, 90, 0], [0, 0, 180], [90, 90, 0], [120, 0, 0])
+    ),
+]
+
+
+def orientation(rng, special=False):
+    """A random orientation of two fluoroscopes, with equal quaternion components if special."""
+    rotation = [
+        SPECIAL[rng.integers(len(SPECIAL))] if special else Rotation.random(random_state=rng)
+        for _ in range(2)
+    ]
+    rotation = [r if isinstance(r, np.ndarray) else r.as_matrix() for r in rotation]
+    root = rng.normal(size=(18, 18)) * 10.0 ** rng.uniform(-6, 1, (18, 1))
+    return RigOrientation(
+        fluoroscopes=('a', 'b'),
+        interior=rng.normal(500, 100, (2, 3)),
+        rotation=np.array(rotation),
+        position_mm=rng.normal(0, 10.0 ** rng.uniform(-3, 4), (2, 3)),
+        covariance=root @ root.T,
+        frame_id='rig',
+        source='capture',
+        calibration_ids=('x', 'y'),
+        stamp_ns=5,
+    )
+
+
+# ---- ids
+
+
+@pytest.mark.parametrize('special', [False, True])
+def test_orientation_keeps_its_id_through_a_message(special):
+    """Metres and quaternions differ in the last bits; both sides round to the same values."""
+    rng = np.random.default_rng(3)
+    for _ in range(100):
+        sent = orientation(rng, special).rounded()
+        assert sent.rounded().orientation_id == sent.orientation_id
+        message = message_from_orientation(sent)
+        assert message.orientation_id == sent.orientation_id
+        assert orientation_from_message(message).orientation_id == sent.orientation_id
+
+
+def test_rounding_changes_less_than_any_standard_deviation():
+    exact = orientation(np.random.default_rng(5))
+    rounded = exact.rounded()
+    np.testing.assert_allclose(rounded.position_mm, exact.position_mm, rtol=1e-12)
+    np.testing.assert_allclose(rounded.rotation, exact.rotation, atol=1e-12)
+    np.testing.assert_allclose(rounded.covariance, exact.covariance, rtol=1e-11)
+
+
+@pytest.mark.parametrize('field', ['x', 'qw', 'c', 'covariance'])
+def test_changed_orientation_is_refused(field):
+    message = message_from_orientation(orientation(np.random.default_rng(1)))
+    values = getattr(message, field)
+    values[0] *= 1 + 1e-9
+    with pytest.raises(DataError, match=r'does not match its id|not symmetric'):
+        orientation_from_message(message)
+
+
+@pytest.mark.parametrize(
+    'field, value',
+    [
+        *(('c', 4000.0), ('interior_estimated', False), ('exposures', 99), ('nu', 3.0)),
+        *(('converged', False), ('rmse_after_u', 0.0), ('iterations', 3), ('inliers', 1)),
+    ],
+)
+def test_changed_calibration_is_refused(field, value):
+    calibration = rigs.calibrated('a', 5, model='none').calibrations['a']
+    message = message_from_calibration(calibration)
+    assert calibration_from_message(message).calibration_id == calibration.calibration_id
+    setattr(message, field, value)
+    with pytest.raises(DataError, match='does not match its id'):
+        calibration_from_message(message)
+
+
+def test_id_of_earlier_versions_is_accepted():
+    calibration = rigs.calibrated('a', 5, model='none').calibrations['a']
+    earlier = replace(calibration, short_id=True)
+    assert earlier.calibration_id != calibration.calibration_id
+    found = calibration_from_message(message_from_calibration(earlier))
+    assert found.calibration_id == earlier.calibration_id
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(
+    'change, sentence',
+    [
+        ({'image_size': (2**32 - 1, 1)}, 'image_size holds a value beyond 32000'),
+        ({'image_size': (32000, 32000)}, 'more than 64 megapixels'),
+        ({'image_sd': 1e308}, 'image_sd holds a value beyond'),
+        ({'interior': np.array([1.0, 1.0, -1.0])}, 'principal distance is -1 px'),
+        ({'model': (2000, 3000)}, 'model_k holds a value beyond 1000'),
+        ({'model': (5, 1001)}, 'training points lie on one place'),
+    ],
+)
+def test_hostile_calibration_with_a_valid_id_is_refused(change, sentence):
+    """Whoever can change the content can compute the id: what would take memory is refused."""
+    calibration = rigs.calibrated('a', 5, model='none').calibrations['a']
+    if 'model' in change:
+        k, count = change['model']
+        uv = np.full((count, 2), 500.0) + (np.arange(count)[:, None] if k > 1000 else 0)
+        model = create_model('knn', k, uv, np.zeros((count, 2)), 0.1, 0.0)
+        change = {'model': model, 'train_exposure': np.zeros(count, np.int64)}
+    message = message_from_calibration(replace(calibration, **change))
+    with pytest.raises(DataError, match=sentence):
+        calibration_from_message(message)
+
+
+# ---- lines of the log
+
+
+class Lines:
+    """A logger that keeps what it is given."""
+
+    def __init__(self):
+        self.lines = []
+
+    def __getattr__(self, _):
+        return self.lines.append
+
+
+@pytest.mark.parametrize('level', ['debug', 'info', 'warning', 'error', 'fatal'])
+def test_log_line_cannot_be_forged(level):
+    inner = Lines()
+    getattr(PrintableLogger(inner), level)(FORGED + 'x' * 10**6)
+    (line,) = inner.lines
+    assert line.startswith('a\\n[FATAL] forged\\x1b[2J') and len(line) <= MAX_LINE + 10
+
+
+def test_traceback_keeps_its_lines_which_are_marked():
+    from fluoro_calib_ros.nodes.runtime.refusals import RefusalLog
+
+    inner = Lines()
+    log = RefusalLog('frame', RateLimitedLogger(PrintableLogger(inner)))
+    try:
+        raise KeyError(FORGED)
+    except KeyError as error:
+        log.fail('a/topic', error)
+    first, *more = inner.lines[0].split('\n')
+    assert 'lost by an internal error' in first and len(more) > 2
+    assert all(line.startswith('  | ') and '\x1b' not in line for line in more)
+
+
+@pytest.mark.parametrize('kind', ['source', 'phantom'])
+def test_command_line_cannot_print_forged_lines(tmp_path, capsys, kind):
+    path = tmp_path / (FORGED.replace('/', '') + '.csv')
+    path.write_text('nonsense\n')
+    source, phantom = (
+        (path, 'bags/phantom.csv') if kind == 'source' else ('bags/calibration', path)
+    )
+    out = tmp_path / 'out'
+    arguments = ('calibrate', source, '--phantom', phantom, '--out', out)
+    assert rigs.run(*arguments, '--image-size', '9x9') == 1
+    error = capsys.readouterr().err
+    assert error.count('\n') == 1 and '\x1b' not in error and 'a\\n[FATAL] forged' in error
+
+
+# ---- arguments and limits
+
+
+@pytest.mark.parametrize(
+    'arguments, sentence',
+    [
+        (['--nonsense'], "unknown arguments after --ros-args: ['--nonsense']"),
+        (['--params-file', 'PIPE'], 'this is a pipe, device or socket, not a file'),
+    ],
+)
+def test_wrong_arguments_of_ros_are_told_in_a_sentence(tmp_path, capfd, arguments, sentence):
+    """The second would wait for ever."""
+    os.mkfifo(tmp_path / 'pipe')
+    words = [str(tmp_path / 'pipe') if word == 'PIPE' else word for word in arguments]
+    with pytest.raises(SystemExit) as stop:
+        run(CalibrationNode, [sys.executable, '--ros-args', *words])
+    assert stop.value.code == 1
+    error = capfd.readouterr().err
+    assert sentence in error and 'Traceback' not in error
+
+
+def test_exposures_are_limited():
+    """Each new one is compared with all: without a limit a peer could stop the stream."""
+    frames = rigs.exposures()
+    options = CollectOptions('still', SimpleNamespace(still_time_s=0.1), None, max_exposures=0)
+    exposures = ExposureInput.__new__(ExposureInput)
+    inner = Lines()
+    exposures._options = options
+    exposures._collector = SimpleNamespace(exposures=[])
+    exposures._limited_logger = RateLimitedLogger(PrintableLogger(inner))
+    exposures._on_pair = lambda pair: None
+    exposures._collect({'a': frames['a'][0]})
+    assert 'as many as max_exposures allows' in exposures.capture_refusal
+    assert inner.lines == [exposures.capture_refusal]
+
+
+@pytest.mark.parametrize(
+    'place, allowed',
+    [('x', True), ('x/y', True), ('x/y/z', False), ('old', True), ('..', True)],
+)
+def test_folders_that_peers_can_make_are_limited(tmp_path, place, allowed):
+    base = tmp_path / 'rig'
+    (base / 'old').mkdir(parents=True)
+    node = SimpleNamespace(_directory=base, _limits=limits.CollectLimits(max_folders=3))
+    if allowed:
+        CalibrationNode._check_folders(node, base / place)
+        return
+    with pytest.raises(DataError, match='as many folders as max_folders allows'):
+        CalibrationNode._check_folders(node, base / place)
+
+
+# ---- found by fuzzing
+
+
+def test_string_with_a_zero_ends_there_as_in_rclpy():
+    data = bytes.fromhex('0001000000000000000000080300000061001100') + bytes(40)
+    assert decode_target_observations(data).frame_id == 'a'

@@ -139,7 +139,7 @@ def _models(
         rows = rows[after.inliers[rows]]
         series = terms.fitted_series(f, after, precise)
         sd = np.hypot(
-            sd_with_misfit(points(rows), series, terms.sd_left_out(f)),
+            sd_with_misfit(points(rows), series, terms.left_out(f)),
             sd_of_rejected(points(rows), rejected, series),
         )
         models[name] = model_type(0, network.uv[rows], values[rows], series=replace(series, sd=sd))

@@ -22,6 +22,7 @@ estimated from the observations (see `priors`).
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -36,7 +37,7 @@ from .exposure_terms import (
     variation,
     without_exposure_terms,
 )
-from .misfit import FittedPoints, has_common_error
+from .misfit import FittedPoints, LeftOut, has_common_error
 from .priors import Prior, gauge_precision, most_likely_prior, prior_precision, starting_prior
 from .series import Functions, Series, sd_over_image
 from .series_model import SeriesModel
@@ -148,10 +149,14 @@ class CollocationTerms(AdjustedTerms):
         sd = sd_over_image(functions, covariance[own, own])
         return Series(functions, coefficients[own].reshape(2, -1), sd)
 
-    def sd_left_out(self, f: int) -> float:
-        """Standard deviation [px] of the signal beyond the sines of fluoroscope f."""
+    def left_out(self, f: int) -> LeftOut | None:
+        """The signal beyond the sines of fluoroscope f."""
         functions = self.functions[f]
-        return self.priors[f].signal.sd_beyond(functions.highest) if functions.modes else 0.0
+        if not functions.modes:
+            return None
+        signal = self.priors[f].signal
+        highest = functions.highest
+        return LeftOut(signal.sd_beyond(highest), partial(signal.correlation_beyond, highest))
 
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment

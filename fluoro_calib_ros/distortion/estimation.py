@@ -25,6 +25,7 @@ import numpy as np
 
 from ..photogrammetry.noise import INLIER_Q
 from .gauge import GaugeKind
+from .misfit import LeftOut
 
 if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment
@@ -125,9 +126,9 @@ class AdjustedTerms(ABC):
         Returns whether nothing changed, and the coefficients with which to continue.
         """
 
-    def sd_left_out(self, f: int) -> float:
-        """Standard deviation [px] of what the series of fluoroscope f leaves out by design."""
-        return 0.0
+    def left_out(self, f: int) -> LeftOut | None:
+        """What the series of fluoroscope f leaves out by design; None: nothing."""
+        return None
 
     def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
         """Return the series of fluoroscope f that an adjustment has estimated."""

@@ -27,6 +27,7 @@ from each other, but these agree.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -41,6 +42,8 @@ POINTS = 60  # image points about a node of the grid
 # of the nodes.
 SIGNIFICANT = 4.0
 SIGNIFICANT_LOCAL = 4.5
+MAX_GROWTH = 4.0  # of a mean product that is extrapolated to no distance
+MIN_CORRELATION = 0.05  # with which products show what a series leaves out
 FAR = 30.0  # standard deviations below zero
 # Rejected image points agree within so many standard deviations of an inlier, over so many times
 # the typical distance of an inlier from the next, with so many others; larger residuals than so
@@ -67,17 +70,32 @@ class FittedPoints:
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """What a series leaves out by design, as its covariance function expects it.
+
+    sd_px: standard deviation [px]; correlation: callable, of distances (n,) [px].
+    """
+
+    sd_px: float
+    correlation: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
 class _Products:
     """Products of the residuals of n image points with those of their neighbours.
 
     uv (n, 2) [px]; value (n,): mean product of a coordinate [px^2]; shown (n,): mean product of
-    the redundancy numbers, the part of a common error that the products show; exposure (n,).
+    the redundancy numbers, the part of a common error that the products show; exposure (n,);
+    distance (n,): mean distance of the neighbours [px]; growth: mean product at no distance over
+    that at the distance of the neighbours, 1 where there is none.
     """
 
     uv: np.ndarray
     value: np.ndarray
     shown: np.ndarray
     exposure: np.ndarray
+    distance: np.ndarray
+    growth: float
 
     def mean_of_all(self) -> tuple[float, float]:
         """Mean product, and its standard error from the scatter between exposures."""
@@ -99,7 +117,7 @@ class _Products:
 def _products(points: FittedPoints) -> _Products:
     """Products of the image points that have neighbours of other exposures."""
     count = min(NEIGHBOURS + 1, len(points.uv))
-    _, near = cKDTree(points.uv).query(points.uv, k=np.arange(2, count + 1))
+    distance, near = cKDTree(points.uv).query(points.uv, k=np.arange(2, count + 1))
     other = points.exposure[near] != points.exposure[:, None]
     r = points.residuals
     redundancy = np.broadcast_to(points.redundancy, len(r))
@@ -109,12 +127,34 @@ def _products(points: FittedPoints) -> _Products:
     def mean(of_pairs: np.ndarray) -> np.ndarray:
         return np.where(other, of_pairs, 0.0).sum(axis=1)[usable] / number[usable]
 
+    product = np.einsum('na,nka->nk', r, r[near]) / 2
     return _Products(
         points.uv[usable],
-        mean(np.einsum('na,nka->nk', r, r[near]) / 2),
+        mean(product),
         mean(redundancy[:, None] * redundancy[near]),
         points.exposure[usable],
+        mean(distance),
+        _growth(product, distance, other),
     )
+
+
+def _growth(product: np.ndarray, distance: np.ndarray, other: np.ndarray) -> float:
+    """Mean product at no distance over the mean of products (n, k) at distances (n, k) [px].
+
+    The covariance of a smooth error falls with the square of the distance: it is extrapolated
+    from nearer and farther neighbours. other (n, k): pairs that count.
+    """
+    nearer = other & (distance < np.median(distance))
+    farther = other & ~nearer
+    if not nearer.any() or not farther.any():
+        return 1.0
+    square = distance**2
+    slope = (product[nearer].mean() - product[farther].mean()) / (
+        square[farther].mean() - square[nearer].mean()
+    )
+    at_zero = product[nearer].mean() + slope * square[nearer].mean()
+    mean = product[other].mean()
+    return float(np.clip(at_zero / mean, 1.0, MAX_GROWTH)) if mean > 0 else 1.0
 
 
 def has_common_error(points: FittedPoints) -> bool:
@@ -122,7 +162,9 @@ def has_common_error(points: FittedPoints) -> bool:
     return _products(points).is_significant()
 
 
-def sd_with_misfit(points: FittedPoints, series: Series, left_out_px: float) -> np.ndarray:
+def sd_with_misfit(
+    points: FittedPoints, series: Series, left_out: LeftOut | None = None
+) -> np.ndarray:
     """Standard deviations (33, 33) [px] of a series with what it cannot follow, on its grid.
 
     Parameters
@@ -130,8 +172,7 @@ def sd_with_misfit(points: FittedPoints, series: Series, left_out_px: float) -> 
     points : FittedPoints
     series : Series
         With the standard deviations of its coefficients alone.
-    left_out_px : float
-        Standard deviation of what the series leaves out, by its covariance function.
+    left_out : LeftOut, optional
 
     Returns
     -------
@@ -140,16 +181,19 @@ def sd_with_misfit(points: FittedPoints, series: Series, left_out_px: float) -> 
     products = _products(points)
     variance = series.sd**2
     if len(products.uv) < 2 * POINTS:
-        return np.sqrt(variance + left_out_px**2)
-    left_out = _variance_left_out(products, series, left_out_px**2)
+        return variance**0.5 if left_out is None else np.hypot(series.sd, left_out.sd_px)
+    beyond = 0.0 if left_out is None else _variance_left_out(products, series, left_out)
     pixels = sd_grid_pixels(series.functions.image_size)
     _, near = cKDTree(products.uv).query(pixels, k=POINTS)
     mean = products.value[near].mean(axis=1)
     # Each product occurs twice among the points about a node.
     error = products.value[near].std(axis=1) * np.sqrt(2 / POINTS)
-    shown = (mean > SIGNIFICANT_LOCAL * error) | products.is_significant()
+    everywhere = products.is_significant()
+    shown = (mean > SIGNIFICANT_LOCAL * error) | everywhere
+    if everywhere:
+        mean = mean * products.growth
     common = mean / products.shown[near].mean(axis=1) + variance.ravel()
-    found = np.where(shown, np.maximum(common, left_out), left_out)
+    found = np.where(shown, np.maximum(common, beyond), beyond)
     return np.sqrt(variance + found.reshape(variance.shape))
 
 
@@ -182,7 +226,7 @@ def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series
     return out.reshape(series.sd.shape)
 
 
-def _variance_left_out(products: _Products, series: Series, expected: float) -> float:
+def _variance_left_out(products: _Products, series: Series, left_out: LeftOut) -> float:
     """Variance [px^2] of what a series leaves out, by its covariance function and the residuals.
 
     The covariance function was estimated from the functions that the series has; beyond them it
@@ -192,11 +236,13 @@ def _variance_left_out(products: _Products, series: Series, expected: float) -> 
     exposures differ, and is left to the test of significance.
     """
     mean, error = products.mean_of_all()
-    if not expected > 0 or not 0 < error < np.inf:
-        return expected
+    expected = left_out.sd_px**2
     part = float(products.shown.mean())
-    error /= part
-    found = mean / part + float(np.mean(series.sd_at(products.uv) ** 2))
+    correlation = float(np.mean(left_out.correlation(products.distance)))
+    if not expected > 0 or not 0 < error < np.inf or correlation < MIN_CORRELATION:
+        return expected
+    error /= part * correlation
+    found = (mean / part + float(np.mean(series.sd_at(products.uv) ** 2))) / correlation
     at = found / error - error / expected
     if at < -FAR:  # the tail is exponential
         return float(-error / at)

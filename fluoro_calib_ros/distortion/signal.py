@@ -29,6 +29,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import lapack, solve_triangular
+from scipy.special import j0
 
 MATERN = 2.5
 MIN_VARIANCE = 1e-10  # of a coefficient of the signal: an amplitude of 1e-8 px
@@ -43,6 +44,9 @@ RIPPLES_PX = 0.2  # standard deviation of ripples that residuals show, to start 
 RIPPLES_REACH = 0.03
 MAX_STEP = 0.8  # of the logarithm of a standard deviation or length
 STEPS = 4  # of the likelihood in one renewal
+# Frequencies of a quadrature, from the lowest to so many times it.
+QUADRATURE = 120
+SHORTEST = 30.0
 MIN_GAIN = 0.02  # of the logarithm of the likelihood that is worth another step
 RIDGE = 0.05  # least damping: added to the expected curvature, it keeps what hardly matters
 
@@ -73,6 +77,18 @@ class Signal:
             a = 2 * MATERN / reach**2
             variance += sd**2 * (a / (a + frequency**2)) ** MATERN
         return float(np.sqrt(variance))
+
+    def correlation_beyond(self, frequency: float, distance: np.ndarray) -> np.ndarray:
+        """Correlation (n,) of that part at distances (n,) [px]: its Hankel transform.
+
+        Ripples shorter than the distance of image points hardly show in products of neighbours.
+        """
+        f = frequency * np.geomspace(1, SHORTEST, QUADRATURE)
+        density = spectral_density(f, self.sd, self.reach)
+        if self.fine_sd:
+            density = density + spectral_density(f, self.fine_sd, self.fine_reach)
+        weight = density * f**2  # f df on a geometric grid
+        return j0(np.outer(distance, f)) @ weight / np.sum(weight)
 
     def with_ripples(self, side: float) -> Signal:
         """Return a signal with a short field to start with; side: of the image [px]."""

@@ -16,6 +16,7 @@
 
 import numpy as np
 import pytest
+from scipy.special import j0
 
 from fluoro_calib_ros.distortion.exposure_terms import (
     VARYING,
@@ -25,8 +26,14 @@ from fluoro_calib_ros.distortion.exposure_terms import (
     without_exposure_terms,
 )
 from fluoro_calib_ros.distortion.gauge import gauge_basis
-from fluoro_calib_ros.distortion.misfit import FittedPoints, sd_of_rejected, sd_with_misfit
+from fluoro_calib_ros.distortion.misfit import (
+    FittedPoints,
+    LeftOut,
+    sd_of_rejected,
+    sd_with_misfit,
+)
 from fluoro_calib_ros.distortion.series import SD_GRID, Functions, Series
+from fluoro_calib_ros.distortion.signal import Signal, spectral_density
 
 SIZE = (800, 600)
 INTERIOR = np.array([410.0, 290.0, 2900.0])
@@ -92,17 +99,17 @@ def test_what_a_series_cannot_follow_is_part_of_its_standard_deviation():
     functions = Functions(SIZE, 1)
     series = Series(functions, np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
     noise = rng.normal(0, NOISE, uv.shape)
-    flat = sd_with_misfit(FittedPoints(uv, noise, exposure), series, 0.0)
+    flat = sd_with_misfit(FittedPoints(uv, noise, exposure), series)
     assert (flat == 0.02).mean() > 0.98
     dent = 1.5 * np.exp(-np.sum((uv - [600, 150]) ** 2, axis=1) / (2 * 50**2))
     row = round(150 / SIZE[1] * (SD_GRID - 1))
     column = round(600 / SIZE[0] * (SD_GRID - 1))
-    found = sd_with_misfit(FittedPoints(uv, noise + dent[:, None], exposure), series, 0.0)
+    found = sd_with_misfit(FittedPoints(uv, noise + dent[:, None], exposure), series)
     assert 0.7 < found[row, column] < 1.6
     assert np.median(found) < 0.1
     # Orientations and object points have absorbed half of noise and dent.
     half = FittedPoints(uv, (noise + dent[:, None]) / 2, exposure, np.full(len(uv), 0.5))
-    np.testing.assert_allclose(sd_with_misfit(half, series, 0.0), found, rtol=0.02)
+    np.testing.assert_allclose(sd_with_misfit(half, series), found, rtol=0.02)
 
 
 def test_residuals_bound_the_variance_beyond_a_series():
@@ -111,12 +118,37 @@ def test_residuals_bound_the_variance_beyond_a_series():
     series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.zeros((SD_GRID, SD_GRID)))
     noise = rng.normal(0, NOISE, uv.shape)
     points = FittedPoints(uv, noise, exposure)
-    assert np.median(sd_with_misfit(points, series, 0.005)) == pytest.approx(0.005, rel=0.2)
-    assert np.median(sd_with_misfit(points, series, 1.0)) < 0.2 * NOISE
+
+    def smooth(sd_px):
+        return LeftOut(sd_px, np.ones_like)
+
+    assert np.median(sd_with_misfit(points, series, smooth(0.005))) == pytest.approx(
+        0.005, rel=0.2
+    )
+    assert np.median(sd_with_misfit(points, series, smooth(1.0))) < 0.2 * NOISE
     ripples = 0.2 * np.sin(uv / 15)
     rippled = FittedPoints(uv, noise + ripples, exposure)
-    shown = np.median(sd_with_misfit(rippled, series, 1.0))
+    shown = np.median(sd_with_misfit(rippled, series, smooth(1.0)))
     assert 0.5 * 0.14 < shown < 1.5 * 0.14
+    # Also ripples that change much from one point to the next.
+    waves = 0.3 * np.sin(uv / 7)
+    found = np.median(sd_with_misfit(FittedPoints(uv, noise + waves, exposure), series))
+    assert 0.7 * 0.21 < found < 1.4 * 0.21
+    # Ripples too short for the distance of the points cannot be excluded.
+    short = LeftOut(0.5, np.zeros_like)
+    assert np.median(sd_with_misfit(points, series, short)) == pytest.approx(0.5)
+
+
+def test_correlation_of_what_a_series_leaves_out():
+    """It is that of random waves which the covariance function expects."""
+    signal = Signal(0.5, 100.0, 0.2, 30.0)
+    distance = np.array([0.0, 10.0, 30.0, 80.0])
+    found = signal.correlation_beyond(0.05, distance)
+    f = np.linspace(0.05, 3.0, 20000)
+    density = spectral_density(f, 0.5, 100.0) + spectral_density(f, 0.2, 30.0)
+    expected = [np.sum(density * f * j0(f * d)) / np.sum(density * f) for d in distance]
+    np.testing.assert_allclose(found, expected, atol=0.02)
+    assert found[0] == pytest.approx(1.0)
 
 
 def test_rejected_points_that_agree_are_an_error_of_the_correction():

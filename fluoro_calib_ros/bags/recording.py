@@ -30,6 +30,8 @@ from .storage import PathLike
 from .writer import BagWriter
 
 MEGABYTE = 10**6
+SMALL_BYTES = 65536  # of a message that is no image
+LARGE_SHARE = 0.9  # of the queue that large messages may fill: images must not displace frames
 WAIT_S = 0.1  # after which the thread looks whether it has to flush or to end
 
 
@@ -86,9 +88,9 @@ class Recording:
     """A bag that is being recorded, from start() to stop().
 
     put() never waits: where the disk is slower than the messages, they wait in a queue of limited
-    size, and what does not fit is dropped and counted. Every flush_period the open chunk is
-    closed and flushed to disk, so that a crash or a power failure costs no more. Where the disk
-    is full, what was not flushed counts as dropped.
+    size, and what does not fit is dropped and counted, large messages first. Every flush_period
+    the open chunk is closed and flushed to disk, so that a crash or a power failure costs no
+    more. Where the disk is full, what was not flushed counts as dropped.
     """
 
     def __init__(self, path: PathLike, options: RecordingOptions | None = None) -> None:
@@ -129,7 +131,8 @@ class Recording:
     def put(self, topic: str, data: bytes, received_ns: int, sent_ns: int) -> bool:
         """Queue a message; returns False where it had to be dropped."""
         with self._condition:
-            full = self.waiting_bytes + len(data) > self.options.queue_size * MEGABYTE
+            share = 1.0 if len(data) <= SMALL_BYTES else LARGE_SHARE
+            full = self.waiting_bytes + len(data) > share * self.options.queue_size * MEGABYTE
             if self.fault or (full and self.waiting_bytes):
                 self.dropped[topic] += 1
                 return False

@@ -126,6 +126,26 @@ def test_slow_disk_drops_and_counts(tmp_path, monkeypatch):
     assert len(list(iterate_messages(tmp_path / 'bag'))) == sum(taken)
 
 
+def test_images_do_not_displace_frames(tmp_path, monkeypatch):
+    """Where the disk is too slow for images, the small messages still find a place."""
+    go = threading.Event()
+    real = writer_module.BagWriter.write
+
+    def slow(self, *arguments):
+        go.wait()
+        real(self, *arguments)
+
+    monkeypatch.setattr(writer_module.BagWriter, 'write', slow)
+    recording = started(tmp_path / 'bag', queue_size=1.0)
+    recording.add_topic(topic('/image'))
+    image = text('x' * 99_000)
+    assert not all(recording.put('/image', image, START + n, START + n) for n in range(20))
+    frames = [recording.put('/stream', text('x'), START + n, START + n) for n in range(200)]
+    go.set()
+    recording.stop()
+    assert all(frames) and set(recording.dropped) == {'/image'}
+
+
 def test_full_disk_ends_the_recording_and_says_so(tmp_path, monkeypatch):
     """What was written before stays a readable or recoverable bag."""
     from fluoro_calib_ros.bags.recovery import recover_bag

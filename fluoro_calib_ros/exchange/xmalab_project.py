@@ -30,13 +30,13 @@ from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
-import cv2
 import numpy as np
 
 from ..errors import DataError
 from ..exposures.frame import Frame, points_on_image
 from ..exposures.names import Names, number_names, safe_names, without_trivial
 from ..files.access import os_error_reason
+from ..images.declared_size import check_size, declared_size
 from ..limits import MAX_FILE
 from . import xmalab_frame
 from .base import Format, Sample
@@ -223,10 +223,14 @@ class _Project:
         for image in camera.findall('CalibrationImage'):
             if image.get('Width'):
                 return self._whole(image, 'Width'), self._whole(image, 'Height')
-            content = np.frombuffer(self._member(self._text(image, 'Filename')), dtype=np.uint8)
-            pixels = cv2.imdecode(content, cv2.IMREAD_UNCHANGED) if len(content) else None
-            if pixels is not None:
-                return pixels.shape[1], pixels.shape[0]
+            name = self._text(image, 'Filename')
+            size = declared_size(memoryview(self._member(name)))
+            try:
+                check_size(*size)
+            except DataError as error:
+                raise DataError(f'{self._path}: {name}: {error}') from None
+            if min(size) > 0:
+                return size
         if self._settings.image_size is None:
             raise DataError(
                 f'{self._path}: the project does not contain the image size of '

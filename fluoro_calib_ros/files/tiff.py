@@ -22,6 +22,7 @@ file.
 from __future__ import annotations
 
 import logging
+import math
 import struct
 from os import PathLike
 from typing import IO
@@ -77,7 +78,11 @@ def count_pages(path: str | PathLike[str]) -> int:
         with TiffFile(path) as file:
             count = len(file.pages)
             complete = _ends_with_last_page(file)
-            size = (int(file.pages.first.imagewidth), int(file.pages.first.imagelength))
+            size = max(
+                ((int(page.imagewidth), int(page.imagelength)) for page in file.pages),
+                key=math.prod,
+                default=(0, 0),
+            )
     except OSError as error:
         raise DataError(f'{path}: cannot be read ({os_error_reason(error)})') from None
     except (TiffFileError, struct.error, ValueError, TypeError, LookupError, OverflowError):

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 
 from ..errors import DataError
-from .declared_size import PNG_SIGNATURE, check_declared_size
+from .declared_size import PNG_SIGNATURE, check_declared_size, declared_size
 
 # Higher levels take several times as long and save a few per cent of an image with noise.
 PNG_COMPRESSION = 1
@@ -55,6 +55,9 @@ def decode(content: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
     data = np.frombuffer(content, dtype=np.uint8)
     if not len(data):
         raise DataError('the image is empty, it has no data')
+    if declared_size(data.data) == (0, 0):
+        # OpenCV knows more formats, but nothing tells their size before they are decoded.
+        raise DataError('this is no image that can be decoded, or it is damaged')
     check_declared_size(data.data)
     if data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE:
         _check_png(data.data)

@@ -265,7 +265,7 @@ def with_datum_of_points(orientation: RigOrientation, points_mm: ArrayLike) -> R
     """
     s = datum_transformation(orientation, points_mm)
     covariance = s @ orientation.covariance @ s.T
-    return replace(orientation, covariance=(covariance + covariance.T) / 2)
+    return replace(orientation, covariance=(covariance + covariance.T) / 2).rounded()
 
 
 def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> np.ndarray:

@@ -90,14 +90,20 @@ def compare_with_survey(
         f'bead {beads.target_id[worst]} lies {size[worst]:.2f} mm from its survey, the worst of '
         f'{count}'
     )
-    layer = displaced_layer(beads) if len(wrong) else None
+    value = size[worst]
+    highest = value * np.sqrt(limit / max(square[worst], 1e-9))
+    # A face of which no single bead is significant may be so as a whole.
+    layer = displaced_layer(beads)
     if layer is not None:
         sentence = layer.sentence()
+        if not len(wrong):
+            value = layer.size_mm
+            highest = layer.limit_mm
     elif len(wrong) and not has_trend:
         sentence = _wrong_beads(beads.target_id[wrong], size[wrong])
     finding = Finding(
-        size[worst],
-        size[worst] * np.sqrt(limit / max(square[worst], 1e-9)),
+        value,
+        highest,
         'mm',
         sentence,
         'survey again, or give a larger sd, and calibrate again',

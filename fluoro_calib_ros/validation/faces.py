@@ -54,6 +54,8 @@ class DisplacedLayer:
         Images - survey of its centre, against the rest.
     tilt_rad : float
         Rotation against the rest.
+    size_mm, limit_mm : float
+        RMS displacement of its beads by this motion, and that which is not significant.
     """
 
     axis: int
@@ -62,6 +64,8 @@ class DisplacedLayer:
     target_id: np.ndarray
     shift_mm: np.ndarray
     tilt_rad: float
+    size_mm: float
+    limit_mm: float
 
     def sentence(self) -> str:
         """Return what is wrong with the layer."""
@@ -115,14 +119,15 @@ def displaced_layer(beads: Beads) -> DisplacedLayer | None:
     if not tried:
         return None
     best = max(tried, key=lambda candidate: candidate.gain)
+    critical = float(chdtri(MOTION, FALSE_ALARM / len(tried)))
     if (
-        best.gain < chdtri(MOTION, FALSE_ALARM / len(tried))
+        best.gain < critical
         or best.gain < EXPLAINED * fit.excess
         or fit.improvement(best) < IMPROVED
     ):
         return None
     # Of two plates, either moved against the other: by the smaller motion.
-    found = [fit.described(candidate) for candidate in best.halves()]
+    found = [fit.described(candidate, critical) for candidate in best.halves()]
     return min(found, key=lambda layer: float(np.linalg.norm(layer.shift_mm)))
 
 
@@ -169,8 +174,8 @@ class _Fit:
         )
         return float(before / after)
 
-    def described(self, candidate: _Candidate) -> DisplacedLayer:
-        """Return a layer with its motion against the rest."""
+    def described(self, candidate: _Candidate, critical: float) -> DisplacedLayer:
+        """Return a layer with its motion against the rest; critical: gain of no significance."""
         own = candidate.own
         survey = self._beads.survey_mm
         coordinate = survey[candidate.order, candidate.axis]
@@ -182,6 +187,8 @@ class _Fit:
 
         motion, rest = self._motion_and_rest(own)
         relative = motion - rest
+        moved = self._design[own] @ relative
+        size = float(np.sqrt(np.mean(np.sum(moved**2, axis=1))))
         middle = _motions((survey[own].mean(axis=0) - self._centre)[None])[0]
         return DisplacedLayer(
             candidate.axis,
@@ -190,6 +197,8 @@ class _Fit:
             self._beads.target_id[own],
             middle @ relative,
             float(np.linalg.norm(relative[3:])),
+            size,
+            size * float(np.sqrt(critical / candidate.gain)),
         )
 
     def _motion_and_rest(self, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -42,7 +42,7 @@ from fluoro_calib_ros.distortion.regressors import KnnRegressor, LocalLinearRegr
 from fluoro_calib_ros.distortion.user_regressor import regressor_name, resolve_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.files.calibration import load_calibration, save_calibration
-from fluoro_calib_ros.files.calibration_request import _read_options
+from fluoro_calib_ros.files.calibration_request import read_options
 from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.phantom import write_phantom
 
@@ -272,7 +272,7 @@ def test_names_of_classes_are_refused_from_files_and_messages(tmp_path):
         '"joint": false, "principal_distance": null}'
     )
     with pytest.raises(DataError, match='only on the command line and in Python'):
-        _read_options(path)
+        read_options(path)
 
 
 @pytest.mark.parametrize('model', [DecisionTreeRegressor, 5, None, {}])

@@ -60,6 +60,15 @@ def test_a_plate_that_is_shifted_is_named():
     assert 'by 1.0 mm' in check.sentence
 
 
+def test_a_plate_is_named_where_no_single_bead_stands_out():
+    rng = np.random.default_rng(5)
+    survey = plates(rng)
+    shift = (survey[:, 2:] > 0) * np.array([0.4, 0.0, 0.0])
+    check = compare_with_survey(beads_of(survey, shift - shift.mean(axis=0), rng))[0]
+    assert check.passed is False and check.value == pytest.approx(0.4, abs=0.05)
+    assert check.limit < 0.3 and 'the face of the phantom with z ' in check.sentence
+
+
 def test_a_plate_that_is_tilted_is_named():
     """By 1 mm at its rim, and nothing in its middle."""
     rng = np.random.default_rng(2)

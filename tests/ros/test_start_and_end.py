@@ -19,6 +19,7 @@ interrupt.
 import shutil
 import signal
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 from fluoro_calib_msgs.msg import TargetObservations
@@ -226,6 +227,33 @@ def test_interrupt_in_the_stream_ends_every_node_cleanly(graph, by_command, expo
     for node in nodes:
         assert node.wait() == 0
         assert not any(word in node.log for word in TROUBLE), node.log
+
+
+@pytest.mark.parametrize(
+    'node, parameters',
+    [
+        ('calibration_node', {'phantom': BAGS / 'phantom.csv'}),
+        ('player_node', {'bag': BAGS / 'tracking'}),
+        ('recorder_node', {'folder': 'bag'}),
+        ('simulator_node', {}),
+    ],
+)
+def test_signal_at_the_first_moment_that_a_node_handles_it(graph, tmp_path, node, parameters):
+    """It has not even joined the graph."""
+    if 'folder' in parameters:
+        parameters = {'folder': tmp_path / parameters['folder']}
+    process = graph.start(node, parameters, wait=False)
+    status = Path('/proc', str(process._process.pid), 'status')
+
+    def handles_sigterm():
+        assert process.running, process.log
+        caught = next(x for x in status.read_text().splitlines() if x.startswith('SigCgt'))
+        return int(caught.split()[1], 16) >> (signal.SIGTERM - 1) & 1
+
+    graph.client.wait_until(handles_sigterm, what='the handler')
+    process._process.send_signal(signal.SIGTERM)
+    assert process.wait() == 0
+    assert not any(word in process.log for word in TROUBLE), process.log
 
 
 def test_interrupt_ends_a_running_job_and_a_waiting_capture(graph, exposures, tmp_path):

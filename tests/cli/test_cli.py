@@ -521,9 +521,10 @@ def test_too_few_exposures_are_reported(rig, tmp_path, capsys):
     assert not (tmp_path / 'x').exists()
 
 
-def test_k_that_is_too_large_is_reported(rig, tmp_path, capsys):
+def test_k_that_no_model_can_have_is_reported(rig, tmp_path, capsys):
     more = ('--fluoroscopes', 'a', '--max-iterations', 1, '--model', 'local_linear', '--k')
-    assert 'fluoroscope a: ' in said(capsys, calibrate(rig, tmp_path / 'x', *more, 100000))
+    assert run(*calibrate(rig, tmp_path / 'x', *more, 100000)) == 2
+    assert 'argument --k: ' in capsys.readouterr().err
     assert 'fluoroscope a: local_linear with k = 3' in said(
         capsys, calibrate(rig, tmp_path / 'x', *more, 3)
     )

@@ -48,6 +48,7 @@ def test_camera_info_without_image_size_is_ignored(graph, by_command, tracking):
         what='the reconstruction node',
     )
     client.wait_until_known_to('reconstruction_node')
+    client.wait_until(lambda: 'size is 0 x 0 px' in node.log, what='the first warning')
     foreign.publish(CameraInfo(width=1024))
     client.wait_until(lambda: '1024 x 0 px' in node.log, what='the warning')
     for row in range(3):

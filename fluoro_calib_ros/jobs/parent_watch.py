@@ -49,7 +49,7 @@ def interrupts_blocked() -> Iterator[None]:
 def start_child(
     context: SpawnContext, function: Callable[..., None], connection: Connection, *arguments: Any
 ) -> SpawnProcess:
-    """Start function(connection, *arguments) in a process that ends with this one.
+    """Start a function in a process that ends with this one.
 
     It watches this process before it reads any other module of the package, which takes seconds
     on a busy machine.

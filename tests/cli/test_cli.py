@@ -349,11 +349,10 @@ def test_adjust_holds_the_calibration(rig, result, tmp_path):
     assert document['history'] == [] and document['converged']
     before = json.loads((result / 'result.json').read_text())
     for name, figures in document['fluoroscopes'].items():
-        assert {**figures['interior'], 'sd': 0} == {
-            **before['fluoroscopes'][name]['interior'],
-            'sd': 0,
-        }
-        assert figures['interior']['sd'] == [0, 0, 0]
+        held = before['fluoroscopes'][name]['interior']
+        assert {**figures['interior'], 'sd': 0} == {**held, 'sd': 0}
+        # Held, but as uncertain as it is.
+        assert np.allclose(figures['interior']['sd'], held['sd'], rtol=0.05)
         assert max(figures['rmse_px']['after']) < 0.35 < 1 < min(figures['rmse_px']['before'])
         assert (tmp_path / f'{name}.calibration.npz').read_bytes() == (
             result / f'{name}.calibration.npz'

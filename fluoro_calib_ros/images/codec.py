@@ -55,11 +55,14 @@ def decode(content: bytes | bytearray | memoryview | np.ndarray) -> np.ndarray:
     data = np.frombuffer(content, dtype=np.uint8)
     if not len(data):
         raise DataError('the image is empty, it has no data')
+    is_png = data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE
     if declared_size(data.data) == (0, 0):
+        if is_png:
+            _check_png(data.data)  # says what is damaged
         # OpenCV knows more formats, but nothing tells their size before they are decoded.
         raise DataError('this is no image that can be decoded, or it is damaged')
     check_declared_size(data.data)
-    if data[: len(PNG_SIGNATURE)].tobytes() == PNG_SIGNATURE:
+    if is_png:
         _check_png(data.data)
     if data[:2].tobytes() == JPEG_START and JPEG_END not in data[-MAX_JPEG_TRAILER:].tobytes():
         raise DataError('the image is cut off, the end of its JPEG data is missing')

@@ -159,8 +159,9 @@ def test_opencv_triangulates_our_points_from_mayacam(lab, result, reconstructed,
         x = cv2.triangulatePoints(matrices['a'], matrices['b'], *(at[:, None] for at in uv))
         distances.append((float(row['residual']), np.linalg.norm(x[:3, 0] / x[3, 0] - xyz)))
     residual, distance = np.array(distances).T
-    # OpenCV does not weight the rays: the point is the same in so far as they meet.
-    assert len(residual) > 100 and np.max(distance / residual) < 0.3
+    # OpenCV does not weight the rays: the point is the same in so far as they meet, and rays
+    # beside each other have much the same weight.
+    assert len(residual) > 100 and np.max(distance / residual) < 0.5
     assert distance.min() < 0.002
     capsys.readouterr()
 

@@ -281,7 +281,8 @@ def test_points_are_published_while_views_are_missing(graph, tmp_path):
         'the count of incomplete exposures',
     )
     assert value_of(status, 'frames late') == value_of(before, 'frames late')
-    assert status.message == 'no frames of c, points are reconstructed from the other fluoroscopes'
+    # The other streams may have ended by now, which the message says, too.
+    assert 'no frames of c, points are reconstructed from the other fluoroscopes' in status.message
     rows, result = offline(folder, kept, tmp_path)
     live = np.concatenate([1e3 * np.stack([m.x, m.y, m.z], axis=1) for m in messages])
     of_file = np.array([[float(row[c] or 'nan') for c in 'xyz'] for row in rows])

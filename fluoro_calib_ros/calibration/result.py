@@ -88,7 +88,7 @@ class FluoroscopeCalibration:
     short_id : bool
         Whether the id is made as by earlier versions, of what determines a correction only.
     calibration_id : str
-        Digest of the content.
+        Digest of the content, but for seconds, stamp and frame id.
     """
 
     fluoroscope: str
@@ -138,7 +138,11 @@ class FluoroscopeCalibration:
         object.__setattr__(self, 'calibration_id', f'{self.fluoroscope}-{digest.hexdigest()[:16]}')
 
     def _add_details(self, digest: hashlib._Hash) -> None:
-        """Add what does not change a correction to a digest."""
+        """Add what does not change a correction to a digest.
+
+        Stamp and frame id are left out: files of observations do not contain them, and a
+        calibration from files has the id of the same one by the node.
+        """
         for array in (
             self.interior_covariance,
             self.train_exposure,
@@ -155,10 +159,8 @@ class FluoroscopeCalibration:
             self.inliers,
             self.iterations,
             self.converged,
-            self.stamp_ns,
         )
         digest.update('/'.join(str(int(word)) for word in words).encode())
-        digest.update(f'/{self.frame_id}'.encode(errors='surrogatepass'))
 
     def with_id(self, identity: str) -> FluoroscopeCalibration | None:
         """Return the calibration with an id that its content has, None where it is of another.

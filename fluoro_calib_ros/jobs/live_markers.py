@@ -28,12 +28,13 @@ from ..drift.clusters import Cluster
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..radiographs.marker_overlay import draw_markers
-from ..radiographs.marker_pair import Decision, MarkerPair
+from ..radiographs.marker_pair import Decision, MarkerPair, PairFrame
 from ..radiographs.markers import Doubt, FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from ..radiographs.overlay import draw_overlay
 from .live_extraction import LiveObservations
 from .service_process import ServiceProcess
 
+MIN_STARTED = 0.5  # of the given markers, in the first image
 DECIDED = {
     'exchanged': 'were exchanged, which is undone from now on',
     'dropped': 'is not what was followed, and is searched for',
@@ -56,7 +57,9 @@ class MarkerFollower:
     """Follows markers, from the first image on in which they are where they are said to be."""
 
     def __init__(self, settings: MarkerSettings) -> None:
+        self._settings = settings
         self._tracker = MarkerTracker(settings.options, first=settings.first)
+        self._begun = False
 
     def extract(self, image: np.ndarray, number: int, overlay: bool = False) -> LiveObservations:
         """Return the markers that are seen in an image (h, w) of uint8 or uint16."""
@@ -64,12 +67,22 @@ class MarkerFollower:
         picture: np.ndarray | None = None
         try:
             found = self._tracker.update(image, number)
+            if not self._begun:
+                self._check_start(found)
             result = _observed(found, len(self._tracker.target_id))
             picture = draw_markers(image, found) if overlay else None
         except DataError as error:
             result = LiveObservations(reason=str(error))
             picture = draw_overlay(image, None, str(error)) if overlay else None
         return replace(result, picture=picture, seconds=time.perf_counter() - start)
+
+    def _check_start(self, found: MarkerFrame) -> None:
+        """Begin, or wait for another image. Raises DataError."""
+        problem = _wrong_start(found, len(self._settings.first.target_id))
+        if problem:
+            self._tracker = MarkerTracker(self._settings.options, first=self._settings.first)
+            raise DataError(problem)
+        self._begun = True
 
 
 @dataclass(frozen=True)
@@ -101,14 +114,19 @@ class PairFollower:
     """Follows markers in both views, from the first exposure on that shows them in both."""
 
     def __init__(self, settings: PairSettings) -> None:
-        self._pair = MarkerPair(
+        self._settings = settings
+        self._pair = self._new_pair()
+        self._begun = False
+
+    def _new_pair(self) -> MarkerPair:
+        settings = self._settings
+        return MarkerPair(
             settings.calibrations,
             settings.orientation,
             settings.options,
             first=settings.first,
             clusters=settings.clusters,
         )
-        self._begun = False
 
     def extract(
         self, images: Mapping[str, np.ndarray], number: int, overlays: Collection[str] = ()
@@ -129,6 +147,8 @@ class PairFollower:
             return {name: LiveObservations(reason='the other view is missing') for name in images}
         try:
             exposure = self._pair.update(images, number)
+            if not self._begun:
+                self._check_start(exposure)
         except DataError as error:
             reason = str(error)
             return {
@@ -138,7 +158,6 @@ class PairFollower:
                 )
                 for name, image in images.items()
             }
-        self._begun = True
         out = {}
         for name, image in images.items():
             found = exposure.views[name]
@@ -149,6 +168,24 @@ class PairFollower:
             note = '; '.join(note for note in notes if note)
             out[name] = replace(result, note=note, picture=picture)
         return out
+
+    def _check_start(self, exposure: PairFrame) -> None:
+        """Begin, or wait for another exposure. Raises DataError."""
+        for name, view in exposure.views.items():
+            problem = _wrong_start(view, len(self._settings.first[name].target_id))
+            if problem:
+                self._pair = self._new_pair()
+                raise DataError(f'fluoroscope {name}: {problem}')
+        self._begun = True
+
+
+def _wrong_start(found: MarkerFrame, expected: int) -> str:
+    """Return why the first image is not the one of the given markers, '' where it may be."""
+    if found.reason or len(found.target_id) >= MIN_STARTED * expected:
+        return found.reason
+    return (
+        f'only {len(found.target_id)} of {expected} markers are where they are said to be at first'
+    )
 
 
 def pair_process(settings: PairSettings) -> ServiceProcess:

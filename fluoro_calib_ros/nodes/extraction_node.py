@@ -73,7 +73,7 @@ from .runtime.stream_reader import FaultHandlers
 
 OVERLAY = 'image_overlay'
 MODES = ('phantom', 'markers')
-PATIENCE_S = 0.1  # with the other view of an exposure
+PATIENCE_S = 1.0  # with the other view of an exposure, unless the next one comes before
 LARGEST_PX = 2**14  # of an image, for points whose image is not known yet
 
 
@@ -318,7 +318,9 @@ class ExtractionNode(StreamNode):
 
     def activate(self) -> None:
         """Start the processes that extract, then the stream reader."""
-        self._queue = ExposureQueue(self.names, self._settings.queue_size)
+        size = self._settings.queue_size
+        # One view of a pair waits for the other until the next exposure comes.
+        self._queue = ExposureQueue(self.names, size if self._pair is None else max(size, 2))
         if self._pair is not None:
             self._start_worker(self._serve_pair, 'pair', pair_process(self._pair))
         else:

@@ -77,6 +77,9 @@ def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
     assert queue.get_exposure(forever) == (1, {'a': ('a', 1), 'b': ('b', 1)})
     assert queue.get_exposure(forever) == (2, {'a': ('a', 2)})  # b is at 3
     assert queue.get_exposure(0.0) == (3, {'b': ('b', 3)})  # of which a may still come
+    for number in (4, 5):
+        queue.put('a', number, ('a', number))
+    assert queue.get_exposure(forever) == (4, {'a': ('a', 4)})  # b is an exposure late
     queue.close()
     assert queue.get_exposure(forever) is None
 

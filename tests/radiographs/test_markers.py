@@ -283,6 +283,8 @@ def test_two_views_live_are_followed_as_in_a_recording():
     pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, clusters=clusters)
     alone = live.extract({'a': images[0]['a'].image}, 1)
     assert alone['a'].reason == 'the other view is missing'
+    empty = {name: np.full((SIZE, SIZE), 20000, np.uint16) for name in 'ab'}
+    assert live.extract(empty, 1)['a'].reason  # and waits for the markers
     for number, of in enumerate(images[:4], 2):
         seen = {name: image.image for name, image in of.items()}
         if number == 4:

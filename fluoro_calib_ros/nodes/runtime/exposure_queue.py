@@ -105,8 +105,10 @@ class ExposureQueue(Generic[T]):
         if self._closed:
             return True
         number = self._lowest()
-        # A fluoroscope with a later exposure has lost this one.
-        return all(number in items or items for items in self._waiting.values())
+        # A fluoroscope with a later exposure has lost this one, and one that is an exposure late
+        # is not waited for.
+        overdue = any(number in items and len(items) > 1 for items in self._waiting.values())
+        return overdue or all(number in items or items for items in self._waiting.values())
 
     def _shed_one(self, full: OrderedDict[int, T]) -> list[str]:
         """Remove an exposure; returns the fluoroscopes that have lost an item."""

@@ -17,7 +17,6 @@
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import threading
 import time
@@ -54,17 +53,25 @@ def start_child(
     It watches this process before it reads any other module of the package, which takes seconds
     on a busy machine.
     """
-    content = pickle.dumps((function, arguments))
-    process = context.Process(target=_begin, daemon=True, args=(os.getpid(), connection, content))
+    arguments = (_ParentWatch(), function, connection, *arguments)
+    process = context.Process(target=_begin, daemon=True, args=arguments)
     with interrupts_blocked():
         process.start()
     return process
 
 
-def _begin(parent: int, connection: Connection, content: bytes) -> None:
-    watch_parent(parent)
-    function, arguments = pickle.loads(content)  # of this program, never of a file
-    function(connection, *arguments)
+class _ParentWatch:
+    """Argument of a process that begins to watch the parent where it arrives.
+
+    Arguments arrive in their order: this one before those that make the process import modules.
+    """
+
+    def __reduce__(self) -> tuple[Callable[[int], None], tuple[int]]:
+        return watch_parent, (os.getpid(),)
+
+
+def _begin(_: None, function: Callable[..., None], connection: Connection, *rest: Any) -> None:
+    function(connection, *rest)
 
 
 def watch_parent(parent: int) -> None:

@@ -105,8 +105,8 @@ def test_open_chunk_is_on_disk_within_the_flush_period(tmp_path, monkeypatch):
     recording.stop()
 
 
-def test_slow_disk_drops_and_counts(tmp_path, monkeypatch):
-    """What is in the bag and what was dropped are together what was given."""
+def stopped_disk(monkeypatch):
+    """Let nothing be written until the event that is returned is set."""
     go = threading.Event()
     real = writer_module.BagWriter.write
 
@@ -115,6 +115,12 @@ def test_slow_disk_drops_and_counts(tmp_path, monkeypatch):
         real(self, *arguments)
 
     monkeypatch.setattr(writer_module.BagWriter, 'write', slow)
+    return go
+
+
+def test_slow_disk_drops_and_counts(tmp_path, monkeypatch):
+    """What is in the bag and what was dropped are together what was given."""
+    go = stopped_disk(monkeypatch)
     recording = started(tmp_path / 'bag', queue_size=1.0)
     data = text('x' * 99_000)
     taken = [recording.put('/stream', data, START + n, START + n) for n in range(30)]
@@ -128,14 +134,7 @@ def test_slow_disk_drops_and_counts(tmp_path, monkeypatch):
 
 def test_images_do_not_displace_frames(tmp_path, monkeypatch):
     """Where the disk is too slow for images, the small messages still find a place."""
-    go = threading.Event()
-    real = writer_module.BagWriter.write
-
-    def slow(self, *arguments):
-        go.wait()
-        real(self, *arguments)
-
-    monkeypatch.setattr(writer_module.BagWriter, 'write', slow)
+    go = stopped_disk(monkeypatch)
     recording = started(tmp_path / 'bag', queue_size=1.0)
     recording.add_topic(topic('/image'))
     image = text('x' * 99_000)

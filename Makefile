@@ -2,7 +2,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test oldest lint docs fuzz audit bench online endurance validation precision convergence pathologies real-data bags bag-readers faults clean
+.PHONY: help setup demo test oldest lint docs fuzz lock audit bench online endurance validation precision convergence pathologies real-data bags bag-readers faults clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
@@ -19,6 +19,7 @@ help:
 	@echo 'make lint         run ruff, mypy and the import contracts (also part of the tests)'
 	@echo 'make docs         build the documentation and the API reference in docs/_build/html'
 	@echo 'make fuzz         fuzz every reader with atheris, SECONDS=600 each: docs/security.md'
+	@echo 'make lock         resolve requirements.in into requirements.lock, with hashes'
 	@echo 'make audit        compare requirements.lock with known vulnerabilities (needs pypi.org or osv.dev)'
 	@echo 'make setup        create or update .venv: packages, ROS 2 and messages; demo, test, ... run it first'
 	@echo 'make bench        run the benchmarks and write docs/performance.md'
@@ -69,6 +70,9 @@ fuzz: setup
 	@$(RUN) -c 'import importlib.util, sys; sys.path.insert(0, ".fuzz/packages"); sys.exit(importlib.util.find_spec("atheris") is None)' \
 	    || $(RUN) -m pip install --quiet --target .fuzz/packages atheris==3.0.0
 	@PYTHONPATH=.fuzz/packages $(RUN) -m fuzz all $(SECONDS) $(ARGS)
+
+lock: setup
+	@sh tools/lock.sh $(ARGS)
 
 audit: setup
 	@sh tools/audit.sh

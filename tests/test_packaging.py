@@ -122,13 +122,13 @@ def test_messages_without_ros():
 
 
 def test_lock_is_exact():
-    """The lock file pins every package to one version, and contains all of requirements.in."""
-    pins = [
-        line
-        for line in (ROOT / 'requirements.lock').read_text().splitlines()
-        if not line.startswith('#')
-    ]
-    assert all(re.fullmatch(r'[\w.-]+==[\w.]+( ; python_version .*)?', pin) for pin in pins)
+    """The lock file pins every package to one version and its files to their hashes, and contains
+    all of requirements.in.
+    """
+    text = (ROOT / 'requirements.lock').read_text()
+    pins = re.findall(r'^[^\s#].*(?:\n    .*)*', text, re.MULTILINE)
+    pin = r'[\w.-]+==[\w.]+( ; [^\\]*)?( \\\n    --hash=sha256:[0-9a-f]{64})+'
+    assert [line for line in pins if not re.fullmatch(pin, line)] == []
     wanted = [
         re.split(r'[\[<=>;]', line)[0].strip()
         for line in (ROOT / 'requirements.in').read_text().splitlines()

@@ -278,15 +278,25 @@ def make_venv() -> None:
     run(BASE_PYTHON, '-m', 'venv', str(VENV))
     # colcon crawls the folder it is started in for packages: not this one
     (VENV / 'COLCON_IGNORE').touch()
-    lines = [line for line in LOCK.read_text().splitlines() if line and not line.startswith('#')]
-    first = [line for line in lines if line.split('==')[0] in ('pip', 'setuptools', 'wheel')]
-    pip = (VENV_PYTHON, '-m', 'pip', 'install', '--no-deps')
-    run(*pip, *first)
+    pip = (VENV_PYTHON, '-m', 'pip', 'install', '--no-deps', '--require-hashes')
+    installers = BUILD / 'installers.lock'
+    installers.write_text(locked_installers(LOCK.read_text()))
+    run(*pip, '-r', str(installers))
     run(*pip, '--no-build-isolation', '-r', str(LOCK))
     rewrite_cmake_files()
     run(VENV_PYTHON, '-m', 'pip', 'check')
     STAMPS.mkdir()
     (STAMPS / 'python').write_text(BASE_PYTHON + '\n')
+
+
+def locked_installers(lock: str) -> str:
+    """Return the part of a lock file that pins pip, setuptools and wheel, with their hashes."""
+    requirements = re.findall(r'^\S+==.*(?:\n    .*)*', lock, re.MULTILINE)
+    return '\n'.join(
+        requirement
+        for requirement in requirements
+        if requirement.split('==')[0] in ('pip', 'setuptools', 'wheel')
+    )
 
 
 def rewrite_cmake_files() -> None:

@@ -44,7 +44,7 @@ from ..photogrammetry.precision import (
 from .anderson import Anderson
 from .initial_network import Measured
 from .options import CalibrationOptions
-from .robust_adjustment import SINGULAR, adjusted_with_precision, with_zero_additional
+from .robust_adjustment import SINGULAR, adjusted_with_precision, with_additional
 from .rounds import History, Round, SelfCalibration
 
 ROUND_TOLERANCE = 1e-4  # decrease of F that a round may leave to the next: a hundredth of a sigma
@@ -257,7 +257,7 @@ def calibrate_by_regression(
     after = before
     if terms is not None:
         network = terms.with_additional(network)
-        after = with_zero_additional(before, terms.zeros())
+        after = with_additional(before, terms.zeros())
     history = History(measured, progress)
     rounds = _Alternation(network, after, regressions, history, raise_if_cancelled)
     converged = False

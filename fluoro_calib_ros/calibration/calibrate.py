@@ -292,6 +292,47 @@ def calibrate_request(
     )
 
 
+def calibrate_part(
+    request: CalibrationRequest,
+    starts: StartValues,
+    image_sd: Mapping[str, float],
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> dict[str, FluoroscopeCalibration]:
+    """Self-calibrate with a part of the exposures of an earlier calibration.
+
+    Parameters
+    ----------
+    request : CalibrationRequest
+        With the frames of the part.
+    starts : StartValues
+        Of the earlier calibration.
+    image_sd : mapping of str to float
+        Standard deviations of image coordinates [px] by fluoroscope, those of all exposures.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop.
+
+    Returns
+    -------
+    dict of str to FluoroscopeCalibration
+
+    Raises
+    ------
+    DataError
+        If the exposures do not suffice.
+    """
+    out: dict[str, FluoroscopeCalibration] = {}
+    with threadpool_limits(1):
+        for group in request.groups:
+            start = time.perf_counter()
+            frames = {name: request.frames[name] for name in group}
+            run = _calibrated_group(request, frames, None, raise_if_cancelled, starts)
+            seconds = time.perf_counter() - start
+            for f, name in enumerate(run.measured.fluoroscopes):
+                digest = digest_of_sources(frames[name], request.phantom)
+                out[name] = _calibration(run, f, name, digest, seconds, image_sd[name])
+    return out
+
+
 def _solved(run: SelfCalibration) -> SolvedNetwork:
     """Network and adjustment of a self-calibration."""
     estimated = run.measured.network.additional_correction(run.after.parameters)
@@ -319,7 +360,14 @@ def _calibrations_of_run(
 ) -> dict[str, FluoroscopeCalibration]:
     """Calibrations of the fluoroscopes of a self-calibration that took some seconds."""
     return {
-        name: _calibration(run, f, name, digest_of_sources(frames[name], phantom), seconds)
+        name: _calibration(
+            run,
+            f,
+            name,
+            digest_of_sources(frames[name], phantom),
+            seconds,
+            _image_sd(run, f, run.models[name]),
+        )
         for f, name in enumerate(run.measured.fluoroscopes)
     }
 
@@ -342,7 +390,8 @@ def _calibrated_group(
             request.known_orientations,
             starts,
         )
-        run = self_calibrate(measured, request.options, progress, raise_if_cancelled)
+        earlier = None if starts is None else starts.earlier
+        run = self_calibrate(measured, request.options, progress, raise_if_cancelled, earlier)
         misfits = misfitting_exposures(run)
         kept = {
             name: [f for f in exposures if (name, f.number) not in misfits]
@@ -593,8 +642,8 @@ def _figures(
     )
 
 
-def _image_sd(run: SelfCalibration, f: int, rows: np.ndarray, model: CorrectionModel) -> float:
-    """Standard deviation [px] of an image coordinate of the image points rows of fluoroscope f.
+def _image_sd(run: SelfCalibration, f: int, model: CorrectionModel) -> float:
+    """Standard deviation [px] of an image coordinate of fluoroscope number f.
 
     It is that of the inlier residuals, which are smaller than the noise by the root of their
     redundancy numbers, together with what the distortion of their exposures differs from the
@@ -602,6 +651,7 @@ def _image_sd(run: SelfCalibration, f: int, rows: np.ndarray, model: CorrectionM
     where the tails are heavy it is smaller than the standard deviation of its core.
     """
     redundancy = geometric_redundancy(run.measured.network, run.after.parameters, run.after.noise)
+    rows = _rows_of(run.measured, f)
     rows = rows[run.after.inliers[rows]]
     noise = np.sum(run.after.residuals[rows] ** 2) / np.sum(2 * redundancy[rows])
     variation = 0.0
@@ -641,6 +691,7 @@ def _calibration(
     name: str,
     digest: str,
     seconds: float,
+    image_sd: float,
 ) -> FluoroscopeCalibration:
     """Calibration of fluoroscope number f of a self-calibration."""
     rows = _rows_of(run.measured, f)
@@ -660,7 +711,7 @@ def _calibration(
         interior_estimated=bool(run.measured.network.interior_free[f]),
         model=model,
         train_exposure=train_exposure,
-        image_sd=_image_sd(run, f, rows, model),
+        image_sd=image_sd,
         sigma0=run.after.noise.scale,
         nu=run.after.noise.nu,
         exposures=len(frames),

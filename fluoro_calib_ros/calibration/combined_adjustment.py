@@ -34,14 +34,12 @@ from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network
-from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
+from ..photogrammetry.noise_estimation import estimate_noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import Precision, covariance_blocks, precision
 from .initial_network import Measured
-from .robust_adjustment import ADVICE, with_zero_additional
+from .robust_adjustment import ADVICE, with_additional
 from .rounds import History, Round, SelfCalibration
-
-FINAL_TOLERANCE = 1e-5  # decrease of F that the last adjustment may leave
 
 
 def calibrate_by_adjustment(
@@ -192,7 +190,7 @@ def adjust_with_terms(
     """
     correction = np.zeros_like(plain.uv)
     zero = correction
-    parameters = with_zero_additional(before, terms.zeros()).parameters
+    parameters = with_additional(before, terms.start()).parameters
     noise = before.noise
     converged = False
     for number in range(max_rounds):
@@ -203,7 +201,7 @@ def adjust_with_terms(
             parameters,
             zero,
             noise,
-            SolverOptions(FINAL_TOLERANCE if final else terms.intermediate_tolerance),
+            SolverOptions(terms.final_tolerance if final else terms.intermediate_tolerance),
             raise_if_cancelled,
         )
         last = correction
@@ -217,7 +215,7 @@ def adjust_with_terms(
         )
         renewed = estimate_noise(network, result, covariance_blocks(matrix))
         converged, coefficients = terms.renew(network, matrix, result)
-        converged &= abs(renewed.scale - noise.scale) <= SETTLED * noise.scale
+        converged &= abs(renewed.scale - noise.scale) <= terms.noise_tolerance * noise.scale
         parameters = replace(result.parameters, additional=coefficients)
         noise = renewed
     return network, result, bool(converged and result.converged)

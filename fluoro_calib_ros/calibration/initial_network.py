@@ -21,12 +21,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..distortion.priors import Prior
+from ..distortion.series import Series
 from ..errors import DataError
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.exterior_prior import HELD_SD_MM, HELD_SD_RAD, ExteriorPrior
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.network import Network
+from ..photogrammetry.noise import Noise
 from ..photogrammetry.plane_resection import flatness, plane_of, tilt_of
 from ..photogrammetry.resection import MIN_FLATNESS, Resection, refine_resection, resection_at
 from ..photogrammetry.rotations import rotation_angle
@@ -105,6 +108,37 @@ class KnownSensor:
 
 
 @dataclass(frozen=True)
+class EarlierCalibration:
+    """What a calibration with some exposures can take over from one with more of them.
+
+    Attributes
+    ----------
+    series : mapping of str to Series
+        Corrections by fluoroscope.
+    varying : frozenset of str
+        Fluoroscopes whose distortion differs between exposures.
+    noise : Noise
+    target_id : (n,) ndarray of int
+        Targets with object points, ascending.
+    points_mm : (n, 3) ndarray
+    priors : dict of str to Prior
+        Of the corrections by fluoroscope: those that the last of several such calibrations has
+        found, with which the next one starts.
+    """
+
+    series: Mapping[str, Series]
+    varying: frozenset[str]
+    noise: Noise
+    target_id: np.ndarray
+    points_mm: np.ndarray
+    priors: dict[str, Prior] = field(default_factory=dict)
+
+    def points(self, target_id: np.ndarray) -> np.ndarray:
+        """Object points (k, 3) [mm] of targets (k,)."""
+        return self.points_mm[np.searchsorted(self.target_id, target_id)]
+
+
+@dataclass(frozen=True)
 class StartValues:
     """Start values from an earlier adjustment of the same exposures, instead of resections.
 
@@ -114,10 +148,13 @@ class StartValues:
         xp, yp, c [px] by fluoroscope.
     exterior : mapping of (str, int) to ((3, 3) ndarray, (3,) ndarray)
         Rotation and position [mm] by fluoroscope and exposure.
+    earlier : EarlierCalibration, optional
+        That of the same exposures and others; the orientations are those with its corrections.
     """
 
     interior: Mapping[str, np.ndarray]
     exterior: Mapping[tuple[str, int], tuple[np.ndarray, np.ndarray]]
+    earlier: EarlierCalibration | None = None
 
 
 @dataclass(frozen=True)
@@ -233,11 +270,12 @@ def _measured(task: _Task, found: Mapping[str, _Resected]) -> Measured:
     network, target_id = _index(frames, fluoroscope, task, len(found))
     if task.known:
         network = replace(network, exterior=_exterior_prior(task, frames))
+    earlier = None if task.starts is None or task.sensors is not None else task.starts.earlier
     start = Parameters(
         np.array([one.interior for one in found.values()]),
         np.array([resection.rotation for resection in resections]),
         np.array([resection.position_mm for resection in resections]),
-        network.survey_mm.copy(),
+        network.survey_mm.copy() if earlier is None else earlier.points(target_id),
     )
     sizes = tuple(one.frames[0].image_size for one in found.values())
     left_out = tuple(sentence for one in found.values() for sentence in one.left_out)
@@ -319,12 +357,17 @@ def _start_all(
     """Start values that are given for the frames of one fluoroscope; returns as _resect_all."""
     assert task.starts is not None
     sensor = None if task.sensors is None else task.sensors[name]
+    earlier = task.starts.earlier
     predict = np.zeros_like if sensor is None else sensor.predict
     interior = task.starts.interior[name] if sensor is None else np.asarray(sensor.interior)
     found: list[Resection | None] = []
     for frame in frames:
         rotation, position = task.starts.exterior[name, frame.number]
         xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        if sensor is None and earlier is not None:
+            uv = frame.uv - earlier.series[name].predict(frame.uv)
+            found.append(resection_at(rotation, position, xyz, uv, interior))
+            continue
         # The sensor may have another gauge than that of the earlier adjustment.
         found.append(
             refine_resection(xyz, frame.uv - predict(frame.uv), interior, rotation, position)

@@ -97,6 +97,6 @@ def adjusted_with_precision(
         raise DataError(SINGULAR) from None
 
 
-def with_zero_additional(adjustment: Adjustment, zeros: tuple[np.ndarray, ...]) -> Adjustment:
-    """Return an adjustment whose parameters have additional parameters, all of them zero."""
-    return replace(adjustment, parameters=replace(adjustment.parameters, additional=zeros))
+def with_additional(adjustment: Adjustment, values: tuple[np.ndarray, ...]) -> Adjustment:
+    """Return an adjustment whose parameters have additional parameters of these values."""
+    return replace(adjustment, parameters=replace(adjustment.parameters, additional=values))

@@ -26,6 +26,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..distortion.base import CorrectionModel, ModelSource
+from ..distortion.collocation import CollocationModel, CollocationTerms, EarlierTerms
 from ..distortion.estimation import (
     AdjustedTerms,
     AdjustmentProblem,
@@ -36,12 +37,12 @@ from ..distortion.gauge import GaugeKind
 from ..distortion.none import NoCorrection
 from ..distortion.registry import model_source
 from ..errors import DataError
-from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.adjustment import Adjustment, residuals_and_q
 from .alternation import Regressions, calibrate_by_regression
 from .combined_adjustment import calibrate_by_adjustment
 from .constraints import gauges_of, interiors_to_estimate, with_constraints
 from .diagnostics import raise_if_undetermined, undetermined_unknowns
-from .initial_network import Measured
+from .initial_network import EarlierCalibration, Measured
 from .model_choice import START_MODEL, better_model
 from .model_errors import with_errors_by
 from .options import AUTO, CalibrationOptions
@@ -54,6 +55,7 @@ def self_calibrate(
     options: CalibrationOptions | None = None,
     progress: Callable[[Round], None] | None = None,
     raise_if_cancelled: Callable[[], None] | None = None,
+    earlier: EarlierCalibration | None = None,
 ) -> SelfCalibration:
     """Self-calibrate the fluoroscopes of a network.
 
@@ -69,6 +71,9 @@ def self_calibrate(
         Called with the Round after every round.
     raise_if_cancelled : callable, optional
         Called before every step of an adjustment; may raise to stop.
+    earlier : EarlierCalibration, optional
+        By collocation, with these exposures and others; the network starts with its solution. The
+        adjustment without correction is then not made: its residuals are those of the start.
 
     Returns
     -------
@@ -82,6 +87,8 @@ def self_calibrate(
     options = options or CalibrationOptions()
     network = replace(measured.network, interior_free=interiors_to_estimate(measured, options))
     measured = with_constraints(replace(measured, network=network), options)
+    if earlier is not None:
+        return _continued(measured, earlier, options, progress, raise_if_cancelled)
     before = _adjusted_without_correction(measured, options, raise_if_cancelled)
     job = _Job(measured, before, gauges_of(measured, options), options, raise_if_cancelled)
     if options.model == AUTO:
@@ -99,6 +106,40 @@ def self_calibrate(
     except DataError:  # what its own residuals show has to do
         return run
     return with_errors_by(reference, run, job.gauges)
+
+
+def _continued(
+    measured: Measured,
+    earlier: EarlierCalibration,
+    options: CalibrationOptions,
+    progress: Callable[[Round], None] | None,
+    raise_if_cancelled: Callable[[], None] | None,
+) -> SelfCalibration:
+    """Self-calibrate by collocation from the solution of an earlier calibration."""
+    network = measured.network
+    residuals, q = residuals_and_q(network, measured.start, 0.0, earlier.noise)
+    start = Adjustment(measured.start, residuals, q, earlier.noise, np.inf, 0, False)
+    problem = AdjustmentProblem(network, measured.image_size, start, gauges_of(measured, options))
+    names = measured.fluoroscopes
+    terms = CollocationTerms(
+        problem,
+        earlier=EarlierTerms(
+            [earlier.series[name] for name in names],
+            [earlier.priors.get(name) for name in names],
+            not earlier.varying.isdisjoint(names),
+        ),
+    )
+    run = calibrate_by_adjustment(
+        measured,
+        start,
+        CollocationModel,
+        terms,
+        options.max_iterations,
+        progress,
+        raise_if_cancelled,
+    )
+    earlier.priors.update(zip(names, terms.priors))
+    return run
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--fast',
         action='store_true',
         help='write neither the verdict (see validate) nor the report; they take two to '
-        'three times as long as the calibration',
+        'twice as long as the calibration',
     )
     result.add_argument(
         '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'

@@ -21,7 +21,8 @@ estimated from the observations (see `priors`).
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
 
@@ -63,6 +64,10 @@ MAX_VARYING_EXPOSURES = 60  # of a fluoroscope that can have terms of their own,
 # swing about their solution for long where the signal is as short as the distance of the points.
 HELD_AFTER = 2
 MIN_START_SD_PX = 0.1
+# Relative change of the noise at which terms that continue an earlier calibration settle: a third
+# of the standard deviation of the noise of 1000 image points.
+CONTINUED_NOISE = 5e-3
+CONTINUED_TOLERANCE = 1e-3  # decrease of F that they may leave: a thirtieth of a sigma
 
 
 class CollocationModel(SeriesModel):
@@ -77,15 +82,40 @@ class CollocationModel(SeriesModel):
         return CollocationTerms(problem)
 
 
+@dataclass(frozen=True)
+class EarlierTerms:
+    """Terms of an earlier calibration with more exposures.
+
+    Attributes
+    ----------
+    series : sequence of Series
+        By fluoroscope.
+    priors : sequence of Prior or None
+        Priors by fluoroscope; None: to be estimated from the series.
+    is_varying : bool
+        Whether the distortion differs between exposures.
+    """
+
+    series: Sequence[Series]
+    priors: Sequence[Prior | None]
+    is_varying: bool
+
+
 class CollocationTerms(AdjustedTerms):
     """Trend and signal of all fluoroscopes of a network, and their priors.
 
-    modes: number of sines along the image to start with; 0: there is no signal.
+    modes: number of sines along the image to start with; 0: there is no signal. earlier: what to
+    start with instead.
     """
 
     intermediate_tolerance = 1.0  # noise and prior still change
 
-    def __init__(self, problem: AdjustmentProblem, modes: int = START_MODES) -> None:
+    def __init__(
+        self,
+        problem: AdjustmentProblem,
+        modes: int = START_MODES,
+        earlier: EarlierTerms | None = None,
+    ) -> None:
         before = problem.before
         self.network = problem.network
         self.gauge_kinds = problem.gauges
@@ -99,12 +129,47 @@ class CollocationTerms(AdjustedTerms):
         self._variation_tested = modes == 0
         self._mode_changes = 0
         self._settled = 0
+        self._start = self.zeros()
+        if earlier is not None:
+            self._continue(earlier, before)
+            return
         for f, size in enumerate(self.sizes):
             rows = self.network.rows(f)
             core = before.residuals[rows][before.inliers[rows]]
             self._set_functions(f, Functions(size, TREND_DEGREE, modes))
             sd = max(float(np.sqrt(np.mean(core**2))), MIN_START_SD_PX)
             self.priors.append(starting_prior(self.functions[f], sd))
+        self._start = self.zeros()
+
+    def _continue(self, earlier: EarlierTerms, before: Adjustment) -> None:
+        """Start with earlier series, and with the priors that are most likely for them."""
+        self._variation_tested = not earlier.is_varying
+        self.noise_tolerance = CONTINUED_NOISE
+        self.final_tolerance = CONTINUED_TOLERANCE
+        self._mode_changes = 1  # those of the earlier series are not the first
+        for f, (series, prior) in enumerate(zip(earlier.series, earlier.priors)):
+            self._set_functions(f, series.functions)
+            self.priors.append(prior or self._prior_of(f, series, before.noise.scale))
+        self._start = tuple(series.coefficients.ravel() for series in earlier.series)
+
+    def _prior_of(self, f: int, series: Series, scale: float) -> Prior:
+        """Prior of fluoroscope f that is most likely for a series; scale: of the noise.
+
+        Orientations are taken to be known, which is near enough to start with.
+        """
+        rows = self.network.rows(f)
+        weighted = self.values[f] / (scale * self.network.sigma[rows])[:, None]
+        information = block_diag(*[weighted.T @ weighted] * 2)
+        coefficients = series.coefficients.ravel()
+        sd = max(float(np.std(self.values[f] @ series.coefficients.T)), MIN_START_SD_PX)
+        start = starting_prior(series.functions, sd)
+        return most_likely_prior(
+            series.functions, information, information @ coefficients, self.gauges[f], start
+        )
+
+    def start(self) -> tuple[np.ndarray, ...]:
+        """Coefficients to start with, by fluoroscope."""
+        return self._start
 
     def _set_functions(self, f: int, functions: Functions) -> None:
         """Use these functions for fluoroscope f."""

@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Generic, TypeVar
 import numpy as np
 
 from ..photogrammetry.noise import INLIER_Q
+from ..photogrammetry.noise_estimation import SETTLED
 from .gauge import GaugeKind
 from .misfit import LeftOut
 
@@ -39,6 +40,7 @@ MIN_TRAINING = 60  # inliers of a fluoroscope that a correction model needs
 # outlier an inlier below half of it.
 STAY_IN = 1.5
 FOLDS = 10  # of the cross-validation
+FINAL_TOLERANCE = 1e-5  # decrease of F that the last adjustment may leave
 
 Model_co = TypeVar('Model_co', covariant=True)  # the correction model that a regression gives
 
@@ -98,16 +100,26 @@ class AdjustedTerms(ABC):
     ----------
     intermediate_tolerance : float
         Decrease of the cost at which an adjustment before the last may stop.
+    final_tolerance : float
+        Decrease of the cost that the last adjustment may leave.
+    noise_tolerance : float
+        Relative change of the scale of the noise at which the terms may settle.
     values : list of ndarray
         Functions at the image points of each fluoroscope, (N, m) or (N, 2, p).
     """
 
     intermediate_tolerance: float
+    final_tolerance = FINAL_TOLERANCE
+    noise_tolerance = SETTLED
     values: list[np.ndarray]
 
     @abstractmethod
     def with_additional(self, network: Network) -> Network:
         """Return the network with the terms as additional parameters."""
+
+    def start(self) -> tuple[np.ndarray, ...]:
+        """Coefficients to start with, by fluoroscope."""
+        return self.zeros()
 
     @abstractmethod
     def zeros(self) -> tuple[np.ndarray, ...]:

@@ -129,10 +129,13 @@ class AdditionalParameters:
         """
         out = np.empty((len(index), covariance.shape[1], 2))
         order = np.argsort(index, kind='stable')
-        starts = np.flatnonzero(np.diff(index[order], prepend=-1))
+        starts = np.flatnonzero(np.diff(index[order], prepend=-1)).tolist()
+        groups = list(zip(starts, [*starts[1:], len(order)], index[order][starts].tolist()))
         for axis, (f, columns) in enumerate(self._by_axis()):
-            f = f[part]
+            ordered = f[part][order]
             mixed = covariance[:, :, columns]
-            for rows in np.split(order, starts[1:]):
-                out[rows, :, axis] = f[rows] @ mixed[index[rows[0]]].T
+            found = np.empty((len(index), covariance.shape[1]))
+            for start, stop, group in groups:
+                np.matmul(ordered[start:stop], mixed[group].T, out=found[start:stop])
+            out[order, :, axis] = found
         return out

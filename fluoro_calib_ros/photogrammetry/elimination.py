@@ -28,7 +28,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import blas, cho_factor, cho_solve
+from scipy.linalg import blas, cho_factor, cho_solve, lapack
 
 from .datum import Gauge, stabilising_factor
 from .network import Network
@@ -128,7 +128,8 @@ class BorderedFactor:
         """Blocks of the inverse of the matrix."""
         k, size = self.inverse.shape[:2]
         q = len(self.schur)
-        rest = cho_solve((self.schur, True), np.eye(q))
+        lower, _ = lapack.dpotri(self.schur, lower=1)
+        rest = np.tril(lower) + np.tril(lower, -1).T
         transposed = self.inverse.transpose(0, 2, 1)
         gain = transposed @ self.half_border.reshape(k, size, q)
         border = -(gain.reshape(-1, q) @ rest).reshape(k, size, q)

@@ -22,11 +22,14 @@ from functools import cached_property
 
 import numpy as np
 
-from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations, calibrate_request
-from ..calibration.initial_network import StartValues
+from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations, calibrate_part
+from ..calibration.held_calibration import noise_of_calibrations
+from ..calibration.initial_network import EarlierCalibration, StartValues
 from ..calibration.options import AUTO
 from ..calibration.request import CalibrationRequest
 from ..calibration.result import FluoroscopeCalibration
+from ..distortion.collocation import CollocationModel
+from ..distortion.exposure_terms import Variation, exposure_functions, is_determined, variation
 from ..distortion.registry import selectable_models
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
@@ -37,6 +40,7 @@ from .residual_tests import Residuals, ResidualTrend, common_trend, residuals_of
 # The calibration of a part has at most so many rounds: with few exposures it converges slowly, and
 # after these rounds without visible change.
 MAX_ROUNDS = 25
+MIN_VARYING_EXPOSURES = 4  # with enough image points, to tell whether the distortion varies
 
 
 @dataclass(frozen=True)
@@ -124,6 +128,40 @@ class Evidence:
             },
         )
 
+    @cached_property
+    def earlier(self) -> EarlierCalibration:
+        """What the calibrations of parts take over."""
+        varying = (name for name in self.frames if self._is_varying(name))
+        targets = self.result.targets
+        return EarlierCalibration(
+            {
+                name: one.model.series
+                for name, one in self.calibrations.items()
+                if one.model.series
+            },
+            frozenset(varying),
+            noise_of_calibrations(self.request.options.loss, self.calibrations.values()),
+            targets.target_id,
+            targets.xyz_mm,
+        )
+
+    def _is_varying(self, name: str) -> bool:
+        found = self.variations[name]
+        return found is not None and found.is_varying
+
+    @cached_property
+    def variations(self) -> dict[str, Variation | None]:
+        """Changes of distortions between exposures; None with too few image points."""
+        return {name: self._variation(name) for name in self.frames}
+
+    def _variation(self, name: str) -> Variation | None:
+        calibration = self.calibrations[name]
+        residuals = self.trends[name].inliers
+        if not is_determined(residuals.exposure, MIN_VARYING_EXPOSURES):
+            return None
+        functions = exposure_functions(residuals.uv, calibration.image_size, calibration.interior)
+        return variation(residuals.r, residuals.exposure, functions)
+
     def fewest_exposures(self, names: Sequence[str]) -> int:
         """Return the number of exposures of the fluoroscope that has the fewest."""
         return min(len(self.frames[name]) for name in names)
@@ -149,9 +187,11 @@ class Evidence:
         if options.model == AUTO and len(kinds) == 1 and kinds <= set(selectable_models()):
             options = replace(options, model=kinds.pop())  # the one that is validated
         part = replace(self.request, frames=frames, options=options, principal_distance=distance)
-        return calibrate_request(
-            part, raise_if_cancelled=self.raise_if_cancelled, starts=self.starts
-        ).calibrations
+        starts = self.starts
+        if options.model == CollocationModel.kind:
+            starts = replace(starts, earlier=self.earlier)
+        sd = {name: self.calibrations[name].image_sd for name in frames}
+        return calibrate_part(part, starts, sd, self.raise_if_cancelled)
 
     def adjust(
         self,

@@ -18,18 +18,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..distortion.exposure_terms import (
-    VARYING,
-    Variation,
-    exposure_functions,
-    is_determined,
-    variation,
-)
+from ..distortion.exposure_terms import VARYING
 from .check import Check, Finding, judge, more_exposures, not_made
 from .evidence import Evidence, Subject
 
 NAME = 'variation'
-MIN_EXPOSURES = 4
 # A change below it leaves corrections and verdict as they are: with 15 exposures it adds less than
 # 2 % to the errors (docs/pathologies.md).
 HARMLESS_PX = 0.1
@@ -40,19 +33,9 @@ def check_variation(evidence: Evidence, names: Sequence[str]) -> list[Check]:
     return [_check(evidence, name) for name in names]
 
 
-def variation_of(evidence: Evidence, name: str) -> Variation | None:
-    """Change of the distortion of a fluoroscope between exposures; None with too few points."""
-    calibration = evidence.calibrations[name]
-    residuals = evidence.trends[name].inliers
-    if not is_determined(residuals.exposure, MIN_EXPOSURES):
-        return None
-    functions = exposure_functions(residuals.uv, calibration.image_size, calibration.interior)
-    return variation(residuals.r, residuals.exposure, functions)
-
-
 def _check(evidence: Evidence, name: str) -> Check:
     count = len(evidence.frames[name])
-    found = variation_of(evidence, name)
+    found = evidence.variations[name]
     if found is None:
         return not_made(
             NAME,

@@ -16,7 +16,7 @@
 
 Every check is a number with a limit. How the limits were found, how often good calibrations exceed
 them and how large a fault must be to be found is in docs/verdict.md. `validate` recalibrates two
-halves and four folds of the exposures, which takes two to three times as long as the calibration.
+halves and four folds of the exposures, which takes about twice as long as the calibration.
 """
 
 from __future__ import annotations

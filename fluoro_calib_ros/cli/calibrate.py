@@ -85,7 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     result.add_argument(
         '--fast',
         action='store_true',
-        help='write neither the verdict (see validate) nor the report; they take two to '
+        help='write neither the verdict (see validate) nor the report; they take about '
         'twice as long as the calibration',
     )
     result.add_argument(

@@ -6,8 +6,8 @@ SHELL := /bin/sh
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
-# processes that run tests
-WORKERS ?= 2
+# processes that run tests: one more than two cores, for tests of nodes wait most of the time
+WORKERS ?= 3
 # of fuzzing, for each target
 SECONDS ?= 600
 OLDEST_PYTHON ?= python3.12

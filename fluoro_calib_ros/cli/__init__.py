@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import argparse
-import signal
+import contextlib
 import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -42,6 +42,7 @@ from . import (
 from .completion import SHELLS
 from .output import print_note, styled
 from .rig import add_rig, find_rig
+from .termination import terminated_by_signals
 
 if TYPE_CHECKING:
     from ..files.rig_file import RigFile
@@ -135,9 +136,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     Exit status 0: done, 1: failed for a reason in the data, 2: wrong usage; 130 and 143 after
     SIGINT and SIGTERM, which leave no unfinished output and no process behind.
     """
-    if arguments is None:  # this process is the command
-        signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
     words = list(sys.argv[1:] if arguments is None else arguments)
+    # Without arguments, this process is the command.
+    with terminated_by_signals() if arguments is None else contextlib.nullcontext():
+        _run(words)
+
+
+def _run(words: list[str]) -> None:
+    """Run the command of these words, and exit with its status if it fails."""
     command = next((word for word in words if not word.startswith('-')), '')
     try:
         rig = find_rig(words, command)

@@ -73,7 +73,7 @@ from .runtime.stream_reader import FaultHandlers
 
 OVERLAY = 'image_overlay'
 MODES = ('phantom', 'markers')
-PATIENCE_S = 1.0  # with the other view of an exposure, unless the next one comes before
+PATIENCE_S = 5.0  # with the other view of an exposure, unless the next one comes before
 LARGEST_PX = 2**14  # of an image, for points whose image is not known yet
 
 

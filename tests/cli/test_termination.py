@@ -1,0 +1,85 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Signals end a command, whatever it does at that moment."""
+
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+
+LOSES_THE_EXCEPTION = """
+import os
+import signal
+import sys
+from fluoro_calib_ros.cli.termination import terminated_by_signals
+
+class Sender:
+    def __del__(self):
+        os.kill(os.getpid(), signal.{name})
+        for _ in range(1000):  # the handler runs here, and Python drops what it raises
+            pass
+
+with terminated_by_signals():
+    sender = Sender()
+    del sender
+    print('goes on', flush=True)
+    while True:
+        pass
+"""
+
+CLEANS_UP = """
+import os
+import signal
+import time
+from fluoro_calib_ros.cli import termination
+termination.AGAIN_S = 0.01
+
+with termination.terminated_by_signals():
+    try:
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(60)
+    finally:
+        end = time.monotonic() + 0.2
+        while time.monotonic() < end:
+            try:
+                int('no number')
+            except ValueError:
+                pass
+        print('cleaned up', flush=True)
+"""
+
+
+def run(program):
+    return subprocess.run(
+        [sys.executable, '-c', program], cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+
+
+@pytest.mark.parametrize(('name', 'status'), [('SIGTERM', 143), ('SIGINT', -signal.SIGINT)])
+def test_exception_that_python_drops_is_raised_again(name, status):
+    done = run(LOSES_THE_EXCEPTION.format(name=name))
+    assert done.returncode == status, done.stderr
+    assert done.stdout == 'goes on\n'
+    assert 'Exception ignored' in done.stderr
+
+
+def test_what_cleans_up_is_not_interrupted():
+    done = run(CLEANS_UP)
+    assert done.returncode == 143, done.stderr
+    assert done.stdout == 'cleaned up\n'

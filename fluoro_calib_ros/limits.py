@@ -41,6 +41,7 @@ MAX_PIXELS = 64 * MEGABYTE  # 8192 x 8192
 # Calibrations and orientations of the rig, in files and messages.
 MAX_IMAGE_SIDE = 32_000  # px: OpenCV holds whole pixels in 16 bits
 MAX_TRAINING_POINTS = 200_000
+MAX_CORNERS = 1000  # of the calibrated area
 MAX_NEIGHBOURS = 1000
 MAX_COINCIDENT = 1000  # training points on one place
 MAX_FLUOROSCOPES = 16

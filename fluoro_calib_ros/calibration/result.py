@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -85,8 +85,6 @@ class FluoroscopeCalibration:
         SHA-256 of observations and phantom.
     seconds : float
         Time the calibration took; NaN where it was read from a file.
-    short_id : bool
-        Whether the id is made as by earlier versions, of what determines a correction only.
     calibration_id : str
         Digest of the content, but for seconds, stamp and frame id.
     """
@@ -114,10 +112,23 @@ class FluoroscopeCalibration:
     frame_id: str
     source_digest: str
     seconds: float = field(default=np.nan, compare=False)
-    short_id: bool = field(default=False, compare=False, repr=False)
     calibration_id: str = field(init=False)
 
     def __post_init__(self) -> None:
+        digest = self._digest_of_correction()
+        self._add_details(digest)
+        object.__setattr__(self, 'calibration_id', self._identity(digest))
+
+    @property
+    def earlier_id(self) -> str:
+        """Id of this calibration in earlier versions: of what determines a correction only."""
+        return self._identity(self._digest_of_correction())
+
+    def _identity(self, digest: hashlib._Hash) -> str:
+        return f'{self.fluoroscope}-{digest.hexdigest()[:16]}'
+
+    def _digest_of_correction(self) -> hashlib._Hash:
+        """Return the digest of what determines a correction."""
         digest = hashlib.sha256()
         for array in (
             self.interior,
@@ -133,9 +144,7 @@ class FluoroscopeCalibration:
                 np.concatenate([[degree, modes], coefficients.ravel(), sd.ravel()]).tobytes()
             )
         digest.update(f'{self.fluoroscope}/{self.model.kind}/{self.source_digest}'.encode())
-        if not self.short_id:
-            self._add_details(digest)
-        object.__setattr__(self, 'calibration_id', f'{self.fluoroscope}-{digest.hexdigest()[:16]}')
+        return digest
 
     def _add_details(self, digest: hashlib._Hash) -> None:
         """Add what does not change a correction to a digest.
@@ -161,17 +170,6 @@ class FluoroscopeCalibration:
             self.converged,
         )
         digest.update('/'.join(str(int(word)) for word in words).encode())
-
-    def with_id(self, identity: str) -> FluoroscopeCalibration | None:
-        """Return the calibration with an id that its content has, None where it is of another.
-
-        Earlier versions made the id of what determines a correction only.
-        """
-        for short in (False, True):
-            other = replace(self, short_id=short)
-            if other.calibration_id == identity:
-                return other
-        return None
 
     @cached_property
     def grid(self) -> CorrectionGrid:

@@ -35,6 +35,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.spatial import ConvexHull, QhullError
 
+from ..limits import MAX_CORNERS
 from .estimation import AdjustedTerms, AdjustmentProblem, RegressionStep, TrainingPoints
 from .series import Series, packed
 
@@ -128,7 +129,13 @@ class CorrectionModel(ABC):
             raise ValueError(
                 f'{self.kind} with k = {self.k} is not possible with {len(uv)} training points'
             )
-        self._set(train_uv=uv, train_duv=duv, _hull=_half_planes(self._calibrated_points(uv)))
+        hull = _half_planes(self._calibrated_points(uv))
+        if len(hull) > MAX_CORNERS:
+            raise ValueError(
+                f'the calibrated area has {len(hull)} corners, more than the {MAX_CORNERS} that '
+                'are possible'
+            )
+        self._set(train_uv=uv, train_duv=duv, _hull=hull)
         self._prepare()
 
     def _set(self, **values: Any) -> None:
@@ -173,6 +180,14 @@ class CorrectionModel(ABC):
             out[:2, part] = self.predict(uv[part]).T
             out[2, part] = self.standard_deviation(uv[part])
         return out
+
+    def bulk_work(self, uv: np.ndarray, limit: float) -> float:
+        """Return the work of `evaluate_in_bulk` at pixels uv (n, 2), in some 50 ns.
+
+        By default the values of functions that are added up. A result above the limit may be too
+        small.
+        """
+        return float(len(uv)) * (1 if self.series is None else len(self.series.functions))
 
     def outside(self, uv: ArrayLike) -> np.ndarray:
         """True (n,) where a pixel uv (n, 2) is beyond the convex hull of the training points."""

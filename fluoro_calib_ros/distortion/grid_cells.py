@@ -15,7 +15,8 @@
 """The cells of a lookup grid: their size, the exact values at their corners, their coefficients.
 
 The cells are as large as LIMIT_PX of `grid_errors` allows. The few in which that is not accurate
-enough, as neighbour models have kinks, are divided once more and have rows in a second table.
+enough, as neighbour models have kinks, are divided once more and have rows in a second table. What
+the values cost is counted beforehand: where it is too much, the cells are larger.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import DataError
 from .base import BULK_CHUNK, CorrectionModel, Smoothness
 from .grid_errors import TARGET_PX, errors_of_finer_grid, errors_where_curved
 
@@ -32,6 +34,10 @@ MAX_SHARE_DIVIDED = 0.01  # of cells, so that not all of them have to be smaller
 MAX_DIVIDED = 2500
 MAX_PARTS = 16  # of a divided cell along a side
 MAX_TABLE_BYTES = 128_000_000
+MAX_CELL_PX = 64  # larger ones would not resemble the model
+# Work of the values at the corners of cells (`CorrectionModel.bulk_work`): some six seconds. That
+# of the errors may be a quarter of it, that of the divided cells half.
+MAX_WORK = 1.2e8
 COEFFICIENTS = 12  # of a cell: 1, u, v, u v, each for du, dv and the standard deviation
 
 Nodes = tuple[np.ndarray, np.ndarray]  # columns (w,) and rows (h,) [px] of the corners of cells
@@ -51,12 +57,15 @@ class Cells:
         Errors [px] of correction and standard deviation in the cells; NaN where not measured.
     outside : (h - 1, w - 1) ndarray of bool
         True for cells with a corner beyond the calibrated area.
+    work : float
+        Of a value, on average.
     """
 
     nodes: Nodes
     values: np.ndarray
     errors: np.ndarray
     outside: np.ndarray
+    work: float
 
 
 @dataclass(frozen=True)
@@ -83,9 +92,13 @@ class DividedCells:
 
 
 def build_cells(model: CorrectionModel, image_size: tuple[int, int]) -> Cells:
-    """Return the cells of an image (width, height) [px] for a model."""
-    nodes, values, errors = _nodes_and_values(model, image_size)
-    return Cells(nodes, values, errors, _outside(model, nodes))
+    """Return the cells of an image (width, height) [px] for a model.
+
+    Raises DataError for a model whose values take too long, even at the corners of large cells.
+    """
+    sizes, work = _affordable_sizes(model, image_size)
+    nodes, values, errors = _nodes_and_values(model, image_size, sizes, work)
+    return Cells(nodes, values, errors, _outside(model, nodes), work)
 
 
 def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
@@ -102,6 +115,12 @@ def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
     # measured points do not show.
     halvings = 1 + np.ceil(np.log2(error[j, i] / TARGET_PX))
     parts = np.minimum(2 ** halvings.astype(np.intp), MAX_PARTS)
+    kept = _affordable_cells(error[j, i], parts, cells.work)
+    if not len(kept):
+        return None
+    j = j[kept]
+    i = i[kept]
+    parts = parts[kept]
     part_nodes = [
         (
             np.linspace(columns[x], columns[x + 1], n + 1),
@@ -120,6 +139,13 @@ def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
             table[start : start + n * n].reshape(n, n, COEFFICIENTS),
         )
     return DividedCells(j, i, parts, first, table)
+
+
+def _affordable_cells(error: np.ndarray, parts: np.ndarray, work: float) -> np.ndarray:
+    """Places, ascending, of the cells with the largest errors whose parts do not take too long."""
+    worst_first = np.argsort(-error, kind='stable')
+    values = np.cumsum((parts[worst_first] + 1) ** 2)
+    return np.sort(worst_first[: np.searchsorted(values * work, MAX_WORK / 2, side='right')])
 
 
 def write_coefficients(nodes: Nodes, values: np.ndarray, out: np.ndarray) -> None:
@@ -157,10 +183,9 @@ def aligned_array(shape: tuple[int, ...]) -> np.ndarray:
 
 
 def _nodes_and_values(
-    model: CorrectionModel, image_size: tuple[int, int]
+    model: CorrectionModel, image_size: tuple[int, int], sizes: list[float], work: float
 ) -> tuple[Nodes, np.ndarray, np.ndarray]:
     """Nodes of the cell size that is chosen, values (3, h, w) there, and errors of the cells."""
-    sizes = _cell_sizes(model.smoothness, image_size)
     nodes = _nodes(image_size, sizes[0], 1)
     values = None
     for number in range(len(sizes) - 1):
@@ -174,7 +199,29 @@ def _nodes_and_values(
         values = finer_values
     if values is None:
         values = _exact_values(model, nodes)
-    return nodes, values, errors_where_curved(model, nodes, values)
+    affordable = int(MAX_WORK / 4 / work)
+    return nodes, values, errors_where_curved(model, nodes, values, affordable)
+
+
+def _affordable_sizes(
+    model: CorrectionModel, image_size: tuple[int, int]
+) -> tuple[list[float], float]:
+    """Sizes of cells to try whose values do not take too long, and the mean work of a value.
+
+    Raises DataError where there are none.
+    """
+    sizes = _cell_sizes(model.smoothness, image_size)
+    while True:
+        pixels = _pixels(_nodes(image_size, sizes[0], 2 ** (len(sizes) - 1)))
+        work = model.bulk_work(pixels, MAX_WORK)
+        if work <= MAX_WORK:
+            return sizes, work / len(pixels)
+        sizes = sizes[:-1] or [2 * sizes[0]]
+        if sizes[0] > MAX_CELL_PX:
+            raise DataError(
+                f'the correction takes too long: its {len(model.train_uv)} training points lie '
+                f'too close together for {model.k} neighbours'
+            )
 
 
 def _cell_sizes(smoothness: Smoothness, image_size: tuple[int, int]) -> list[float]:

@@ -28,6 +28,7 @@ TARGET_PX = 0.6 * LIMIT_PX
 # differences.
 MIN_MEASURED = 500
 MAX_MEASURED = 25_000
+PLACES = ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.5, 1.0), (1.0, 0.5))  # in a cell, where it is
 
 
 def errors_of_finer_grid(values: np.ndarray) -> np.ndarray:
@@ -48,7 +49,10 @@ def errors_of_finer_grid(values: np.ndarray) -> np.ndarray:
 
 
 def errors_where_curved(
-    model: CorrectionModel, nodes: tuple[np.ndarray, np.ndarray], values: np.ndarray
+    model: CorrectionModel,
+    nodes: tuple[np.ndarray, np.ndarray],
+    values: np.ndarray,
+    affordable: int,
 ) -> np.ndarray:
     """Errors of cells, measured where second differences suggest that they may be too large.
 
@@ -59,12 +63,14 @@ def errors_where_curved(
         Columns and rows [px] of the corners of the cells.
     values : (3, h, w) ndarray
         du, dv and standard deviation there.
+    affordable : int
+        Number of exact values that do not take too long.
 
     Returns
     -------
     (2, h - 1, w - 1) ndarray
         Errors of correction and standard deviation [px]; NaN in cells that are not measured. At
-        least MIN_MEASURED cells are.
+        least MIN_MEASURED cells are, if that is affordable.
     """
     columns, rows = nodes
     curvature = _second_differences(values)
@@ -73,10 +79,11 @@ def errors_where_curved(
     if model.smoothness is not Smoothness.STEPPED:
         curved = np.count_nonzero(curvature > 1.5 * TARGET_PX)
         count = int(np.clip(curved, MIN_MEASURED, MAX_MEASURED))
+    count = max(1, min(count, affordable // len(PLACES)))
     j, i = np.unravel_index(np.argsort(-curvature, axis=None)[:count], curvature.shape)
     errors = np.full((2, *curvature.shape), np.nan)
     errors[:, j, i] = 0.0
-    for x, y in ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.5, 1.0), (1.0, 0.5)):
+    for x, y in PLACES:
         u = columns[i] + x * (columns[i + 1] - columns[i])
         v = rows[j] + y * (rows[j + 1] - rows[j])
         upper = (1 - x) * values[:, j, i] + x * values[:, j, i + 1]

@@ -36,6 +36,7 @@ MAX_DEGREE = 15  # of a series that is read
 MAX_MODES = 100
 SD_GRID = 33  # nodes of the standard deviation along each side of the image
 PREDICTION_CHUNK = 20_000  # pixels for which a series is evaluated at once
+PREDICTION_VALUES = 20_000_000  # of functions at these pixels, to bound the memory
 
 
 @dataclass(frozen=True)
@@ -150,9 +151,10 @@ class Series:
 
     def predict_in_chunks(self, uv: np.ndarray) -> np.ndarray:
         """Corrections (n, 2) [px] at many pixels uv (n, 2), with bounded memory."""
-        starts = range(0, len(uv), PREDICTION_CHUNK)
+        size = min(PREDICTION_CHUNK, max(1, PREDICTION_VALUES // max(1, len(self.functions))))
+        starts = range(0, len(uv), size)
         return np.concatenate(
-            [self.predict(uv[i : i + PREDICTION_CHUNK]) for i in starts] or [np.zeros((0, 2))]
+            [self.predict(uv[i : i + size]) for i in starts] or [np.zeros((0, 2))]
         )
 
     def sd_at(self, uv: ArrayLike) -> np.ndarray:

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike
 from scipy.spatial import cKDTree
 
 from .base import BULK_CHUNK, Correction, CorrectionModel, Smoothness
-from .blocks import blocks_with_candidates
+from .blocks import blocks_with_candidates, work_of_blocks
 from .neighbours import Neighbourhoods
 from .trend import Trend, least_squares_map
 
@@ -110,20 +110,28 @@ class NeighbourSmoother(CorrectionModel):
         """Return du, dv and standard deviation (3, n) [px] at many pixels uv (n, 2)."""
         out = np.zeros((3, len(uv)))
         norm2 = np.zeros(len(uv))
-        for block, near in blocks_with_candidates(self.tree, uv, self.k):
-            if len(near) > MAX_CANDIDATES * (self.k + 1):  # coincident training points
+        most = MAX_CANDIDATES * (self.k + 1)
+        for block, near in blocks_with_candidates(self.tree, uv, self.k, most):
+            if near is None:
                 predicted, norm2[block] = self._local_part(uv[block])
                 out[:2, block] = predicted.T
                 continue
-            weights = self.weights_of_candidates(self.train_uv[near], uv[block], self.k)
-            for axis, remainder in enumerate(self.remainder[near].T):
-                out[axis, block] = np.einsum('nk,k->n', weights, remainder)
-            norm2[block] = np.einsum('nk,nk->n', weights, weights)
+            rows = max(1, WEIGHTS_CHUNK // len(near))
+            for start in range(0, len(block), rows):
+                some = block[start : start + rows]
+                weights = self.weights_of_candidates(self.train_uv[near], uv[some], self.k)
+                for axis, remainder in enumerate(self.remainder[near].T):
+                    out[axis, some] = np.einsum('nk,k->n', weights, remainder)
+                norm2[some] = np.einsum('nk,nk->n', weights, weights)
         for start in range(0, len(uv), BULK_CHUNK):
             part = slice(start, start + BULK_CHUNK)
             out[:2, part] += self._global_part(uv[part]).T
             out[2, part] = self._sd(norm2[part], uv[part])
         return out
+
+    def bulk_work(self, uv: np.ndarray, limit: float) -> float:
+        """Return the work of `evaluate_in_bulk`: candidates of neighbours, and functions."""
+        return super().bulk_work(uv, limit) + work_of_blocks(self.tree, uv, self.k, limit)
 
     def _global_part(self, uv: np.ndarray) -> np.ndarray:
         """Trend or series (n, 2) [px] at pixels uv (n, 2)."""

@@ -44,6 +44,9 @@ from .labels import named_targets
 
 MISSING = -1.0
 STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
+# Of the process that reads: to start, for each byte of the file, and at most.
+BASE_SECONDS = 10
+SECONDS_OF_BYTE = 1e-6
 MAX_SECONDS = 60
 MAX_FRAME = 65535  # the header counts in uint16
 _MAGIC = 0x50
@@ -127,11 +130,13 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
     known = os.environ.get('PYTHONPATH')
     environment = {
         **os.environ,
+        'OPENBLAS_NUM_THREADS': '1',  # each takes address space
         'PYTHONPATH': os.pathsep.join([str(root), *filter(None, [known])]),
     }
+    seconds = min(BASE_SECONDS + SECONDS_OF_BYTE * path.stat().st_size, MAX_SECONDS)
     try:
         done = subprocess.run(
-            command, capture_output=True, timeout=MAX_SECONDS, env=environment, check=False
+            command, capture_output=True, timeout=seconds, env=environment, check=False
         )
     except subprocess.TimeoutExpired:
         raise DataError(f'{path}: this C3D file cannot be read, it is damaged') from None

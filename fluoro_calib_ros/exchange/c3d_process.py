@@ -21,13 +21,17 @@ Standard output is an .npz of the arrays labels, unit, rate, first, xyz (m, n, 3
 from __future__ import annotations
 
 import io
+import os
 import sys
 from contextlib import suppress
 from typing import Any
 
 import numpy as np
 
-MAX_MEMORY = 8 * 2**30  # bytes of address space
+# Bytes of address space: for the program, for each byte of the file, and at most.
+BASE_MEMORY = 3 * 2**30
+MEMORY_OF_BYTE = 100
+MAX_MEMORY = 8 * 2**30
 
 
 def labels_of(parameters: Any) -> list[str]:
@@ -62,7 +66,9 @@ def main() -> None:
     with suppress(ImportError, ValueError, OSError):  # Windows has no such limit
         import resource
 
-        resource.setrlimit(resource.RLIMIT_AS, (MAX_MEMORY, MAX_MEMORY))
+        size = os.path.getsize(sys.argv[1])
+        memory = min(BASE_MEMORY + MEMORY_OF_BYTE * size, MAX_MEMORY)
+        resource.setrlimit(resource.RLIMIT_AS, (memory, memory))
     try:
         arrays = arrays_of(sys.argv[1])
     except Exception as error:  # the errors of ezc3d have no type

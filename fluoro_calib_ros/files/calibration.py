@@ -150,9 +150,15 @@ def check_model_content(
 def load_calibration(path: PathLike) -> FluoroscopeCalibration:
     """Read a calibration, which is equal to the saved one to the last bit; its seconds are NaN.
 
-    Raises DataError for a file that is not a calibration, is damaged, or has a version of the
-    layout that is not known.
+    The file of an earlier version may have the id that it gave; the calibration has that of this
+    version. Raises DataError for a file that is not a calibration, is damaged, or has a version of
+    the layout that is not known.
     """
+    return read_with_id(path)[0]
+
+
+def read_with_id(path: PathLike) -> tuple[FluoroscopeCalibration, str]:
+    """Read a calibration as `load_calibration` does, and the id that its file has."""
     arrays = read_arrays(path, LAYOUT)
     _check_content(path, arrays)
     values = to_values(arrays)
@@ -163,15 +169,15 @@ def load_calibration(path: PathLike) -> FluoroscopeCalibration:
     content = {entry: values.pop(name) for name, entry in _MODEL_ENTRIES.items()}
     try:
         model = model_from_arrays(content, values['image_size'])
-        calibration = FluoroscopeCalibration(model=model, **values).with_id(identity)
     except ValueError as error:
         raise DataError(f'{path}: {error}') from None
-    if calibration is None:
+    calibration = FluoroscopeCalibration(model=model, **values)
+    if identity not in (calibration.calibration_id, calibration.earlier_id):
         raise DataError(
             f'{path}: the content does not belong to its calibration_id {identity}, '
             f'the file was changed'
         )
-    return calibration
+    return calibration, identity
 
 
 def load_calibrations(directory: PathLike) -> dict[str, FluoroscopeCalibration]:

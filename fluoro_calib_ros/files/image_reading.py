@@ -164,7 +164,9 @@ def _open_video(path: Path) -> ImageSource:
     count = max(0, round(video.get(cv2.CAP_PROP_FRAME_COUNT)))
     if not 0 < frame_rate < 1e6:
         raise DataError(f'{path}: the video does not state its frame rate')
-    pixel_format = int(video.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)).to_bytes(4, 'little')
+    # A damaged video may have none, which is -1.
+    code = int(video.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) % 2**32
+    pixel_format = code.to_bytes(4, 'little')
     if pixel_format == GREY_16:
         video.set(cv2.CAP_PROP_CONVERT_RGB, 0)
     elif pixel_format[:3] == GREY_16[:3]:

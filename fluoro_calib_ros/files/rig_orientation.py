@@ -17,11 +17,14 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
+from dataclasses import replace
 
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from .access import PathLike, check_safe_name, make_folder
 from .arrays import ArraySpec, Layout, read_arrays, to_arrays, to_values, write_arrays
+from .calibration import calibration_path, read_with_id
 
 NAME = 'rig_orientation.npz'
 
@@ -72,8 +75,10 @@ def save_orientation(directory: PathLike, orientation: RigOrientation) -> str:
 def load_orientation(path: PathLike) -> RigOrientation:
     """Read an orientation, which is equal to the saved one to the last bit.
 
-    Raises DataError for a file that is not the orientation of a rig, is damaged or was changed, or
-    has a version of the layout that is not known.
+    Where the calibrations beside it are of an earlier version, it refers to them by the ids of
+    this version, and so has an id of its own. Raises DataError for a file that is not the
+    orientation of a rig, is damaged or was changed, or has a version of the layout that is not
+    known.
     """
     values = to_values(read_arrays(path, LAYOUT))
     identity = values.pop('orientation_id')
@@ -90,4 +95,22 @@ def load_orientation(path: PathLike) -> RigOrientation:
             f'{path}: the content does not belong to its orientation_id {identity}, '
             f'the file was changed'
         )
-    return orientation
+    present = _present_ids(path, orientation)
+    if present == orientation.calibration_ids:
+        return orientation
+    return replace(orientation, calibration_ids=present)
+
+
+def _present_ids(path: PathLike, orientation: RigOrientation) -> tuple[str, ...]:
+    """Ids of the calibrations of an orientation, in place of those that earlier versions gave."""
+    folder = os.path.dirname(os.path.abspath(path))
+    out = []
+    for name, identity in zip(orientation.fluoroscopes, orientation.calibration_ids):
+        present = identity
+        beside = calibration_path(folder, name)
+        if os.path.isfile(beside):
+            with suppress(DataError):  # told where the calibration is needed
+                calibration, stored = read_with_id(beside)
+                present = calibration.calibration_id if stored == identity else identity
+        out.append(present)
+    return tuple(out)

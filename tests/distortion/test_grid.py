@@ -32,6 +32,7 @@ from fluoro_calib_ros.distortion.grid_errors import LIMIT_PX
 from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.distortion.status import CorrectionStatus
+from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import points_on_image
 
 OK, OUTSIDE, INVALID = CorrectionStatus
@@ -248,6 +249,41 @@ def test_large_image_has_larger_cells(monkeypatch):
             grid.error_px, grid.error_outside_px
         )
     assert found[0] == 2 and found == sorted(found) and found[-1] > 8
+
+
+def hostile_points(kind, count):
+    """Training points (count, 2) that nobody has, in an image of 1024 x 1024 px."""
+    rng = np.random.default_rng(7)
+    if kind == 'heap':
+        return 500 + rng.uniform(0, 2, (count, 2))
+    if kind == 'two heaps':
+        return np.where(rng.random((count, 1)) < 0.5, 100, 900) + rng.uniform(0, 3, (count, 2))
+    return rng.uniform(0, 1024, (count, 2))
+
+
+@pytest.mark.parametrize(
+    'kind, model, k', [('heap', 'local_linear', 50), ('two heaps', 'knn', 1000), ('all', 'knn', 5)]
+)
+def test_work_on_hostile_training_points_is_bounded(monkeypatch, kind, model, k):
+    """200,000 of them took minutes. The cells are larger instead, and the errors are known."""
+    uv = hostile_points(kind, 200_000)
+    found = create_model(model, k, uv, np.sin(uv / 100), 0.1, 0.0)
+    done = []
+    original = type(found).evaluate_in_bulk
+
+    def evaluate(self, pixels):
+        done.append(self.bulk_work(pixels, np.inf))
+        return original(self, pixels)
+
+    monkeypatch.setattr(type(found), 'evaluate_in_bulk', evaluate)
+    if kind != 'all':
+        grid = CorrectionGrid(found, (1024, 1024))
+        assert grid.cell_px > 8
+        assert sum(done) < 2 * grid_cells.MAX_WORK
+    else:
+        with pytest.raises(DataError, match='takes too long: its 200000 training points'):
+            CorrectionGrid(found, (2**13, 2**13))
+        assert not done
 
 
 @pytest.mark.parametrize('size', [(1, 1), (3, 2), (17, 33), (130, 7), (121, 94)])

@@ -40,6 +40,8 @@ from fluoro_calib_ros.files.image_points import correct_points, read_points, wri
 from fluoro_calib_ros.files.json_file import read_json, write_json
 from fluoro_calib_ros.files.observations import read_observations_csv, write_observations_csv
 from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
+from fluoro_calib_ros.files.rig_orientation import load_orientation, save_orientation
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 SIZE = (1024, 960)
 OBSERVATIONS = 'fluoroscope,exposure,target_id,u,v,sigma\n'
@@ -443,6 +445,30 @@ def test_invalid_calibration_is_refused(tmp_path, arrays, sentence):
     said = message_of(load_calibration, path)
     assert said.startswith(path) and sentence in said
     assert not os.path.exists('/tmp/this_must_never_be_made')
+
+
+def test_calibration_of_an_earlier_version_gets_the_id_of_its_content(tmp_path):
+    """So does the orientation beside it, which names the calibrations that it belongs to."""
+    found = some_calibration()
+    earlier = found.earlier_id
+    assert (
+        load_calibration(changed(tmp_path, calibration_id=np.array(earlier))).calibration_id
+        == found.calibration_id
+    )
+    orientation = RigOrientation(
+        ('a',),
+        found.interior[None],
+        np.eye(3)[None],
+        np.zeros((1, 3)),
+        np.eye(9),
+        'phantom',
+        'joint calibration',
+        (earlier,),
+    )
+    saved = load_orientation(save_orientation(tmp_path, orientation))
+    assert saved.calibration_ids == (found.calibration_id,)
+    details = changed(tmp_path, calibration_id=np.array(earlier), converged=np.array(False))
+    assert load_calibration(details).calibration_id not in (earlier, found.calibration_id)
 
 
 def test_truncated_or_damaged_calibration_is_refused(tmp_path):

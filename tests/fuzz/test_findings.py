@@ -18,6 +18,7 @@ import sqlite3
 import struct
 import zlib
 
+import cv2
 import numpy as np
 import pytest
 import tifffile
@@ -104,3 +105,20 @@ def test_format_that_does_not_tell_its_size():
 def test_property_of_messages_can_fail(text):
     with pytest.raises(Broken):
         check_message(text)
+
+
+def test_video_without_a_pixel_format(tmp_path):
+    """OpenCV says -1."""
+    path = tmp_path / 'trial.mp4'
+    path.write_bytes(load('video').seeds()[1].replace(b'mvhd', b'xvhd'))
+    assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT) == -1
+    assert sum(1 for _ in open_images(path).images) == 3
+
+
+@pytest.mark.ros
+def test_orientation_without_fluoroscopes():
+    messages = pytest.importorskip('fluoro_calib_ros.nodes.messages.rig_orientation')
+    from fluoro_calib_msgs.msg import RigOrientation
+
+    with pytest.raises(DataError, match='it has no fluoroscopes'):
+        messages.orientation_from_message(RigOrientation())

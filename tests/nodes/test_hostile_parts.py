@@ -121,12 +121,15 @@ def test_changed_calibration_is_refused(field, value):
         calibration_from_message(message)
 
 
-def test_id_of_earlier_versions_is_accepted():
+@pytest.mark.parametrize('changed', [False, True])
+def test_id_of_earlier_versions_is_refused(changed):
+    """It does not show changes of what does not determine a correction."""
     calibration = rigs.calibrated('a', 5, model='none').calibrations['a']
-    earlier = replace(calibration, short_id=True)
-    assert earlier.calibration_id != calibration.calibration_id
-    found = calibration_from_message(message_from_calibration(earlier))
-    assert found.calibration_id == earlier.calibration_id
+    message = message_from_calibration(calibration)
+    message.calibration_id = calibration.earlier_id
+    message.converged ^= changed
+    with pytest.raises(DataError, match='does not match its id'):
+        calibration_from_message(message)
 
 
 @pytest.mark.filterwarnings('error')
@@ -151,6 +154,18 @@ def test_hostile_calibration_with_a_valid_id_is_refused(change, sentence):
         change = {'model': model, 'train_exposure': np.zeros(count, np.int64)}
     message = message_from_calibration(replace(calibration, **change))
     with pytest.raises(DataError, match=sentence):
+        calibration_from_message(message)
+
+
+def test_calibrated_area_with_too_many_corners_is_refused():
+    """Each pixel is compared with each of them."""
+    message = message_from_calibration(rigs.calibrated('a', 5, model='none').calibrations['a'])
+    angle = np.linspace(0, 2 * np.pi, 1100, endpoint=False)
+    message.train_u = 500 + 400 * np.cos(angle)
+    message.train_v = 500 + 400 * np.sin(angle)
+    message.train_du = message.train_dv = np.zeros(1100)
+    message.train_exposure = np.zeros(1100, np.uint32)
+    with pytest.raises(DataError, match='the calibrated area has 1100 corners'):
         calibration_from_message(message)
 
 

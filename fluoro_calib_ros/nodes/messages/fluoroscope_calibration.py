@@ -80,6 +80,19 @@ def calibration_from_message(
 
     Raises DataError where the message holds no valid calibration, or not the one its id says.
     """
+    calibration = content_of_calibration(message)
+    if calibration.calibration_id != message.calibration_id:
+        raise DataError(
+            f'calibration of fluoroscope {message.fluoroscope}: its content does not match its id '
+            f'{message.calibration_id}'
+        )
+    return calibration
+
+
+def content_of_calibration(
+    message: FluoroscopeCalibration,
+) -> calibration_result.FluoroscopeCalibration:
+    """Return the calibration of a message, whatever its id says. Raises DataError."""
     where = f'calibration of fluoroscope {message.fluoroscope}'
     calibration = calibration_result.FluoroscopeCalibration(
         image_size=(message.image_width, message.image_height),
@@ -92,9 +105,7 @@ def calibration_from_message(
         stamp_ns=nanoseconds_from_stamp(message.header.stamp),
         frame_id=message.header.frame_id,
         **{name: getattr(message, name) for name in SAME_NAME},
-    ).with_id(message.calibration_id)
-    if calibration is None:
-        raise DataError(f'{where}: its content does not match its id {message.calibration_id}')
+    )
     validated_arrays(where, calibration)
     return calibration
 

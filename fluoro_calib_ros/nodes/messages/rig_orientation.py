@@ -61,11 +61,23 @@ def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
 
     Raises DataError where the message holds no valid orientation, or not the one its id says.
     """
+    orientation = content_of_orientation(message)
+    if orientation.orientation_id != message.orientation_id:
+        raise DataError(
+            f'rig orientation: its content does not match its id {message.orientation_id}'
+        )
+    return orientation
+
+
+def content_of_orientation(message: RigOrientation) -> rig.RigOrientation:
+    """Return the orientation of a message, whatever its id says. Raises DataError."""
     count = len(message.fluoroscope)
     if count > MAX_FLUOROSCOPES:
         raise DataError(
             f'rig orientation: {count} fluoroscopes, more than {MAX_FLUOROSCOPES} are not read'
         )
+    if not count:
+        raise DataError('rig orientation: it has no fluoroscopes')
     columns = {
         name: np.array(getattr(message, name)) for name in (*_INTERIOR, *_POSITION, *_ATTITUDE)
     }
@@ -84,7 +96,7 @@ def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
         raise DataError('rig orientation: an attitude is not a unit quaternion')
     if not np.isfinite(covariance).all():
         raise DataError('rig orientation: its covariance is not finite')
-    orientation = rig.RigOrientation(
+    return rig.RigOrientation(
         tuple(message.fluoroscope),
         np.stack([columns[name] for name in _INTERIOR], axis=1),
         matrix_from_quaternion(attitude).transpose(0, 2, 1),
@@ -97,11 +109,6 @@ def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
         message.exposures,
         tuple(message.optical_frame_id),
     ).rounded()
-    if orientation.orientation_id != message.orientation_id:
-        raise DataError(
-            f'rig orientation: its content does not match its id {message.orientation_id}'
-        )
-    return orientation
 
 
 def description_of(message: RigOrientation) -> str:

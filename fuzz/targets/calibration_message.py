@@ -1,0 +1,78 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""Messages of calibrations and orientations; the ids are made to match what was changed."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+from fluoro_calib_msgs.msg import FluoroscopeCalibration, RigOrientation
+from rclpy.serialization import deserialize_message, serialize_message
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
+    calibration_from_message,
+    content_of_calibration,
+    message_from_calibration,
+)
+from fluoro_calib_ros.nodes.messages.rig_orientation import (
+    content_of_orientation,
+    message_from_orientation,
+    orientation_from_message,
+)
+
+from ..harness import Broken, Target, both
+from ..seeds import calibration, orientation
+
+
+def _read(path: Path) -> None:
+    data = path.read_bytes()
+    both(lambda: _read_calibration(data), lambda: _read_orientation(data))
+
+
+def _read_calibration(data: bytes) -> None:
+    message = _decoded(FluoroscopeCalibration, data)
+    message.calibration_id = content_of_calibration(message).calibration_id
+    found = calibration_from_message(message)
+    again = calibration_from_message(message_from_calibration(found))
+    if again.calibration_id != found.calibration_id:
+        raise Broken('another calibration than was sent')
+
+
+def _read_orientation(data: bytes) -> None:
+    message = _decoded(RigOrientation, data)
+    message.orientation_id = content_of_orientation(message).orientation_id
+    found = orientation_from_message(message)
+    again = orientation_from_message(message_from_orientation(found))
+    if again.orientation_id != found.orientation_id:
+        raise Broken('another orientation than was sent')
+
+
+def _decoded(kind: type, data: bytes) -> Any:
+    try:
+        return deserialize_message(data, kind)
+    except Exception as error:  # of rclpy: the stream readers count such messages
+        raise DataError(f'undecodable ({type(error).__name__})') from None
+
+
+@functools.cache
+def _seeds() -> list[bytes]:
+    messages = [message_from_calibration(calibration(m)) for m in ('knn', 'parametric', 'none')]
+    messages.append(message_from_orientation(orientation()))
+    return [bytes(serialize_message(message)) for message in messages]
+
+
+TARGET = Target('calibration_message', 'message', _read, _seeds)

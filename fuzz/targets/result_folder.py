@@ -1,0 +1,66 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+"""result.json of a result folder, as `report` and `convert` read it."""
+
+from __future__ import annotations
+
+import functools
+import json
+import tempfile
+from pathlib import Path
+from unittest import mock
+
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.jobs.calibration import run_calibration
+from fluoro_calib_ros.jobs.conversion import stations_of
+from fluoro_calib_ros.jobs.report import write_report
+from fluoro_calib_ros.jobs.result_folder import RESULT, save_outcome
+from fluoro_calib_ros.report import html
+from fluoro_calib_ros.simulation.exposures import simulate_exposures
+
+from ..harness import Target, both
+from ..seeds import rig
+
+
+@functools.cache
+def _folder() -> tempfile.TemporaryDirectory[str]:
+    """Return the result folder of a small calibration; it lives as long as the process."""
+    temporary = tempfile.TemporaryDirectory()
+    frames = {'a': simulate_exposures(rig(), 5, 1).frames['a']}
+    options = CalibrationOptions(model='none', max_iterations=2)
+    outcome = run_calibration(CalibrationRequest(frames, rig().phantom, options, False))
+    save_outcome(Path(temporary.name) / 'result', outcome)
+    return temporary
+
+
+def _read(path: Path) -> None:
+    folder = Path(_folder().name) / 'result'
+    (folder / RESULT).write_bytes(path.read_bytes())
+    with mock.patch.object(html, '_pictures', lambda *_: {}):  # seconds, from other files
+        both(lambda: list(stations_of(folder / RESULT)), lambda: write_report(folder))
+
+
+@functools.cache
+def _seed() -> bytes:
+    """Return a result with few targets and exposures."""
+    document = json.loads((Path(_folder().name) / 'result' / RESULT).read_text())
+    document['targets'] = document['targets'][:3]
+    document['correlations'] = document.get('correlations', [])[:2]
+    for fluoroscope in document['fluoroscopes'].values():
+        fluoroscope['exposures'] = fluoroscope['exposures'][:2]
+    return json.dumps(document).encode()
+
+
+TARGET = Target('result_folder', RESULT, _read, lambda: [_seed()])

@@ -330,6 +330,21 @@ def test_change_of_trend_is_detected_with_its_size():
     assert found.size > found.limit and abs(found.size - 0.2 / np.sqrt(2)) < 0.05
 
 
+@pytest.mark.parametrize('middle', [(448.0, 448.0), (512.0, 512.0)])
+def test_local_change_is_found_wherever_it_is(middle):
+    """In the middle of a cell and where four of them meet; noise alone is far from the limit."""
+
+    def ripple(uv, e):
+        bump = np.exp(-np.sum((uv - middle) ** 2, axis=1) / (2 * 60.0**2))
+        return (e >= 6)[:, None] * 0.7 * bump[:, None] * (0.8, 0.6)
+
+    found = change_of_trend(noise(4, trend=ripple), SIZE)
+    assert found.cell_size > found.cell_limit
+    assert np.linalg.norm(found.place - middle) < 100
+    honest = change_of_trend(noise(4), SIZE)
+    assert honest.cell_size < 0.9 * honest.cell_limit
+
+
 def test_residuals_agree_with_the_adjustment():
     job = calibrated('a', **LOCAL)
     frames = exposures()['a']

@@ -15,41 +15,116 @@
 """Limits of what is read, in one place.
 
 They lie far above what a lab has, and bound time and memory where a file or message claims more.
-`StreamLimits` and `CollectLimits` are parameters of the nodes; the others hold for files and
-messages, whoever reads them.
+`StreamLimits` and `CollectLimits` are parameters of the nodes. `ReadLimits` hold for whatever a
+process reads; they are parameters of the nodes and options of the command line, which set them
+once, at the start, and worker processes get those of their parent.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
-from .options import option
+from .options import option, validate_options
 
 MEGABYTE = 2**20
 
-# Files and bags [bytes].
-MAX_FILE = 256 * MEGABYTE  # that is read as a whole: some five million image points
+# Bags [bytes].
 MAX_CHUNK = 512 * MEGABYTE  # of a bag, without compression
 MAX_OBSERVATIONS = 4 * MEGABYTE  # of a message in a bag: 150,000 image points
 MAX_TOPICS = 2000  # of a bag
-# Messages that a node takes [bytes]: an image of MAX_PIXELS with 16 bits, and its header.
-MAX_MESSAGE = 130 * MEGABYTE
 BYTES_OF_HEAD = 4096  # of a message of image points: header and names
 BYTES_OF_POINT = 41  # at most: an id, four numbers and a status, and their padding
-# Images.
-MAX_PIXELS = 64 * MEGABYTE  # 8192 x 8192
 # Calibrations and orientations of the rig, in files and messages.
 MAX_IMAGE_SIDE = 32_000  # px: OpenCV holds whole pixels in 16 bits
-MAX_TRAINING_POINTS = 200_000
 MAX_CORNERS = 1000  # of the calibrated area
 MAX_NEIGHBOURS = 1000
 MAX_COINCIDENT = 1000  # training points on one place
-MAX_FLUOROSCOPES = 16
 MAX_PX = 1e6  # of a coordinate or correction
 MAX_PRINCIPAL_DISTANCE_PX = 1e9
-# Names [characters].
-MAX_NAME = 100  # of a fluoroscope
+BYTES_OF_TRAINING_POINT = 36  # in a message: four numbers and an exposure
+BYTES_OF_CALIBRATION = 2 * MEGABYTE  # in a message, at most, without training points
+BYTES_OF_IMAGE = MEGABYTE  # in a message, at most, without pixels
+# Texts [characters].
 MAX_TEXT = 4096  # of a parameter
+
+
+@dataclass(frozen=True)
+class ReadLimits:
+    """What is read from files and messages."""
+
+    max_file_mb: int = option(
+        268,
+        'files that are read as a whole, and unpacked archives; larger ones are refused unread',
+        minimum=1,
+        maximum=100_000,
+        unit='MB',
+    )
+    max_image_megapixels: int = option(
+        64,
+        'images, of 2^20 px; larger ones are refused by their header',
+        minimum=1,
+        maximum=1024,
+        unit='megapixels',
+    )
+    max_training_points: int = option(
+        200_000,
+        'training points of a calibration; those with more are refused',
+        minimum=1,
+        maximum=10_000_000,
+    )
+    max_targets: int = option(
+        100_000, 'targets of a phantom; those with more are refused', minimum=1, maximum=10_000_000
+    )
+    max_fluoroscopes: int = option(
+        16,
+        'fluoroscopes of a rig orientation; those with more are refused',
+        minimum=1,
+        maximum=1000,
+    )
+    max_name_length: int = option(
+        100,
+        'characters of the name of a fluoroscope in files; longer ones are refused',
+        minimum=1,
+        maximum=200,
+    )
+
+    def __post_init__(self) -> None:
+        validate_options(self)
+
+    @property
+    def max_file_bytes(self) -> int:
+        """Size of the largest file."""
+        return self.max_file_mb * 10**6
+
+    @property
+    def max_pixels(self) -> int:
+        """Number of pixels of the largest image."""
+        return self.max_image_megapixels * MEGABYTE
+
+    @property
+    def max_image_bytes(self) -> int:
+        """Size of the largest message of an image, of 16 bits."""
+        return 2 * self.max_pixels + BYTES_OF_IMAGE
+
+    @property
+    def max_calibration_bytes(self) -> int:
+        """Size of the largest message of a calibration."""
+        return BYTES_OF_CALIBRATION + BYTES_OF_TRAINING_POINT * self.max_training_points
+
+
+# A reader is called from everywhere. So that not every function above hands the limits on, a
+# process has one set of them.
+_of_this_process = [ReadLimits()]
+
+
+def read_limits() -> ReadLimits:
+    """Return the limits of this process."""
+    return _of_this_process[0]
+
+
+def use_read_limits(limits: ReadLimits) -> None:
+    """Set the limits of this process, at its start."""
+    _of_this_process[0] = limits
 
 
 @dataclass(frozen=True)

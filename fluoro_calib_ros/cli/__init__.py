@@ -39,6 +39,7 @@ from . import (
     validate,
     watch,
 )
+from .arguments import add_read_limits, set_read_limits
 from .completion import SHELLS
 from .output import print_note, styled
 from .rig import add_rig, find_rig
@@ -65,6 +66,8 @@ COMMANDS = (
     watch,
     bridge,
 )
+
+READ_NOTHING = (simulate, watch, bridge)
 
 
 class _Version(argparse.Action):
@@ -126,6 +129,8 @@ def make_parser(command: str | None = None, rig: RigFile | None = None) -> argpa
                 '--json', action='store_true', help='print the result as JSON on standard output'
             )
             module.add_arguments(sub)
+            if module not in READ_NOTHING:
+                add_read_limits(sub)
             add_rig(sub, module.NAME, rig)
     return parser
 
@@ -151,6 +156,7 @@ def _run(words: list[str]) -> None:
         options = parser.parse_args(words)
         if hasattr(options.module, 'check'):
             options.module.check(options, parser.error)
+        set_read_limits(options)
         if rig is not None:
             print_note(f'defaults of {rig.path}')
         options.module.run(options)

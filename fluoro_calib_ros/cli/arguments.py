@@ -22,6 +22,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..limits import ReadLimits, use_read_limits
 from ..options import Option, declared
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
 UNITS = ('mm', 'cm', 'm')
+READ_LIMITS = ('max_file_mb', 'max_image_megapixels', 'max_training_points')  # that are options
 
 
 def image_size(text: str) -> tuple[int, int]:
@@ -99,6 +101,20 @@ def add_option(parser: Parser, option: Option, **changes: Any) -> None:
         settings['type'] = _number(option, int)
     settings.update(changes)
     parser.add_argument('--' + option.name.replace('_', '-'), **settings)
+
+
+def add_read_limits(parser: argparse.ArgumentParser) -> None:
+    """Add the limits of what a command reads."""
+    group = parser.add_argument_group('limits of what is read')
+    options = declared(ReadLimits)
+    for name in READ_LIMITS:
+        add_option(group, options[name], metavar='N')
+
+
+def set_read_limits(arguments: argparse.Namespace) -> None:
+    """Use the limits of the arguments, the default ones for a command that has none."""
+    given = {name: getattr(arguments, name) for name in READ_LIMITS if hasattr(arguments, name)}
+    use_read_limits(ReadLimits(**given))
 
 
 def _number(option: Option, kind: type) -> Callable[[str], Any]:

@@ -37,7 +37,7 @@ from ..exposures.frame import Frame, points_on_image
 from ..exposures.names import Names, number_names, safe_names, without_trivial
 from ..files.access import os_error_reason
 from ..images.declared_size import check_size, declared_size
-from ..limits import MAX_FILE
+from ..limits import read_limits
 from . import xmalab_frame
 from .base import Format, Sample
 from .camera_files import check_matrix, check_rotation
@@ -119,7 +119,7 @@ class _Project:
         info = self._members.get(posixpath.normpath(name.replace('\\', '/')))
         if info is None:
             raise DataError(f'{self._path}: the project does not contain {name}')
-        if info.file_size > MAX_FILE:
+        if info.file_size > read_limits().max_file_bytes:
             raise DataError(f'{self._path}: {name} is too large, {info.file_size} bytes')
         try:
             return self._archive.read(info)

@@ -21,9 +21,9 @@ import re
 import stat
 
 from ..errors import DataError
-from ..limits import MAX_FILE, MAX_NAME
+from ..limits import read_limits
 
-_SAFE_NAME = re.compile(rf'[A-Za-z0-9_-]{{1,{MAX_NAME}}}')
+_SAFE_NAME = re.compile('[A-Za-z0-9_-]+')
 
 PathLike = str | os.PathLike[str]
 
@@ -55,9 +55,10 @@ def read_bytes(path: PathLike) -> bytes:
     try:
         with open(path, 'rb') as file:
             size = os.fstat(file.fileno()).st_size
-            if size > MAX_FILE:
+            limits = read_limits()
+            if size > limits.max_file_bytes:
                 raise DataError(
-                    f'{path}: the file has {size / 1e6:.0f} MB, more than {MAX_FILE / 1e6:.0f} MB '
+                    f'{path}: the file has {size / 1e6:.0f} MB, more than {limits.max_file_mb} MB '
                     'are not read'
                 )
             content = file.read()
@@ -94,10 +95,11 @@ def check_safe_name(name: str, where: object) -> None:
 
     It may contain letters, digits, _ and -; where begins the message.
     """
-    if not _SAFE_NAME.fullmatch(str(name)):
+    longest = read_limits().max_name_length
+    if len(str(name)) > longest or not _SAFE_NAME.fullmatch(str(name)):
         raise DataError(
             f'{where}: the fluoroscope is called {name!r}, but a name consists of letters, '
-            f'digits, _ and -, at most {MAX_NAME} of them'
+            f'digits, _ and -, at most {longest} of them'
         )
 
 

@@ -35,7 +35,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError
-from ..limits import MAX_FILE
+from ..limits import read_limits
 from .access import PathLike, read_bytes
 from .atomic import atomic_file
 
@@ -187,9 +187,10 @@ def _read_members(
     """Return the arrays of an archive; its version is checked first."""
     members = archive.namelist()
     total = sum(info.file_size for info in archive.infolist())
-    if total > MAX_FILE:
+    limits = read_limits()
+    if total > limits.max_file_bytes:
         raise DataError(
-            f'{path}: its arrays take {total / 1e6:.0f} MB, more than {MAX_FILE / 1e6:.0f} MB are '
+            f'{path}: its arrays take {total / 1e6:.0f} MB, more than {limits.max_file_mb} MB are '
             'not read'
         )
     version = _read_version(path, archive, layout)

@@ -31,11 +31,9 @@ from ..limits import (
     MAX_COINCIDENT,
     MAX_IMAGE_SIDE,
     MAX_NEIGHBOURS,
-    MAX_PIXELS,
     MAX_PRINCIPAL_DISTANCE_PX,
     MAX_PX,
-    MAX_TRAINING_POINTS,
-    MEGABYTE,
+    read_limits,
 )
 from .access import PathLike, check_safe_name, make_folder, os_error_reason
 from .arrays import ArraySpec, Layout, read_arrays, to_arrays, to_values, write_arrays
@@ -51,9 +49,9 @@ ARRAYS = {
     'interior_estimated': ArraySpec('bool'),
     'model_kind': ArraySpec('text'),
     'model_k': ArraySpec('int', minimum=0, maximum=MAX_NEIGHBOURS),
-    'train_uv': ArraySpec('float', ('N', 2), maximum=MAX_PX, longest=MAX_TRAINING_POINTS),
-    'train_duv': ArraySpec('float', ('N', 2), maximum=MAX_PX, longest=MAX_TRAINING_POINTS),
-    'train_exposure': ArraySpec('int', ('N',), minimum=0, longest=MAX_TRAINING_POINTS),
+    'train_uv': ArraySpec('float', ('N', 2), maximum=MAX_PX),
+    'train_duv': ArraySpec('float', ('N', 2), maximum=MAX_PX),
+    'train_exposure': ArraySpec('int', ('N',), minimum=0),
     'noise_px': ArraySpec('float', minimum=0, maximum=MAX_PX),
     'bias_px': ArraySpec('float', minimum=0, maximum=MAX_PX),
     'series_degree': ArraySpec('int', minimum=-1, maximum=MAX_DEGREE),
@@ -217,6 +215,12 @@ def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
     if len(set(lengths.values())) > 1:
         listed = ', '.join(f'{name} {length}' for name, length in lengths.items())
         raise DataError(f'{where}: the training arrays differ in length ({listed})')
+    limits = read_limits()
+    if lengths['train_uv'] > limits.max_training_points:
+        raise DataError(
+            f'{where}: {lengths["train_uv"]} training points, more than '
+            f'{limits.max_training_points} are not read'
+        )
     if _largest_heap(arrays['train_uv']) > MAX_COINCIDENT:
         raise DataError(
             f'{where}: more than {MAX_COINCIDENT} training points lie on one place of the image'
@@ -225,10 +229,10 @@ def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
     if c <= 0:
         raise DataError(f'{where}: the principal distance is {c:g} px')
     width, height = arrays['image_size'].tolist()
-    if width * height > MAX_PIXELS:
+    if width * height > limits.max_pixels:
         raise DataError(
             f'{where}: the images have {width} x {height} px, those of more than '
-            f'{MAX_PIXELS // MEGABYTE} megapixels are not read'
+            f'{limits.max_image_megapixels} megapixels are not read'
         )
 
 

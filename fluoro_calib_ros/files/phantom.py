@@ -29,6 +29,7 @@ from ..exposures.columns import first_repeated
 from ..exposures.moving_points import MovingPoints
 from ..exposures.names import Names, without_trivial
 from ..exposures.phantom import Phantom
+from ..limits import read_limits
 from .atomic import atomic_file
 from .csv_table import read_blocks, write_rows
 from .named_column import NamedColumn
@@ -58,9 +59,14 @@ def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
     number_parts = []
     line_parts = []
     diameter_parts = []
+    most = read_limits().max_targets
+    count = 0
     for block in read_blocks(path, COLUMNS):
         numbers = np.column_stack([block.floats(name) for name in COLUMNS[1:]])
         id_parts.append(column.read(block))
+        count += len(numbers)
+        if count > most:
+            raise DataError(f'{path}: phantoms of more than {most} targets are not read')
         block.require('sd', numbers[:, 3] > 0, 'not above 0')
         number_parts.append(numbers)
         line_parts.append(block.lines)

@@ -21,6 +21,7 @@ from contextlib import suppress
 from dataclasses import replace
 
 from ..errors import DataError
+from ..limits import read_limits
 from ..photogrammetry.rig_orientation import RigOrientation
 from .access import PathLike, check_safe_name, make_folder
 from .arrays import ArraySpec, Layout, read_arrays, to_arrays, to_values, write_arrays
@@ -82,6 +83,12 @@ def load_orientation(path: PathLike) -> RigOrientation:
     """
     values = to_values(read_arrays(path, LAYOUT))
     identity = values.pop('orientation_id')
+    most = read_limits().max_fluoroscopes
+    if len(values['fluoroscope']) > most:
+        raise DataError(
+            f'{path}: the orientation has {len(values["fluoroscope"])} fluoroscopes, more than '
+            f'{most} are not read'
+        )
     for name in values['fluoroscope'].tolist():
         check_safe_name(name, path)
     try:

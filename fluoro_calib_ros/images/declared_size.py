@@ -27,7 +27,7 @@ import re
 import tifffile
 
 from ..errors import DataError
-from ..limits import MAX_PIXELS
+from ..limits import read_limits
 
 PNG_SIGNATURE = b'\x89PNG\r\n\x1a\n'
 TIFF_SIGNATURES = (b'II*\0', b'MM\0*', b'II+\0', b'MM\0+')
@@ -37,7 +37,7 @@ PNM = re.compile(rb'P[1-6]\s(?:\s*#[^\n]*\n)*\s*(\d{1,9})\s(?:\s*#[^\n]*\n)*\s*(
 
 
 def check_declared_size(content: memoryview) -> None:
-    """Raise DataError for an image file that declares more than MAX_PIXELS pixels.
+    """Raise DataError for an image file that declares more pixels than are read.
 
     Files of other formats, and headers that are damaged, are left to the decoder.
     """
@@ -46,11 +46,12 @@ def check_declared_size(content: memoryview) -> None:
 
 
 def check_size(width: int, height: int) -> None:
-    """Raise DataError for an image of more than MAX_PIXELS pixels."""
-    if width * height > MAX_PIXELS:
+    """Raise DataError for an image of more pixels than are read."""
+    limits = read_limits()
+    if width * height > limits.max_pixels:
         raise DataError(
-            f'the image is {width} x {height} px, images of more than {MAX_PIXELS // 2**20} '
-            'megapixels are not read'
+            f'the image is {width} x {height} px, images of more than '
+            f'{limits.max_image_megapixels} megapixels are not read'
         )
 
 

@@ -27,6 +27,8 @@ from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnContext, SpawnProcess
 from typing import Any
 
+from ..limits import ReadLimits, read_limits, use_read_limits
+
 PARENT_POLL_S = 0.5  # interval at which a worker looks whether its caller is alive [s]
 
 
@@ -53,7 +55,7 @@ def start_child(
     It watches this process before it reads any other module of the package, which takes seconds
     on a busy machine.
     """
-    arguments = (_ParentWatch(), function, connection, *arguments)
+    arguments = (_ParentWatch(), read_limits(), function, connection, *arguments)
     process = context.Process(target=_begin, daemon=True, args=arguments)
     with interrupts_blocked():
         process.start()
@@ -70,7 +72,14 @@ class _ParentWatch:
         return watch_parent, (os.getpid(),)
 
 
-def _begin(_: None, function: Callable[..., None], connection: Connection, *rest: Any) -> None:
+def _begin(
+    _: None,
+    limits: ReadLimits,
+    function: Callable[..., None],
+    connection: Connection,
+    *rest: Any,
+) -> None:
+    use_read_limits(limits)
     function(connection, *rest)
 
 

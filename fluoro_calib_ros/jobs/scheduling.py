@@ -29,6 +29,7 @@ import cv2
 from threadpoolctl import threadpool_limits
 
 from ..errors import DataError
+from ..limits import ReadLimits, read_limits, use_read_limits
 from .parent_watch import interrupts_blocked, watch_parent
 
 Task = TypeVar('Task')
@@ -92,15 +93,16 @@ class LocalWorkers:
 
     def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
         """Yield the results of tasks in their order. Raises DataError for a worker that died."""
+        limits = read_limits()
         if self._executor is None:
             for task in tasks:
-                yield _alone(function, task)
+                yield _alone(function, task, limits)
             return
         executor = self._executor
 
         def submit(task: Task) -> Future[Result]:
             with interrupts_blocked():  # the executor starts processes when it needs them
-                return executor.submit(_alone, function, task)
+                return executor.submit(_alone, function, task, limits)
 
         try:
             yield from _in_order(submit, tasks, QUEUED * self._count)
@@ -146,11 +148,12 @@ class DaskWorkers:
         """Yield the results of tasks in their order. Raises DataError for a lost cluster."""
         from distributed import CancelledError, KilledWorker
 
+        limits = read_limits()
         threads = max(sum(self._client.nthreads().values()), 1)
         try:
             yield from _in_order(
                 lambda task: self._client.submit(
-                    _alone, function, task, pure=False, retries=RETRIES
+                    _alone, function, task, limits, pure=False, retries=RETRIES
                 ),
                 tasks,
                 QUEUED * threads,
@@ -159,8 +162,9 @@ class DaskWorkers:
             raise DataError(f'the Dask cluster has lost a task: {error}') from None
 
 
-def _alone(function: Callable[[Task], Result], task: Task) -> Result:
-    """Run a task on one core: its worker has others beside it."""
+def _alone(function: Callable[[Task], Result], task: Task, limits: ReadLimits) -> Result:
+    """Run a task on one core, as its worker has others beside it, with the caller's limits."""
+    use_read_limits(limits)
     cv2.setNumThreads(1)
     with threadpool_limits(1):
         return function(task)

@@ -22,13 +22,16 @@ from typing import Any
 
 from fluoro_calib_msgs.msg import FluoroscopeCalibration
 from rclpy.node import Node
+from rclpy.serialization import deserialize_message
 
 from ..calibration import result as calibration_result
 from ..errors import DataError
+from ..limits import read_limits
 from .messages.fluoroscope_calibration import calibration_from_message, message_from_calibration
 from .runtime.discovery import publisher_conflict
 from .runtime.errors import one_line
 from .runtime.qos import latched_qos
+from .runtime.stream_reader import DECODING_ERRORS
 
 # Calls of release() after which an undisputed calibration is used, in case a second node that is
 # seen has died.
@@ -79,8 +82,9 @@ class CalibrationInput:
             node.create_subscription(
                 FluoroscopeCalibration,
                 f'{name}/calibration',
-                lambda message, name=name: self._on_calibration(name, message),
+                lambda data, name=name: self._on_data(name, data),
                 latched_qos(),
+                raw=True,
             )
             for name in names
         ]
@@ -126,6 +130,29 @@ class CalibrationInput:
                 self._start(name, list(held.values())[-1])
                 held.clear()
 
+    def _on_data(self, name: str, data: bytes) -> None:
+        """Decode a message of limited size."""
+        most = read_limits().max_calibration_bytes
+        if len(data) > most:
+            self._refuse(
+                name,
+                f'the message has {len(data) / 1e6:.0f} MB, calibrations of more than '
+                f'{most / 1e6:.0f} MB are not read',
+            )
+            return
+        try:
+            message = deserialize_message(data, FluoroscopeCalibration)
+        except DECODING_ERRORS:
+            self._refuse(name, f'the message on topic {name}/calibration cannot be decoded')
+            return
+        self._on_calibration(name, message)
+
+    def _refuse(self, name: str, reason: str) -> None:
+        self._node.get_logger().error(
+            f'calibration refused, the current one stays in use: {reason}'
+        )
+        self._on_refused(name, reason)
+
     def _on_calibration(self, name: str, message: FluoroscopeCalibration) -> None:
         if self.conflict(name):
             self._held[name].pop(message.calibration_id, None)
@@ -166,11 +193,7 @@ class CalibrationInput:
                 )
             prepared = self._prepare(calibration)
         except Exception as error:  # a message may hold anything, and the stream has to go on
-            reason = one_line(error)
-            self._node.get_logger().error(
-                f'calibration refused, the current one stays in use: {reason}'
-            )
-            self._on_refused(name, reason)
+            self._refuse(name, one_line(error))
             return
         self._current[name] = prepared
         self._on_ready(name, prepared)

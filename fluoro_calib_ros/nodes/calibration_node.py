@@ -94,9 +94,11 @@ from .runtime.errors import StartError
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run
 from .runtime.parameters import (
+    READ_LIMITS,
     ManagedParameters,
     ParameterGroup,
     check_timeout,
+    declare_read_limits,
     default_calibration_directory,
     expand_path,
 )
@@ -165,7 +167,7 @@ _CALIBRATION = ParameterGroup(
     CalibrationOptions, {name: name for name in _OF_REQUESTS}, settable=_OF_REQUESTS
 )
 _LIMITS = ParameterGroup(CollectLimits)
-PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION, _LIMITS)
+PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION, _LIMITS, READ_LIMITS)
 
 
 class Cancelled(Exception):
@@ -194,6 +196,7 @@ class CalibrationNode(StreamNode):
 
     def __init__(self) -> None:
         super().__init__('calibration_node')
+        declare_read_limits(self)
         self._settings = _NODE.declare(self)
         self._still = _STILL.declare(self)
         self._pairing = _PAIRING.declare(self)

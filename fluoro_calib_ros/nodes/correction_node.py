@@ -34,7 +34,12 @@ from .messages.corrected_observations import encode_corrected_observations
 from .messages.target_observations import ObservedFrame, decode_target_observations
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
-from .runtime.parameters import CalibratedParameters, ParameterGroup
+from .runtime.parameters import (
+    READ_LIMITS,
+    CalibratedParameters,
+    ParameterGroup,
+    declare_read_limits,
+)
 from .runtime.qos import latched_qos, observations_qos
 from .runtime.refusals import Refused
 
@@ -42,7 +47,7 @@ from .runtime.refusals import Refused
 INVALID = int(CorrectionStatus.INVALID)
 _NODE = ParameterGroup(CalibratedParameters)
 _LIMITS = ParameterGroup(StreamLimits)
-PARAMETERS = (_NODE, _LIMITS)
+PARAMETERS = (_NODE, _LIMITS, READ_LIMITS)
 
 
 class _ObservationStream(Stream):
@@ -65,6 +70,7 @@ class CorrectionNode(CorrectingNode):
 
     def __init__(self) -> None:
         super().__init__('correction_node')
+        declare_read_limits(self)
         self._limits = _LIMITS.declare(self)
         self.use_parameters(_NODE.declare(self))
 

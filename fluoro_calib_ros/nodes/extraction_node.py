@@ -65,7 +65,13 @@ from .runtime.exposure_queue import ExposureQueue
 from .runtime.lifecycle import StreamNode
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
-from .runtime.parameters import ManagedParameters, ParameterGroup, expand_path
+from .runtime.parameters import (
+    READ_LIMITS,
+    ManagedParameters,
+    ParameterGroup,
+    declare_read_limits,
+    expand_path,
+)
 from .runtime.qos import images_qos, observations_qos
 from .runtime.refusals import RefusalLog, Refused
 from .runtime.stall import StallDetector
@@ -140,7 +146,7 @@ _FOLLOWING = ParameterGroup(
     MarkerOptions,
     {name: name for name in ('gate', 'shutter', 'lost_after', 'search_every')},
 )
-PARAMETERS = (_NODE, _PAIRING, _FOLLOWING)
+PARAMETERS = (_NODE, _PAIRING, _FOLLOWING, READ_LIMITS)
 
 
 @dataclass(frozen=True)
@@ -212,6 +218,7 @@ class ExtractionNode(StreamNode):
 
     def __init__(self) -> None:
         super().__init__('extraction_node')
+        declare_read_limits(self)
         self._settings = _NODE.declare(self)
         self._tolerance_ns = _PAIRING.declare(self).tolerance_ns
         self.autostart = self._settings.autostart

@@ -43,7 +43,12 @@ from .messages.image import (
 )
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
-from .runtime.parameters import CalibratedParameters, ParameterGroup
+from .runtime.parameters import (
+    READ_LIMITS,
+    CalibratedParameters,
+    ParameterGroup,
+    declare_read_limits,
+)
 from .runtime.qos import images_qos, latched_qos
 from .runtime.refusals import Refused
 
@@ -76,7 +81,7 @@ class ImageParameters(CalibratedParameters):
 
 
 _NODE = ParameterGroup(ImageParameters, settable=('compressed_format', 'jpeg_quality'))
-PARAMETERS = (_NODE,)
+PARAMETERS = (_NODE, READ_LIMITS)
 
 
 class _PreparedCalibration:
@@ -108,6 +113,7 @@ class ImageNode(CorrectingNode):
 
     def __init__(self) -> None:
         super().__init__('image_node')
+        declare_read_limits(self)
         self._settings = _NODE.declare(self)
         self._inputs = INPUTS[self._settings.inputs]
         self.topics = tuple(topic for _, topic in self._inputs)

@@ -40,7 +40,12 @@ from .runtime.logging import Trace
 from .runtime.main import run
 from .runtime.message_types import installed_type
 from .runtime.pace import Pace
-from .runtime.parameters import ParameterGroup, ParameterNode
+from .runtime.parameters import (
+    READ_LIMITS,
+    ParameterGroup,
+    ParameterNode,
+    declare_read_limits,
+)
 from .runtime.qos import clock_qos, observations_qos, qos_overrides, recorded_latched_qos
 
 OBSERVATIONS = 'TargetObservations'
@@ -85,7 +90,7 @@ class PlayerParameters:
 
 
 _NODE = ParameterGroup(PlayerParameters, settable=('rate', 'loop'))
-PARAMETERS = (_NODE,)
+PARAMETERS = (_NODE, READ_LIMITS)
 
 
 class PlayerNode(ParameterNode):
@@ -93,6 +98,7 @@ class PlayerNode(ParameterNode):
 
     def __init__(self) -> None:
         super().__init__('player_node')
+        declare_read_limits(self)
         self._settings = _NODE.declare(self)
         if not self._settings.bag:
             raise StartError('parameter bag is not set: it names the bag to play')

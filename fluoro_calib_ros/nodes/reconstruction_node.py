@@ -75,7 +75,13 @@ from .messages.transforms import transforms_of_orientation
 from .runtime.diagnostics import OK, WARN, LatencyWindow, Status
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run
-from .runtime.parameters import CalibratedParameters, ParameterGroup, expand_path
+from .runtime.parameters import (
+    READ_LIMITS,
+    CalibratedParameters,
+    ParameterGroup,
+    declare_read_limits,
+    expand_path,
+)
 from .runtime.qos import latched_qos, observations_qos
 from .runtime.refusals import RefusalLog, Refused
 from .runtime.stall import StallDetector
@@ -142,7 +148,7 @@ _DRIFT_OPTIONS = ParameterGroup(
     settable=('drift_warn_interval', 'drift_error_interval'),
 )
 _LIMITS = ParameterGroup(StreamLimits)
-PARAMETERS = (_NODE, _PAIRING, _DRIFT, _DRIFT_OPTIONS, _LIMITS)
+PARAMETERS = (_NODE, _PAIRING, _DRIFT, _DRIFT_OPTIONS, _LIMITS, READ_LIMITS)
 
 
 @dataclass(frozen=True)
@@ -169,6 +175,7 @@ class ReconstructionNode(StreamNode):
 
     def __init__(self) -> None:
         super().__init__('reconstruction_node')
+        declare_read_limits(self)
         self._settings = _NODE.declare(self)
         self._limits = _LIMITS.declare(self)
         self._pairing = _PAIRING.declare(self)

@@ -31,7 +31,7 @@ from fluoro_calib_ros.images.codec import decode
 from fluoro_calib_ros.photogrammetry.resection import robust_dlt
 from fuzz.__main__ import load
 from fuzz.harness import Broken, check_message
-from fuzz.seeds import SEPARATOR
+from fuzz.seeds import SEPARATOR, orientation
 
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
@@ -123,3 +123,13 @@ def test_orientation_without_fluoroscopes():
 
     with pytest.raises(DataError, match='it has no fluoroscopes'):
         messages.orientation_from_message(RigOrientation())
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize('name', ['covariance', 'x', 'qw', 'c'])
+def test_orientation_message_with_giant_numbers(name):
+    messages = pytest.importorskip('fluoro_calib_ros.nodes.messages.rig_orientation')
+    message = messages.message_from_orientation(orientation())
+    getattr(message, name)[0] = 1.7e308
+    with pytest.raises(DataError, match=f'the array {name} holds a number'):
+        messages.orientation_from_message(message)

@@ -20,7 +20,7 @@ import numpy as np
 from fluoro_calib_msgs.msg import RigOrientation
 
 from ...errors import DataError
-from ...limits import MAX_FLUOROSCOPES
+from ...limits import read_limits
 from ...photogrammetry import rig_orientation as rig
 from ...photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from .fields import float64_field, nanoseconds_from_stamp, stamp_from_nanoseconds
@@ -28,6 +28,7 @@ from .fields import float64_field, nanoseconds_from_stamp, stamp_from_nanosecond
 _INTERIOR = ('xp', 'yp', 'c')
 _POSITION = ('x', 'y', 'z')
 _ATTITUDE = ('qw', 'qx', 'qy', 'qz')
+MAX_NUMBER = 1e30  # of any array: far beyond a rig, and far from overflow
 MIN_QUATERNION_NORM = 0.5  # below, a quaternion is damaged and not only rounded
 
 
@@ -72,10 +73,9 @@ def orientation_from_message(message: RigOrientation) -> rig.RigOrientation:
 def content_of_orientation(message: RigOrientation) -> rig.RigOrientation:
     """Return the orientation of a message, whatever its id says. Raises DataError."""
     count = len(message.fluoroscope)
-    if count > MAX_FLUOROSCOPES:
-        raise DataError(
-            f'rig orientation: {count} fluoroscopes, more than {MAX_FLUOROSCOPES} are not read'
-        )
+    most = read_limits().max_fluoroscopes
+    if count > most:
+        raise DataError(f'rig orientation: {count} fluoroscopes, more than {most} are not read')
     if not count:
         raise DataError('rig orientation: it has no fluoroscopes')
     columns = {
@@ -88,14 +88,18 @@ def content_of_orientation(message: RigOrientation) -> rig.RigOrientation:
         raise DataError(
             f'rig orientation: {count} fluoroscopes, but the array {wrong[0]} has another length'
         )
+    for name, column in (*columns.items(), ('covariance', np.array(message.covariance))):
+        if not (np.abs(column) <= MAX_NUMBER).all():
+            raise DataError(
+                f'rig orientation: the array {name} holds a number that is not finite or beyond '
+                f'{MAX_NUMBER:g}'
+            )
     scale = _metre_scale(count)
     covariance = np.array(message.covariance).reshape(len(scale), -1) / (scale * scale[:, None])
     attitude = np.stack([columns[name] for name in _ATTITUDE], axis=1)
     norm = np.linalg.norm(attitude, axis=1)
-    if not np.isfinite(attitude).all() or not (norm > MIN_QUATERNION_NORM).all():
+    if not (norm > MIN_QUATERNION_NORM).all():
         raise DataError('rig orientation: an attitude is not a unit quaternion')
-    if not np.isfinite(covariance).all():
-        raise DataError('rig orientation: its covariance is not finite')
     return rig.RigOrientation(
         tuple(message.fluoroscope),
         np.stack([columns[name] for name in _INTERIOR], axis=1),

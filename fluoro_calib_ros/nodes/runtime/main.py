@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
@@ -63,6 +64,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
         sys.exit(0)
     ended = threading.Event()
     node = None
+    executor = None
     code = 0
     try:
         _init(args)
@@ -83,14 +85,18 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
             _spin(executor, node, ended)
         finally:
             getattr(node, 'stop', lambda: None)()
-            executor.shutdown()
         code = int(getattr(node, 'failed', False))
     except (StartError, ParameterException) as error:
         rclpy.logging.get_logger('fluoro_calib').fatal(log_line(str(error)))
         code = 1
     finally:
+        # What is left to the end of the interpreter is destroyed in any order, beside the threads
+        # of the middleware: the process may end with a segmentation fault.
+        if executor is not None:
+            executor.shutdown()
         if node is not None:
             node.destroy_node()
+        gc.collect()
         rclpy.try_shutdown()
     sys.exit(code)
 
@@ -139,8 +145,17 @@ def _make(make_node: Callable[[], Node]) -> Node:
     """Make the node. Raises StartError where its arguments are invalid."""
     try:
         return make_node()
-    except USER_ERRORS as error:
-        raise StartError(one_line(error)) from None
+    except BaseException as error:
+        # Half a node has joined the graph, too; the frame of its constructor still knows it.
+        for frame, _ in traceback.walk_tb(error.__traceback__):
+            half = frame.f_locals.get('self')
+            if isinstance(half, Node):
+                with suppress(Exception):  # what it does not have yet
+                    half.destroy_node()
+                break
+        if isinstance(error, USER_ERRORS):
+            raise StartError(one_line(error)) from None
+        raise
 
 
 def _call_on_interrupt(end: Callable[[], None]) -> None:

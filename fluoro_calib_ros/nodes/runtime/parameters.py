@@ -36,7 +36,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from ...errors import DataError, printable, shortened
-from ...limits import MAX_TEXT
+from ...limits import MAX_TEXT, ReadLimits, use_read_limits
 from ...options import Option, declared, option
 from .errors import StartError
 from .logging import PrintableLogger
@@ -197,6 +197,14 @@ class ParameterGroup(Generic[T]):
         for parameter, declaration in self.declarations.items():
             declaration.validate(values[parameter])
         return self.options(**{name: values[parameter] for name, parameter in self._names.items()})
+
+
+READ_LIMITS = ParameterGroup(ReadLimits)  # of every node that reads files or images
+
+
+def declare_read_limits(node: Node) -> None:
+    """Declare the parameters READ_LIMITS and use them in this process. Raises StartError."""
+    use_read_limits(READ_LIMITS.declare(node))
 
 
 def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -> Any:

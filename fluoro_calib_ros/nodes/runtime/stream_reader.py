@@ -48,7 +48,7 @@ from rclpy.qos import (
 from rclpy.serialization import deserialize_message
 from rclpy.subscription import Subscription
 
-from ...limits import MAX_MESSAGE
+from ...limits import read_limits
 from .discovery import needs_best_effort
 from .qos import incompatible_qos_message, qos_overrides
 
@@ -116,7 +116,7 @@ class StreamReader:
         callback: Callable[[Any, dict], None],
         qos: QoSProfile,
         decode: Callable[[bytes], Any] | None = None,
-        max_bytes: int = MAX_MESSAGE,
+        max_bytes: int | None = None,
     ) -> None:
         """Subscribe to a topic, also while messages are being received.
 
@@ -132,7 +132,8 @@ class StreamReader:
         decode : callable, optional
             Makes the message from its bytes, or raises ValueError; by default that of ROS.
         max_bytes : int, optional
-            Larger messages are dropped before they are decoded.
+            Larger messages are dropped before they are decoded; by default those that are larger
+            than an image may be.
         """
         subscription = self._node.create_subscription(
             kind,
@@ -143,7 +144,7 @@ class StreamReader:
             qos_overriding_options=qos_overrides(),
             event_callbacks=SubscriptionEventCallbacks(use_default_callbacks=False),
         )
-        self._max_bytes[topic] = max_bytes
+        self._max_bytes[topic] = max_bytes or read_limits().max_image_bytes
         decode = decode or (lambda data: deserialize_message(data, kind))
         self._routes.append((topic, subscription, decode, callback))
 

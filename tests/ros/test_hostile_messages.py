@@ -20,10 +20,12 @@ import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from fluoro_calib_msgs.msg import FluoroscopeCalibration, RigOrientation
 from ros_graph import ROOT, Process, value_of
 
+from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.files.calibration import load_calibration
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
@@ -165,4 +167,31 @@ def test_changed_orientation_under_its_id_is_refused(chain):
         'reconstruction_node', lambda s: value_of(s, 'orientation'), 'reconstruction'
     )
     assert value_of(status, 'orientation') == sent.orientation_id
+    client.destroy_publisher(output)
+
+
+def test_stream_goes_on_beside_a_hostile_calibration(chain, tracking):
+    """Of 200,000 training points on 4 square pixels; its grid took minutes."""
+    client = chain.client
+    node = chain.nodes['correction_node']
+    count = 200_000
+    uv = 500 + np.random.default_rng(1).uniform(0, 2, (count, 2))
+    hostile = replace(
+        load_calibration(chain.folder / 'a.calibration.npz'),
+        model=create_model('local_linear', 50, uv, np.sin(uv), 0.1, 0.0),
+        train_exposure=np.zeros(count, dtype=np.int64),
+    )
+    output = client.create_publisher(FluoroscopeCalibration, 'a/calibration', latched_qos())
+    client.wait_until(output.get_subscription_count, what='the readers of calibrations')
+    output.publish(message_from_calibration(hostile))
+    before = len(chain.corrected)
+    messages = [
+        ('b', message_from_frame(replace(tracking['b'][i], number=i))) for i in range(FRAMES)
+    ]
+    client.publish_in_step(messages, lambda: len(chain.corrected) - before)
+    client.wait_until(lambda: len(chain.corrected) == before + FRAMES, what='all frames of b')
+    client.wait_until(
+        lambda: f'calibration {hostile.calibration_id} in use' in node.log, what='its use'
+    )
+    assert node.running and memory_kb(node) < MEMORY_KB
     client.destroy_publisher(output)

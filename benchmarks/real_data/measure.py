@@ -64,9 +64,9 @@ class Fold:
         The same inside with the survey held.
     nse : float
         Of an adjustment of the tested exposures with the calibration held: square sum of the
-        residuals inside over their claimed variance, by degree of freedom.
+        residuals inside over their claimed variance, by degree of freedom, without the rejected.
     rejected : float
-        Share of these image points that the adjustment takes as gross errors.
+        Share of the image points inside that the adjustment takes as gross errors.
     seconds : float
         CPU time of the calibration.
     model : str
@@ -242,10 +242,11 @@ def _test_claims(
     kept = np.array(
         [counts[key] for key in zip(table.exposure.tolist(), table.target_id.tolist())]
     )
+    fold.rejected = float(np.mean(table.outlier[kept]))
+    kept &= ~table.outlier
     claimed = outcome.calibrations[CAMERA].correct(table.uv[kept], exact=True).sigma
     square = np.sum(table.residual[kept] ** 2 / claimed[:, None] ** 2)
     fold.nse = float(square / np.sum(table.redundancy[kept]))
-    fold.rejected = float(np.mean(table.outlier[kept]))
 
 
 def measure(data: DataSet, mrcal: str | None, validated: bool) -> dict[str, Any]:

@@ -57,8 +57,9 @@ are not part of this project; `--download` fetches them.
   without those that no camera explains (8 robust standard deviations for each). **inside**: in the
   convex hull of the image points of the calibration. **outside**: beyond it.
 - **NSE**: square sum of the residuals of `fc.adjust` inside over the variance that the calibration
-  claims (noise and correction), by redundancy; 1 is honest. **rejected**: share of the image
-  points that `fc.adjust` takes as gross errors, of those that some camera explains.
+  claims (noise and correction), by redundancy, without the rejected; 1 is honest. **rejected**:
+  share of the image points that `fc.adjust` takes as gross errors, of those that some camera
+  explains.
 - **s**: CPU seconds of a calibration, on a shared machine.
 
 {summary}

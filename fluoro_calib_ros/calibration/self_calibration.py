@@ -118,7 +118,9 @@ def _continued(
     """Self-calibrate by collocation from the solution of an earlier calibration."""
     network = measured.network
     residuals, q = residuals_and_q(network, measured.start, 0.0, earlier.noise)
-    start = Adjustment(measured.start, residuals, q, earlier.noise, np.inf, 0, False)
+    start = Adjustment(
+        measured.start, residuals, q, earlier.noise, np.inf, 0, False, network.exposure
+    )
     problem = AdjustmentProblem(network, measured.image_size, start, gauges_of(measured, options))
     names = measured.fluoroscopes
     terms = CollocationTerms(

@@ -135,6 +135,13 @@ def run(arguments: argparse.Namespace) -> None:
     print_unpaired(arguments.source, outcome.unpaired)
     if outcome.disagreement:
         print_note(f'{arguments.source}: {outcome.disagreement}')
+    if outcome.widening > 1:
+        print_note(
+            f'{arguments.source}: the rays miss each other by more than their standard deviations '
+            f'allow; the limit of false matches was widened {outcome.widening:.1f} times, to '
+            f'{arguments.reject * outcome.widening:.1f} standard deviations; check the sigma of '
+            'the image points, and whether a fluoroscope has moved since its calibration'
+        )
     _print(arguments, outcome)
 
 

@@ -16,7 +16,9 @@
 
 Least-squares collocation (Moritz, "Advanced Physical Geodesy", 1980): the distortion is a cubic
 trend plus a random field, both among the unknowns of the adjustment, with priors that are
-estimated from the observations (see `priors`).
+estimated from the observations (see `priors`). Radial terms of degree 5 and 7 and a spiral of
+degree 5 join the trend where the observations make them likely: beyond the image points a field
+returns to zero, and a trend goes on.
 """
 
 from __future__ import annotations
@@ -39,7 +41,14 @@ from .exposure_terms import (
     without_exposure_terms,
 )
 from .misfit import FittedPoints, LeftOut, has_common_error
-from .priors import Prior, gauge_precision, most_likely_prior, prior_precision, starting_prior
+from .priors import (
+    Prior,
+    gauge_precision,
+    has_rings,
+    most_likely_prior,
+    prior_precision,
+    starting_prior,
+)
 from .series import Functions, Series, sd_over_image
 from .series_model import SeriesModel
 
@@ -49,6 +58,7 @@ if TYPE_CHECKING:
     from ..photogrammetry.network import Network
 
 TREND_DEGREE = 3  # pincushion, S-shape and spiral are cubic to first order (Gronenschild 1997)
+RINGS = 2  # radial polynomials of degree 5 and 7: what a lens or a curved screen adds at the rim
 START_MODES = 16  # half waves along the image, until the signal is known
 MIN_MODES = 10
 MAX_MODES = 30  # the time grows with the sixth power
@@ -104,8 +114,8 @@ class EarlierTerms:
 class CollocationTerms(AdjustedTerms):
     """Trend and signal of all fluoroscopes of a network, and their priors.
 
-    modes: number of sines along the image to start with; 0: there is no signal. earlier: what to
-    start with instead.
+    modes: number of sines along the image to start with; 0: there is no signal, and the trend has
+    no rings (see `series.Functions`). earlier: what to start with instead.
     """
 
     intermediate_tolerance = 1.0  # noise and prior still change
@@ -136,7 +146,7 @@ class CollocationTerms(AdjustedTerms):
         for f, size in enumerate(self.sizes):
             rows = self.network.rows(f)
             core = before.residuals[rows][before.inliers[rows]]
-            self._set_functions(f, Functions(size, TREND_DEGREE, modes))
+            self._set_functions(f, Functions(size, TREND_DEGREE, modes, RINGS if modes else 0))
             sd = max(float(np.sqrt(np.mean(core**2))), MIN_START_SD_PX)
             self.priors.append(starting_prior(self.functions[f], sd))
         self._start = self.zeros()
@@ -147,24 +157,29 @@ class CollocationTerms(AdjustedTerms):
         self.noise_tolerance = CONTINUED_NOISE
         self.final_tolerance = CONTINUED_TOLERANCE
         self._mode_changes = 1  # those of the earlier series are not the first
+        start = []
         for f, (series, prior) in enumerate(zip(earlier.series, earlier.priors)):
-            self._set_functions(f, series.functions)
-            self.priors.append(prior or self._prior_of(f, series, before.noise.scale))
-        self._start = tuple(series.coefficients.ravel() for series in earlier.series)
+            functions = series.functions
+            rings = RINGS if functions.modes else 0
+            functions, matrix = functions.as_rings(series.coefficients, TREND_DEGREE, rings)
+            self._set_functions(f, functions)
+            self.priors.append(prior or self._prior_of(f, matrix, before.noise.scale))
+            start.append(matrix.ravel())
+        self._start = tuple(start)
 
-    def _prior_of(self, f: int, series: Series, scale: float) -> Prior:
-        """Prior of fluoroscope f that is most likely for a series; scale: of the noise.
+    def _prior_of(self, f: int, matrix: np.ndarray, scale: float) -> Prior:
+        """Prior of fluoroscope f that is most likely for coefficients (2, m); scale: of the noise.
 
         Orientations are taken to be known, which is near enough to start with.
         """
         rows = self.network.rows(f)
         weighted = self.values[f] / (scale * self.network.sigma[rows])[:, None]
         information = block_diag(*[weighted.T @ weighted] * 2)
-        coefficients = series.coefficients.ravel()
-        sd = max(float(np.std(self.values[f] @ series.coefficients.T)), MIN_START_SD_PX)
-        start = starting_prior(series.functions, sd)
+        coefficients = matrix.ravel()
+        sd = max(float(np.std(self.values[f] @ matrix.T)), MIN_START_SD_PX)
+        start = starting_prior(self.functions[f], sd)
         return most_likely_prior(
-            series.functions, information, information @ coefficients, self.gauges[f], start
+            self.functions[f], information, information @ coefficients, self.gauges[f], start
         )
 
     def start(self) -> tuple[np.ndarray, ...]:
@@ -212,7 +227,11 @@ class CollocationTerms(AdjustedTerms):
         functions = self.functions[f]
         own = slice(2 * len(functions))
         sd = sd_over_image(functions, covariance[own, own])
-        return Series(functions, coefficients[own].reshape(2, -1), sd)
+        values = coefficients[own].reshape(2, -1)
+        if has_rings(functions, self.priors[f]):
+            return Series(*functions.as_polynomials(values), sd)
+        plain = replace(functions, rings=0)
+        return Series(plain, plain.converted(functions, values.ravel()).reshape(2, -1), sd)
 
     def left_out(self, f: int) -> LeftOut | None:
         """The signal beyond the sines of fluoroscope f."""
@@ -332,7 +351,7 @@ class CollocationTerms(AdjustedTerms):
         if not functions.modes:
             return 0
         m = len(functions)
-        level = float(np.mean(np.diagonal(information)[len(functions.powers) : m]))
+        level = float(np.mean(np.diagonal(information)[functions.trend : m]))
         numbers = np.arange(MIN_MODES, MAX_MODES + 1)
         variance = self.priors[f].signal.variance(numbers * functions.frequency_of_mode)
         enough = numbers[variance * level < NEGLIGIBLE]
@@ -346,7 +365,9 @@ class CollocationTerms(AdjustedTerms):
         """Use these numbers of modes; return the coefficients for them."""
         out = []
         for f, functions in enumerate(self.functions):
-            self._set_functions(f, Functions(self.sizes[f], TREND_DEGREE, modes[f]))
+            self._set_functions(
+                f, Functions(self.sizes[f], TREND_DEGREE, modes[f], functions.rings)
+            )
             end = 2 * len(functions)
             series = self.functions[f].converted(functions, coefficients[f][:end])
             out.append(np.concatenate([series, coefficients[f][end:]]))

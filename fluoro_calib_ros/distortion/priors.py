@@ -39,6 +39,12 @@ GAUGE_SD_PX = 3e-5
 # Prior variance of a trend term that does not exist, relative to that with which it is determined.
 MIN_RELATIVE_VARIANCE = 1e-3
 MAX_VARIANCE = 1e8  # of a trend term that exists
+# Terms of the rings that can exist: the radial one and the spiral of degree 5, the radial of 7.
+RING_TERMS = (0, 1, 4)
+ABSENT_VARIANCE = 1e-12  # px^2, of a term of a ring that does not exist
+# Square of such a term over its variance from which it exists. It costs errors beyond the
+# calibrated area, where it grows fast; at 1, chance alone would make one of three exist.
+RING_EXISTS = 9.0
 SWEEPS = 3  # over the terms of the trend
 
 
@@ -55,15 +61,22 @@ class Prior:
 
 def starting_prior(functions: Functions, sd: float) -> Prior:
     """Return a prior to start with; sd: RMS residual without correction [px]."""
-    _, count = trend_transformation(functions.degree)
+    _, count = trend_transformation(functions.degree, functions.rings)
     signal = starting_signal(0.3 * sd, max(functions.image_size))
-    return Prior(signal, np.full(count, MAX_VARIANCE))
+    trend = np.full(count, MAX_VARIANCE)
+    trend[count - 4 * functions.rings :] = ABSENT_VARIANCE
+    return Prior(signal, trend)
+
+
+def has_rings(functions: Functions, prior: Prior) -> bool:
+    """Whether a term of the rings exists."""
+    return bool(np.any(prior.trend[len(prior.trend) - 4 * functions.rings :] > ABSENT_VARIANCE))
 
 
 def prior_precision(functions: Functions, prior: Prior) -> np.ndarray:
     """Precision matrix (2m, 2m) of the coefficients of a series."""
     m = len(functions)
-    t = len(functions.powers)
+    t = functions.trend
     out = np.zeros((2 * m, 2 * m))
     if functions.modes:
         signal = 1 / prior.signal.variance(functions.frequency)
@@ -76,15 +89,15 @@ def prior_precision(functions: Functions, prior: Prior) -> np.ndarray:
 
 
 def _trend_columns(functions: Functions) -> np.ndarray:
-    """Places of the coefficients of the polynomials, those of u first."""
+    """Places of the coefficients of polynomials and rings, those of u first."""
     m = len(functions)
-    t = len(functions.powers)
+    t = functions.trend
     return np.concatenate([np.arange(t), m + np.arange(t)])
 
 
 def _trend_precision(functions: Functions, prior: Prior) -> np.ndarray:
-    """Precision matrix of the coefficients of the polynomials; zero for what the gauge holds."""
-    to_terms, count = trend_transformation(functions.degree)
+    """Precision matrix of the coefficients of the trend; zero for what the gauge holds."""
+    to_terms, count = trend_transformation(functions.degree, functions.rings)
     return to_terms[:count].T @ (to_terms[:count] / prior.trend[:, None])
 
 
@@ -161,7 +174,7 @@ def _most_likely_trend(
     functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
 ) -> Prior:
     """Return the prior with renewed variances of the trend terms, one after the other."""
-    to_terms, count = trend_transformation(functions.degree)
+    to_terms, count = trend_transformation(functions.degree, functions.rings)
     if not count:
         return prior
     matrix, right = _trend_alone(functions, information, right, prior)
@@ -169,8 +182,9 @@ def _most_likely_trend(
     matrix = back.T @ matrix @ back
     right = back.T @ right
     variance = prior.trend.copy()
+    rings = count - 4 * functions.rings
     for _ in range(SWEEPS):
-        for j in range(count):
+        for j in (*range(rings), *(rings + k for k in RING_TERMS if rings + k < count)):
             precision = np.concatenate([1 / variance, np.zeros(len(to_terms) - count)])
             precision[j] = 0
             # The term is estimated without its prior; its square exceeds its own variance by that
@@ -181,13 +195,15 @@ def _most_likely_trend(
             variance[j] = np.clip(
                 c[j, 0] ** 2 - c[j, 1], MIN_RELATIVE_VARIANCE * c[j, 1], MAX_VARIANCE
             )
+            if j >= rings and c[j, 0] ** 2 < RING_EXISTS * c[j, 1]:
+                variance[j] = ABSENT_VARIANCE
     return replace(prior, trend=variance)
 
 
 def _trend_alone(
     functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Information and right side of the coefficients of the polynomials, the signal eliminated."""
+    """Information and right side of the coefficients of the trend, the signal eliminated."""
     at = _trend_columns(functions)
     rest = np.setdiff1d(np.arange(len(right)), at)
     if not len(rest):

@@ -23,15 +23,19 @@ Computing 30, 2020).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
+from math import comb
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import map_coordinates
 
+from .terms import ring_coefficients
+
 MARGIN = 1.3  # size of the rectangle of the sines, which vanish at its border, over the image
+RING_DEGREE = 5  # of the first radial polynomial beyond a cubic trend
 MAX_DEGREE = 15  # of a series that is read
 MAX_MODES = 100
 SD_GRID = 33  # nodes of the standard deviation along each side of the image
@@ -53,11 +57,15 @@ class Functions:
         Highest degree of the polynomials; -1: there are none.
     modes : int
         Number of sines along the longer side of the image; 0: there are none.
+    rings : int
+        Number of radial polynomials R of the degrees 5, 7, ... (see `terms.ring_coefficients`),
+        each with the functions x R(r) / r and y R(r) / r; r is 1 at the corners of the image.
     """
 
     image_size: tuple[int, int]
     degree: int
     modes: int = 0
+    rings: int = 0
 
     @cached_property
     def powers(self) -> list[tuple[int, int]]:
@@ -90,7 +98,42 @@ class Functions:
         return (self.modes + 0.5) * self.frequency_of_mode
 
     def __len__(self) -> int:
-        return len(self.powers) + len(self._sines)
+        return self.trend + len(self._sines)
+
+    @property
+    def trend(self) -> int:
+        """Number of functions of the trend: all but the sines."""
+        return len(self.powers) + 2 * self.rings
+
+    @property
+    def _ring_polynomials(self) -> np.ndarray:
+        """Coefficients (rings, k) of r^0, r^2, r^4, ... in R(r) / r, coordinates as elsewhere."""
+        corner = np.hypot(*self.image_size) / max(self.image_size)
+        out = np.zeros((self.rings, RING_DEGREE // 2 + self.rings))
+        for row, values in enumerate(out):
+            found = ring_coefficients(RING_DEGREE + 2 * row)
+            values[: len(found)] = found / corner ** (2 * np.arange(len(found)) + 1)
+        return out
+
+    def as_polynomials(self, coefficients: np.ndarray) -> tuple[Functions, np.ndarray]:
+        """Functions without rings, and their coefficients (2, m) for the same series.
+
+        The rings are written as polynomials of their degree.
+        """
+        if not self.rings:
+            return self, coefficients
+        degree = RING_DEGREE + 2 * (self.rings - 1)
+        out = Functions(self.image_size, degree, self.modes)
+        matrix = out.converted(self, coefficients.ravel()).reshape(2, -1)
+        number = {power: k for k, power in enumerate(out.powers)}
+        for k, polynomial in enumerate(self._ring_polynomials):
+            own = coefficients[:, len(self.powers) + 2 * k :][:, :2]
+            for order, factor in enumerate(polynomial):
+                for i in range(order + 1):
+                    part = factor * comb(order, i)
+                    matrix[:, number[2 * i + 1, 2 * (order - i)]] += part * own[:, 0]
+                    matrix[:, number[2 * i, 2 * (order - i) + 1]] += part * own[:, 1]
+        return out, matrix
 
     def converted(self, other: Functions, coefficients: np.ndarray) -> np.ndarray:
         """Coefficients (2m,) for these functions from those for others.
@@ -101,9 +144,32 @@ class Functions:
         mine = np.asarray([number.get(key, -1) for key in self._keys()])
         return np.where(mine >= 0, coefficients.reshape(2, -1)[:, mine], 0.0).ravel()
 
+    def as_rings(
+        self, coefficients: np.ndarray, degree: int, rings: int
+    ) -> tuple[Functions, np.ndarray]:
+        """Functions with rings, and their coefficients (2, m) for the same series.
+
+        It is the inverse of `as_polynomials`, and the nearest series where these functions cannot
+        express it. coefficients (2, n): for these functions, which have no rings.
+        """
+        out = Functions(self.image_size, degree, self.modes, rings)
+        matrix = out.converted(self, coefficients.ravel()).reshape(2, -1)
+        if self.degree <= degree:
+            return out, matrix
+        trend = replace(out, modes=0)
+        units = np.eye(out.trend)
+        columns = [trend.as_polynomials(unit.reshape(1, -1).repeat(2, axis=0)) for unit in units]
+        highest = columns[0][0]
+        mine = highest.converted(replace(self, modes=0), coefficients[:, : self.trend].ravel())
+        design = np.stack([values[0] for _, values in columns], axis=1)
+        found = np.linalg.lstsq(design, mine.reshape(2, -1).T, rcond=None)[0]
+        matrix[:, : out.trend] = found.T
+        return out, matrix
+
     def _keys(self) -> list[tuple]:
         """What tells each function from the others, in their order."""
-        return [*self.powers, *(('sine', int(i), int(j)) for i, j in self._sines)]
+        rings = [('ring', k, axis) for k in range(self.rings) for axis in 'xy']
+        return [*self.powers, *rings, *(('sine', int(i), int(j)) for i, j in self._sines)]
 
     def _coordinates(self, uv: ArrayLike) -> np.ndarray:
         return (
@@ -112,17 +178,22 @@ class Functions:
         ).T
 
     def __call__(self, uv: ArrayLike) -> np.ndarray:
-        """Values (n, m) at pixels uv (n, 2): the polynomials, then the sines."""
+        """Values (n, m) at pixels uv (n, 2): the polynomials, the rings, then the sines."""
         x, y = self._coordinates(uv)
         out = np.empty((len(x), len(self)))
         of_x, of_y = (np.vander(a, self.degree + 1, increasing=True) for a in (x, y))
         for column, (i, j) in enumerate(self.powers):
             np.multiply(of_x[:, i], of_y[:, j], out=out[:, column])
+        if self.rings:
+            squares = np.vander(x * x + y * y, self._ring_polynomials.shape[1], increasing=True)
+            rings = squares @ self._ring_polynomials.T
+            out[:, len(self.powers) : self.trend : 2] = rings * x[:, None]
+            out[:, len(self.powers) + 1 : self.trend : 2] = rings * y[:, None]
         if self.modes:
             half = MARGIN * np.asarray(self.image_size) / 2
             waves = [self._waves(a, extent) for a, extent in zip((x, y), half)]
             i, j = self._sines.T - 1
-            np.multiply(waves[0][:, i], waves[1][:, j], out=out[:, len(self.powers) :])
+            np.multiply(waves[0][:, i], waves[1][:, j], out=out[:, self.trend :])
         return out
 
     def _waves(self, coordinate: np.ndarray, extent: float) -> np.ndarray:

@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from functools import cache
-from math import comb
+from math import comb, factorial
 
 import numpy as np
 
@@ -140,18 +140,42 @@ def cubic_terms() -> dict[str, list[Part]]:
     }
 
 
-@cache
-def trend_transformation(degree: int) -> tuple[np.ndarray, int]:
-    """Matrix (2m, 2m) from coefficients of polynomials to those of terms; number of terms.
+def ring_coefficients(degree: int) -> np.ndarray:
+    """Coefficients (k,) of r^0, r^2, r^4, ... in R(r) / r, R the radial polynomial of a degree.
 
-    The polynomials are those of u, then of v. The terms that are not gauge come first, and only
-    they are counted. degree: 3, or -1 without a trend.
+    R is Zernike's of azimuthal order one, so that R(r) / r (x, y) is orthogonal over the unit disc
+    to the same terms of lower degree (Born and Wolf, "Principles of Optics", 7th ed., 9.2.1).
+    degree: odd.
+    """
+    half = (degree - 1) // 2
+    out = np.zeros(half + 1)
+    for k in range(half + 1):
+        number = (-1) ** k * factorial(degree - k)
+        out[half - k] = number / (factorial(k) * factorial(half + 1 - k) * factorial(half - k))
+    return out
+
+
+@cache
+def trend_transformation(degree: int, rings: int = 0) -> tuple[np.ndarray, int]:
+    """Matrix (2t, 2t) from coefficients of the trend's functions to those of terms; their number.
+
+    The functions are those of `series.Functions` for u, then for v. The terms that are not gauge
+    come first, and only they are counted: 14 of the polynomials, then of each ring the radial one,
+    the spiral, and two like affinity and shear. degree: 3, or -1 without a trend.
     """
     if degree < 0:
         return np.zeros((0, 0)), 0
     own = cubic_terms()
-    columns = [
-        polynomial_coefficients(degree, parts).ravel()
-        for parts in [*own.values(), *GAUGE.values()]
-    ]
-    return np.linalg.inv(np.stack(columns, axis=1)), len(own)
+    cubic = [polynomial_coefficients(degree, parts) for parts in [*own.values(), *GAUGE.values()]]
+    m = cubic[0].shape[1]
+    columns = np.zeros((2 * m + 4 * rings, 2, m + 2 * rings))
+    first = len(own)
+    last = first + 4 * rings
+    columns[:first, :, :m] = cubic[:first]
+    columns[last:, :, :m] = cubic[first:]
+    for k in range(rings):
+        # Factors of x R / r and y R / r in u, and in v.
+        pairs = [[(1, 0), (0, 1)], [(0, -1), (1, 0)], [(1, 0), (0, -1)], [(0, 1), (1, 0)]]
+        at = m + 2 * k
+        columns[first + 4 * k : first + 4 * k + 4, :, at : at + 2] = pairs
+    return np.linalg.inv(columns.reshape(len(columns), -1).T), last

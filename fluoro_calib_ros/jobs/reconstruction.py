@@ -29,6 +29,7 @@ from ..exposures.frame import Frame
 from ..exposures.pairing import PAIR_BY, PairingOptions, disagreement_of_recording
 from ..options import option, validate_options
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.scatter import ObservedScatter
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
 
@@ -77,6 +78,9 @@ class ReconstructionOutcome:
         None where the drift watch is switched off.
     disagreement : str
         Set where frames that were paired by number are far apart in time.
+    widening : float
+        Factor of the limit of false matches at the end: above 1 where the rays miss each other by
+        more than their standard deviations allow.
     """
 
     frames: list[ReconstructedFrame]
@@ -84,6 +88,7 @@ class ReconstructionOutcome:
     orientation: RigOrientation
     drift: DriftVerdict | None
     disagreement: str = ''
+    widening: float = 1.0
 
     @property
     def incomplete(self) -> int:
@@ -137,6 +142,7 @@ def reconstruct(
         )
     orientation = orientation.subset(names)
     watch, drift = _drift_watch(orientation, calibrations, options)
+    scatter = ObservedScatter()
     found, unpaired = reconstruct_recording(
         frames,
         calibrations,
@@ -144,6 +150,7 @@ def reconstruct(
         options.pair_by,
         watch,
         options.pair_tolerance,
+        scatter,
     )
     if not found:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
@@ -151,7 +158,7 @@ def reconstruct(
     if options.has_stamps and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})
     drift = watch.verdict() if watch else drift
-    return ReconstructionOutcome(found, unpaired, orientation, drift, disagreement)
+    return ReconstructionOutcome(found, unpaired, orientation, drift, disagreement, scatter.factor)
 
 
 def check_orientation(

@@ -44,6 +44,7 @@ from ..files.rig_orientation import load_orientation, orientation_path
 from ..limits import StreamLimits
 from ..options import option
 from ..photogrammetry import rig_orientation
+from ..photogrammetry.scatter import ObservedScatter
 from ..reconstruction.correspondence import CorrectedView
 from ..reconstruction.intersection import (
     FAILED,
@@ -162,11 +163,12 @@ class _View:
 
 
 class _Rig(NamedTuple):
-    """An orientation that has arrived, with its intersector and drift watch, if there is one."""
+    """An orientation that has arrived, its intersector, scatter, and drift watch if any."""
 
     orientation_id: str
     orientation: rig_orientation.RigOrientation
     intersector: Intersector
+    scatter: ObservedScatter
     watch: RigDriftWatch | None
 
 
@@ -323,6 +325,7 @@ class ReconstructionNode(StreamNode):
                 message.orientation_id,
                 orientation,
                 Intersector(orientation, self._settings.reject),
+                ObservedScatter(),
                 self._drift.make_watch(orientation),
             )
         except ValueError as error:  # DataError among them
@@ -395,7 +398,7 @@ class ReconstructionNode(StreamNode):
         ]
         first = next(exposure[name] for name in self._names if name in exposure)
         self._drift.newest = rig.watch, rig.orientation, first.stamp_ns
-        found = intersect_exposure(views, rig.intersector)
+        found = intersect_exposure(views, rig.intersector, rig.scatter)
         content = PointsContent(
             first.stamp_ns,
             first.frame.frame_number,
@@ -458,6 +461,7 @@ class ReconstructionNode(StreamNode):
             **self._refusals.values(CORRECTED_REFUSALS),
             'points': self._points['points'],
             **{f'points {name}': self._points[name] for name in COUNTED_STATUSES},
+            'limit of false matches widened by': round(rig.scatter.factor, 2) if rig else 1.0,
             'last fault': self._refusals.last_fault,
             'orientation': rig.orientation_id if rig else '',
             'source of the orientation': rig.orientation.source if rig else '',

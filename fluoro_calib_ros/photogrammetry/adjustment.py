@@ -25,6 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -34,6 +35,7 @@ from .network import Network
 from .noise import DEFAULT_NOISE, Noise
 from .normal_equations import normal_equations, project_network
 from .relative_orientation import discrepancies
+from .scatter import widening_by_group
 from .unknowns import Parameters
 
 # Relative increase of the cost that rounding errors can cause.
@@ -84,6 +86,8 @@ class Adjustment:
     steps : int
         Number of steps, refused ones included.
     converged : bool
+    exposure : (N,) ndarray of int
+        Exposures of the image points.
     """
 
     parameters: Parameters
@@ -93,11 +97,17 @@ class Adjustment:
     cost: float
     steps: int
     converged: bool
+    exposure: np.ndarray
 
-    @property
+    @cached_property
     def inliers(self) -> np.ndarray:
-        """True (N,) for the image points in the core of the noise distribution."""
-        return self.noise.accepts(self.q)
+        """True (N,) for the image points in the core of the noise distribution.
+
+        An exposure whose image points scatter more than those of others has a wider limit.
+        """
+        size = np.sqrt(self.q / self.noise.median)
+        limit = float(np.sqrt(self.noise.limit / self.noise.median))
+        return self.noise.accepts(self.q / widening_by_group(size, limit, self.exposure) ** 2)
 
 
 def residuals_and_q(
@@ -299,4 +309,5 @@ def adjust(
         found.cost,
         iteration.steps,
         iteration.converged,
+        network.exposure,
     )

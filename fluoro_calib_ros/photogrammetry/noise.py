@@ -155,6 +155,16 @@ class Noise:
         return q <= INLIER_Q
 
     @property
+    def median(self) -> float:
+        """Median of the normalised square of image points that are no gross errors.
+
+        P(q > x) = (1 + x/nu)^(-nu/2) for D = 2.
+        """
+        if not np.isfinite(self.nu):
+            return float(2 * np.log(2))
+        return float(self.nu * np.expm1(2 / self.nu * np.log(2)))
+
+    @property
     def limit(self) -> float:
         """Normalised square beyond which an image point is taken for a gross error.
 

@@ -38,6 +38,7 @@ from scipy.special import chdtri, erfc
 
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
+from ..photogrammetry.scatter import ObservedScatter
 
 
 class PointStatus(IntEnum):
@@ -123,7 +124,11 @@ class IntersectedPoints:
 
 @dataclass(frozen=True)
 class _Solution:
-    """Least-squares solution of n points; failed (n,): the rays have no intersection."""
+    """Least-squares solution of n points.
+
+    failed (n,): the rays have no intersection; by_rig (n,): part of the expected square of the
+    misfit that is by the orientation of the rig.
+    """
 
     xyz: np.ndarray
     covariance: np.ndarray
@@ -131,6 +136,7 @@ class _Solution:
     residual: np.ndarray
     standardised: np.ndarray
     failed: np.ndarray
+    by_rig: np.ndarray
 
 
 class Intersector:
@@ -143,7 +149,8 @@ class Intersector:
     reject : float or None
         Standardised epipolar distance above which two rays do not belong together; None: accept
         all. With more rays the limit is the quantile of chi-square of the same probability, and a
-        ray is dropped if the others agree without it.
+        ray is dropped if the others agree without it. Where the points of a recording are seen to
+        scatter more than stated, it is wider.
 
     Raises
     ------
@@ -183,9 +190,14 @@ class Intersector:
             _derivative_functions(orientation), orientation.covariance_root()
         )
         self._limit = _limits(np.inf if reject is None else float(reject), count)
+        self._median = _medians(count)
 
     def intersect(
-        self, uv: ArrayLike, sigma: ArrayLike, outside: ArrayLike | None = None
+        self,
+        uv: ArrayLike,
+        sigma: ArrayLike,
+        outside: ArrayLike | None = None,
+        scatter: ObservedScatter | None = None,
     ) -> IntersectedPoints:
         """Intersect the rays of n points.
 
@@ -198,6 +210,8 @@ class Intersector:
             (F, n), standard deviations of their coordinates [px].
         outside : array_like, optional
             (F, n), True for image points beyond the calibrated area.
+        scatter : ObservedScatter, optional
+            Scatter of the recording, which these points add to. It widens the limit.
 
         Returns
         -------
@@ -221,18 +235,20 @@ class Intersector:
                 f'not {uv.shape} and {sigma.shape}'
             )
         with np.errstate(all='ignore'):
-            found = self._intersect(uv.transpose(1, 0, 2), sigma.T**-2.0)
+            found = self._intersect(uv.transpose(1, 0, 2), sigma.T**-2.0, scatter)
         if outside is not None and np.any(outside):
             used = np.isfinite(sigma) & (np.arange(self._count)[:, None] != found.dropped_view)
             found.status[(found.status == OK) & (used & outside).any(axis=0)] = OUTSIDE
         return found
 
-    def _intersect(self, uv: np.ndarray, weight: np.ndarray) -> IntersectedPoints:
+    def _intersect(
+        self, uv: np.ndarray, weight: np.ndarray, scatter: ObservedScatter | None
+    ) -> IntersectedPoints:
         """Intersect image points uv (n, F, 2) of weights (n, F) [1/px^2], NaN where unseen."""
         seen = np.isfinite(uv.sum(axis=2) + weight)
         rays = seen.sum(axis=1)
         if rays.min(initial=self._count) == self._count:  # the usual frame: nothing to mask
-            return self._classified(uv, weight, rays, self._solve(uv, weight, rays))
+            return self._classified(uv, weight, rays, self._solve(uv, weight, rays), scatter)
         uv = np.where(seen[:, :, None], uv, 0.0)
         weight = np.where(seen, weight, 0.0)
         enough = rays >= 2
@@ -241,6 +257,7 @@ class Intersector:
             weight[enough],
             rays[enough],
             self._solve(uv[enough], weight[enough], rays[enough]),
+            scatter,
         )
         return found if enough.all() else _expanded(found, enough, rays)
 
@@ -285,6 +302,7 @@ class Intersector:
             residual,
             np.sqrt(squares.sum(axis=1) / expected),
             ~in_front | ~(determinant > MIN_DETERMINANT),
+            1 - freedom / expected,
         )
 
     def _start(self, uv: np.ndarray, flat: np.ndarray) -> np.ndarray:
@@ -323,16 +341,26 @@ class Intersector:
         )
 
     def _classified(
-        self, uv: np.ndarray, weight: np.ndarray, rays: np.ndarray, solution: _Solution
+        self,
+        uv: np.ndarray,
+        weight: np.ndarray,
+        rays: np.ndarray,
+        solution: _Solution,
+        scatter: ObservedScatter | None,
     ) -> IntersectedPoints:
         """Give the points of a solution their status; drop false rays where the others agree."""
-        wrong = solution.failed | (solution.standardised > self._limit[rays])
+        limit = self._limit
+        if scatter is not None and self.reject is not None:
+            size = np.where(solution.failed, np.nan, solution.standardised) / self._median[rays]
+            scatter.add(size, solution.by_rig, limit[2] / self._median[2])
+            limit = scatter.factor * limit
+        wrong = solution.failed | (solution.standardised > limit[rays])
         dropped_view = np.full(len(rays), -1)
         if wrong.any():
             rows = np.flatnonzero(wrong & (rays > 2))
             if len(rows):
                 solution, dropped_view[rows] = self._drop_one_ray(
-                    uv[rows], weight[rows], rays[rows], rows, solution
+                    uv[rows], weight[rows], rays[rows], rows, solution, limit
                 )
                 rays = rays - (dropped_view >= 0)
                 wrong = wrong & (dropped_view < 0)
@@ -356,19 +384,20 @@ class Intersector:
         rays: np.ndarray,
         rows: np.ndarray,
         solution: _Solution,
+        limit: np.ndarray,
     ) -> tuple[_Solution, np.ndarray]:
         """Replace points of a solution by those without their false ray.
 
         Each ray of the image points uv (m, F, 2) of the points in rows (m,) is dropped in turn.
         If the remaining rays agree in exactly one case, that is the solution. Otherwise the false
-        ray cannot be identified. Returns the solution and the number (m,) of the dropped
-        fluoroscope, -1 where there is none.
+        ray cannot be identified. limit (F + 1,): largest misfit by the number of rays. Returns the
+        solution and the number (m,) of the dropped fluoroscope, -1 where there is none.
         """
         m, count = weight.shape
         remaining = (weight[:, None, :] * (1 - np.eye(count))).reshape(m * count, count)
         fewer = np.repeat(rays - 1, count)
         tried = self._solve(np.repeat(uv, count, axis=0), remaining, fewer)
-        agree = ~tried.failed & (tried.standardised <= self._limit[fewer])
+        agree = ~tried.failed & (tried.standardised <= limit[fewer])
         agree = agree.reshape(m, count) & (weight > 0)
         dropped = np.where(agree.sum(axis=1) == 1, agree.argmax(axis=1), -1)
         identified = np.flatnonzero(dropped >= 0)
@@ -435,6 +464,12 @@ def _limits(reject: float, count: int) -> np.ndarray:
     # Where the probability underflows, the degrees of freedom make no difference.
     quantile = chdtri(freedom, tail) if tail > 1e-200 else reject**2
     return np.sqrt(quantile / freedom)
+
+
+def _medians(count: int) -> np.ndarray:
+    """Median standardised misfit (count + 1,) of points of 0, 1, ... rays that agree."""
+    freedom = np.maximum(2.0 * np.arange(count + 1) - 3, 1)
+    return np.sqrt(chdtri(freedom, 0.5) / freedom)
 
 
 def _depth_of_axes(orientation: RigOrientation) -> np.ndarray:

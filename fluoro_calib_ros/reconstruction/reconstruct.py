@@ -31,6 +31,7 @@ from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 from ..exposures.frame import Frame, image_size_error, repeated_target_error
 from ..exposures.pairing import PairingOptions, recorded_pairer
+from ..photogrammetry.scatter import ObservedScatter
 from .correspondence import CorrectedView, MatchedViews, match_views
 from .intersection import IntersectedPoints, Intersector
 
@@ -89,14 +90,17 @@ class ReconstructedFrame:
 
 
 def intersect_exposure(
-    views: Sequence[CorrectedView | None], intersector: Intersector
+    views: Sequence[CorrectedView | None],
+    intersector: Intersector,
+    scatter: ObservedScatter | None = None,
 ) -> IntersectedViews:
     """Match and intersect the views of an exposure.
 
-    They are in the order of the orientation's fluoroscopes, None for one that is missing.
+    They are in the order of the orientation's fluoroscopes, None for one that is missing. scatter:
+    that of the recording, by which the limit of false matches is widened.
     """
     matched = match_views(views)
-    points = intersector.intersect(matched.uv, matched.sigma, matched.outside)
+    points = intersector.intersect(matched.uv, matched.sigma, matched.outside, scatter)
     return IntersectedViews(matched, points)
 
 
@@ -119,6 +123,7 @@ def reconstruct_exposure(
     calibrations: Mapping[str, FluoroscopeCalibration],
     intersector: Intersector,
     watch: ExposureWatch | None = None,
+    scatter: ObservedScatter | None = None,
 ) -> ReconstructedFrame:
     """Correct and intersect the observed image points of one exposure.
 
@@ -130,6 +135,8 @@ def reconstruct_exposure(
     intersector : Intersector
     watch : ExposureWatch, optional
         Examines the exposure.
+    scatter : ObservedScatter, optional
+        Scatter of the recording so far.
 
     Returns
     -------
@@ -145,7 +152,7 @@ def reconstruct_exposure(
         None if frame is None else _corrected_view(frame, calibrations[frame.fluoroscope])
         for frame in frames
     ]
-    found = intersect_exposure(views, intersector)
+    found = intersect_exposure(views, intersector, scatter)
     present = [frame for frame in frames if frame is not None]
     if watch is not None:
         watch_exposure(watch, present[0].stamp_ns, found)
@@ -181,6 +188,7 @@ def reconstruct_recording(
     pair_by: str = 'frame_number',
     watch: ExposureWatch | None = None,
     tolerance_s: float = PairingOptions.tolerance_s,
+    scatter: ObservedScatter | None = None,
 ) -> tuple[list[ReconstructedFrame], dict[str, int]]:
     """Reconstruct the exposures of a recording.
 
@@ -197,6 +205,9 @@ def reconstruct_recording(
         Examines the exposures.
     tolerance_s : float
         Largest difference between the stamps of an exposure [s].
+    scatter : ObservedScatter, optional
+        Learns the scatter of the recording, and widens the limit of false matches by it. Without
+        it there is one all the same.
 
     Returns
     -------
@@ -222,7 +233,9 @@ def reconstruct_recording(
     )
     exposures = [exposure for frame in ordered for exposure in pairer.add(frame)]
     exposures += pairer.flush()
+    scatter = scatter or ObservedScatter()
     out = [
-        reconstruct_exposure(exposure, calibrations, intersector, watch) for exposure in exposures
+        reconstruct_exposure(exposure, calibrations, intersector, watch, scatter)
+        for exposure in exposures
     ]
     return out, dict(pairer.unpaired)

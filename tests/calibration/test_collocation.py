@@ -38,6 +38,7 @@ from fluoro_calib_ros.distortion.gauge import GaugeKind
 from fluoro_calib_ros.distortion.priors import (
     Prior,
     gauge_precision,
+    has_rings,
     most_likely_prior,
     starting_prior,
 )
@@ -123,6 +124,65 @@ def test_functions_agree_with_the_documentation():
     ]
     np.testing.assert_allclose(functions(uv), np.stack(columns, axis=1), atol=1e-12)
     assert len(functions) == len(columns)
+
+
+def test_rings_are_orthogonal_radial_polynomials():
+    """R(r) / r (x, y) of Zernike's polynomials, over the disc around the image."""
+    size = (640, 480)
+    functions = Functions(size, 3, 0, 2)
+    radius = np.hypot(*size) / 2
+    rng = np.random.default_rng(4)
+    r = np.sqrt(rng.uniform(0, 1, 40_000))
+    angle = rng.uniform(0, 2 * np.pi, len(r))
+    x = r * np.cos(angle)
+    y = r * np.sin(angle)
+    values = functions(radius * np.column_stack([x, y]) + [319.5, 239.5])[:, 10:]
+    fifth = 10 * r**4 - 12 * r**2 + 3
+    seventh = 35 * r**6 - 60 * r**4 + 30 * r**2 - 4
+    expected = np.stack([x * fifth, y * fifth, x * seventh, y * seventh], axis=1)
+    np.testing.assert_allclose(values, expected, atol=1e-10)
+    lower = np.stack([x, x * r**2], axis=1)
+    assert np.abs(lower.T @ values[:, [0, 2]] / len(r)).max() < 0.02
+
+
+def test_rings_are_written_as_polynomials():
+    functions = Functions(SIZE, 3, 4, 2)
+    coefficients = np.random.default_rng(5).normal(size=(2, len(functions)))
+    plain, same = functions.as_polynomials(coefficients)
+    assert (plain.degree, plain.rings, plain.modes) == (7, 0, 4)
+    uv = pixels(50)
+    np.testing.assert_allclose(plain(uv) @ same.T, functions(uv) @ coefficients.T, atol=1e-10)
+    again, back = plain.as_rings(same, 3, 2)
+    assert again == functions
+    np.testing.assert_allclose(back, coefficients, atol=1e-9)
+    cubic = Functions(SIZE, 3, 4)
+    _, values = cubic.as_rings(np.ones((2, len(cubic))), 3, 2)
+    assert (values[:, :10] == 1).all() and (values[:, 10:14] == 0).all()
+
+
+@pytest.mark.parametrize('amplitude', [0.0, 5.0])
+def test_rings_exist_where_the_distortion_has_them(amplitude):
+    """A radial term of degree 5 besides a random field, seen in the middle of the image only."""
+    side = 1024
+    functions = Functions((side, side), 3, 12, 2)
+    uv = pixels(1500, 6, (side, side))
+    uv = uv[np.linalg.norm(uv - 511.5, axis=1) < 480]
+    rng = np.random.default_rng(7)
+    sd = np.sqrt(Signal(0.1, 300.0).variance(functions.frequency))
+    values = functions(uv)
+    observed = values[:, functions.trend :] @ (sd[:, None] * rng.normal(size=(len(sd), 2)))
+    xy = (uv - 511.5) / 512
+    observed += amplitude * np.sum(xy**2, axis=1, keepdims=True) ** 2 * xy
+    observed += rng.normal(0, 0.25, observed.shape)
+    information = np.kron(np.eye(2), values.T @ values / 0.25**2)
+    right = (values.T @ observed / 0.25**2).T.ravel()
+    prior = starting_prior(functions, 1.0)
+    gauge = gauge_precision(values, uv, np.array([511.5, 511.5, 4000.0]))
+    for _ in range(4):
+        prior = most_likely_prior(functions, information, right, gauge, prior)
+    assert has_rings(functions, prior) == (amplitude > 0)
+    # The spiral and what is like affinity and shear do not exist.
+    assert (prior.trend[[15, 16, 17]] < 1e-6).all()
 
 
 def test_packing_of_a_series_is_exact():

@@ -27,6 +27,7 @@ from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.photogrammetry.scatter import ObservedScatter
 from fluoro_calib_ros.reconstruction.correspondence import CorrectedView, match_views
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry, epipolar_residuals
 from fluoro_calib_ros.reconstruction.intersection import (
@@ -141,6 +142,27 @@ def test_intersection_is_the_least_squares_solution(names):
         and (found.rays == len(names)).all()
         and (found.dropped_view == -1).all()
     )
+
+
+def test_limit_follows_the_scatter_of_a_recording():
+    """Noise is twice what sigma says, and one match in ten is false."""
+    orientation = orientation_of(uncertain=0.3)
+    intersector = Intersector(orientation)
+    scatter = ObservedScatter()
+    rejected = []
+    alone = []
+    false = []
+    for seed in range(60):
+        _, uv, sigma = seen(orientation, 30, seed, 2 * SIGMA)
+        uv[0, :3] += np.random.default_rng(seed).normal(0, 40, (3, 2))
+        status = intersector.intersect(uv, sigma, None, scatter).status
+        false.append(status[:3] == REJECTED)
+        if seed >= 10:
+            rejected.append(status[3:] == REJECTED)
+            alone.append(intersector.intersect(uv, sigma).status[3:] == REJECTED)
+    assert np.mean(alone) > 0.03
+    assert np.mean(rejected) < 0.005
+    assert np.mean(false) > 0.85
 
 
 def test_pycolmap_triangulates_the_same_points():

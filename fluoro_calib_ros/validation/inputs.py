@@ -258,12 +258,21 @@ def wrong_image_size(exposures: Sequence[Frame]) -> str:
 
 
 def wrong_unit(distance_mm: float, phantom: Phantom) -> str:
-    """Return a sentence where the source is so near or so far that the unit must be wrong."""
+    """Return a sentence where the source is so near or so far that the unit must be wrong.
+
+    A phantom larger than its distance is a wide-angle view in any unit.
+    """
     low, high = DISTANCES_MM
     if low <= distance_mm <= high:
         return ''
-    units = [unit for unit, mm in UNITS_MM.items() if low <= distance_mm * mm <= high]
     extent = float(np.linalg.norm(np.ptp(phantom.xyz_mm, axis=0)))
+    if distance_mm < min(low, extent):  # no unit changes their ratio
+        return (
+            f'the source would be {distance_mm:.3g} mm from a phantom that is {extent:.3g} mm '
+            'large, nearer than that of a fluoroscope: the principal distance is wrong, or the '
+            'images are those of a wide-angle camera'
+        )
+    units = [unit for unit, mm in UNITS_MM.items() if low <= distance_mm * mm <= high]
     return (
         f'the coordinates of the phantom are not in mm{_in(units)}: it would be {extent:.3g} mm '
         f'large and {distance_mm:.3g} mm from the source'

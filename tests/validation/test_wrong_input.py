@@ -36,7 +36,7 @@ from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, rotation_angle
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.validation.inputs import copied_exposures, find_wrong_input
+from fluoro_calib_ros.validation.inputs import copied_exposures, find_wrong_input, wrong_unit
 from fluoro_calib_ros.validation.plausibility import implausible
 from fluoro_calib_ros.validation.verdict import validate_or_report
 
@@ -289,6 +289,23 @@ def test_difficult_input_is_accepted(kind):
 def test_random_rigs_with_strong_distortion_are_accepted(seed):
     strong = virtual_rig(seed, 2.0)
     assert find_wrong_input(simulate_exposures(strong, 5, seed).frames, strong.phantom) == {}
+
+
+@pytest.mark.parametrize(
+    ('distance', 'extent', 'sentence'),
+    [
+        (130.0, 30.0, 'not in mm, but perhaps in cm'),
+        (159.0, 1030.0, 'wide-angle camera'),
+        (600.0, 1030.0, ''),
+    ],
+)
+def test_wide_angle_is_no_wrong_unit(distance, extent, sentence):
+    """The distance of the source over the size of the phantom is the same in any unit."""
+    corners = np.array([[0.0, 0, 0], [0, 1, 0], [0, 0.5, 0], [0, 0.2, 0]])
+    phantom = Phantom(np.arange(4), extent * corners, np.full(4, 0.1))
+    found = wrong_unit(distance, phantom)
+    assert sentence in found
+    assert bool(found) == bool(sentence)
 
 
 def test_few_wrong_exposures_are_left_out_and_named():

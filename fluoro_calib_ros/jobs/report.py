@@ -22,6 +22,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import UndefinedError
 
 from ..errors import DataError
@@ -44,8 +45,19 @@ def write_report(directory: str | os.PathLike[str]) -> str:
     path = Path(directory) / REPORT
     given = read_report_input(directory)
     try:
-        text = report_html(given)
-    except (KeyError, TypeError, IndexError, UndefinedError) as error:
+        with np.errstate(all='ignore'):  # giant numbers of a damaged result
+            text = report_html(given)
+    except DataError:
+        raise
+    except (
+        ArithmeticError,
+        AttributeError,
+        IndexError,
+        KeyError,
+        TypeError,
+        UndefinedError,
+        ValueError,
+    ) as error:
         raise DataError(
             f'{Path(directory) / RESULT}: this is not the result of a calibration ({error})'
         ) from None

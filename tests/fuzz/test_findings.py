@@ -14,6 +14,7 @@
 
 """What the fuzzer found: each input is refused in a sentence."""
 
+import json
 import sqlite3
 import struct
 import zlib
@@ -133,3 +134,13 @@ def test_orientation_message_with_giant_numbers(name):
     getattr(message, name)[0] = 1.7e308
     with pytest.raises(DataError, match=f'the array {name} holds a number'):
         messages.orientation_from_message(message)
+
+
+def test_giant_numbers_in_a_result(tmp_path):
+    target = load('result_folder')
+    document = json.loads(target.seeds()[0])
+    document['targets'][0]['xyz_mm'][0] = 1e300
+    path = tmp_path / target.file_name
+    path.write_text(json.dumps(document))
+    with pytest.raises(DataError, match='this is not the result of a calibration'):
+        target.read(path)

@@ -92,7 +92,8 @@ class ResidualTable:
     weight : (N,) ndarray
         Robust weights, 0 to about 1.
     outlier : (N,) ndarray of bool
-        Beyond the core of the noise: four standard deviations, more where the tails are heavy.
+        Beyond the core of the noise: four standard deviations, more where the tails are heavy or
+        the image points of the exposure scatter more than those of others.
     """
 
     fluoroscope: np.ndarray

@@ -74,10 +74,8 @@ MAX_VARYING_EXPOSURES = 60  # of a fluoroscope that can have terms of their own,
 # swing about their solution for long where the signal is as short as the distance of the points.
 HELD_AFTER = 2
 MIN_START_SD_PX = 0.1
-# Relative change of the noise at which terms that continue an earlier calibration settle: a third
-# of the standard deviation of the noise of 1000 image points.
-CONTINUED_NOISE = 5e-3
-CONTINUED_TOLERANCE = 1e-3  # decrease of F that they may leave: a thirtieth of a sigma
+# Decrease of F that terms which continue an earlier calibration may leave: a thirtieth of a sigma.
+CONTINUED_TOLERANCE = 1e-3
 
 
 class CollocationModel(SeriesModel):
@@ -119,6 +117,8 @@ class CollocationTerms(AdjustedTerms):
     """
 
     intermediate_tolerance = 1.0  # noise and prior still change
+    # A third of the standard deviation of the noise of 1000 image points; what is left is less.
+    noise_tolerance = 5e-3
 
     def __init__(
         self,
@@ -154,7 +154,6 @@ class CollocationTerms(AdjustedTerms):
     def _continue(self, earlier: EarlierTerms, before: Adjustment) -> None:
         """Start with earlier series, and with the priors that are most likely for them."""
         self._variation_tested = not earlier.is_varying
-        self.noise_tolerance = CONTINUED_NOISE
         self.final_tolerance = CONTINUED_TOLERANCE
         self._mode_changes = 1  # those of the earlier series are not the first
         start = []

@@ -47,7 +47,7 @@ STEPS = 4  # of the likelihood in one renewal
 # Frequencies of a quadrature, from the lowest to so many times it.
 QUADRATURE = 120
 SHORTEST = 30.0
-MIN_GAIN = 0.02  # of the logarithm of the likelihood that is worth another step
+MIN_GAIN = 0.1  # of the logarithm of the likelihood that is worth another step
 RIDGE = 0.05  # least damping: added to the expected curvature, it keeps what hardly matters
 
 

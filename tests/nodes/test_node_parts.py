@@ -27,6 +27,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import rigs
+from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
 from fluoro_calib_ros.distortion.registry import create_model
@@ -140,8 +141,9 @@ class Inbox:
             lambda name, sentence: self.refused.append(sentence),
         )
 
-    def _subscribe(self, kind, topic, callback, qos):
-        self.put = callback
+    def _subscribe(self, kind, topic, callback, qos, raw):
+        assert raw
+        self.put = lambda message: callback(serialize_message(message))
 
     def _take(self, name, kept):
         self.taken.append(kept)

@@ -229,7 +229,7 @@ def _summary(results: Sequence[Result]) -> str:
 
     def best(table: str, weight: str) -> str:
         ratios = {camera: _ratio(results, table, camera, weight) for camera in cameras}
-        ours = ratios.pop(OURS)
+        ours = ratios.pop(OURS, float('nan'))
         peers = {camera: ratio for camera, ratio in ratios.items() if np.isfinite(ratio)}
         if not peers:
             return f'{ours:.3f}'

@@ -41,7 +41,8 @@ MIN_RELATIVE_VARIANCE = 1e-3
 MAX_VARIANCE = 1e8  # of a trend term that exists
 # Terms of the rings that can exist: the radial one and the spiral of degree 5, the radial of 7.
 RING_TERMS = (0, 1, 4)
-ABSENT_VARIANCE = 1e-12  # px^2, of a term of a ring that does not exist
+# Variance [px^2] of a term of a ring that does not exist; 1e-12 makes normal matrices singular.
+ABSENT_VARIANCE = 1e-8
 # Square of such a term over its variance from which it exists. It costs errors beyond the
 # calibrated area, where it grows fast; at 1, chance alone would make one of three exist.
 RING_EXISTS = 9.0

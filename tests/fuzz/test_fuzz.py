@@ -49,7 +49,7 @@ WORD = re.compile(rb'[-+.\w]+')
 NEED_ROS = ('calibration_message', 'image_message', 'wire')
 EXAMPLES = {  # the slow ones
     **{'exchange': 12, 'bag_mcap': 20, 'bag_metadata': 20, 'numbers': 8, 'result_folder': 5},
-    **{'archive_npz': 30, 'calibration_message': 20, 'c3d': 15, 'points_csv': 30},
+    **{'archive_npz': 30, 'calibration_message': 10, 'c3d': 10, 'points_csv': 30},
 }
 
 

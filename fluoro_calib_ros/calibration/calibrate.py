@@ -267,7 +267,7 @@ def calibrate_request(
         relative = [
             relative_orientations(run, options.relative_orientation) for run in runs.values()
         ]
-    targets = [_targets(run.measured, run.after, run.precision) for run in runs.values()]
+    targets = [_targets(run.measured, run.after, run.claims) for run in runs.values()]
     return CalibrationResult(
         figures,
         calibrations,
@@ -347,7 +347,7 @@ def _now() -> str:
 def _figures_of_run(run: SelfCalibration) -> dict[str, FluoroscopeResult]:
     """Figures of the fluoroscopes of a self-calibration."""
     return {
-        name: _figures(run.measured, run.before, run.after, run.precision, f, run.models[name])
+        name: _figures(run.measured, run.before, run.after, run.claims, f, run.models[name])
         for f, name in enumerate(run.measured.fluoroscopes)
     }
 
@@ -707,7 +707,7 @@ def _calibration(
         fluoroscope=name,
         image_size=run.measured.image_size[f],
         interior=run.after.parameters.interior[f],
-        interior_covariance=run.precision.interior[f],
+        interior_covariance=run.claims.interior[f],
         interior_estimated=bool(run.measured.network.interior_free[f]),
         model=model,
         train_exposure=train_exposure,

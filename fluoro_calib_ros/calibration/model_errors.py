@@ -18,7 +18,8 @@ The residuals of a forced model show only a part of its errors: orientations and
 absorb the rest, in every round. Collocation of the same exposures gives the distortion as the
 posterior of a random field, with its covariance. The expected squared error of any other
 correction is then its squared difference from the posterior mean plus the posterior variance
-(Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, 2.4).
+(Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, 2.4). The same holds for
+object points and orientations, which take up what the correction leaves.
 """
 
 from __future__ import annotations
@@ -32,6 +33,8 @@ from ..distortion.base import CorrectionModel
 from ..distortion.gauge import GaugeKind, gauge_basis
 from ..distortion.series import sd_grid_pixels
 from ..distortion.series_model import SeriesModel
+from ..photogrammetry.precision import Precision
+from ..photogrammetry.rotations import vector_from_matrix
 from .rounds import SelfCalibration
 
 MIN_PIXELS = 20  # of the grid that are within both calibrated areas
@@ -40,7 +43,7 @@ MIN_PIXELS = 20  # of the grid that are within both calibrated areas
 def with_errors_by(
     reference: SelfCalibration, run: SelfCalibration, gauges: Sequence[GaugeKind]
 ) -> SelfCalibration:
-    """Return a self-calibration whose models state their errors by a reference.
+    """Return a self-calibration whose models and unknowns state their errors by a reference.
 
     reference: self-calibration of the same exposures by collocation; gauges: what the orientation
     of each fluoroscope can express.
@@ -66,7 +69,34 @@ def with_errors_by(
         difference = difference - gauge_basis(pixels, interior, gauges[f]) @ shared
         square = np.mean(difference**2, axis=1) + found.sd**2
         models[name] = _with_variance(model, pixels, square, inside)
-    return replace(run, models=models)
+    return replace(run, models=models, stated=_precision_by(reference, run))
+
+
+def _precision_by(reference: SelfCalibration, run: SelfCalibration) -> Precision:
+    """Precision of a run: covariances of a reference, and the products of the differences.
+
+    Its covariances with additional parameters and other global unknowns are those of the network.
+    """
+    found = run.after.parameters
+    other = reference.after.parameters
+    points = found.points_mm - other.points_mm
+    turn = vector_from_matrix(found.rotation @ other.rotation.transpose(0, 2, 1))
+    exterior = np.concatenate([found.position_mm - other.position_mm, turn], axis=1)
+    interior = found.interior - other.interior
+    precise = reference.precision
+    joint = precise.joint_points
+    return replace(
+        run.precision,
+        interior=precise.interior + _squares(interior),
+        exterior=precise.exterior + _squares(exterior),
+        points=precise.points + _squares(points),
+        joint_points=None if joint is None else joint + np.outer(points, points),
+    )
+
+
+def _squares(differences: np.ndarray) -> np.ndarray:
+    """Products (n, s, s) of the components of differences (n, s)."""
+    return differences[:, :, None] * differences[:, None, :]
 
 
 def _with_variance(

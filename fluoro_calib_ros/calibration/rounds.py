@@ -82,6 +82,8 @@ class SelfCalibration:
     history : tuple of Round
     converged : bool
         False where the largest number of rounds ended it.
+    stated : Precision or None
+        With the errors of the models (see `model_errors`); None: these are in the precision.
     """
 
     measured: Measured
@@ -93,6 +95,12 @@ class SelfCalibration:
     models: Mapping[str, CorrectionModel]
     history: tuple[Round, ...]
     converged: bool
+    stated: Precision | None = None
+
+    @property
+    def claims(self) -> Precision:
+        """What the unknowns claim, errors of the models included."""
+        return self.stated or self.precision
 
 
 class History:

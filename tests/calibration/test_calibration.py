@@ -145,6 +145,11 @@ def test_local_linear_is_more_accurate_than_knn():
     # Its steps make heavy tails, which are not taken for gross errors.
     assert knn.fluoroscopes['a'].rmse_after.max() < 1.2 * NOISE_PX
     assert 2.5 * field_error(rigs.calibrated()) < field_error(knn) < 1.2
+    # What it cannot follow is in the claims of the object points.
+    targets = knn.targets
+    offset = targets.xyz_mm - rigs.rig().true_mm[PHANTOM.index(targets.target_id)]
+    variance = np.diagonal(targets.covariance, axis1=1, axis2=2)
+    assert 0.7 < np.mean(offset**2 / variance) < 1.3
 
 
 def test_without_a_model_there_is_one_round():

@@ -24,33 +24,41 @@ except ImportError:  # without the plugin, one process runs all tests
     LoadFileScheduling = None
 
 
-ROS = 'tests/ros'
+ROS = ('tests/ros 1', 'tests/ros 2')
 
 if LoadFileScheduling is not None:
 
-    class OneWorkerForRos(LoadFileScheduling):
-        """Keep the tests of a file on one worker, and all tests with ROS nodes on one.
+    class TwoWorkersForRos(LoadFileScheduling):
+        """Keep the tests of a file on one worker, and all tests with ROS nodes on two.
 
-        The tests of a file share fixtures. ROS nodes mostly wait, so one worker runs them while
-        the others compute; two graphs at once would only slow each other down.
+        The tests of a file share fixtures. ROS nodes mostly wait, so two workers run them while a
+        third one computes; more graphs at once would only slow each other down.
         """
 
+        def __init__(self, *arguments) -> None:
+            super().__init__(*arguments)
+            self._files_of_ros = []
+
         def _split_scope(self, nodeid: str) -> str:
-            if nodeid.startswith('tests/ros/'):
-                return ROS
-            return super()._split_scope(nodeid)
+            name = super()._split_scope(nodeid)
+            if not name.startswith('tests/ros/'):
+                return name
+            if name not in self._files_of_ros:
+                self._files_of_ros.append(name)
+            return ROS[self._files_of_ros.index(name) % len(ROS)]
 
         def _assign_work_unit(self, node) -> None:
             """Begin with ROS, which takes longest."""
-            if ROS in self.workqueue:
-                self.workqueue.move_to_end(ROS, last=False)
+            for scope in reversed(ROS):
+                if scope in self.workqueue:
+                    self.workqueue.move_to_end(scope, last=False)
             super()._assign_work_unit(node)
 
     @pytest.hookimpl(optionalhook=True)
     def pytest_xdist_make_scheduler(config, log):
         """Distribute by file unless another distribution is asked for."""
         if config.getvalue('dist') == 'loadfile':
-            return OneWorkerForRos(config, log)
+            return TwoWorkersForRos(config, log)
         return None
 
 

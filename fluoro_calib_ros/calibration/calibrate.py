@@ -336,7 +336,7 @@ def calibrate_part(
 def _solved(run: SelfCalibration) -> SolvedNetwork:
     """Network and adjustment of a self-calibration."""
     estimated = run.measured.network.additional_correction(run.after.parameters)
-    return SolvedNetwork(run.measured, run.after, run.correction - estimated)
+    return SolvedNetwork(run.measured, run.after, run.correction - estimated, stated=run.stated)
 
 
 def _now() -> str:

@@ -25,7 +25,7 @@ from ..photogrammetry.diagnosis import global_names
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.held_precision import equations_with_held_interiors
 from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.precision import covariance_blocks, joint_covariance
+from ..photogrammetry.precision import Precision, covariance_blocks, joint_covariance
 from .initial_network import Measured
 
 # Position of the source in the frame of the phantom, rotation about the axes of the sensor.
@@ -65,12 +65,16 @@ class SolvedNetwork:
         Correction that was held [px].
     held : (F, 3, 3) ndarray or None
         Covariances of interior orientations that were held [px^2].
+    stated : Precision or None
+        What the unknowns claim where that is not the precision of the network: the matrix then
+        has these standard deviations, and the correlations of the network.
     """
 
     measured: Measured
     adjustment: Adjustment
     correction: np.ndarray
     held: np.ndarray | None = None
+    stated: Precision | None = None
 
     def joint_precision(self) -> JointPrecision:
         """Covariance matrix of all unknowns.
@@ -102,8 +106,24 @@ class SolvedNetwork:
                     *others,
                 ]
             ),
-            joint_covariance(blocks).matrix,
+            self._as_stated(joint_covariance(blocks).matrix),
         )
+
+    def _as_stated(self, covariance: np.ndarray) -> np.ndarray:
+        """Scale a covariance matrix to the standard deviations that the unknowns claim."""
+        if self.stated is None:
+            return covariance
+        claimed = np.concatenate(
+            [
+                np.diagonal(blocks, axis1=1, axis2=2).ravel()
+                for blocks in (self.stated.exterior, self.stated.points, self.stated.interior)
+            ]
+        )
+        variance = np.diagonal(covariance)[: len(claimed)]
+        scale = np.ones(len(covariance))
+        free = variance > 0  # not of what was held
+        scale[: len(claimed)][free] = np.sqrt(claimed[free] / variance[free])
+        return scale[:, None] * covariance * scale
 
     def _exterior_names(self) -> list[str]:
         return [

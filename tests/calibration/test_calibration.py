@@ -252,8 +252,9 @@ def test_adjustment_and_model_are_of_the_same_round():
     """
     job = rigs.calibrated()
     run = job.runs['a']
+    # Terms of the trend that are absent in the model have a variance of 1e-8 in the adjustment.
     np.testing.assert_allclose(
-        run.models['a'].predict(run.measured.network.uv), run.correction, atol=1e-8
+        run.models['a'].predict(run.measured.network.uv), run.correction, atol=1e-6
     )
     last = run.history[-1]
     assert last.iteration == len(run.history) and pytest.approx(run.after.cost, abs=0.01) == last.F

@@ -29,7 +29,7 @@ from contextlib import suppress
 from itertools import pairwise
 
 import rclpy
-from rclpy._rclpy_pybind11 import RCLError, UnknownROSArgsError
+from rclpy._rclpy_pybind11 import InvalidHandle, RCLError, UnknownROSArgsError
 from rclpy.exceptions import ParameterException
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
@@ -63,6 +63,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
         print(help_text(sys.modules[make_node.__module__]))
         sys.exit(0)
     ended = threading.Event()
+    woken = threading.Event()
     node = None
     executor = None
     code = 0
@@ -72,7 +73,9 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
 
         def end() -> None:
             ended.set()
-            executor.create_task(lambda: None)  # something to do, so that spin_once returns
+            with suppress(InvalidHandle):  # the executor has been shut down
+                executor.create_task(lambda: None)  # something to do, so that spin_once returns
+            woken.set()
 
         _call_on_interrupt(end)
         node = _make(make_node)
@@ -92,6 +95,8 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
     finally:
         # What is left to the end of the interpreter is destroyed in any order, beside the threads
         # of the middleware: the process may end with a segmentation fault.
+        if ended.is_set():
+            woken.wait(ONE_INTERRUPT_S)  # for the thread that wakes the executor
         if executor is not None:
             executor.shutdown()
         if node is not None:

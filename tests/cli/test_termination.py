@@ -53,7 +53,7 @@ termination.AGAIN_S = 0.01
 with termination.terminated_by_signals():
     try:
         os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(60)
+        signal.pause()
     finally:
         end = time.monotonic() + 0.2
         while time.monotonic() < end:

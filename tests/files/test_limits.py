@@ -144,30 +144,3 @@ def test_workers_have_the_limits_of_their_parent(limited):
     limited(max_file_mb=7)
     with LocalWorkers(2) as workers:
         assert next(workers.map(limits_of_worker, [0])) == ReadLimits(max_file_mb=7)
-
-
-@pytest.mark.ros
-def test_calibration_in_a_message(limited):
-    messages = pytest.importorskip('fluoro_calib_ros.nodes.messages.fluoroscope_calibration')
-    message = messages.message_from_calibration(some_calibration())
-    limited(max_training_points=29)
-    assert '30 training points' in refused(messages.calibration_from_message, message)
-
-
-@pytest.mark.ros
-def test_message_of_a_calibration_is_refused_by_its_size(limited):
-    pytest.importorskip('rclpy')
-    from types import SimpleNamespace
-
-    from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
-
-    told = []
-    node = SimpleNamespace(get_logger=lambda: SimpleNamespace(error=told.append))
-    calibrations = CalibrationInput.__new__(CalibrationInput)
-    calibrations._node = node
-    calibrations._on_refused = lambda name, reason: told.append(reason)
-    limited(max_training_points=1000)
-    calibrations._on_data('a', bytes(3_000_000))
-    assert told[1] == 'the message has 3 MB, calibrations of more than 2 MB are not read'
-    calibrations._on_data('a', bytes(7))
-    assert 'cannot be decoded' in told[3]

@@ -32,7 +32,7 @@ from fluoro_calib_ros.images.codec import decode
 from fluoro_calib_ros.photogrammetry.resection import robust_dlt
 from fuzz.__main__ import load
 from fuzz.harness import Broken, check_message
-from fuzz.seeds import SEPARATOR, orientation
+from fuzz.seeds import SEPARATOR
 
 pytestmark = pytest.mark.filterwarnings('error::RuntimeWarning')
 
@@ -115,25 +115,6 @@ def test_video_without_a_pixel_format(tmp_path):
     assert cv2.VideoCapture(str(path)).get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT) == -1
     with pytest.raises(DataError, match='0 of 3 frames can be read'):
         list(open_images(path).images)
-
-
-@pytest.mark.ros
-def test_orientation_without_fluoroscopes():
-    messages = pytest.importorskip('fluoro_calib_ros.nodes.messages.rig_orientation')
-    from fluoro_calib_msgs.msg import RigOrientation
-
-    with pytest.raises(DataError, match='it has no fluoroscopes'):
-        messages.orientation_from_message(RigOrientation())
-
-
-@pytest.mark.ros
-@pytest.mark.parametrize('name', ['covariance', 'x', 'qw', 'c'])
-def test_orientation_message_with_giant_numbers(name):
-    messages = pytest.importorskip('fluoro_calib_ros.nodes.messages.rig_orientation')
-    message = messages.message_from_orientation(orientation())
-    getattr(message, name)[0] = 1.7e308
-    with pytest.raises(DataError, match=f'the array {name} holds a number'):
-        messages.orientation_from_message(message)
 
 
 def test_giant_numbers_in_a_result(tmp_path):

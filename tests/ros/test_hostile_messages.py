@@ -195,3 +195,18 @@ def test_stream_goes_on_beside_a_hostile_calibration(chain, tracking):
     )
     assert node.running and memory_kb(node) < MEMORY_KB
     client.destroy_publisher(output)
+
+
+def test_calibration_larger_than_the_limit_is_not_read(graph):
+    node = graph.start('correction_node', {'max_training_points': 1000})
+    client = graph.client
+    output = client.create_publisher(FluoroscopeCalibration, 'a/calibration', latched_qos())
+    client.wait_until(output.get_subscription_count, what='the reader of calibrations')
+    for data, told in (
+        (bytes(3_000_000), 'the message has 3 MB, calibrations of more than 2 MB are not read'),
+        (bytes(7), 'the message on topic a/calibration cannot be decoded'),
+    ):
+        output.publish(data)
+        client.wait_until(lambda told=told: told in node.log, what='the refusal')
+    assert node.running and 'Traceback' not in node.log
+    client.destroy_publisher(output)

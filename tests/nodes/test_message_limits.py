@@ -1,0 +1,62 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Messages that hold more than the limits allow, or nonsense, give one sentence."""
+
+import pytest
+import rigs
+from fluoro_calib_msgs.msg import RigOrientation
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.limits import ReadLimits, use_read_limits
+from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
+    calibration_from_message,
+    message_from_calibration,
+)
+from fluoro_calib_ros.nodes.messages.rig_orientation import (
+    message_from_orientation,
+    orientation_from_message,
+)
+from fuzz.seeds import orientation
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def limited():
+    """Set limits, which are the default ones again after the test."""
+    yield lambda **changes: use_read_limits(ReadLimits(**changes))
+    use_read_limits(ReadLimits())
+
+
+def test_calibration_of_too_many_training_points(limited):
+    calibration = rigs.pincushion('a', (64, 64))
+    message = message_from_calibration(calibration)
+    count = len(calibration.model.train_uv)
+    limited(max_training_points=count - 1)
+    with pytest.raises(DataError, match=f'{count} training points'):
+        calibration_from_message(message)
+
+
+def test_orientation_without_fluoroscopes():
+    with pytest.raises(DataError, match='it has no fluoroscopes'):
+        orientation_from_message(RigOrientation())
+
+
+@pytest.mark.parametrize('name', ['covariance', 'x', 'qw', 'c'])
+def test_orientation_with_giant_numbers(name):
+    message = message_from_orientation(orientation())
+    getattr(message, name)[0] = 1.7e308
+    with pytest.raises(DataError, match=f'the array {name} holds a number'):
+        orientation_from_message(message)

@@ -17,7 +17,6 @@
 Few examples a target, the same ones on every run. Hours of it: `make fuzz SECONDS=3600`.
 """
 
-import importlib.util
 import re
 
 import pytest
@@ -76,10 +75,13 @@ def damaged(draw, seeds):
     return bytes(content)
 
 
-@pytest.mark.parametrize('name', NAMES)
+def of_targets(names):
+    """Parameters of a test; those of targets that need ROS have its marker."""
+    return [pytest.param(n, marks=[pytest.mark.ros] if n in NEED_ROS else []) for n in names]
+
+
+@pytest.mark.parametrize('name', of_targets(NAMES))
 def test_reader_gives_a_result_or_one_sentence(name, tmp_path):
-    if name in NEED_ROS and importlib.util.find_spec('rclpy') is None:
-        pytest.skip('there is no ROS')
     target = load(name)
     seeds = list(target.seeds())
 
@@ -104,10 +106,8 @@ SEVERAL_KINDS = (
 )
 
 
-@pytest.mark.parametrize('name', [name for name in NAMES if name not in SEVERAL_KINDS])
+@pytest.mark.parametrize('name', of_targets(n for n in NAMES if n not in SEVERAL_KINDS))
 def test_first_seed_is_accepted(name, tmp_path):
     """Else the fuzzer would begin with what is refused at once."""
-    if name in NEED_ROS and importlib.util.find_spec('rclpy') is None:
-        pytest.skip('there is no ROS')
     target = load(name)
     assert check(target, target.seeds()[0], tmp_path)

@@ -27,8 +27,10 @@ import cv2
 import numpy as np
 
 import fluoro_calib_ros as fc
+from fluoro_calib_ros.distortion.collocation import CollocationModel
 from fluoro_calib_ros.exposures.frame import Frame
 
+from .claims import expected_square
 from .peers import MODELS, calibrate_with_mrcal, calibrate_with_opencv
 from .scoring import (
     STEP_PX,
@@ -65,6 +67,8 @@ class Fold:
     nse : float
         Of an adjustment of the tested exposures with the calibration held: square sum of the
         residuals inside over their claimed variance, by degree of freedom, without the rejected.
+    nse_correlated : float
+        The same over its expectation by the covariances of the calibration (see `claims`).
     rejected : float
         Share of the image points inside that the adjustment takes as gross errors.
     seconds : float
@@ -91,6 +95,7 @@ class Fold:
     rms: dict[str, float] = field(default_factory=dict)
     rms_held: dict[str, float] = field(default_factory=dict)
     nse: float = float('nan')
+    nse_correlated: float = float('nan')
     rejected: float = float('nan')
     seconds: float = float('nan')
     model: str = ''
@@ -235,7 +240,8 @@ def _test_claims(
 
     good: image points, in the order of the frames, that count.
     """
-    table = fc.adjust({CAMERA: tested}, data.phantom, outcome.calibrations).residuals
+    adjusted = fc.adjust({CAMERA: tested}, data.phantom, outcome.calibrations)
+    table = adjusted.residuals
     assert table is not None
     keys = [(f.number, i) for f in tested for i in f.target_id.tolist()]
     counts = dict(zip(keys, good.tolist()))
@@ -247,6 +253,11 @@ def _test_claims(
     claimed = outcome.calibrations[CAMERA].correct(table.uv[kept], exact=True).sigma
     square = np.sum(table.residual[kept] ** 2 / claimed[:, None] ** 2)
     fold.nse = float(square / np.sum(table.redundancy[kept]))
+    run = outcome.result.runs[CAMERA]
+    if fold.model == CollocationModel.kind:
+        sigma = outcome.calibrations[CAMERA].correct(table.uv, exact=True).sigma
+        expected = expected_square(run, adjusted.solved[CAMERA], sigma, kept)
+        fold.nse_correlated = float(np.sum(table.residual[kept] ** 2) / expected)
 
 
 def measure(data: DataSet, mrcal: str | None, validated: bool) -> dict[str, Any]:

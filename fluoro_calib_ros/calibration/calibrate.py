@@ -29,7 +29,6 @@ from ..distortion.base import CorrectionModel
 from ..exposures.frame import validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
-from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.held_precision import precision_with_held_interiors
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.precision import Precision, geometric_redundancy
@@ -366,7 +365,7 @@ def _calibrations_of_run(
             name,
             digest_of_sources(frames[name], phantom),
             seconds,
-            _image_sd(run, f, run.models[name]),
+            _image_sd(run, f, name),
         )
         for f, name in enumerate(run.measured.fluoroscopes)
     }
@@ -642,47 +641,19 @@ def _figures(
     )
 
 
-def _image_sd(run: SelfCalibration, f: int, model: CorrectionModel) -> float:
+def _image_sd(run: SelfCalibration, f: int, name: str) -> float:
     """Standard deviation [px] of an image coordinate of fluoroscope number f.
 
     It is that of the inlier residuals, which are smaller than the noise by the root of their
-    redundancy numbers, together with what the distortion of their exposures differs from the
-    model, as that of any later exposure will. The scale of a Student-t noise is no substitute:
-    where the tails are heavy it is smaller than the standard deviation of its core.
+    redundancy numbers, together with what the distortion of an exposure differs from the model.
+    The scale of a Student-t noise is no substitute: where the tails are heavy it is smaller than
+    the standard deviation of its core.
     """
     redundancy = geometric_redundancy(run.measured.network, run.after.parameters, run.after.noise)
     rows = _rows_of(run.measured, f)
     rows = rows[run.after.inliers[rows]]
     noise = np.sum(run.after.residuals[rows] ** 2) / np.sum(2 * redundancy[rows])
-    variation = 0.0
-    if model.series is not None:
-        own = run.correction[rows] - model.predict(run.measured.network.uv[rows])
-        variation = _variance_in_exposures(run, rows, own)
-    return float(np.sqrt(noise + variation))
-
-
-def _variance_in_exposures(
-    run: SelfCalibration, rows: np.ndarray, differences: np.ndarray
-) -> float:
-    """Mean square of differences (n, 2) [px] without what orientations of exposures absorb.
-
-    rows (n,): their image points.
-    """
-    square = 0.0
-    if not differences.any():
-        return square
-    network = run.measured.network
-    _, by_exterior, _, _ = project_with_jacobian(*network.per_image_point(run.after.parameters))
-    exposure = network.exposure[rows]
-    for number in np.unique(exposure):
-        at = exposure == number
-        values = differences[at].ravel()
-        # In units in which the six unknowns matter alike.
-        absorbed = by_exterior[rows[at]].reshape(len(values), -1)
-        absorbed = absorbed / np.linalg.norm(absorbed, axis=0)
-        left = values - absorbed @ np.linalg.lstsq(absorbed, values, rcond=None)[0]
-        square += float(left @ left)
-    return square / (2 * len(rows))
+    return float(np.sqrt(noise + run.between_exposures.get(name, 0.0)))
 
 
 def _calibration(

@@ -89,6 +89,10 @@ def calibrate_by_adjustment(
             measured.network, before, terms, max_rounds, report, raise_if_cancelled
         )
         precise = precision(network, after)
+        between = {
+            name: terms.variance_between_exposures(f, network, after, precise)
+            for f, name in enumerate(measured.fluoroscopes)
+        }
     except np.linalg.LinAlgError:
         raise DataError(
             'the exposures do not determine orientation and distortion: '
@@ -105,6 +109,7 @@ def calibrate_by_adjustment(
         _models(model_type, terms, measured, after, precise),
         tuple(history.rounds),
         converged,
+        between_exposures=between,
     )
 
 

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -84,6 +84,9 @@ class SelfCalibration:
         False where the largest number of rounds ended it.
     stated : Precision or None
         With the errors of the models (see `model_errors`); None: these are in the precision.
+    between_exposures : mapping of str to float
+        Variance [px^2] by which the distortion differs between exposures, without what
+        orientations absorb, of the fluoroscopes where it does.
     """
 
     measured: Measured
@@ -96,6 +99,7 @@ class SelfCalibration:
     history: tuple[Round, ...]
     converged: bool
     stated: Precision | None = None
+    between_exposures: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def claims(self) -> Precision:

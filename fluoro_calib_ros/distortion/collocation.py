@@ -40,6 +40,7 @@ from .exposure_terms import (
     variation,
     without_exposure_terms,
 )
+from .exposure_variance import variance_between_exposures
 from .misfit import FittedPoints, LeftOut, has_common_error
 from .priors import (
     Prior,
@@ -56,6 +57,7 @@ if TYPE_CHECKING:
     from ..photogrammetry.adjustment import Adjustment
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
+    from ..photogrammetry.precision import Precision
 
 TREND_DEGREE = 3  # pincushion, S-shape and spiral are cubic to first order (Gronenschild 1997)
 RINGS = 2  # radial polynomials of degree 5 and 7: what a lens or a curved screen adds at the rim
@@ -241,6 +243,24 @@ class CollocationTerms(AdjustedTerms):
         highest = functions.highest
         return LeftOut(signal.sd_beyond(highest), partial(signal.correlation_beyond, highest))
 
+    def variance_between_exposures(
+        self, f: int, network: Network, adjustment: Adjustment, precise: Precision
+    ) -> float:
+        """See `AdjustedTerms`."""
+        own = self.exposure_terms[f]
+        covariance = precise.additional[f]
+        if own is None or covariance is None:
+            return 0.0
+        last = slice(-own.count, None)
+        return variance_between_exposures(
+            network,
+            adjustment,
+            f,
+            own,
+            coefficients_of(adjustment)[f][last],
+            covariance[last, last],
+        )
+
     def renew(
         self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
     ) -> tuple[bool, tuple[np.ndarray, ...]]:
@@ -338,7 +358,7 @@ class CollocationTerms(AdjustedTerms):
             core = adjustment.inliers[rows]
             found = variation(adjustment.residuals[rows][core], exposure[core], functions[core])
             if found.is_varying and len(np.unique(exposure)) <= MAX_VARYING_EXPOSURES:
-                self.exposure_terms[f] = ExposureTerms(functions, exposure)
+                self.exposure_terms[f] = ExposureTerms(functions, exposure, found.size_px)
         return any(own is not None for own in self.exposure_terms)
 
     def _modes(self, f: int, information: np.ndarray) -> int:

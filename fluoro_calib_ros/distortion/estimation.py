@@ -142,6 +142,16 @@ class AdjustedTerms(ABC):
         """What the series of fluoroscope f leaves out by design; None: nothing."""
         return None
 
+    def variance_between_exposures(
+        self, f: int, network: Network, adjustment: Adjustment, precise: Precision
+    ) -> float:
+        """Variance [px^2] by which the distortion of fluoroscope f differs between exposures.
+
+        It is without what orientations absorb. network: that with the terms as additional
+        parameters; adjustment and precise: of this network.
+        """
+        return 0.0
+
     def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
         """Return the series of fluoroscope f that an adjustment has estimated."""
         coefficients = adjustment.parameters.additional[f]

@@ -37,7 +37,6 @@ TREND_DEGREE = 3
 # taken to vary. Object points and the common distortion absorb a part of the residuals: constant
 # distortions have 0.4 to 0.8 (docs/pathologies.md).
 VARYING = 0.85
-START_VARIANCE = 0.04  # px^2
 MIN_VARIANCE = 1e-8  # px^2
 ORIENTATION = 6  # unknowns of an exposure
 MIN_POINTS = 30  # of an exposure whose terms are tested
@@ -118,7 +117,8 @@ def variation(residuals: np.ndarray, exposure: np.ndarray, functions: np.ndarray
 class ExposureTerms:
     """Terms of every exposure of a fluoroscope as additional parameters.
 
-    The coefficients of one exposure stand after those of the one before.
+    The coefficients of one exposure stand after those of the one before. size_px: RMS of a
+    coordinate of the change to start with [px].
 
     Attributes
     ----------
@@ -128,14 +128,14 @@ class ExposureTerms:
         Variance of the coefficients of each term over the exposures [px^2].
     """
 
-    def __init__(self, functions: np.ndarray, exposure: np.ndarray) -> None:
+    def __init__(self, functions: np.ndarray, exposure: np.ndarray, size_px: float) -> None:
         numbers, place = np.unique(exposure, return_inverse=True)
         n, _, count = functions.shape
         self.exposures = len(numbers)
         values = np.zeros((n, 2, self.exposures, count))
         values[np.arange(n), :, place] = functions
         self.values = values.reshape(n, 2, -1)
-        self.variance = np.full(count, START_VARIANCE)
+        self.variance = np.full(count, max(size_px**2 / count, MIN_VARIANCE))
 
     @property
     def count(self) -> int:

@@ -53,8 +53,9 @@ def _check(evidence: Evidence, name: str) -> Check:
             f'fluoroscope {name}: the distortion differs between exposures by '
             f'{found.size_px:.2f} px (chi2/dof {found.chi2_per_dof:.2f}, constant up to '
             f'{VARYING:.2f})',
-            'a magnetic field that turns with the C-arm, a phantom that moved or was bent; '
-            f'{more_exposures(count)} at the angle that is used, or calibrate each angle',
+            'a C-arm at another angle, a lens that was focused or zoomed, a source or detector '
+            'that is not rigid, or a phantom that moved, was bent or is surveyed wrongly; '
+            f'{more_exposures(count)} at the angle and setting that are used, or calibrate each',
         ),
         evidence.trends[name].is_significant,
     )

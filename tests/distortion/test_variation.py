@@ -76,7 +76,7 @@ def test_variances_of_the_terms_are_found_and_vanish_where_nothing_differs():
     coefficients = rng.normal(0, 1, (EXPOSURES, 14)) * true
     values = np.einsum('nak,nk->na', functions, coefficients[exposure])
     values += rng.normal(0, NOISE, values.shape)
-    terms = ExposureTerms(functions, exposure)
+    terms = ExposureTerms(functions, exposure, 0.5)
     a = terms.values.reshape(2 * len(uv), -1)
     information = a.T @ a / NOISE**2
     right = a.T @ values.ravel() / NOISE**2

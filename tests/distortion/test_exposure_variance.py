@@ -1,0 +1,94 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""How far the distortion of a later exposure differs: what object points can absorb is not it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import rigs
+
+from fluoro_calib_ros.distortion.exposure_terms import ExposureTerms, exposure_functions
+from fluoro_calib_ros.distortion.exposure_variance import variance_between_exposures
+from fluoro_calib_ros.photogrammetry.adjustment import adjust
+from fluoro_calib_ros.photogrammetry.collinearity import project_with_jacobian
+from fluoro_calib_ros.photogrammetry.noise import Noise
+
+SIZE = (1024, 1024)
+SIZE_PX = 0.5
+EXPOSURES = 10
+
+
+@pytest.fixture(scope='module')
+def case():
+    """Network, its adjustment and derivatives, and terms of the exposures."""
+    network, true = rigs.small_network(EXPOSURES, 80, survey_sd_mm=0.2, free=False, seed=3)
+    found = adjust(network, true, np.zeros_like(network.uv), Noise('gaussian', 0.3))
+    _, by_exterior, by_point, _ = project_with_jacobian(*network.per_image_point(found.parameters))
+    functions = exposure_functions(network.uv, SIZE, found.parameters.interior[0])
+    return (
+        network,
+        found,
+        by_exterior,
+        by_point,
+        ExposureTerms(functions, network.exposure, SIZE_PX),
+    )
+
+
+def mean_square_left(network, by_exterior, values):
+    """Mean square of values (N, 2) without what the orientation of each exposure absorbs."""
+    square = 0.0
+    for number in range(network.n_exposures):
+        at = network.exposure == number
+        y = values[at].ravel()
+        a = by_exterior[at].reshape(len(y), -1)
+        a = a / np.linalg.norm(a, axis=0)
+        square += np.sum((y - a @ np.linalg.lstsq(a, y, rcond=None)[0]) ** 2)
+    return square / values.size
+
+
+def test_terms_that_differ_at_random_have_their_own_size(case):
+    network, found, by_exterior, _, terms = case
+    rng = np.random.default_rng(1)
+    exact = np.zeros((terms.count, terms.count))
+    ratios = []
+    for _ in range(10):
+        coefficients = rng.normal(0, np.sqrt(np.tile(terms.variance, terms.exposures)))
+        true = mean_square_left(network, by_exterior, terms.values @ coefficients)
+        got = variance_between_exposures(network, found, 0, terms, coefficients, exact)
+        ratios.append(got / true)
+    assert np.mean(ratios) == pytest.approx(1, abs=0.05)
+    assert np.std(ratios) < 0.1
+    # Coefficients that are only known to be within their prior are as large as it says.
+    prior = np.diag(np.tile(terms.variance, terms.exposures))
+    got = variance_between_exposures(network, found, 0, terms, np.zeros(terms.count), prior)
+    draws = [rng.normal(0, np.sqrt(np.diagonal(prior))) for _ in range(20)]
+    expected = np.mean([mean_square_left(network, by_exterior, terms.values @ c) for c in draws])
+    assert got == pytest.approx(expected, rel=0.1)
+
+
+def test_a_phantom_that_has_shrunk_is_no_variation(case):
+    network, found, by_exterior, by_point, terms = case
+    loose = replace(network, survey_sd_mm=np.full(network.n_points, 3.0))
+    shrunk = network.survey_mm * [2e-3, -2e-3, 0]
+    shift = np.einsum('nak,nk->na', by_point, shrunk[network.point])
+    values = terms.values.reshape(2 * len(shift), -1)
+    coefficients = np.linalg.lstsq(values, shift.ravel(), rcond=None)[0]
+    like_variation = terms.values @ coefficients
+    scale = np.sqrt(np.mean(like_variation**2))
+    assert scale > 0.1  # the terms can follow it
+    exact = np.zeros((terms.count, terms.count))
+    got = variance_between_exposures(loose, found, 0, terms, coefficients, exact)
+    assert got < 0.3 * mean_square_left(network, by_exterior, like_variation)

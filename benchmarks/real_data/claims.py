@@ -71,17 +71,17 @@ def _to_residuals(
     design[at, :, columns] = by_exterior.transpose(0, 2, 1)
     columns = first_point + 3 * network.point[rows][:, None] + np.arange(3)
     design[at, :, columns] = by_point.transpose(0, 2, 1)
-    design = design.reshape(2 * len(rows), -1)
+    flat = design.reshape(2 * len(rows), -1)
     weight = adjustment.noise.weight(adjustment.q)[rows]
     weight = np.repeat(weight / (adjustment.noise.scale * network.sigma[rows]) ** 2, 2)
-    prior = np.zeros(design.shape[1])
+    prior = np.zeros(flat.shape[1])
     prior[first_point:] = np.repeat(1 / network.survey_sd_mm**2, 3)
-    normal = design.T @ (weight[:, None] * design) + np.diag(prior)
+    normal = flat.T @ (weight[:, None] * flat) + np.diag(prior)
     unit = 1 / np.sqrt(np.diagonal(normal))
     normal = normal * np.outer(unit, unit)
     inverse = np.linalg.inv(normal) * np.outer(unit, unit)
-    projected = design @ inverse
-    to_residuals = np.eye(len(design)) - projected @ (design.T * weight)
+    projected = flat @ inverse
+    to_residuals = np.eye(len(flat)) - projected @ (flat.T * weight)
     return to_residuals, projected * np.sqrt(prior), by_interior.reshape(-1, 3)
 
 

@@ -141,6 +141,7 @@ class CollocationTerms(AdjustedTerms):
         self._variation_tested = modes == 0
         self._mode_changes = 0
         self._settled = 0
+        self._searched = [False] * len(self.sizes)
         self._start = self.zeros()
         if earlier is not None:
             self._continue(earlier, before)
@@ -342,11 +343,21 @@ class CollocationTerms(AdjustedTerms):
             )
             if abs(own.size_px - before) > SETTLED_VARIATION * before:
                 self._settled = 0
-        self.priors[f] = most_likely_prior(functions, information, right, self.gauges[f], last)
+
+        def renewed(prior: Prior, search: bool) -> Prior:
+            gauge = self.gauges[f]
+            return most_likely_prior(functions, information, right, gauge, prior, search)
+
+        prior = renewed(last, False)
+        change = prior.signal.change(last.signal, functions.frequency) if functions.modes else 0.0
+        if functions.modes and change < SETTLED_PRIOR and not self._searched[f]:
+            self._searched[f] = True
+            prior = renewed(prior, True)
+            change = prior.signal.change(last.signal, functions.frequency)
+        self.priors[f] = prior
         self.gauges[f] = self._gauge(f)
         if not functions.modes:
             return 0, True
-        change = self.priors[f].signal.change(last.signal, functions.frequency)
         return self._modes(f, information), change < SETTLED_PRIOR
 
     def _add_exposure_terms(self, adjustment: Adjustment) -> bool:

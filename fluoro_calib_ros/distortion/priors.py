@@ -30,7 +30,7 @@ from scipy.linalg import cho_factor, cho_solve
 
 from .gauge import GaugeKind, gauge_rows
 from .series import Functions
-from .signal import Signal, most_likely_signal, starting_signal
+from .signal import Signal, SignalEquations, most_likely_signal, starting_signal
 from .terms import trend_transformation
 
 # Standard deviation to which the gauge is held; a much smaller one would damp the steps of the
@@ -134,6 +134,7 @@ def most_likely_prior(
     right: np.ndarray,
     gauge: np.ndarray,
     prior: Prior,
+    search: bool = False,
 ) -> Prior:
     """Return a prior with a larger marginal likelihood: signal first, then trend.
 
@@ -148,18 +149,20 @@ def most_likely_prior(
         Precision matrix of the gauge.
     prior : Prior
         Present prior.
+    search : bool
+        Whether to look for a short field that may have been missed.
 
     Returns
     -------
     Prior
     """
     if functions.modes:
-        prior = _most_likely_signal(functions, information + gauge, right, prior)
+        prior = _most_likely_signal(functions, information + gauge, right, prior, search)
     return _most_likely_trend(functions, information + gauge, right, prior)
 
 
 def _most_likely_signal(
-    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior, search: bool
 ) -> Prior:
     """Return the prior with a renewed signal."""
     at = _trend_columns(functions)
@@ -167,7 +170,8 @@ def _most_likely_signal(
     base[np.ix_(at, at)] += _trend_precision(functions, prior)
     columns = np.setdiff1d(np.arange(len(right)), at)
     side = max(functions.image_size)
-    found = most_likely_signal(prior.signal, functions.frequency, base, right, columns, side)
+    equations = SignalEquations(functions.frequency, base, right, columns)
+    found = most_likely_signal(prior.signal, equations, side, search)
     return replace(prior, signal=found)
 
 

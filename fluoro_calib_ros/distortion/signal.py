@@ -14,29 +14,46 @@
 
 """Covariance function of the signal of a distortion, and its estimation.
 
-The signal is the sum of two random fields with covariance functions of Matern's family, nu = 5/2,
-the same for u and v: a long one for what bends over the image, a short one for the local ripples
-that the first, with one correlation length for all, would smooth away. Their standard deviations
-and correlation lengths are those of the largest marginal likelihood (Rasmussen and Williams,
-"Gaussian Processes for Machine Learning", 2006, 5.4), found by Fisher scoring: the slopes and
-the expected curvature of the likelihood follow from the posterior means and variances of the
-coefficients (MacKay, "Bayesian interpolation", Neural Computation 4, 1992).
+The signal is the sum of two random fields with covariance functions of Matern's family, the same
+for u and v: a long one for what bends over the image, a short one for the local ripples that the
+first, with one correlation length for all, would smooth away. Their standard deviations,
+correlation lengths and common smoothness are those of the largest marginal likelihood (Rasmussen
+and Williams, "Gaussian Processes for Machine Learning", 2006, 5.4) with weak priors, found by
+Fisher scoring: the slopes and the expected curvature of the likelihood follow from the posterior
+means and variances of the coefficients (MacKay, "Bayesian interpolation", Neural Computation 4,
+1992).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import lapack, solve_triangular
 from scipy.special import j0
 
-MATERN = 2.5
+# Smoothness nu of the long field: its range, and the median and the standard deviation of its
+# logarithm before it is estimated. It tells how much of the signal the sines leave out.
+SMOOTHNESS_RANGE = (1.0, 4.0)
+SMOOTHNESS = 3.0
+SMOOTHNESS_SD = 0.5
+FINE_SMOOTHNESS = 2.5
 MIN_VARIANCE = 1e-10  # of a coefficient of the signal: an amplitude of 1e-8 px
 MIN_SD_PX = 1e-3  # of a field
 # Ranges of the correlation lengths relative to the longer side of the image.
 REACH_RANGE = (0.02, 1.0)
 FINE_RANGE = (0.012, 0.2)
+# Prior of the short field: scales of the inverse of its correlation length, over the inverse of
+# the extent of the sines, and of its standard deviation [px]. Their densities are exponential
+# (Fuglstad et al., "Constructing priors that penalize the complexity of Gaussian random fields",
+# JASA 114, 2019), so that it only exists where the observations need it.
+FINE_PER_EXTENT = 15.0
+FINE_PX = 0.5
+# Short fields that may have been missed: their standard deviation [px], their correlation lengths
+# relative to the image, and the gain of the logarithm of the likelihood from which they exist.
+SEARCH_PX = 0.1
+SEARCH_REACH = (0.03, 0.06, 0.12)
+MIN_SEARCH_GAIN = 2.0
 START_REACH = 0.15
 START_FINE_REACH = 0.06
 START_FINE_SHARE = 0.1  # of the standard deviation of the long field
@@ -53,19 +70,30 @@ RIDGE = 0.05  # least damping: added to the expected curvature, it keeps what ha
 
 @dataclass(frozen=True)
 class Signal:
-    """Standard deviations [px] and correlation lengths [px] of the long and the short field."""
+    """Standard deviations [px] and correlation lengths [px] of the long and the short field.
+
+    smoothness: nu of the long field.
+    """
 
     sd: float
     reach: float
     fine_sd: float = 0.0
     fine_reach: float = 1.0
+    smoothness: float = SMOOTHNESS
+
+    @property
+    def fields(self) -> tuple[tuple[float, float, float], ...]:
+        """Standard deviation, correlation length and smoothness of each field."""
+        long = (self.sd, self.reach, self.smoothness)
+        fine = (self.fine_sd, self.fine_reach, FINE_SMOOTHNESS)
+        return (long, fine) if self.fine_sd else (long,)
+
+    def _density(self, frequency: np.ndarray) -> np.ndarray:
+        return np.sum([spectral_density(frequency, *field) for field in self.fields], axis=0)
 
     def variance(self, frequency: np.ndarray) -> np.ndarray:
         """Prior variances (s,) of the coefficients of sines of frequency (s,) [1/px]."""
-        out = spectral_density(frequency, self.sd, self.reach)
-        if self.fine_sd:
-            out = out + spectral_density(frequency, self.fine_sd, self.fine_reach)
-        return np.maximum(out, MIN_VARIANCE)
+        return np.maximum(self._density(frequency), MIN_VARIANCE)
 
     def sd_beyond(self, frequency: float) -> float:
         """Standard deviation [px] of the part of the signal with larger frequencies [1/px].
@@ -73,9 +101,9 @@ class Signal:
         It is the integral of the spectral density over the plane outside of a circle.
         """
         variance = 0.0
-        for sd, reach in ((self.sd, self.reach), (self.fine_sd, self.fine_reach)):
-            a = 2 * MATERN / reach**2
-            variance += sd**2 * (a / (a + frequency**2)) ** MATERN
+        for sd, reach, nu in self.fields:
+            a = 2 * nu / reach**2
+            variance += sd**2 * (a / (a + frequency**2)) ** nu
         return float(np.sqrt(variance))
 
     def correlation_beyond(self, frequency: float, distance: np.ndarray) -> np.ndarray:
@@ -84,15 +112,12 @@ class Signal:
         Ripples shorter than the distance of image points hardly show in products of neighbours.
         """
         f = frequency * np.geomspace(1, SHORTEST, QUADRATURE)
-        density = spectral_density(f, self.sd, self.reach)
-        if self.fine_sd:
-            density = density + spectral_density(f, self.fine_sd, self.fine_reach)
-        weight = density * f**2  # f df on a geometric grid
+        weight = self._density(f) * f**2  # f df on a geometric grid
         return j0(np.outer(distance, f)) @ weight / np.sum(weight)
 
     def with_ripples(self, side: float) -> Signal:
         """Return a signal with a short field to start with; side: of the image [px]."""
-        return Signal(self.sd, self.reach, RIPPLES_PX, RIPPLES_REACH * side)
+        return replace(self, fine_sd=RIPPLES_PX, fine_reach=RIPPLES_REACH * side)
 
     def change(self, other: Signal, frequency: np.ndarray) -> float:
         """Mean change of the logarithms of the variances at frequency (s,) from another signal."""
@@ -100,13 +125,16 @@ class Signal:
         return float(np.mean(np.abs(np.log(ratio))))
 
 
-def spectral_density(frequency: np.ndarray, sd: float, reach: float) -> np.ndarray:
+def spectral_density(
+    frequency: np.ndarray, sd: float, reach: float, nu: float = SMOOTHNESS
+) -> np.ndarray:
     """Variances (s,) of the coefficients of sines: Matern's covariance in two dimensions.
 
-    frequency (s,) [1/px]; sd, reach [px] (Rasmussen and Williams 2006, Eq. 4.15 for D = 2).
+    frequency (s,) [1/px]; sd, reach [px]; nu: smoothness (Rasmussen and Williams 2006, Eq. 4.15
+    for D = 2).
     """
-    a = 2 * MATERN / reach**2
-    return sd**2 * 4 * np.pi * MATERN * a**MATERN * (a + frequency**2) ** -(MATERN + 1)
+    a = 2 * nu / reach**2
+    return sd**2 * 4 * np.pi * nu / a * (a / (a + frequency**2)) ** (nu + 1)
 
 
 def starting_signal(sd: float, side: float) -> Signal:
@@ -114,22 +142,51 @@ def starting_signal(sd: float, side: float) -> Signal:
     return Signal(sd, START_REACH * side, START_FINE_SHARE * sd, START_FINE_REACH * side)
 
 
+def _parameters(signal: Signal) -> np.ndarray:
+    """Logarithms (5,) of the parameters of a signal."""
+    fine = [signal.fine_sd, signal.fine_reach]
+    return np.log([signal.sd, signal.reach, *fine, signal.smoothness])
+
+
 def _slopes(signal: Signal, frequency: np.ndarray) -> np.ndarray:
-    """Derivatives (s, 4) of the logarithms of the variances by those of the parameters."""
-    parts = []
-    for sd, reach in ((signal.sd, signal.reach), (signal.fine_sd, signal.fine_reach)):
-        a = 2 * MATERN / reach**2
-        density = spectral_density(frequency, sd, reach)
-        by_reach = -2 * MATERN + 2 * (MATERN + 1) * a / (a + frequency**2)
-        parts += [2 * density, by_reach * density]
-    return np.stack(parts, axis=1) / signal.variance(frequency)[:, None]
+    """Derivatives (s, 5) of the logarithms of the variances by those of the parameters."""
+    out = []
+    for sd, reach, nu in signal.fields:
+        a = 2 * nu / reach**2
+        density = spectral_density(frequency, sd, reach, nu)
+        part = a / (a + frequency**2)
+        by_reach = 2 * (nu + 1) * part - 2 * nu
+        by_smoothness = 1 + nu + nu * np.log(part) - (nu + 1) * part
+        out += [2 * density, by_reach * density, by_smoothness * density]
+    long, fine = out[:3], out[3:]
+    columns = [*long[:2], *fine[:2], long[2]]
+    return np.stack(columns, axis=1) / signal.variance(frequency)[:, None]
+
+
+@dataclass(frozen=True)
+class SignalEquations:
+    """Normal equations of all coefficients of a series, with every prior but that of the signal.
+
+    Attributes
+    ----------
+    frequency : (s,) ndarray
+        Frequencies of the sines [1/px].
+    information, right : (p, p) and (p,) ndarray
+    columns : (2 s,) ndarray of int
+        Places of the coefficients of the sines, those of u first.
+    """
+
+    frequency: np.ndarray
+    information: np.ndarray
+    right: np.ndarray
+    columns: np.ndarray
 
 
 @dataclass(frozen=True)
 class _Likelihood:
-    """Marginal likelihood of a signal.
+    """Marginal likelihood of a signal, with the priors of its parameters.
 
-    cost: its negative logarithm, without constants; slopes (4,) and curvature (4, 4) by the
+    cost: its negative logarithm, without constants; slopes (5,) and curvature (5, 5) by the
     logarithms of the parameters.
     """
 
@@ -139,12 +196,7 @@ class _Likelihood:
 
 
 def most_likely_signal(
-    signal: Signal,
-    frequency: np.ndarray,
-    information: np.ndarray,
-    right: np.ndarray,
-    columns: np.ndarray,
-    side: float,
+    signal: Signal, coefficients: SignalEquations, side: float, search: bool = False
 ) -> Signal:
     """Return a signal with a larger marginal likelihood.
 
@@ -152,31 +204,47 @@ def most_likely_signal(
     ----------
     signal : Signal
         Present one.
-    frequency : (s,) ndarray
-        Frequencies of the sines [1/px].
-    information, right : (p, p) and (p,) ndarray
-        Normal equations of all coefficients, with every prior but that of the signal.
-    columns : (2 s,) ndarray of int
-        Places of the coefficients of the sines, those of u first.
+    coefficients : SignalEquations
     side : float
         Longer side of the image [px].
+    search : bool
+        Whether to start from several short fields too. One that has vanished cannot return by
+        itself, and a rough long field may have taken its place.
 
     Returns
     -------
     Signal
     """
-    low = np.log([MIN_SD_PX, REACH_RANGE[0] * side, MIN_SD_PX, FINE_RANGE[0] * side])
-    high = np.log([side, REACH_RANGE[1] * side, side, FINE_RANGE[1] * side])
-    at = np.clip(np.log([signal.sd, signal.reach, signal.fine_sd, signal.fine_reach]), low, high)
-    here = _likelihood(at, frequency, information, right, columns)
+    cost, found = _more_likely(signal, coefficients, side)
+    if not search:
+        return found
+    for reach in SEARCH_REACH:
+        for smoothness in (found.smoothness, SMOOTHNESS):
+            start = replace(
+                found, fine_sd=SEARCH_PX, fine_reach=reach * side, smoothness=smoothness
+            )
+            there, other = _more_likely(start, coefficients, side)
+            if there < cost - MIN_SEARCH_GAIN:
+                cost = there
+                found = other
+    return found
+
+
+def _more_likely(
+    signal: Signal, coefficients: SignalEquations, side: float
+) -> tuple[float, Signal]:
+    """Return cost and signal after some steps of Fisher scoring."""
+    low, high = _ranges(side)
+    at = np.clip(_parameters(signal), low, high)
+    here = _likelihood(at, coefficients)
     if here is None:
-        return signal
+        return np.inf, signal
     damping = RIDGE
     for _ in range(STEPS):
-        step = np.linalg.solve(here.curvature + damping * np.eye(4), -here.slopes)
+        step = np.linalg.solve(here.curvature + damping * np.eye(len(at)), -here.slopes)
         step = step / max(1.0, np.max(np.abs(step)) / MAX_STEP)
         trial = np.clip(at + step, low, high)
-        there = _likelihood(trial, frequency, information, right, columns)
+        there = _likelihood(trial, coefficients)
         if there is None or there.cost > here.cost:
             damping *= 30
             continue
@@ -186,25 +254,37 @@ def most_likely_signal(
         damping = max(RIDGE, damping / 10)
         if gain < MIN_GAIN:
             break
-    return Signal(*(float(value) for value in np.exp(at)))
+    return here.cost, Signal(*(float(value) for value in np.exp(at)))
 
 
-def _likelihood(
-    at: np.ndarray,
-    frequency: np.ndarray,
-    information: np.ndarray,
-    right: np.ndarray,
-    columns: np.ndarray,
-) -> _Likelihood | None:
-    """Return the likelihood at logarithms (4,) of the parameters; None where it has none."""
+def _ranges(side: float) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest logarithms (5,) of the parameters; side: of the image [px]."""
+    return (
+        np.log(
+            [
+                MIN_SD_PX,
+                REACH_RANGE[0] * side,
+                MIN_SD_PX,
+                FINE_RANGE[0] * side,
+                SMOOTHNESS_RANGE[0],
+            ]
+        ),
+        np.log([side, REACH_RANGE[1] * side, side, FINE_RANGE[1] * side, SMOOTHNESS_RANGE[1]]),
+    )
+
+
+def _likelihood(at: np.ndarray, coefficients: SignalEquations) -> _Likelihood | None:
+    """Return the likelihood at logarithms (5,) of the parameters; None where it has none."""
     signal = Signal(*np.exp(at))
+    frequency = coefficients.frequency
+    columns = coefficients.columns
     variance = np.tile(signal.variance(frequency), 2)
-    matrix = information.copy(order='F')
+    matrix = coefficients.information.copy(order='F')
     matrix[columns, columns] += 1 / variance
     factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=1)
     if failed:
         return None
-    z = solve_triangular(factor, right, lower=True, check_finite=False)
+    z = solve_triangular(factor, coefficients.right, lower=True, check_finite=False)
     cost = np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(variance)) / 2 - z @ z / 2
     inverse, failed = lapack.dtrtri(factor, lower=1)
     if failed or not np.isfinite(cost):
@@ -214,8 +294,22 @@ def _likelihood(
     square = np.einsum('ij,ij->j', inverse, inverse)[columns]  # posterior variances
     slopes = np.tile(_slopes(signal, frequency), (2, 1))
     determined = np.clip(1 - square / variance, 0, 1)
-    return _Likelihood(
+    likelihood = _Likelihood(
         float(cost),
         slopes.T @ (1 - (mean**2 + square) / variance) / 2,
         (slopes * (determined**2)[:, None]).T @ slopes / 2,
+    )
+    return _with_priors(likelihood, at, np.pi / frequency.min())
+
+
+def _with_priors(likelihood: _Likelihood, at: np.ndarray, extent: float) -> _Likelihood:
+    """Return the posterior of logarithms (5,) of the parameters; extent: of the sines [px]."""
+    _, _, fine_sd, fine_reach, smoothness = at
+    large = np.exp(fine_sd) / FINE_PX
+    short = extent / np.exp(fine_reach) / FINE_PER_EXTENT
+    rough = (smoothness - np.log(SMOOTHNESS)) / SMOOTHNESS_SD
+    return _Likelihood(
+        likelihood.cost + float(large + short + rough**2 / 2),
+        likelihood.slopes + [0, 0, large, -short, rough / SMOOTHNESS_SD],
+        likelihood.curvature + np.diag([0, 0, large, short, SMOOTHNESS_SD**-2]),
     )

@@ -52,7 +52,12 @@ from fluoro_calib_ros.distortion.series import (
     sd_over_image,
     unpacked,
 )
-from fluoro_calib_ros.distortion.signal import Signal, _likelihood, spectral_density
+from fluoro_calib_ros.distortion.signal import (
+    Signal,
+    SignalEquations,
+    _likelihood,
+    spectral_density,
+)
 from fluoro_calib_ros.distortion.terms import (
     GAUGE,
     HIGHEST,
@@ -250,17 +255,17 @@ def test_model_with_a_series_has_a_calibrated_area():
 # ---- signal and trend
 
 
-@pytest.mark.parametrize('sd, reach', [(0.5, 180.0), (1.2, 100.0)])
-def test_sines_have_the_matern_covariance_function(sd, reach):
+@pytest.mark.parametrize('sd, reach, nu', [(0.5, 180.0, 2.5), (1.2, 100.0, 2.5), (0.5, 150, 6.0)])
+def test_sines_have_the_matern_covariance_function(sd, reach, nu):
     """Against the closed form with a Bessel function (Rasmussen and Williams 2006, Eq. 4.14), away
     from the edge, where the sines vanish.
     """
     functions = Functions((1024, 1024), -1, 40)
     uv = pixels(40, size=(500, 500)) + 262
     values = functions(uv)
-    ours = (values * spectral_density(functions.frequency, sd, reach)) @ values.T
-    scaled = np.sqrt(5) * np.maximum(cdist(uv, uv), 1e-9) / reach
-    theirs = sd**2 * 2**-1.5 / gamma(2.5) * scaled**2.5 * kv(2.5, scaled)
+    ours = (values * spectral_density(functions.frequency, sd, reach, nu)) @ values.T
+    scaled = np.sqrt(2 * nu) * np.maximum(cdist(uv, uv), 1e-9) / reach
+    theirs = sd**2 * 2 ** (1 - nu) / gamma(nu) * scaled**nu * kv(nu, scaled)
     np.testing.assert_allclose(ours, theirs, atol=0.02 * sd**2)
 
 
@@ -330,11 +335,43 @@ def test_slopes_of_the_likelihood_of_a_signal():
     columns = np.concatenate([np.arange(t, m), m + np.arange(t, m)])
 
     def cost(at):
-        return _likelihood(at, functions.frequency, information, right, columns)
+        return _likelihood(at, SignalEquations(functions.frequency, information, right, columns))
 
-    at = np.log([0.6, 300.0, 0.3, 80.0])
-    numeric = [(cost(at + h).cost - cost(at - h).cost) / 2e-4 for h in 1e-4 * np.eye(4)]
+    at = np.log([0.6, 300.0, 0.3, 80.0, 3.5])
+    numeric = [(cost(at + h).cost - cost(at - h).cost) / 2e-4 for h in 1e-4 * np.eye(5)]
     np.testing.assert_allclose(cost(at).slopes, numeric, rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize('smoothness', [1.5, 4.0])
+def test_prior_of_a_signal_says_what_short_waves_have(smoothness):
+    """A rough and a smooth field with the same standard deviation and correlation length."""
+    functions = Functions((1024, 1024), -1, 20)
+    uv = pixels(2500, 3, (1024, 1024))
+    there = Prior(Signal(1.0, 200.0, smoothness=smoothness), np.zeros(0))
+    information, right = drawn_field(functions, there, 4, uv, 0.1)
+    prior = starting_prior(functions, 1.0)
+    for _ in range(5):
+        prior = most_likely_prior(functions, information, right, np.zeros_like(information), prior)
+    for part in (0.7, 1.0):
+        at = part * functions.highest
+        assert prior.signal.sd_beyond(at) == pytest.approx(there.signal.sd_beyond(at), rel=0.4)
+
+
+def test_a_short_field_that_has_vanished_is_found_again():
+    """The long field alone explains such an image worse, however rough it is."""
+    functions = Functions((1024, 1024), -1, 22)
+    uv = pixels(2500, 3, (1024, 1024))
+    information, right = drawn_field(
+        functions, Prior(Signal(3.0, 600.0, 0.3, 60.0), np.zeros(0)), 2, uv, 0.25
+    )
+    prior = Prior(Signal(1.0, 300.0, 1e-3, 200.0), np.zeros(0))
+    gauge = np.zeros_like(information)
+    for _ in range(3):
+        prior = most_likely_prior(functions, information, right, gauge, prior)
+    assert prior.signal.fine_sd < 0.05
+    prior = most_likely_prior(functions, information, right, gauge, prior, search=True)
+    assert prior.signal.fine_sd == pytest.approx(0.3, rel=0.25)
+    assert prior.signal.fine_reach == pytest.approx(60, rel=0.3)
 
 
 def test_a_signal_of_two_scales_is_found_from_the_observations():

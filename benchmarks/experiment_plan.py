@@ -230,7 +230,7 @@ def quick_plan() -> Plan:
         (1,),
         (1,),
         (Setting('5 exposures'), hard),
-        4,
+        2,
         1.0,
     )
 

@@ -25,14 +25,23 @@ except ImportError:  # without the plugin, one process runs all tests
 
 
 ROS = ('tests/ros 1', 'tests/ros 2')
+# Files whose tests share the calibrations of tests/rigs.py, so that one worker makes them once.
+SHARING = (
+    'tests/calibration/test_calibration.py',
+    'tests/calibration/test_orientation.py',
+    'tests/distortion/test_grid.py',
+    'tests/images/test_undistortion.py',
+    'tests/validation/test_validation.py',
+)
 
 if LoadFileScheduling is not None:
 
     class TwoWorkersForRos(LoadFileScheduling):
         """Keep the tests of a file on one worker, and all tests with ROS nodes on two.
 
-        The tests of a file share fixtures. ROS nodes mostly wait, so two workers run them while a
-        third one computes; more graphs at once would only slow each other down.
+        The tests of a file share fixtures, and those of SHARING calibrations. ROS nodes mostly
+        wait, so two workers run them while a third one computes; more graphs at once would only
+        slow each other down.
         """
 
         def __init__(self, *arguments) -> None:
@@ -41,6 +50,8 @@ if LoadFileScheduling is not None:
 
         def _split_scope(self, nodeid: str) -> str:
             name = super()._split_scope(nodeid)
+            if name in SHARING:
+                return SHARING[0]
             if not name.startswith('tests/ros/'):
                 return name
             if name not in self._files_of_ros:
@@ -48,8 +59,8 @@ if LoadFileScheduling is not None:
             return ROS[self._files_of_ros.index(name) % len(ROS)]
 
         def _assign_work_unit(self, node) -> None:
-            """Begin with ROS, which takes longest."""
-            for scope in reversed(ROS):
+            """Begin with what takes longest."""
+            for scope in reversed((*ROS, SHARING[0])):
                 if scope in self.workqueue:
                     self.workqueue.move_to_end(scope, last=False)
             super()._assign_work_unit(node)

@@ -26,16 +26,30 @@ import pytest
 
 import fluoro_calib_ros as fc
 from fluoro_calib_ros import api
+from fluoro_calib_ros.jobs.dataset import write_bag
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 EXAMPLES = ROOT / 'examples'
 
 
-def example(name, *arguments):
-    """Run an example as a user would; returns what it prints."""
+@pytest.fixture(scope='module')
+def place(tmp_path_factory):
+    """Folder with bags/ in which examples run; its bag for the calibration is a short one."""
+    folder = tmp_path_factory.mktemp('examples')
+    bags = folder / 'bags'
+    bags.mkdir()
+    for name in ('phantom.csv', 'tracking'):
+        (bags / name).symlink_to(ROOT / 'bags' / name)
+    frames = api.read_source(ROOT / 'bags' / 'calibration', collect='all').frames
+    write_bag(bags / 'calibration', {name: of[:8] for name, of in frames.items()})
+    return folder
+
+
+def example(name, *arguments, place=ROOT):
+    """Run an example as a user would, in a folder with bags/; returns what it prints."""
     done = subprocess.run(
         [sys.executable, EXAMPLES / name, *map(str, arguments)],
-        cwd=ROOT,
+        cwd=place,
         capture_output=True,
         text=True,
         timeout=280,
@@ -96,11 +110,11 @@ def test_notebook_runs_and_prints_what_it_shows(monkeypatch, capsys):
 
 
 @pytest.mark.long
-def test_calibrate_a_bag_then_reconstruct(tmp_path):
-    said = example('calibrate_bag.py', tmp_path / 'result')
+def test_calibrate_a_bag_then_reconstruct(tmp_path, place):
+    said = example('calibrate_bag.py', tmp_path / 'result', place=place)
     assert 'verdict: pass' in said
     assert (tmp_path / 'result' / 'validation.json').is_file()
-    said = example('points_in_space.py', tmp_path / 'result')
+    said = example('points_in_space.py', tmp_path / 'result', place=place)
     assert '360 exposures' in said
     assert 'target 1001: ' in said
 
@@ -113,5 +127,6 @@ def test_out_of_sample_test_of_a_calibration(tmp_path):
 
 
 @pytest.mark.long
-def test_own_regressor_is_saved_as_a_lookup_grid(tmp_path):
-    assert example('own_regressor.py', tmp_path / 'result').startswith('lookup: RMSE 0.')
+def test_own_regressor_is_saved_as_a_lookup_grid(tmp_path, place):
+    said = example('own_regressor.py', tmp_path / 'result', place=place)
+    assert said.startswith('lookup: RMSE 0.')

@@ -14,10 +14,13 @@
 
 """Fixtures of the tests with real nodes: a ROS domain, graphs, and a calibration."""
 
+import fcntl
+import os
 import shutil
 import subprocess
 
 import pytest
+from node_server import NodeServer
 from ros_graph import BAGS, ROOT, Graph, entry_point, free_domain
 
 from fluoro_calib_ros.bags.reader import read_frames
@@ -44,8 +47,16 @@ def ros(tmp_path_factory):
         rclpy.shutdown()
 
 
+@pytest.fixture(scope='session')
+def node_server():
+    """Return the process that the nodes of this session are forked from."""
+    server = NodeServer()
+    yield server
+    server.close()
+
+
 def _graph(request, directory):
-    graph = Graph(directory)
+    graph = Graph(directory, request.getfixturevalue('node_server'))
     request.node.graphs = [*getattr(request.node, 'graphs', ()), graph]
     yield graph
     graph.close()
@@ -87,32 +98,50 @@ def tracking():
     return read_frames(BAGS / 'tracking').frames
 
 
+def made_once(tmp_path_factory, name, make):
+    """Return a folder that the first worker of this session that needs it makes by make(folder).
+
+    No test may change it.
+    """
+    root = tmp_path_factory.getbasetemp()
+    if 'PYTEST_XDIST_WORKER' in os.environ:
+        root = root.parent
+    folder = root / name
+    with open(root / f'{name}.lock', 'w') as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not folder.exists():
+            begun = root / f'{name}.begun'
+            shutil.rmtree(begun, ignore_errors=True)
+            make(begun)
+            begun.rename(folder)
+    return folder
+
+
+def _calibrate_by_command(folder):
+    command = [*entry_point('cli'), 'calibrate', BAGS / 'calibration']
+    command += ['--phantom', BAGS / 'phantom.csv', '--out', folder, '--fast']
+    subprocess.run(command, cwd=ROOT, stdout=subprocess.DEVNULL, timeout=240, check=True)
+
+
 @pytest.fixture(scope='session')
 def by_command(tmp_path_factory):
-    """Two folders, each with a calibration of bags/calibration by the command line."""
-    folders = [tmp_path_factory.mktemp('by_command') for _ in range(2)]
-    commands = [
-        subprocess.Popen(
-            [
-                *entry_point('cli'),
-                'calibrate',
-                BAGS / 'calibration',
-                '--phantom',
-                BAGS / 'phantom.csv',
-                '--out',
-                folder,
-                '--fast',
-            ],
-            cwd=ROOT,
-            stdout=subprocess.DEVNULL,
-        )
-        for folder in folders
-    ]
-    assert [command.wait(240) for command in commands] == [0, 0]
-    return folders
+    """Folder with a calibration of bags/calibration by the command line."""
+    folder = tmp_path_factory.mktemp('by_command') / 'result'
+    shutil.copytree(
+        made_once(tmp_path_factory, 'by_command', _calibrate_by_command), folder
+    )  # nodes may save there
+    return folder
+
+
+@pytest.fixture(scope='session')
+def by_second_command(tmp_path_factory):
+    """Folder with the result of the same command, run once more."""
+    folder = tmp_path_factory.mktemp('by_second_command')
+    _calibrate_by_command(folder)
+    return folder
 
 
 @pytest.fixture
 def calibrated(by_command, tmp_path):
     """Folder with a calibration of a and b that a test may change."""
-    return shutil.copytree(by_command[0], tmp_path / 'calibrated')
+    return shutil.copytree(by_command, tmp_path / 'calibrated')

@@ -130,7 +130,7 @@ def entry_point(node):
 
 
 class Process:
-    """A node as a process of its own; its output is in .log."""
+    """A command as a process of its own; its output is in .log."""
 
     def __init__(self, command, path):
         self.path = path
@@ -184,12 +184,26 @@ class Process:
             return self.wait()
 
 
+class ForkedProcess(Process):
+    """A node as a process that is forked from the NodeServer."""
+
+    def __init__(self, server, node, arguments, path):
+        self.path = path
+        self._process = server.start(node, arguments, path)
+
+
 class Graph:
-    """Nodes and a client in a namespace of their own."""
+    """Nodes and a client in a namespace of their own.
+
+    .fork: whether nodes are forked from a process that has loaded their modules; else each is the
+    command of a user.
+    """
 
     _numbers = itertools.count(1)
 
-    def __init__(self, directory):
+    def __init__(self, directory, server):
+        self.fork = True
+        self._server = server
         self.namespace = f'/rig{next(self._numbers)}'
         self.directory = directory
         self.processes = []
@@ -208,7 +222,11 @@ class Graph:
             **(remaps or {}),
         }.items():  # of two rules the first counts
             arguments += ['-r', f'{key}:={value}']
-        process = Process(entry_point(node) + arguments, self.directory / f'{number}_{node}.log')
+        log = self.directory / f'{number}_{node}.log'
+        if self.fork:
+            process = ForkedProcess(self._server, node, arguments, log)
+        else:
+            process = Process(entry_point(node) + arguments, log)
         self.processes.append(process)
         if wait:
             self.client.connect(node, process)

@@ -95,9 +95,9 @@ def rig(module_graph, by_command, exposures):
     graph = module_graph
     client = module_graph.client
     frame = exposures['a'][0]
-    graph.nodes = graph.both_nodes(by_command[0], collect='request')
+    graph.nodes = graph.both_nodes(by_command, collect='request')
     corrected = client.listen('a/corrected_observations')
-    used = load_calibrations(by_command[0])['a'].calibration_id
+    used = load_calibrations(by_command)['a'].calibration_id
     client.wait_for_diagnostics('correction_node', lambda s: used in [v.value for v in s.values])
     changes = [lambda message: None]
     for change, _, _ in BAD.values():

@@ -39,6 +39,7 @@ def test_foxglove_receives_the_messages_with_their_definition(graph, tmp_path):
     from websockets.asyncio.client import connect
 
     graph.calibration_node(tmp_path / 'out')
+    graph.fork = False
     bridge = graph.start('bridge_node', {'port': 0})
     topic = f'{graph.namespace}/a/calibration_status'
     client = graph.client

@@ -75,7 +75,7 @@ def stream(module_graph, by_command, tracking):
     """1,600 messages of each fluoroscope, every tenth of a damaged in one of several ways."""
     graph = module_graph
     client = module_graph.client
-    graph.nodes = graph.whole_chain(by_command[0])
+    graph.nodes = graph.whole_chain(by_command)
     graph.corrected = {name: client.listen(f'{name}/corrected_observations') for name in NAMES}
     graph.points = client.listen('reconstruction/points_with_covariance')
     client.wait_until(

@@ -38,7 +38,7 @@ def test_calibration_is_used_and_the_saved_one_kept_where_the_disk_is_full(
     """Told before the job where nothing at all can be written, else in the answer."""
     client = graph.client
     folder = disk.path / 'calibrations'
-    shutil.copytree(by_command[0], folder)
+    shutil.copytree(by_command, folder)
     saved = {name: c.calibration_id for name, c in load_calibrations(folder).items()}
     node = graph.calibration_node(folder)
     for pair in zip(*(frames[:5] for frames in exposures.values())):

@@ -89,6 +89,7 @@ def rig(module_graph, tmp_path_factory):
     folder = tmp_path_factory.mktemp('rig')
     phantom = folder / 'phantom.csv'
     write_phantom(phantom, Phantom(np.arange(48) + 1, BEADS, np.full(48, 0.05)))
+    module_graph.fork = False
     client = module_graph.client
     client.expect(ChangeState, 'extraction_node/change_state')
     publishers = {}

@@ -37,7 +37,7 @@ def test_camera_info_without_image_size_is_ignored(graph, by_command, tracking):
     client = graph.client
     foreign = client.create_publisher(CameraInfo, 'a/camera_info', latched_qos())
     foreign.publish(CameraInfo())
-    nodes = graph.whole_chain(by_command[0])
+    nodes = graph.whole_chain(by_command)
     node = nodes['reconstruction_node']
     points = client.listen('reconstruction/points_with_covariance')
     client.wait_until(

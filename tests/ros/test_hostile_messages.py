@@ -44,10 +44,10 @@ def chain(module_graph, by_command):
     client.listen('a/corrected_observations')
     module_graph.corrected = client.listen('b/corrected_observations')
     module_graph.orientations = client.listen('rig_orientation')
-    module_graph.nodes = module_graph.whole_chain(by_command[0])
+    module_graph.nodes = module_graph.whole_chain(by_command)
     client.wait_until(lambda: module_graph.orientations, what='the orientation')
     module_graph.wait_for_readers(2)
-    module_graph.folder = by_command[0]
+    module_graph.folder = by_command
     return module_graph
 
 

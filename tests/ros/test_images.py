@@ -139,11 +139,12 @@ def pixels_of(message):
 @pytest.fixture(scope='module')
 def eyes(module_graph, by_command):
     """The image node with a calibration that a calibration node has published."""
-    module_graph.calibration_node(by_command[0], wait=False)
+    module_graph.fork = False
+    module_graph.calibration_node(by_command, wait=False)
     module_graph.client.expect(ChangeState, 'image_node/change_state')
     module_graph.node = module_graph.start('image_node', {'fluoroscopes': '[a]'})
     eyes = Eyes(module_graph)
-    eyes.calibration = load_calibrations(by_command[0])['a']
+    eyes.calibration = load_calibrations(by_command)['a']
     eyes.corrector = ImageCorrector(eyes.calibration)
     eyes.node = module_graph.node
     eyes.client.wait_until(eyes.connected, what='the image node')
@@ -366,7 +367,7 @@ def test_calibrations_change_between_two_images(graph, by_command, pictures):
         lambda: eyes.connected() and latched.get_subscription_count(), what='the image node'
     )
     eyes.client.wait_until_known_to('image_node')
-    first = load_calibrations(by_command[0])['a']
+    first = load_calibrations(by_command)['a']
     second = replace(first, model=no_correction(), train_exposure=np.zeros(0, dtype=np.int64))
     results = [ImageCorrector(c).correct(image).tobytes() for c in (first, second)]
     stream = eyes.client.create_timer(0.05, lambda: eyes.raw.publish(eyes.message(image)))

@@ -108,7 +108,7 @@ def test_every_namespace_has_its_own_folder(graph, by_command, tmp_path, monkeyp
     """Below ROS_HOME, where that is set."""
     monkeypatch.setenv('ROS_HOME', str(tmp_path / 'home'))
     folder = tmp_path / 'home' / 'fluoro_calib' / graph.namespace.strip('/')
-    shutil.copytree(by_command[0], folder)
+    shutil.copytree(by_command, folder)
     graph.start('calibration_node', {'phantom': BAGS / 'phantom.csv'})
     graph.client.wait_for_diagnostics(
         'calibration_node', lambda s: value_of(s, 'calibration') == ids_of(folder)['a']

@@ -58,7 +58,7 @@ def state(client, node):
 def test_node_processes_frames_only_while_active(graph, by_command, tracking):
     client = graph.client
     expect(client, 'correction_node')
-    graph.calibration_node(by_command[0])
+    graph.calibration_node(by_command)
     node = graph.start('correction_node', {'autostart': 'false'}, wait=False)
     corrected = client.listen('a/corrected_observations')
     client.wait_until_known_to('correction_node')
@@ -167,7 +167,7 @@ def test_every_transition_and_a_clean_end(graph, node):
 
 def test_shutdown_by_the_lifecycle(graph, by_command):
     expect(graph.client, 'correction_node')
-    graph.both_nodes(by_command[0])
+    graph.both_nodes(by_command)
     assert change(graph.client, 'correction_node', Transition.TRANSITION_ACTIVE_SHUTDOWN)
     assert state(graph.client, 'correction_node') == State.PRIMARY_STATE_FINALIZED
     assert graph.processes[-1].end() == 0 and 'Traceback' not in graph.processes[-1].log
@@ -241,14 +241,14 @@ def test_every_parameter_is_described(graph, node):
     assert any(n.startswith('qos_overrides.') and n.endswith('.depth') for n in names)
 
 
-def test_two_rigs_in_parallel(ros, request, graph, by_command, tracking, tmp_path):
+def test_two_rigs_in_parallel(node_server, request, graph, by_command, tracking, tmp_path):
     """Two namespaces, one with simulated time: they do not receive each other's messages."""
     (tmp_path / 'other').mkdir()
-    other = Graph(tmp_path / 'other')
+    other = Graph(tmp_path / 'other', node_server)
     request.node.graphs = [*getattr(request.node, 'graphs', ()), other]
     try:
-        graph.whole_chain(by_command[0])
-        other.both_nodes(by_command[0])
+        graph.whole_chain(by_command)
+        other.both_nodes(by_command)
         simulated = other.start(
             'reconstruction_node', {'use_sim_time': 'true', 'pair_by': 'stamp'}
         )

@@ -154,7 +154,7 @@ def test_refused_orientation_gives_the_reason(graph, tmp_path, calibrated):
 
 def test_new_exposures_are_collected_on_request(graph, by_command):
     client = graph.client
-    graph.calibration_node(by_command[0], collect='request')
+    graph.calibration_node(by_command, collect='request')
     collect(graph, readers=1)
     answer = client.call(Reset, 'collect_anew')
     assert answer.success and '15 exposures discarded' in answer.message

@@ -37,7 +37,8 @@ def rig(module_graph, by_command, tracking):
     """All three nodes, after the first frames of markers in motion."""
     graph = module_graph
     client = module_graph.client
-    graph.nodes = graph.whole_chain(by_command[0], {'drift_rate': 1000.0})
+    graph.fork = False
+    graph.nodes = graph.whole_chain(by_command, {'drift_rate': 1000.0})
     for topic in ('points_with_covariance', 'points', 'markers', 'drift'):
         client.listen(f'reconstruction/{topic}')
         client.wait_until(lambda: client.count_publishers(f'reconstruction/{topic}'), what=topic)
@@ -118,7 +119,7 @@ def test_points_are_as_accurate_as_stated(rig):
 
 
 def test_header_ids_and_sizes(rig, tracking, by_command):
-    orientation = load_orientation(orientation_path(by_command[0]))
+    orientation = load_orientation(orientation_path(by_command))
     assert [m.frame_number for m in rig.points] == [f.number for f in tracking['a'][:FRAMES]]
     for message, frame in zip(rig.points, tracking['a']):
         assert message.header.stamp.sec * 10**9 + message.header.stamp.nanosec == frame.stamp_ns
@@ -141,7 +142,7 @@ def test_the_command_line_gives_the_same_numbers(rig, by_command, tmp_path):
         'reconstruct',
         BAGS / 'tracking',
         '--calibration',
-        by_command[0],
+        by_command,
         '--out',
         out,
     ]
@@ -198,7 +199,7 @@ def test_cloud_and_ellipsoids_are_the_same_points(rig):
 
 
 def test_tf_has_the_positions_of_the_sources(rig, by_command):
-    orientation = load_orientation(orientation_path(by_command[0]))
+    orientation = load_orientation(orientation_path(by_command))
     found = rig.client.wait_until(
         lambda: [
             t

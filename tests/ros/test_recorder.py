@@ -54,6 +54,7 @@ def test_recorded_bag_holds_what_was_published(graph, exposures, tmp_path):
     latched = client.create_publisher(String, 'note', latched_qos())
     latched.publish(String(data='before the recording'))
     topics = [f'{graph.namespace}/{n}/target_observations' for n in NAMES]
+    graph.fork = False
     recorder = graph.start(
         'recorder_node',
         {'folder': tmp_path / 'bag', 'topics': str([*topics, f'{graph.namespace}/note'])},

@@ -209,9 +209,10 @@ def test_node_that_cannot_start_gives_the_reason(graph, tmp_path, node, paramete
 
 def test_interrupt_in_the_stream_ends_every_node_cleanly(graph, by_command, exposures):
     client = graph.client
+    graph.fork = False
     client.listen('a/corrected_observations')
     nodes = [
-        *graph.both_nodes(by_command[0]).values(),
+        *graph.both_nodes(by_command).values(),
         graph.start('simulator_node', {'scene': 'markers', 'rate': 120.0}),
         graph.start(
             'player_node', {'bag': BAGS / 'tracking', 'loop': True, 'wait_for_readers': 1}
@@ -242,6 +243,7 @@ def test_signal_at_the_first_moment_that_a_node_handles_it(graph, tmp_path, node
     """It has not even joined the graph."""
     if 'folder' in parameters:
         parameters = {'folder': tmp_path / parameters['folder']}
+    graph.fork = False
     process = graph.start(node, parameters, wait=False)
     status = Path('/proc', str(process._process.pid), 'status')
 
@@ -334,7 +336,7 @@ def test_player_latches_recorded_latched_topics(graph, by_command):
     """A late subscriber receives a recorded latched calibration."""
     from fluoro_calib_ros.bags.qos import PROFILES, to_yaml
 
-    calibration = load_calibrations(by_command[0])['a']
+    calibration = load_calibrations(by_command)['a']
     with open(graph.directory / 'latched.mcap', 'wb') as file:
         writer = Writer(file)
         writer.start('ros2', 'test')

@@ -77,7 +77,7 @@ class Rig:
 
 @pytest.fixture(scope='module')
 def rig(module_graph, by_command, tracking):
-    return Rig(module_graph, by_command[0], tracking)
+    return Rig(module_graph, by_command, tracking)
 
 
 def test_repeated_recording_and_clocks_that_jump(rig):

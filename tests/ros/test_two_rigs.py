@@ -28,10 +28,10 @@ from fluoro_calib_ros.files.calibration import load_calibrations, save_calibrati
 
 
 @pytest.fixture
-def rigs(ros, request, graph, calibrated, tmp_path):
+def rigs(node_server, request, graph, calibrated, tmp_path):
     """Two graphs; .folder has the calibrations of each, .ids their ids by fluoroscope."""
     (tmp_path / 'other').mkdir()
-    other = Graph(tmp_path / 'other')
+    other = Graph(tmp_path / 'other', node_server)
     request.node.graphs = [*getattr(request.node, 'graphs', ()), other]
     for number, rig in enumerate((graph, other)):
         rig.folder = tmp_path / f'calibrations_{number}'

@@ -55,6 +55,7 @@ RESULT_FIELDS = (
 def rig(module_graph, tmp_path_factory):
     """The graph with all recorded exposures collected."""
     graph = module_graph
+    graph.fork = False
     client = module_graph.client
     graph.directory_of_calibrations = tmp_path_factory.mktemp('calibrations')
     graph.both_nodes(graph.directory_of_calibrations)
@@ -143,7 +144,7 @@ def test_action_gives_feedback_and_the_same_result(rig, by_service):
 
 
 def test_command_line_gives_the_same_calibration(by_service, by_command):
-    saved = load_calibrations(by_command[0])
+    saved = load_calibrations(by_command)
     assert [c.calibration_id for c in saved.values()] == list(by_service.calibration_id)
     for f, calibration in enumerate(saved.values()):
         live = [by_service.xp[f], by_service.yp[f], by_service.c[f]]
@@ -151,8 +152,11 @@ def test_command_line_gives_the_same_calibration(by_service, by_command):
 
 
 @pytest.mark.parametrize('name', NAMES)
-def test_command_line_twice_gives_the_same_bytes(by_command, name):
-    one, two = ((folder / f'{name}.calibration.npz').read_bytes() for folder in by_command)
+def test_command_line_twice_gives_the_same_bytes(by_command, by_second_command, name):
+    one, two = (
+        (folder / f'{name}.calibration.npz').read_bytes()
+        for folder in (by_command, by_second_command)
+    )
     assert one == two
 
 

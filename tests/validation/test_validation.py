@@ -160,8 +160,8 @@ def test_too_few_exposures_for_halves():
 
 
 def test_joint_validation_reports_progress_and_can_be_cancelled():
-    options = CalibrationOptions(max_iterations=4)
-    frames = {n: f[:8] for n, f in exposures().items()}
+    options = CalibrationOptions(max_iterations=2)
+    frames = {n: f[:6] for n, f in exposures().items()}
     job = calibrate(frames, rig().phantom, options, joint=True)
     steps = []
     request = CalibrationRequest(frames, rig().phantom, options, joint=True)
@@ -452,11 +452,11 @@ def test_too_few_beads():
 
 @pytest.fixture(scope='module')
 def folder(tmp_path_factory):
-    """A folder that calibrate has written: fluoroscope a, eight exposures, few rounds."""
+    """A folder that calibrate has written: fluoroscope a, six exposures, few rounds."""
     place = tmp_path_factory.mktemp('validate')
     root = pathlib.Path(__file__).resolve().parents[2] / 'bags'
     lines = (root / 'calibration.csv').read_text().splitlines()
-    few = [line for line in lines if not line.startswith('a,') or int(line.split(',')[1]) <= 8]
+    few = [line for line in lines if not line.startswith('a,') or int(line.split(',')[1]) <= 6]
     (place / 'few.csv').write_text('\n'.join(few) + '\n')
     assert (
         run(
@@ -474,7 +474,7 @@ def folder(tmp_path_factory):
             '--model',
             'local_linear',
             '--max-iterations',
-            3,
+            2,
         )
         == 0
     )
@@ -622,9 +622,10 @@ def test_table_fits_a_terminal_and_gives_advice():
 
 def test_imprecise_correction_does_not_pass():
     """A neighbour model that follows the noise: 50 % larger errors than with known distortion."""
-    job = calibrated(count=8, model='knn')
+    few_rounds = {'model': 'knn', 'max_iterations': 4}
+    job = calibrated(count=8, **few_rounds)
     request = CalibrationRequest(
-        {'a': exposures()['a'][:8]}, rig().phantom, CalibrationOptions('knn')
+        {'a': exposures()['a'][:8]}, rig().phantom, CalibrationOptions(**few_rounds)
     )
     verdict = validate(request, job.calibrations)
     (check,) = [c for c in verdict.checks if c.name == 'precision']

@@ -352,7 +352,7 @@ class CollocationTerms(AdjustedTerms):
         change = prior.signal.change(last.signal, functions.frequency) if functions.modes else 0.0
         if functions.modes and change < SETTLED_PRIOR and not self._searched[f]:
             self._searched[f] = True
-            prior = renewed(prior, True)
+            prior = renewed(last, True)
             change = prior.signal.change(last.signal, functions.frequency)
         self.priors[f] = prior
         self.gauges[f] = self._gauge(f)

@@ -38,7 +38,7 @@ SMOOTHNESS_RANGE = (1.0, 4.0)
 SMOOTHNESS = 3.0
 SMOOTHNESS_SD = 0.5
 FINE_SMOOTHNESS = 2.5
-MIN_VARIANCE = 1e-10  # of a coefficient of the signal: an amplitude of 1e-8 px
+MIN_VARIANCE = 1e-8  # of a coefficient of the signal: an amplitude of 1e-7 px
 MIN_SD_PX = 1e-3  # of a field
 # Ranges of the correlation lengths relative to the longer side of the image.
 REACH_RANGE = (0.02, 1.0)
@@ -53,7 +53,7 @@ FINE_PX = 0.5
 # relative to the image, and the gain of the logarithm of the likelihood from which they exist.
 SEARCH_PX = 0.1
 SEARCH_REACH = (0.03, 0.06, 0.12)
-MIN_SEARCH_GAIN = 2.0
+MIN_SEARCH_GAIN = 6.0
 START_REACH = 0.15
 START_FINE_REACH = 0.06
 START_FINE_SHARE = 0.1  # of the standard deviation of the long field

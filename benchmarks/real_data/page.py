@@ -29,7 +29,7 @@ WIDTH = 120
 REFERENCE = 'OpenCV Brown'
 MAX_NSE = 1.5
 HONEST = (0.8, 1.25)  # range of an NSE
-SENTENCE = 300  # characters of a finding that are shown
+SENTENCE = 450  # characters of a finding that are shown
 
 Result = dict[str, Any]
 

@@ -209,10 +209,8 @@ class CollocationTerms(AdjustedTerms):
         own = self.exposure_terms[f]
         if own is None:
             return AdditionalParameters(self.values[f], prior)
-        series = np.einsum('nm,ab->nabm', self.values[f], np.eye(2))
-        series = series.reshape(len(series), 2, -1)
-        values = np.concatenate([series, own.values], axis=2)
-        return AdditionalParameters(values, block_diag(prior, np.diag(own.precision)))
+        prior = block_diag(prior, np.diag(own.precision))
+        return AdditionalParameters(self.values[f], prior, own.functions)
 
     def zeros(self) -> tuple[np.ndarray, ...]:
         """Coefficients of no correction, by fluoroscope."""

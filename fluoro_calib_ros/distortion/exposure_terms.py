@@ -28,6 +28,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..photogrammetry.additional_parameters import GroupedFunctions
 from .gauge import gauge_basis
 from .series import Functions
 from .terms import trend_transformation
@@ -122,25 +123,23 @@ class ExposureTerms:
 
     Attributes
     ----------
-    values : (N, 2, 14 e) ndarray
-        Functions at the image points; zero but for those of the own exposure.
+    functions : GroupedFunctions
+        At the image points; the groups are the exposures.
     variance : (14,) ndarray
         Variance of the coefficients of each term over the exposures [px^2].
     """
 
     def __init__(self, functions: np.ndarray, exposure: np.ndarray, size_px: float) -> None:
         numbers, place = np.unique(exposure, return_inverse=True)
-        n, _, count = functions.shape
         self.exposures = len(numbers)
-        values = np.zeros((n, 2, self.exposures, count))
-        values[np.arange(n), :, place] = functions
-        self.values = values.reshape(n, 2, -1)
+        self.functions = GroupedFunctions(functions, place)
+        count = functions.shape[2]
         self.variance = np.full(count, max(size_px**2 / count, MIN_VARIANCE))
 
     @property
     def count(self) -> int:
         """Number of coefficients."""
-        return self.values.shape[2]
+        return self.functions.count
 
     @property
     def precision(self) -> np.ndarray:

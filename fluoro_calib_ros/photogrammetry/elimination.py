@@ -211,6 +211,10 @@ class Elimination(ABC):
         """
 
     @abstractmethod
+    def right_sides(self, right: UnknownVector) -> tuple[np.ndarray, np.ndarray]:
+        """Right sides (k, s) and (q,) of the eliminated and the remaining unknowns."""
+
+    @abstractmethod
     def to_unknowns(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> UnknownVector:
         """Values (k, s, ...) of the eliminated and (q, ...) of the remaining unknowns, by kind."""
 
@@ -297,8 +301,13 @@ class EliminatePoints(Elimination):
         rest[rows[b][:, :, None], rows[a][:, None, :]] = equations.coupled.transpose(0, 2, 1)
         if equations.gauge is not None:
             self._fix_gauge(rest, equations.gauge.exteriors)
-        rest_right = np.concatenate([equations.e.ravel(), equations.g[free]])
-        return BorderedSystem(equations.pp, border, rest, equations.p, rest_right)
+        right = self.right_sides(UnknownVector(equations.e, equations.p, equations.g))
+        return BorderedSystem(equations.pp, border, rest, *right)
+
+    def right_sides(self, right: UnknownVector) -> tuple[np.ndarray, np.ndarray]:
+        """Right sides of object points (n, 3), and of exposures and free global unknowns (q,)."""
+        free = self.network.layout.free
+        return right.points, np.concatenate([right.exteriors.ravel(), right.globals[free]])
 
     def to_unknowns(self, x_blocks: np.ndarray, x_rest: np.ndarray) -> UnknownVector:
         """Values of object points (n, 3, ...) and of the remaining unknowns (q, ...), by kind."""
@@ -359,17 +368,18 @@ class EliminateExposures(Elimination):
         rest = self._rest_matrix(equations.pp, equations.pg, equations)
         if equations.gauge is not None:
             self._fix_gauge(rest, equations.gauge.points)
-        width = EXTERIOR_SIZE * self.n_places
-        right = np.zeros((self.n_cells, self.n_places, EXTERIOR_SIZE))
-        right[self.cell, self.place] = equations.e
-        free = self.network.layout.free
+        right = self.right_sides(UnknownVector(equations.e, equations.p, equations.g))
         return BorderedSystem(
-            self._cell_blocks(equations),
-            self._cell_border(equations),
-            rest,
-            right.reshape(self.n_cells, width),
-            np.concatenate([equations.p.ravel(), equations.g[free]]),
+            self._cell_blocks(equations), self._cell_border(equations), rest, *right
         )
+
+    def right_sides(self, right: UnknownVector) -> tuple[np.ndarray, np.ndarray]:
+        """Right sides of cells (k, s), and of object points and free global unknowns (q,)."""
+        of_cells = np.zeros((self.n_cells, self.n_places, EXTERIOR_SIZE))
+        of_cells[self.cell, self.place] = right.exteriors
+        free = self.network.layout.free
+        rest = np.concatenate([right.points.ravel(), right.globals[free]])
+        return of_cells.reshape(self.n_cells, -1), rest
 
     def _cell_blocks(self, equations: NormalEquations) -> np.ndarray:
         """Blocks (k, s, s) of the cells; an empty place has ones in its diagonal."""

@@ -34,7 +34,7 @@ from .elimination import CovarianceBlocks, factorize
 from .network import Network
 from .noise import DEFAULT_NOISE, Noise
 from .normal_equations import normal_equations
-from .precision import covariance_blocks, covariance_of_projection
+from .precision import covariance_blocks, variance_of_projection
 from .unknowns import Parameters
 
 MAX_ROUNDS = 40
@@ -108,8 +108,7 @@ def adjust_and_estimate_noise(
 def estimate_noise(network: Network, adjustment: Adjustment, blocks: CovarianceBlocks) -> Noise:
     """Noise model from the residuals of an adjustment and the covariances of its unknowns."""
     noise = adjustment.noise
-    projected = covariance_of_projection(network, adjustment.parameters, blocks)
     variance = (noise.scale * network.sigma) ** 2
-    unresolved = np.trace(projected, axis1=1, axis2=2) / variance
+    unresolved = variance_of_projection(network, adjustment.parameters, blocks) / variance
     new = noise.estimate_from(adjustment.q * noise.scale**2, unresolved)
     return replace(new, scale=max(new.scale, MIN_NOISE_PX / float(np.median(network.sigma))))

@@ -31,7 +31,7 @@ from .network import Network
 from .noise import Noise
 from .relative_orientation import discrepancies_with_jacobian
 from .relative_pose import POSE_SIZE
-from .unknowns import EXTERIOR_SIZE, Parameters
+from .unknowns import EXTERIOR_SIZE, Parameters, UnknownVector
 
 # Image points that are linearised at once: their arrays stay in the cache.
 CHUNK = 8_000
@@ -336,9 +336,9 @@ def normal_equations(
     blocks.add_interiors(parameters, sums)
     coupled_pairs, coupled = _add_relative(parameters, ee, e, blocks)
     if network.exterior is not None:
-        weights = network.exterior.weights
-        ee[:, np.arange(EXTERIOR_SIZE), np.arange(EXTERIOR_SIZE)] += weights
-        e -= weights * network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
+        diagonal = np.arange(EXTERIOR_SIZE)
+        ee[:, diagonal, diagonal] += network.exterior.weights
+        e += _exterior_pull(network, parameters)
     if sums.linearised:
         _add_additional(parameters, sums.linearised, blocks)
     return NormalEquations(
@@ -357,16 +357,79 @@ def normal_equations(
     )
 
 
+def right_sides(
+    network: Network, parameters: Parameters, correction: np.ndarray | float, noise: Noise
+) -> UnknownVector:
+    """Right sides of `normal_equations` alone, for a network without relative orientations.
+
+    It takes a small part of the time where there are additional parameters.
+    """
+    correction = correction + network.additional_correction(parameters)
+    correction = np.broadcast_to(correction, network.uv.shape)
+    problem = _Linearisation(network, parameters, correction, noise, 1.0)
+    by_exposure = np.zeros((network.n_exposures, 9))
+    points = np.zeros((3, network.n_points))
+    weighted = np.empty_like(network.uv)  # residuals times weights
+    for first, stop, starts in _chunks(network):
+        rows = slice(starts[0], starts[-1])
+        lin = problem.at(rows)
+        local = starts - starts[0]
+        for e, start, end in zip(range(first, stop), local, local[1:]):
+            part = slice(start, end)
+            by_exposure[e] = lin.u[:9, part] @ lin.u[9, part] + lin.v[:9, part] @ lin.v[9, part]
+        for i in range(3):
+            products = lin.pu[i] * lin.u[9] + lin.pv[i] * lin.v[9]
+            points[i] += np.bincount(network.point[rows], products, network.n_points)
+        weighted[rows] = (lin.root * np.stack([lin.u[9], lin.v[9]])).T
+    exteriors = by_exposure[:, :6]
+    exteriors[:, :3] = (exteriors[:, None, :3] @ parameters.rotation)[:, 0]
+    if network.exterior is not None:
+        exteriors += _exterior_pull(network, parameters)
+    layout = network.layout
+    of_globals = np.zeros(layout.n_globals)
+    for f, columns in enumerate(layout.interiors):
+        of_globals[columns] = by_exposure[network.fluoroscope == f, 6:].sum(axis=0)
+    if network.interior_sd is not None:
+        of_globals[layout.all_interiors] += _interior_pull(network, parameters)
+    for f, (additional, columns) in enumerate(zip(network.additional, layout.additional)):
+        if additional is not None:
+            pull = additional.prior @ parameters.additional[f]
+            of_globals[columns] = additional.right_side(weighted[network.rows(f)]) - pull
+    return UnknownVector(exteriors, points.T + _survey_pull(network, parameters), of_globals)
+
+
+def _survey_weight(network: Network) -> np.ndarray:
+    """Weights (n, 1) of the surveyed coordinates; zeros in a free network."""
+    if network.datum != 'survey':
+        return np.zeros((network.n_points, 1))
+    return 1 / network.survey_sd_mm[:, None] ** 2
+
+
+def _survey_pull(network: Network, parameters: Parameters) -> np.ndarray:
+    """What the survey adds (n, 3) to the right side."""
+    return _survey_weight(network) * (network.survey_mm - parameters.points_mm)
+
+
+def _exterior_pull(network: Network, parameters: Parameters) -> np.ndarray:
+    """What known exterior orientations add (m, 6) to the right side."""
+    assert network.exterior is not None
+    off = network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
+    return -network.exterior.weights * off
+
+
+def _interior_pull(network: Network, parameters: Parameters) -> np.ndarray:
+    """What the prior of the interior orientations adds (3 F,) to the right side."""
+    return (network.interior_weight * (network.interior_mean - parameters.interior)).ravel()
+
+
 def _point_blocks(
     network: Network, parameters: Parameters, sums: _ImageSums
 ) -> tuple[np.ndarray, np.ndarray]:
     """Blocks pp (n, 3, 3) and right side p (n, 3), with the survey."""
-    n = network.n_points
-    survey = 1 / network.survey_sd_mm**2 if network.datum == 'survey' else np.zeros(n)
     products = sums.by_point[:, POINT_PRODUCTS].sum(axis=0)
-    symmetric = products[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(n, 3, 3)
-    pp = symmetric + survey[:, None, None] * np.eye(3)
-    return pp, products[6:].T + survey[:, None] * (network.survey_mm - parameters.points_mm)
+    symmetric = products[[0, 1, 2, 1, 3, 4, 2, 4, 5]].T.reshape(-1, 3, 3)
+    pp = symmetric + _survey_weight(network)[:, :, None] * np.eye(3)
+    return pp, products[6:].T + _survey_pull(network, parameters)
 
 
 @dataclass(frozen=True)
@@ -403,10 +466,9 @@ class _GlobalBlocks:
             self.pg[:, :, columns] = by_point.T.reshape(network.n_points, 3, 3)
         if network.interior_sd is not None:
             columns = network.layout.all_interiors
-            weight = network.interior_weight
             diagonal = np.einsum('ii->i', self.gg[columns, columns])  # a view
-            diagonal += weight.ravel()
-            self.g[columns] += (weight * (network.interior_mean - parameters.interior)).ravel()
+            diagonal += network.interior_weight.ravel()
+            self.g[columns] += _interior_pull(network, parameters)
 
 
 def _add_relative(

@@ -20,11 +20,13 @@ C_r = C_l - A C_x A^T (Foerstner and Wrobel, "Photogrammetric Computer Vision", 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import blas
 
+from .additional_parameters import AdditionalParameters
 from .adjustment import Adjustment
 from .collinearity import project_with_jacobian
 from .datum import Gauge, STransformation
@@ -39,6 +41,8 @@ from .unknowns import Parameters, UnknownVector
 MIN_WEIGHT = 1e-9
 # Image points handled at once, to limit memory.
 CHUNK = 5_000
+# Columns of a triangular matrix that are multiplied at once.
+BLOCK = 128
 # Object points up to which their covariances with each other are kept. The more there are, the
 # less these matter: what all have in common is the datum.
 MAX_JOINT_POINTS = 150
@@ -141,8 +145,7 @@ def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> np.ndar
     additional = layout.all_additional
     size = additional.stop - additional.start  # all of them are free
     last = slice(len(matrix.factor.schur) - size, None)
-    factor = np.tril(matrix.factor.schur[last, last])
-    everything = factor @ factor.T
+    everything = _square_of(matrix.factor.schur[last, last])
     columns = layout.additional[f]
     own = np.arange(columns.start, columns.stop) - additional.start
     others = np.setdiff1d(np.arange(size), own)
@@ -153,11 +156,59 @@ def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> np.ndar
     return out
 
 
+def _square_of(factor: np.ndarray) -> np.ndarray:
+    """L L^T (n, n) of a lower triangular matrix L; the upper triangle of factor is not used."""
+    n = len(factor)
+    out = np.zeros((n, n), order='F')
+    for start in range(0, n, BLOCK):
+        stop = min(start + BLOCK, n)
+        columns = np.array(factor[start:, start:stop], order='F')
+        columns[: stop - start] = np.tril(columns[: stop - start])
+        out[start:, start:] += blas.dsyrk(1.0, columns, lower=1)
+    return out + np.tril(out, -1).T
+
+
 def covariance_of_projection(
     network: Network, parameters: Parameters, blocks: CovarianceBlocks
 ) -> np.ndarray:
     """A C_x A^T (N, 2, 2) [px^2] of the image points; additional parameters are unknowns too."""
     out = np.empty((network.n_image_points, 2, 2))
+    for f, local, a in _design(network, parameters):
+        part = network.rows(f)[local]
+        covariance = _covariance_of_orientation(network, blocks, f, part)
+        out[part] = a @ covariance @ a.transpose(0, 2, 1)
+        additional = network.additional[f] if network.additional else None
+        if additional is not None:
+            columns = network.layout.additional[f]
+            mixed = a @ _mixed_covariance(network, additional, blocks, f, local)
+            out[part] += additional.correction_covariance(blocks.gg[columns, columns], local)
+            out[part] += mixed + mixed.transpose(0, 2, 1)
+    return out
+
+
+def variance_of_projection(
+    network: Network, parameters: Parameters, blocks: CovarianceBlocks
+) -> np.ndarray:
+    """Traces (N,) [px^2] of `covariance_of_projection`, for less work."""
+    out = np.empty(network.n_image_points)
+    for f, local, a in _design(network, parameters):
+        part = network.rows(f)[local]
+        covariance = _covariance_of_orientation(network, blocks, f, part)
+        out[part] = np.sum((a @ covariance) * a, axis=(1, 2))
+        additional = network.additional[f] if network.additional else None
+        if additional is not None:
+            columns = network.layout.additional[f]
+            mixed = _mixed_covariance(network, additional, blocks, f, local)
+            out[part] += additional.correction_variance(blocks.gg[columns, columns], local)
+            out[part] += 2 * np.sum(a * mixed.transpose(0, 2, 1), axis=(1, 2))
+    return out
+
+
+def _design(network: Network, parameters: Parameters) -> Iterator[tuple[int, slice, np.ndarray]]:
+    """Derivatives (k, 2, 12) of image points by exterior, object point and interior orientation.
+
+    Yields fluoroscope f, a range among its image points, and their derivatives.
+    """
     per_image_point = network.per_image_point(parameters)
     for f in range(network.n_fluoroscopes):
         rows = network.rows(f)
@@ -165,11 +216,7 @@ def covariance_of_projection(
             local = slice(start, start + CHUNK)
             part = rows[local]
             _, d_e, d_p, d_i = project_with_jacobian(*(a[part] for a in per_image_point))
-            a = np.concatenate([d_e, d_p, d_i], axis=2)
-            covariance = _covariance_of_orientation(network, blocks, f, part)
-            out[part] = a @ covariance @ a.transpose(0, 2, 1)
-            _add_additional(network, blocks, f, local, a, out)
-    return out
+            yield f, local, np.concatenate([d_e, d_p, d_i], axis=2)
 
 
 def _covariance_of_orientation(
@@ -194,28 +241,23 @@ def _covariance_of_orientation(
     return c
 
 
-def _add_additional(
+def _mixed_covariance(
     network: Network,
+    additional: AdditionalParameters,
     blocks: CovarianceBlocks,
     f: int,
     local: slice,
-    a: np.ndarray,
-    projected: np.ndarray,
-) -> None:
-    """Add the share of the additional parameters to the covariances of the projection (N, 2, 2).
+) -> np.ndarray:
+    """Covariances (k, 12, 2) of the orientation with the corrections by additional parameters.
 
-    local: rows among the image points of fluoroscope f; a (k, 2, 12): their derivatives by the
-    orientation.
+    local: rows among the image points of fluoroscope f, whose parameters are `additional`.
     """
-    additional = network.additional[f] if network.additional else None
-    if additional is None:
-        return
     part = network.rows(f)[local]
     e = network.exposure[part]
     p = network.point[part]
     columns = network.layout.additional[f]
     own = blocks.gg[None, network.layout.interiors[f], columns]
-    mixed = a @ np.concatenate(
+    return np.concatenate(
         [
             additional.cross_covariance(blocks.eg[:, :, columns], e, local),
             additional.cross_covariance(blocks.pg[:, :, columns], p, local),
@@ -223,8 +265,6 @@ def _add_additional(
         ],
         axis=1,
     )
-    projected[part] += additional.correction_covariance(blocks.gg[columns, columns], local)
-    projected[part] += mixed + mixed.transpose(0, 2, 1)
 
 
 def precision(
@@ -405,6 +445,5 @@ def geometric_redundancy(network: Network, parameters: Parameters, noise: Noise)
     plain = Noise('gaussian', noise.scale)
     equations = normal_equations(network, parameters, 0.0, plain)
     blocks = covariance_blocks(factorize(network, equations))
-    projected = covariance_of_projection(network, parameters, blocks)
     variance = (noise.scale * network.sigma) ** 2
-    return 1 - np.trace(projected, axis1=1, axis2=2) / (2 * variance)
+    return 1 - variance_of_projection(network, parameters, blocks) / (2 * variance)

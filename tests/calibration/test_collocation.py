@@ -65,7 +65,10 @@ from fluoro_calib_ros.distortion.terms import (
     polynomial_coefficients,
     trend_transformation,
 )
-from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
+from fluoro_calib_ros.photogrammetry.additional_parameters import (
+    AdditionalParameters,
+    GroupedFunctions,
+)
 from fluoro_calib_ros.photogrammetry.adjustment import (
     SolverOptions,
     adjust,
@@ -77,13 +80,15 @@ from fluoro_calib_ros.photogrammetry.elimination import (
     EliminatePoints,
     factorize,
 )
+from fluoro_calib_ros.photogrammetry.exterior_prior import ExteriorPrior
 from fluoro_calib_ros.photogrammetry.noise import Noise
-from fluoro_calib_ros.photogrammetry.normal_equations import normal_equations
+from fluoro_calib_ros.photogrammetry.normal_equations import normal_equations, right_sides
 from fluoro_calib_ros.photogrammetry.precision import (
     covariance_blocks,
     covariance_of_projection,
     information_of_additional,
     precision,
+    variance_of_projection,
 )
 from fluoro_calib_ros.simulation.distortion import DistortionField
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
@@ -405,9 +410,9 @@ def test_expert_terms_and_gauge_are_independent():
 # ---- additional parameters in the adjustment
 
 
-def network_with_additional(scalar, seed=0, **shape):
+def network_with_additional(kind, seed=0, **shape):
     """A small network of two fluoroscopes with additional parameters in both, and its true
-    parameters.
+    parameters. kind: 'separate' for u and v, 'shared' by them, or 'grouped' by exposures, too.
     """
     network, truth = rigs.small_network(fluoroscopes=2, seed=seed, **shape)
     rng = np.random.default_rng(seed)
@@ -416,9 +421,14 @@ def network_with_additional(scalar, seed=0, **shape):
     for f in range(2):
         uv = network.uv[network.rows(f)]
         values = Functions((1024, 1024), 2, 2)(uv)[:, 3:]
-        if not scalar:
+        own = None
+        if kind == 'shared':
             values = np.einsum('nm,amt->nat', values, rng.normal(size=(2, values.shape[1], 5)))
-        made = AdditionalParameters(values, np.zeros((1, 1)))
+        if kind == 'grouped':
+            exposure = network.exposure[network.rows(f)]
+            own = np.einsum('nm,amt->nat', values, rng.normal(size=(2, values.shape[1], 2)))
+            own = GroupedFunctions(own, exposure - exposure[0])
+        made = AdditionalParameters(values, np.zeros((1, 1)), own)
         root = rng.normal(size=(made.count, made.count))
         additional.append(replace(made, prior=root @ root.T / made.count + np.eye(made.count)))
         coefficients.append(rng.normal(size=made.count))
@@ -471,11 +481,11 @@ def dense_normal(network, result):
     return normal, u, a
 
 
-@pytest.mark.parametrize('scalar', [True, False])
+@pytest.mark.parametrize('kind', ['separate', 'shared', 'grouped'])
 @pytest.mark.parametrize('shape', [dict(exposures=3, targets=30), dict(exposures=7, targets=20)])
-def test_covariances_with_additional_parameters_equal_the_dense_inverse(scalar, shape):
+def test_covariances_with_additional_parameters_equal_the_dense_inverse(kind, shape):
     """Of all unknowns and of the projection, and the information of the additional parameters."""
-    network, truth = network_with_additional(scalar, **shape)
+    network, truth = network_with_additional(kind, **shape)
     result = adjust(
         network,
         rigs.disturbed(truth).__class__(
@@ -513,13 +523,45 @@ def test_covariances_with_additional_parameters_equal_the_dense_inverse(scalar, 
         rtol=2e-3,
         atol=1e-6,
     )
+    np.testing.assert_allclose(
+        variance_of_projection(network, result.parameters, blocks),
+        np.trace(projected, axis1=1, axis2=2),
+        rtol=2e-3,
+        atol=1e-6,
+    )
     precise = precision(network, result)
     assert [len(c) for c in precise.additional] == [count, count]
 
 
+@pytest.mark.parametrize('kind', ['separate', 'shared', 'grouped'])
+@pytest.mark.parametrize('prior', ['interior', 'exterior'])
+def test_right_sides_alone_equal_those_of_the_normal_equations(kind, prior):
+    network, truth = network_with_additional(kind, exposures=4, targets=20)
+    if prior == 'interior':
+        network = replace(
+            network, interior_mean=truth.interior + 3.0, interior_sd=np.full((2, 3), 2.0)
+        )
+    else:
+        sd = np.tile([5.0, 5.0, 5.0, 1e-3, 1e-3, 1e-3], (network.n_exposures, 1))
+        network = replace(
+            network, exterior=ExteriorPrior(truth.rotation, truth.position_mm + 1.0, sd)
+        )
+    at = replace(rigs.disturbed(truth), additional=truth.additional)
+    noise = Noise('student_t', 0.3, 8.0)
+    correction = np.full_like(network.uv, 0.1)
+    equations = normal_equations(network, at, correction, noise)
+    found = right_sides(network, at, correction, noise)
+    for one, other in (
+        (found.exteriors, equations.e),
+        (found.points, equations.p),
+        (found.globals, equations.g),
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * np.abs(other).max())
+
+
 @pytest.mark.parametrize('elimination', [EliminatePoints, EliminateExposures])
 def test_both_eliminations_agree_with_additional_parameters(elimination):
-    network, truth = network_with_additional(True, exposures=4, targets=25)
+    network, truth = network_with_additional('separate', exposures=4, targets=25)
     expected = adjust(
         network, truth, noise=Noise('student_t', 0.3, 8.0), options=SolverOptions(tolerance=1e-12)
     )
@@ -535,7 +577,7 @@ def test_both_eliminations_agree_with_additional_parameters(elimination):
 
 
 def test_gradient_is_zero_at_the_solution_with_additional_parameters():
-    network, truth = network_with_additional(True, exposures=4, targets=25)
+    network, truth = network_with_additional('separate', exposures=4, targets=25)
     result = adjust(
         network, truth, noise=Noise('student_t', 0.3, 8.0), options=SolverOptions(tolerance=1e-12)
     )

@@ -34,6 +34,7 @@ from fluoro_calib_ros.distortion.misfit import (
 )
 from fluoro_calib_ros.distortion.series import SD_GRID, Functions, Series
 from fluoro_calib_ros.distortion.signal import Signal, spectral_density
+from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
 
 SIZE = (800, 600)
 INTERIOR = np.array([410.0, 290.0, 2900.0])
@@ -77,8 +78,12 @@ def test_variances_of_the_terms_are_found_and_vanish_where_nothing_differs():
     values = np.einsum('nak,nk->na', functions, coefficients[exposure])
     values += rng.normal(0, NOISE, values.shape)
     terms = ExposureTerms(functions, exposure, 0.5)
-    a = terms.values.reshape(2 * len(uv), -1)
-    information = a.T @ a / NOISE**2
+    parameters = AdditionalParameters(np.zeros((len(uv), 0)), np.zeros((0, 0)), terms.functions)
+    a = np.zeros((len(uv), 2, EXPOSURES, 14))
+    a[np.arange(len(uv)), :, exposure] = functions
+    a = a.reshape(2 * len(uv), -1)
+    information = parameters.normal_matrix(np.full(len(uv), NOISE**-2.0))
+    np.testing.assert_allclose(information, a.T @ a / NOISE**2, rtol=1e-9, atol=1e-6)
     right = a.T @ values.ravel() / NOISE**2
     for _ in range(40):
         posterior = np.linalg.inv(information + np.diag(terms.precision))

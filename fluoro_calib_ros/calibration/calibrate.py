@@ -32,7 +32,7 @@ from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.held_precision import precision_with_held_interiors
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.precision import Precision, geometric_redundancy
-from ..photogrammetry.rotations import quaternion_from_matrix
+from ..photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from .adjustment_report import (
     AdjustmentStatistics,
     ResidualTable,
@@ -57,6 +57,7 @@ from .rounds import Round, SelfCalibration, rmse_of_inliers
 from .self_calibration import self_calibrate
 
 MAX_REPEATS = 3  # of a calibration, to leave out exposures that do not fit
+EQUAL_WEIGHTS_NU = 100.0  # degrees of freedom from which weights of inliers hardly differ
 TOLERANCE_WITHOUT_CORRECTION = 1e-4  # its residuals are only reported
 
 
@@ -184,6 +185,18 @@ class CalibrationResult:
     residuals: ResidualTable | None = None
     created: str = ''
     solved: dict[str, SolvedNetwork] = field(default_factory=dict)
+
+    @property
+    def starts(self) -> StartValues:
+        """Start values of other adjustments of the same exposures."""
+        return StartValues(
+            {name: figures.interior for name, figures in self.fluoroscopes.items()},
+            {
+                (name, e.exposure): (matrix_from_quaternion(e.quaternion_wxyz), e.position_mm)
+                for name, figures in self.fluoroscopes.items()
+                for e in figures.exposures
+            },
+        )
 
 
 def calibrate(
@@ -649,7 +662,11 @@ def _image_sd(run: SelfCalibration, f: int, name: str) -> float:
     The scale of a Student-t noise is no substitute: where the tails are heavy it is smaller than
     the standard deviation of its core.
     """
-    redundancy = geometric_redundancy(run.measured.network, run.after.parameters, run.after.noise)
+    noise_model = run.after.noise
+    if noise_model.loss != 'huber' and noise_model.nu >= EQUAL_WEIGHTS_NU:
+        redundancy = run.precision.redundancy.mean(axis=1)
+    else:
+        redundancy = geometric_redundancy(run.measured.network, run.after.parameters, noise_model)
     rows = _rows_of(run.measured, f)
     rows = rows[run.after.inliers[rows]]
     noise = np.sum(run.after.residuals[rows] ** 2) / np.sum(2 * redundancy[rows])

@@ -66,7 +66,7 @@ from .held_calibration import (
     noise_of_calibrations,
     too_few_rays_for_noise,
 )
-from .initial_network import MIN_TARGETS_OF_EXPOSURE, Frames, Measured
+from .initial_network import MIN_TARGETS_OF_EXPOSURE, Frames, Measured, StartValues
 from .result import FluoroscopeCalibration
 from .robust_adjustment import adjusted_with_precision
 
@@ -222,6 +222,7 @@ def orientation_of_exposures(
     calibrations: Calibrations,
     loss: str = 'student_t',
     raise_if_cancelled: Callable[[], None] | None = None,
+    starts: StartValues | None = None,
 ) -> RigOrientation:
     """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
 
@@ -241,6 +242,8 @@ def orientation_of_exposures(
         Noise model of the image points.
     raise_if_cancelled : callable, optional
         Called during the adjustment; may raise to stop it.
+    starts : StartValues, optional
+        Of an earlier adjustment of the frames.
 
     Returns
     -------
@@ -254,7 +257,9 @@ def orientation_of_exposures(
     _validate(frames, phantom, calibrations)
     paired = _paired(frames)
     with threadpool_limits(1):
-        measured = network_of_calibrations(paired, phantom, calibrations, raise_if_cancelled)
+        measured = network_of_calibrations(
+            paired, phantom, calibrations, raise_if_cancelled, starts=starts
+        )
         held = _adjusted(measured, calibrations, loss, False, raise_if_cancelled)
         exteriors, exposures = _relative_to_first(held)
     first = held.measured.fluoroscopes[0]

@@ -28,6 +28,7 @@ import numpy as np
 from ..distortion.base import CorrectionModel, ModelSource
 from ..distortion.collocation import CollocationModel, CollocationTerms, EarlierTerms
 from ..distortion.estimation import (
+    FINAL_TOLERANCE,
     AdjustedTerms,
     AdjustmentProblem,
     RegressionStep,
@@ -48,6 +49,8 @@ from .model_errors import with_errors_by
 from .options import AUTO, CalibrationOptions
 from .robust_adjustment import adjusted_with_precision, start_noise
 from .rounds import Round, SelfCalibration
+
+TOLERANCE = 1e-8  # decrease of F that an adjustment that is a result may leave
 
 
 def self_calibrate(
@@ -250,7 +253,8 @@ def _adjusted_without_correction(
             measured.start,
             np.zeros_like(measured.network.uv),
             start_noise(options.loss),
-            raise_if_cancelled=raise_if_cancelled,
+            TOLERANCE if options.model == NoCorrection.kind else FINAL_TOLERANCE,
+            raise_if_cancelled,
         )
     except DataError as error:
         raise DataError(undetermined_unknowns(measured) or str(error)) from None

@@ -281,6 +281,7 @@ def _orientation(
             {name: frames[name] for name in names},
             request.phantom,
             {name: calibrations[name] for name in names},
+            starts=result.starts,
         )
     except DataError as error:
         return None, str(error)

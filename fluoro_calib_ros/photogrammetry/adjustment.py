@@ -40,9 +40,10 @@ from .unknowns import Parameters
 
 # Relative increase of the cost that rounding errors can cause.
 ROUNDING = 1e-12
-# A refused step that predicts less than this part of the tolerance ends the adjustment: rounding
-# errors hide the decrease that is left.
+# A refused step that predicts less than this part of the tolerance, or less than so much of what
+# the tolerance allows, ends the adjustment: rounding errors hide the decrease that is left.
 NEGLIGIBLE = 1e-3
+NEGLIGIBLE_DECREASE = 1e-6
 # Part of the decrease of F by the last step up to which one with its normal matrix pays.
 REPEATED = 0.2
 
@@ -288,7 +289,7 @@ class _LevenbergMarquardt:
             return
         trial = self._problem.evaluate(moved)
         if self._is_worse(trial):
-            self.converged = predicted <= NEGLIGIBLE * self._tolerance
+            self.converged = self._is_negligible(predicted)
             self.finished = self.converged or self._damping.refuse()
             return
         self._damping.accept((self.current.cost - trial.cost) / max(predicted, 1e-300))
@@ -309,7 +310,7 @@ class _LevenbergMarquardt:
             return False
         trial = self._problem.evaluate(moved)
         if self._is_worse(trial):
-            self.converged = predicted <= NEGLIGIBLE * self._tolerance
+            self.converged = self._is_negligible(predicted)
             self.finished = self.converged
             return self.converged
         self._accept(trial, predicted)
@@ -317,6 +318,10 @@ class _LevenbergMarquardt:
 
     def _is_worse(self, trial: _Iterate) -> bool:
         return trial.cost > self.current.cost + ROUNDING * abs(self.current.cost)
+
+    def _is_negligible(self, predicted: float) -> bool:
+        limit = min(self._tolerance, NEGLIGIBLE_DECREASE)
+        return predicted <= max(limit, NEGLIGIBLE * self._tolerance)
 
     def _accept(self, trial: _Iterate, predicted: float) -> None:
         self.current = trial

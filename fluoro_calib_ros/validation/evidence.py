@@ -33,7 +33,6 @@ from ..distortion.exposure_terms import Variation, exposure_functions, is_determ
 from ..distortion.registry import selectable_models
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
-from ..photogrammetry.rotations import matrix_from_quaternion
 from .check import Check
 from .residual_tests import Residuals, ResidualTrend, common_trend, residuals_of
 
@@ -119,14 +118,7 @@ class Evidence:
     @cached_property
     def starts(self) -> StartValues:
         """Start values of the adjustments of parts."""
-        return StartValues(
-            {name: calibration.interior for name, calibration in self.calibrations.items()},
-            {
-                (name, e.exposure): (matrix_from_quaternion(e.quaternion_wxyz), e.position_mm)
-                for name, figures in self.result.fluoroscopes.items()
-                for e in figures.exposures
-            },
-        )
+        return self.result.starts
 
     @cached_property
     def earlier(self) -> EarlierCalibration:

@@ -31,7 +31,7 @@ from ..distortion.base import CorrectionModel
 from ..distortion.estimation import AdjustedTerms, require_training
 from ..distortion.misfit import FittedPoints, sd_of_rejected, sd_with_misfit
 from ..errors import DataError
-from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust_with_matrix
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise_estimation import estimate_noise
@@ -40,6 +40,12 @@ from ..photogrammetry.precision import Precision, covariance_blocks, precision
 from .initial_network import Measured
 from .robust_adjustment import ADVICE, with_additional
 from .rounds import History, Round, SelfCalibration
+
+# Decrease of F by image point that the first adjustment may leave: its noise is still that of an
+# adjustment without correction.
+FIRST_TOLERANCE = 1e-3
+# Information factor from which noise and prior are estimated with the matrix of the last steps.
+NEARLY_ONE = 0.98
 
 
 def calibrate_by_adjustment(
@@ -201,13 +207,11 @@ def adjust_with_terms(
     for number in range(max_rounds):
         network = terms.with_additional(plain)
         final = converged or number == max_rounds - 1
-        result = adjust(
-            network,
-            parameters,
-            zero,
-            noise,
-            SolverOptions(terms.final_tolerance if final else terms.intermediate_tolerance),
-            raise_if_cancelled,
+        tolerance = terms.final_tolerance if final else terms.intermediate_tolerance
+        if not number and not final:
+            tolerance = max(tolerance, FIRST_TOLERANCE * network.n_image_points)
+        result, matrix = adjust_with_matrix(
+            network, parameters, zero, noise, SolverOptions(tolerance), raise_if_cancelled
         )
         last = correction
         correction = network.additional_correction(result.parameters)
@@ -215,9 +219,10 @@ def adjust_with_terms(
         if final:
             break
         factor = noise.information_factor(result.q)
-        matrix = factorize(
-            network, normal_equations(network, result.parameters, zero, noise, factor)
-        )
+        if matrix is None or factor < NEARLY_ONE:
+            matrix = factorize(
+                network, normal_equations(network, result.parameters, zero, noise, factor)
+            )
         renewed = estimate_noise(network, result, covariance_blocks(matrix))
         converged, coefficients = terms.renew(network, matrix, result)
         converged &= abs(renewed.scale - noise.scale) <= terms.noise_tolerance * noise.scale

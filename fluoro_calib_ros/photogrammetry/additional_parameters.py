@@ -29,6 +29,8 @@ import numpy as np
 from scipy import sparse
 from scipy.linalg import blas
 
+from .symmetric import mirror_lower
+
 ALL = slice(None)
 
 
@@ -124,7 +126,7 @@ class AdditionalParameters:
             weighted = np.sqrt(weight)[:, None] * self.functions
             # BLAS stores by columns, so the transpose needs no copy.
             lower = blas.dsyrk(1.0, weighted.T, lower=1)
-            out[:k, :k] = lower + np.tril(lower, -1).T
+            out[:k, :k] = mirror_lower(lower)
             out[k : 2 * k, k : 2 * k] = out[:k, :k]
             if self.own is not None:
                 self._add_own(self.own, weight, out)
@@ -133,7 +135,7 @@ class AdditionalParameters:
         for f, _ in self._by_axis():
             weighted = np.sqrt(weight)[:, None] * f
             lower = blas.dsyrk(1.0, weighted.T, beta=1.0, c=lower, lower=1, overwrite_c=1)
-        return lower + np.tril(lower, -1).T
+        return mirror_lower(lower)
 
     def _add_own(self, own: GroupedFunctions, weight: np.ndarray, out: np.ndarray) -> None:
         """Fill in the rows and columns of functions of groups in a normal matrix."""

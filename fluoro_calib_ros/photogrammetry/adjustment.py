@@ -30,7 +30,13 @@ from functools import cached_property
 import numpy as np
 
 from .datum import transform_to_datum
-from .elimination import BorderedFactor, BorderedSystem, Elimination, choose_elimination
+from .elimination import (
+    BorderedFactor,
+    BorderedSystem,
+    Elimination,
+    FactorizedNormalMatrix,
+    choose_elimination,
+)
 from .network import Network
 from .noise import DEFAULT_NOISE, Noise
 from .normal_equations import normal_equations, project_network, right_sides
@@ -44,8 +50,16 @@ ROUNDING = 1e-12
 # the tolerance allows, ends the adjustment: rounding errors hide the decrease that is left.
 NEGLIGIBLE = 1e-3
 NEGLIGIBLE_DECREASE = 1e-6
-# Part of the decrease of F by the last step up to which one with its normal matrix pays.
-REPEATED = 0.2
+# Image points from which steps with the normal matrix of the last one pay, without additional
+# parameters, with which they always do.
+LARGE = 5_000
+# Damping that changes no covariance visibly.
+UNDAMPED = 1e-6
+# Part of the decrease of F by the last step up to which one with the same normal matrix pays, and
+# up to which it does where new normal matrices bring no faster convergence, as with heavy tails.
+REPEATED = 0.5
+REPEATED_SLOW = 0.9
+SLOWER = 1.2  # rate of convergence, relative to that of new normal matrices
 
 
 @dataclass(frozen=True)
@@ -191,10 +205,11 @@ class _Problem:
         return self.elimination.bordered_system(equations)
 
     @property
-    def can_repeat(self) -> bool:
-        """Whether right sides alone are much cheaper than normal equations."""
+    def is_large(self) -> bool:
+        """Whether right sides take a small part of the time of normal equations."""
         network = self.network
-        return not network.relative and any(a is not None for a in network.additional)
+        has_additional = any(one is not None for one in network.additional)
+        return has_additional or network.n_image_points >= LARGE
 
     def factorize(self, system: BorderedSystem, mu: float) -> _Solver:
         """Normal equations that are damped by mu, factorized.
@@ -258,7 +273,8 @@ class _LevenbergMarquardt:
     """Levenberg-Marquardt iteration.
 
     `current` is the best iterate so far, `steps` the number of steps, refused ones included.
-    `finished` ends the iteration, `converged` tells whether at a minimum.
+    `finished` ends the iteration, `converged` tells whether at a minimum. `used`: the normal
+    equations of the last accepted step; None with relative orientations.
     """
 
     def __init__(self, problem: _Problem, start: Parameters, tolerance: float) -> None:
@@ -271,7 +287,9 @@ class _LevenbergMarquardt:
         self._damping = _NielsenDamping()
         self._system: BorderedSystem | None = None  # at the current parameters
         self._last: _Solver | None = None  # of the last step, if it may be used again
+        self.used: _Solver | None = None
         self._predicted = np.inf  # decrease of F by the last accepted step
+        self._rate = 0.0  # that decrease over the one before, at the last new normal matrix
 
     def step(self) -> None:
         """Take or refuse one damped step."""
@@ -293,8 +311,10 @@ class _LevenbergMarquardt:
             self.finished = self.converged or self._damping.refuse()
             return
         self._damping.accept((self.current.cost - trial.cost) / max(predicted, 1e-300))
-        if self._problem.can_repeat:
-            self._last = solver
+        if not self._problem.network.relative:
+            self.used = solver
+            self._last = solver if self._problem.is_large else None
+        self._rate = predicted / self._predicted
         self._accept(trial, predicted)
 
     def _repeat(self, solver: _Solver) -> bool:
@@ -306,7 +326,8 @@ class _LevenbergMarquardt:
         """
         solver = self._problem.at(self.current.parameters, solver)
         moved, predicted = self._problem.step(self.current, solver)
-        if predicted > REPEATED * self._predicted:
+        slow = min(SLOWER * self._rate, REPEATED_SLOW)
+        if predicted > max(REPEATED, slow) * self._predicted:
             return False
         trial = self._problem.evaluate(moved)
         if self._is_worse(trial):
@@ -359,6 +380,23 @@ def adjust(
     Adjustment
         `converged` is False where `max_steps` ended the iteration or no step was found.
     """
+    return adjust_with_matrix(network, start, correction, noise, options, raise_if_cancelled)[0]
+
+
+def adjust_with_matrix(
+    network: Network,
+    start: Parameters,
+    correction: np.ndarray | None = None,
+    noise: Noise = DEFAULT_NOISE,
+    options: SolverOptions = DEFAULT_OPTIONS,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> tuple[Adjustment, FactorizedNormalMatrix | None]:
+    """Adjust a network; return also the normal matrix of the last steps.
+
+    The matrix belongs to parameters near the solution, without `Noise.information_factor`. It is
+    None for a free network, with relative orientations, and where the steps were damped. The
+    arguments are those of `adjust`.
+    """
     correction = np.zeros_like(network.uv) if correction is None else correction
     elimination = (options.elimination or choose_elimination(network))(network)
     problem = _Problem(network, correction, noise, elimination)
@@ -368,7 +406,7 @@ def adjust(
             raise_if_cancelled()
         iteration.step()
     found = iteration.current
-    return Adjustment(
+    adjustment = Adjustment(
         transform_to_datum(network, found.parameters),
         found.residuals,
         found.q,
@@ -378,3 +416,7 @@ def adjust(
         iteration.converged,
         network.exposure,
     )
+    used = iteration.used
+    if used is None or used.mu > UNDAMPED or network.datum != 'survey':
+        return adjustment, None
+    return adjustment, FactorizedNormalMatrix(elimination, used.factor)

@@ -33,6 +33,7 @@ from scipy.linalg import blas, cho_factor, cho_solve, lapack
 from .datum import Gauge, stabilising_factor
 from .network import Network
 from .normal_equations import NormalEquations
+from .symmetric import mirror_lower
 from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ReducedLayout, UnknownVector
 
 
@@ -129,7 +130,7 @@ class BorderedFactor:
         k, size = self.inverse.shape[:2]
         q = len(self.schur)
         lower, _ = lapack.dpotri(self.schur, lower=1)
-        rest = np.tril(lower) + np.tril(lower, -1).T
+        rest = mirror_lower(lower).T  # by rows
         transposed = self.inverse.transpose(0, 2, 1)
         gain = transposed @ self.half_border.reshape(k, size, q)
         border = -(gain.reshape(-1, q) @ rest).reshape(k, size, q)

@@ -24,7 +24,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import blas
 
 from .additional_parameters import AdditionalParameters
 from .adjustment import Adjustment
@@ -35,14 +34,13 @@ from .network import Network
 from .noise import Noise
 from .normal_equations import normal_equations
 from .relative_orientation import discrepancies_with_jacobian
+from .symmetric import square_of_lower
 from .unknowns import Parameters, UnknownVector
 
 # Smallest weight of a gross error, so that its variance stays finite.
 MIN_WEIGHT = 1e-9
 # Image points handled at once, to limit memory.
 CHUNK = 5_000
-# Columns of a triangular matrix that are multiplied at once.
-BLOCK = 128
 # Object points up to which their covariances with each other are kept. The more there are, the
 # less these matter: what all have in common is the datum.
 MAX_JOINT_POINTS = 150
@@ -145,7 +143,7 @@ def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> np.ndar
     additional = layout.all_additional
     size = additional.stop - additional.start  # all of them are free
     last = slice(len(matrix.factor.schur) - size, None)
-    everything = _square_of(matrix.factor.schur[last, last])
+    everything = square_of_lower(matrix.factor.schur[last, last])
     columns = layout.additional[f]
     own = np.arange(columns.start, columns.stop) - additional.start
     others = np.setdiff1d(np.arange(size), own)
@@ -154,18 +152,6 @@ def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> np.ndar
         mixed = everything[np.ix_(others, own)]
         out = out - mixed.T @ np.linalg.solve(everything[np.ix_(others, others)], mixed)
     return out
-
-
-def _square_of(factor: np.ndarray) -> np.ndarray:
-    """L L^T (n, n) of a lower triangular matrix L; the upper triangle of factor is not used."""
-    n = len(factor)
-    out = np.zeros((n, n), order='F')
-    for start in range(0, n, BLOCK):
-        stop = min(start + BLOCK, n)
-        columns = np.array(factor[start:, start:stop], order='F')
-        columns[: stop - start] = np.tril(columns[: stop - start])
-        out[start:, start:] += blas.dsyrk(1.0, columns, lower=1)
-    return out + np.tril(out, -1).T
 
 
 def covariance_of_projection(

@@ -40,7 +40,7 @@ SAMPLES = 200  # with 20 % false matches 1 - (1 - 0.8^6)^200: a good sample is c
 # Smallest over largest extent of the targets below which they lie in one plane.
 MIN_FLATNESS = 1e-2
 DLT_ITERATIONS = 10
-SETTLED_WEIGHTS = 1e-3  # change of the robust weights at which the iterations end
+SETTLED_WEIGHTS = 0.02  # change of the robust weights at which the iterations end
 TINY = 1e-14  # of the trace of normal equations, added to the diagonal of singular ones
 NU = 3.0  # of the Student-t of the robust weights: heavy tails
 MIN_VARIANCE = 1e-12  # [px^2], for exact observations

@@ -324,20 +324,27 @@ def copied_exposures(exposures: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
     Copies have the same image points to the last digit; exposures of a standing phantom differ by
     their noise.
     """
+    ordered = sorted(exposures, key=lambda f: f.number)
+    if not ordered:
+        return []
+    ids = np.unique(np.concatenate([frame.target_id for frame in ordered]))
+    uv = np.full((len(ordered), len(ids), 2), np.nan)
+    for own, frame in zip(uv, ordered):
+        own[np.searchsorted(ids, frame.target_id)] = frame.uv
     out = []
-    kept: list[Frame] = []
-    for frame in sorted(exposures, key=lambda f: f.number):
-        original = next((other for other in kept if _is_copy(frame, other)), None)
-        if original is None:
-            kept.append(frame)
+    kept: list[int] = []
+    for row, frame in enumerate(ordered):
+        originals = np.flatnonzero(_are_copied(uv[row], uv[kept]))
+        if len(originals):
+            out.append((frame, ordered[kept[originals[0]]]))
         else:
-            out.append((frame, original))
+            kept.append(row)
     return out
 
 
-def _is_copy(frame: Frame, other: Frame) -> bool:
-    _, one, two = np.intersect1d(frame.target_id, other.target_id, return_indices=True)
-    if len(one) < MIN_COMMON:
-        return False
-    distance = np.abs(np.asarray(frame.uv)[one] - np.asarray(other.uv)[two]).max(axis=1)
-    return bool(np.mean(distance <= SAME_PX) >= COPIED)
+def _are_copied(uv: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Which (k,) of others (k, n, 2) have the image points uv (n, 2) [px]; NaN where unseen."""
+    distance = np.abs(others - uv).max(axis=2)
+    common = np.sum(np.isfinite(distance), axis=1)
+    same = np.sum(distance <= SAME_PX, axis=1)
+    return (common >= MIN_COMMON) & (same >= COPIED * common)

@@ -223,7 +223,8 @@ def adjust_with_terms(
             matrix = factorize(
                 network, normal_equations(network, result.parameters, zero, noise, factor)
             )
-        renewed = estimate_noise(network, result, covariance_blocks(matrix))
+        blocks = covariance_blocks(matrix)
+        renewed = estimate_noise(network, result, blocks, matrix.information_factor)
         converged, coefficients = terms.renew(network, matrix, result)
         converged &= abs(renewed.scale - noise.scale) <= terms.noise_tolerance * noise.scale
         parameters = replace(result.parameters, additional=coefficients)

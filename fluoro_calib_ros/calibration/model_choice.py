@@ -40,6 +40,8 @@ ALTERNATIVES = ('local_linear', 'knn', 'parametric')
 # Neighbour models with the largest k that is tried: more neighbours follow a distortion no closer
 # than collocation does.
 MAX_NEIGHBOURS: dict[type[NeighbourModel], int] = {LocalLinearModel: 100, KnnModel: 40}
+# Image points of a fluoroscope whose predictions are compared: more tell the models no better.
+MAX_TESTED = 5_000
 # With more image points of a fluoroscope no other model was better than collocation.
 MAX_IMAGE_POINTS = 40_000
 
@@ -73,12 +75,13 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
         weight = after.noise.weight(after.q[rows])
         weight = weight / (after.noise.scale * network.sigma[rows]) ** 2
         fold = exposure_folds(network.exposure[rows])
-        near = NeighbourTable(uv, min(max(MAX_NEIGHBOURS.values()), len(uv)))
+        tested = np.unique(np.linspace(0, len(uv) - 1, MAX_TESTED).astype(int))
+        near = NeighbourTable(uv, min(max(MAX_NEIGHBOURS.values()), len(uv)), tested)
+        information = weight[:, None, None] * np.eye(2)
         for model_type, max_k in MAX_NEIGHBOURS.items():
             candidates = model_type.candidate_k(len(uv))
             candidates = candidates[candidates <= max_k]
-            validation = CrossValidation(model_type, uv, fold, candidates, near)
-            information = weight[:, None, None] * np.eye(2)
+            validation = CrossValidation(model_type, uv, fold, candidates, near, tested)
             scores[model_type.kind] += float(np.min(validation.scores(values, information)))
         held_out = {
             START_MODEL: _held_out(
@@ -89,7 +92,8 @@ def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
             ),
         }
         for kind, predicted in held_out.items():
-            scores[kind] += float(np.sum(weight[:, None] * (values - predicted) ** 2))
+            errors = (weight[:, None] * (values - predicted) ** 2)[tested]
+            scores[kind] += float(np.sum(errors))
     best = min(ALTERNATIVES, key=lambda kind: scores[kind])
     return best if scores[best] < MAX_RATIO * scores[START_MODEL] else None
 

@@ -54,6 +54,7 @@ from ..photogrammetry.resection import (
 
 # Below this flatness the plane of the targets is tried too.
 NEARLY_FLAT = 0.08
+START_TOLERANCE = 1e-2  # a tenth of a standard deviation: the adjustment goes on from there
 # With fewer targets a direct linear transformation may be far off.
 FEW_TARGETS = 20
 # Rounds in which poses of planes and a preliminary correction are estimated in turn, and the
@@ -148,7 +149,7 @@ def principal_distance_of_views(
 def orient_view(view: View, interior: np.ndarray) -> Resection:
     """Return the exterior orientation of a view with the smallest residuals. Raises DataError."""
     if view.projection is not None and not view.needs_samples:
-        return resect(view.xyz, view.uv, interior, view.projection)
+        return resect(view.xyz, view.uv, interior, view.projection, tolerance=START_TOLERANCE)
     found = []
     errors = []
     for start in _starts(view, interior):

@@ -329,6 +329,7 @@ class CollocationTerms(AdjustedTerms):
         last = self.priors[f]
         present = prior_of_additional(network, f)
         information = information_of_additional(matrix, f) - present
+        information *= matrix.information_factor
         right = (information + present) @ coefficients
         own = self.exposure_terms[f]
         if own is not None:

@@ -45,6 +45,8 @@ class CrossValidation:
         Values of k, ascending.
     near : NeighbourTable, optional
         Table of uv, where there is one already.
+    tested : (T,) ndarray of int, optional
+        Training points whose values are predicted; by default all.
 
     Raises
     ------
@@ -59,9 +61,12 @@ class CrossValidation:
         fold: np.ndarray,
         candidates: ArrayLike,
         near: NeighbourTable | None = None,
+        tested: np.ndarray | None = None,
     ) -> None:
-        folds = [np.flatnonzero(fold == f) for f in np.unique(fold)]
-        trains = [np.flatnonzero(fold != f) for f in np.unique(fold)]
+        self._tested = np.arange(len(uv)) if tested is None else tested
+        numbers = np.unique(fold)
+        folds = [np.flatnonzero(fold[self._tested] == f) for f in numbers]
+        trains = [np.flatnonzero(fold != f) for f in numbers]
         candidates = np.asarray(candidates)
         self.model_type = model_type
         self.candidates = candidates[candidates <= min(len(train) for train in trains)]
@@ -69,38 +74,37 @@ class CrossValidation:
             raise ValueError(
                 f'{len(uv)} image points are too few for a cross-validation of {model_type.kind}'
             )
-        self._index = np.empty((len(uv), self.candidates[-1]), dtype=np.intp)
+        self._index = np.empty((len(self._tested), self.candidates[-1]), dtype=np.intp)
         self._trend = []
         near = NeighbourTable(uv, self.candidates[-1]) if near is None else near
         basis = Trend(model_type.trend_degree, uv).basis(uv)
-        for held_out, train in zip(folds, trains):
-            allowed = np.ones(len(uv), dtype=bool)
-            allowed[held_out] = False
-            self._index[held_out] = near.nearest(held_out, allowed, self.candidates[-1])
+        for number, held_out, train in zip(numbers, folds, trains):
+            rows = self._tested[held_out]
+            self._index[held_out] = near.nearest(rows, fold != number, self.candidates[-1])
             self._trend.append((held_out, train, least_squares_map(basis[train])))
         self._basis = basis
-        self._near = Neighbourhoods(uv[self._index], uv)
-        few = len(uv) * int(np.sum(self.candidates)) <= MAX_CACHED_WEIGHTS
+        self._near = Neighbourhoods(uv[self._index], uv[self._tested])
+        few = len(self._tested) * int(np.sum(self.candidates)) <= MAX_CACHED_WEIGHTS
         cached = few and not model_type.equal_weights
         self._weights = list(self._all_weights()) if cached else None
 
     def _all_weights(self) -> Iterable[np.ndarray]:
-        """Weights (N, k) for every candidate k."""
+        """Weights (T, k) for every candidate k."""
         return (self.model_type.weights(self._near, k) for k in self.candidates)
 
     def _neighbour_values(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Values less trend at the neighbours (2, N, K), and trend (N, 2), of the other folds."""
+        """Values less trend at the neighbours (2, T, K), and trend (T, 2), of the other folds."""
         near = np.empty((2,) + self._index.shape)
-        trend = np.zeros_like(values)
+        trend = np.zeros((len(self._tested), 2))
         for held_out, train, fit in self._trend:
             coefficients = fit @ values[train]
             remainder = (values - self._basis @ coefficients).T
             near[:, held_out] = remainder[:, self._index[held_out]]
-            trend[held_out] = self._basis[held_out] @ coefficients
+            trend[held_out] = self._basis[self._tested[held_out]] @ coefficients
         return near, trend
 
     def predictions(self, values: np.ndarray) -> np.ndarray:
-        """Held-out predictions (K, N, 2) of values (N, 2), for every candidate."""
+        """Held-out predictions (K, T, 2) of values (N, 2), for every candidate."""
         near, trend = self._neighbour_values(values)
         if self.model_type.equal_weights:
             sums = np.cumsum(near, axis=2)[:, :, self.candidates - 1]
@@ -111,15 +115,15 @@ class CrossValidation:
         )
 
     def predictions_for(self, k: int, values: np.ndarray) -> np.ndarray:
-        """Held-out predictions (N, 2) of values (N, 2) with k neighbours."""
+        """Held-out predictions (T, 2) of values (N, 2) with k neighbours."""
         near, trend = self._neighbour_values(values)
         weights = self.model_type.weights(self._near, k)
         return trend + np.einsum('nk,cnk->nc', weights, near[:, :, :k])
 
     def scores(self, values: np.ndarray, information: np.ndarray) -> np.ndarray:
         """G (K,) for every candidate: errors weighted by information (N, 2, 2) = C_r^-1."""
-        error = values - self.predictions(values)
-        return weighted_square_sum(error, information)
+        error = values[self._tested] - self.predictions(values)
+        return weighted_square_sum(error, information[self._tested])
 
 
 def weighted_square_sum(error: np.ndarray, information: np.ndarray) -> np.ndarray:

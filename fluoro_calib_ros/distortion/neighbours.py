@@ -106,13 +106,18 @@ class NeighbourTable:
     count : int
         Number of neighbours that will be asked for. Some more are looked up, so that excluded
         points can be skipped.
+    rows : (T,) ndarray of int, optional
+        Points whose neighbours will be asked for; by default all.
     """
 
-    def __init__(self, uv: np.ndarray, count: int) -> None:
+    def __init__(self, uv: np.ndarray, count: int, rows: np.ndarray | None = None) -> None:
         self._uv = uv
-        _, self._near = cKDTree(uv).query(
-            uv, k=np.arange(1, min(len(uv), int(1.3 * count) + 30) + 1)
-        )
+        numbers = np.arange(1, min(len(uv), int(1.3 * count) + 30) + 1)
+        if rows is None:
+            _, self._near = cKDTree(uv).query(uv, k=numbers)
+            return
+        self._near = np.empty((len(uv), len(numbers)), dtype=np.intp)
+        _, self._near[rows] = cKDTree(uv).query(uv[rows], k=numbers)
 
     def nearest(self, rows: np.ndarray, allowed: np.ndarray, count: int) -> np.ndarray:
         """Return the count nearest allowed points (n, count) of the points rows (n,), in order.

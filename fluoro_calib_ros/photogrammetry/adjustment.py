@@ -393,9 +393,8 @@ def adjust_with_matrix(
 ) -> tuple[Adjustment, FactorizedNormalMatrix | None]:
     """Adjust a network; return also the normal matrix of the last steps.
 
-    The matrix belongs to parameters near the solution, without `Noise.information_factor`. It is
-    None for a free network, with relative orientations, and where the steps were damped. The
-    arguments are those of `adjust`.
+    The matrix belongs to parameters near the solution. It is None for a free network, with
+    relative orientations, and where the steps were damped. The arguments are those of `adjust`.
     """
     correction = np.zeros_like(network.uv) if correction is None else correction
     elimination = (options.elimination or choose_elimination(network))(network)
@@ -419,4 +418,5 @@ def adjust_with_matrix(
     used = iteration.used
     if used is None or used.mu > UNDAMPED or network.datum != 'survey':
         return adjustment, None
-    return adjustment, FactorizedNormalMatrix(elimination, used.factor)
+    factor = noise.information_factor(found.q)
+    return adjustment, FactorizedNormalMatrix(elimination, used.factor, None, factor)

@@ -470,11 +470,14 @@ class FactorizedNormalMatrix:
     """A normal matrix after elimination and Cholesky factorization.
 
     gauge: the directions that the network leaves open, None where there are none.
+    information_factor: part of the weights of the image points that is information (see `Noise`),
+    where the matrix has all of them; 1 where it has that part.
     """
 
     elimination: Elimination
     factor: BorderedFactor
     gauge: Gauge | None = None
+    information_factor: float = 1.0
 
     @property
     def network(self) -> Network:

@@ -105,10 +105,16 @@ def adjust_and_estimate_noise(
     return replace(result, converged=result.converged and settled)
 
 
-def estimate_noise(network: Network, adjustment: Adjustment, blocks: CovarianceBlocks) -> Noise:
-    """Noise model from the residuals of an adjustment and the covariances of its unknowns."""
+def estimate_noise(
+    network: Network, adjustment: Adjustment, blocks: CovarianceBlocks, factor: float = 1.0
+) -> Noise:
+    """Noise model from the residuals of an adjustment and the covariances of its unknowns.
+
+    factor: information factor near one that the covariances are without.
+    """
     noise = adjustment.noise
     variance = (noise.scale * network.sigma) ** 2
-    unresolved = variance_of_projection(network, adjustment.parameters, blocks) / variance
+    unresolved = variance_of_projection(network, adjustment.parameters, blocks)
+    unresolved = unresolved / (factor * variance)
     new = noise.estimate_from(adjustment.q * noise.scale**2, unresolved)
     return replace(new, scale=max(new.scale, MIN_NOISE_PX / float(np.median(network.sigma))))

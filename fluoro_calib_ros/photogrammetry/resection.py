@@ -266,6 +266,7 @@ def resect(
     interior: np.ndarray,
     projection: np.ndarray | None = None,
     max_steps: int = 100,
+    tolerance: float = TOLERANCE,
 ) -> Resection:
     """Exterior orientation of one exposure for a given interior orientation.
 
@@ -283,6 +284,8 @@ def resect(
         Result of robust_dlt; computed by default.
     max_steps : int
         Largest number of steps of the refinement.
+    tolerance : float
+        Squared step at which it ends, in standard deviations.
 
     Raises
     ------
@@ -291,7 +294,8 @@ def resect(
     """
     projection = robust_dlt(xyz, uv) if projection is None else projection
     problem = _Problem(xyz, uv, interior)
-    return _refined(problem, *_start_orientation(projection, problem), max_steps)
+    start = _start_orientation(projection, problem)
+    return _refined(problem, *start, max_steps, tolerance)
 
 
 def refine_resection(
@@ -328,14 +332,18 @@ def resection_at(
 
 
 def _refined(
-    problem: _Problem, rotation: np.ndarray, position: np.ndarray, max_steps: int
+    problem: _Problem,
+    rotation: np.ndarray,
+    position: np.ndarray,
+    max_steps: int,
+    tolerance: float = TOLERANCE,
 ) -> Resection:
     """Refine an exterior orientation. Raises DataError for a target behind the source."""
     mu = START_DAMPING
     for _ in range(max_steps):
         system = problem.linearise(rotation, position)
         rotation, position, step, mu = _damped_step(problem, system, rotation, position, mu)
-        if step @ system.normal @ step <= TOLERANCE * system.noise.scale**2:
+        if step @ system.normal @ step <= tolerance * system.noise.scale**2:
             break
     noise = system.noise
     return Resection(

@@ -142,6 +142,14 @@ class ExposureTerms:
         return self.functions.count
 
     @property
+    def values(self) -> np.ndarray:
+        """Functions (N, 2, 14 e) at the image points; zero but for those of the own exposure."""
+        own = self.functions
+        out = np.zeros((len(own.group), 2, self.exposures, own.values.shape[2]))
+        out[np.arange(len(own.group)), :, own.group] = own.values
+        return out.reshape(len(own.group), 2, -1)
+
+    @property
     def precision(self) -> np.ndarray:
         """Prior precisions (14 e,) of the coefficients."""
         return np.tile(1 / self.variance, self.exposures)

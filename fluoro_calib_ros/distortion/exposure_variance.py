@@ -90,7 +90,8 @@ def _information(
     """Information (p, p) of the terms where only orientations and object points are unknown."""
     additional: list[AdditionalParameters | None] = [None] * network.n_fluoroscopes
     start: list[np.ndarray | None] = [None] * network.n_fluoroscopes
-    additional[f] = AdditionalParameters(terms.values, np.diag(terms.precision))
+    none = np.zeros((len(network.rows(f)), 0))
+    additional[f] = AdditionalParameters(none, np.diag(terms.precision), terms.functions)
     start[f] = np.zeros(terms.count)
     plain = replace(
         network,
@@ -112,11 +113,10 @@ def _mean_square_left(
     inliers = adjustment.inliers[rows]
     _, by_exterior, _, _ = project_with_jacobian(*network.per_image_point(adjustment.parameters))
     exposure = network.exposure[rows]
-    values = terms.values.reshape(len(rows), 2, terms.exposures, -1)
     square = 0.0
-    for place, number in enumerate(np.unique(exposure)):
+    for number in np.unique(exposure):
         at = inliers & (exposure == number)
-        own = values[at, :, place].reshape(2 * int(at.sum()), -1)
+        own = terms.functions.values[at].reshape(2 * int(at.sum()), -1)
         # In units in which the six unknowns matter alike.
         absorbed = by_exterior[rows[at]].reshape(len(own), -1)
         absorbed = absorbed / np.linalg.norm(absorbed, axis=0)

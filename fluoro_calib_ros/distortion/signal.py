@@ -244,7 +244,7 @@ def _more_likely(
         step = np.linalg.solve(here.curvature + damping * np.eye(len(at)), -here.slopes)
         step = step / max(1.0, np.max(np.abs(step)) / MAX_STEP)
         trial = np.clip(at + step, low, high)
-        there = _likelihood(trial, coefficients)
+        there = _likelihood(trial, coefficients, here.cost)
         if there is None or there.cost > here.cost:
             damping *= 30
             continue
@@ -273,8 +273,13 @@ def _ranges(side: float) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _likelihood(at: np.ndarray, coefficients: SignalEquations) -> _Likelihood | None:
-    """Return the likelihood at logarithms (5,) of the parameters; None where it has none."""
+def _likelihood(
+    at: np.ndarray, coefficients: SignalEquations, limit: float = np.inf
+) -> _Likelihood | None:
+    """Return the likelihood at logarithms (5,) of the parameters.
+
+    None where there is none, or where its cost is found to be above a limit.
+    """
     signal = Signal(*np.exp(at))
     frequency = coefficients.frequency
     columns = coefficients.columns
@@ -286,12 +291,14 @@ def _likelihood(at: np.ndarray, coefficients: SignalEquations) -> _Likelihood | 
         return None
     z = solve_triangular(factor, coefficients.right, lower=True, check_finite=False)
     cost = np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(variance)) / 2 - z @ z / 2
-    inverse, failed = lapack.dtrtri(factor, lower=1)
-    if failed or not np.isfinite(cost):
+    if not np.isfinite(cost) or cost > limit:  # the priors only add to it
         return None
-    inverse = np.tril(inverse)
-    mean = (z @ inverse)[columns]
-    square = np.einsum('ij,ij->j', inverse, inverse)[columns]  # posterior variances
+    mean = solve_triangular(factor, z, trans='T', lower=True, check_finite=False)[columns]
+    inverse, failed = lapack.dtrtri(factor, lower=1, overwrite_c=1)
+    if failed:
+        return None
+    # Columns are contiguous, and what is above the diagonal is zero.
+    square = np.sum(np.square(inverse, out=inverse), axis=0)[columns]  # posterior variances
     slopes = np.tile(_slopes(signal, frequency), (2, 1))
     determined = np.clip(1 - square / variance, 0, 1)
     likelihood = _Likelihood(

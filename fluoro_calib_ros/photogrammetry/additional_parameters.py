@@ -123,11 +123,12 @@ class AdditionalParameters:
         out = np.zeros((self.count, self.count))
         if self.functions.ndim == 2:
             k = self.functions.shape[1]
-            weighted = np.sqrt(weight)[:, None] * self.functions
-            # BLAS stores by columns, so the transpose needs no copy.
-            lower = blas.dsyrk(1.0, weighted.T, lower=1)
-            out[:k, :k] = mirror_lower(lower)
-            out[k : 2 * k, k : 2 * k] = out[:k, :k]
+            if k:  # BLAS reports empty matrices as an error
+                weighted = np.sqrt(weight)[:, None] * self.functions
+                # BLAS stores by columns, so the transpose needs no copy.
+                lower = blas.dsyrk(1.0, weighted.T, lower=1)
+                out[:k, :k] = mirror_lower(lower)
+                out[k : 2 * k, k : 2 * k] = out[:k, :k]
             if self.own is not None:
                 self._add_own(self.own, weight, out)
             return out

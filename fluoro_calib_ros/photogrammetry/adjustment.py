@@ -60,6 +60,9 @@ UNDAMPED = 1e-6
 REPEATED = 0.5
 REPEATED_SLOW = 0.9
 SLOWER = 1.2  # rate of convergence, relative to that of new normal matrices
+# Decrease of F for an image point by a step with the normal matrix of the last one, at most: the
+# weights of the image points change with larger steps, and outliers would keep those that are lost.
+REPEATED_DECREASE = 0.01
 
 
 @dataclass(frozen=True)
@@ -327,7 +330,8 @@ class _LevenbergMarquardt:
         solver = self._problem.at(self.current.parameters, solver)
         moved, predicted = self._problem.step(self.current, solver)
         slow = min(SLOWER * self._rate, REPEATED_SLOW)
-        if predicted > max(REPEATED, slow) * self._predicted:
+        limit = REPEATED_DECREASE * self._problem.network.n_image_points
+        if predicted > min(max(REPEATED, slow) * self._predicted, limit):
             return False
         trial = self._problem.evaluate(moved)
         if self._is_worse(trial):

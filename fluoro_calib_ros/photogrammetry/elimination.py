@@ -91,6 +91,8 @@ class BorderedSystem:
         """
         inverse = np.linalg.inv(np.linalg.cholesky(self.blocks))
         half = (inverse @ self.border).reshape(-1, self.border.shape[2])
+        if not half.shape[1]:  # BLAS reports empty matrices as an error
+            return BorderedFactor(inverse, half, np.zeros((0, 0)))
         # BLAS stores by columns, where `half` is its own transpose: no copy is made, and dsyrk
         # takes half the operations of a full product.
         schur = blas.dsyrk(-1.0, half.T, beta=1.0, c=self.rest.T, trans=0, lower=1, overwrite_c=1)

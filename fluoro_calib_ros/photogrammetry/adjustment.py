@@ -61,7 +61,7 @@ REPEATED = 0.5
 REPEATED_SLOW = 0.9
 SLOWER = 1.2  # rate of convergence, relative to that of new normal matrices
 # Decrease of F for an image point by a step with the normal matrix of the last one, at most: the
-# weights of the image points change with larger steps, and outliers would keep those that are lost.
+# weights of the image points change with larger steps.
 REPEATED_DECREASE = 0.01
 
 

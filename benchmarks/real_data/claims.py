@@ -147,11 +147,9 @@ def _variation(
     additional = _additional(run)
     count = 2 * len(_functions(run))
     network = tested.measured.network
-    exposures = run.measured.network.n_exposures
-    if additional.count == count:
+    if additional.own is None:
         return np.zeros((2 * len(rows), 0)), 0.0
-    own = additional.functions[:, :, count:]
-    own = own.reshape(len(own), 2, exposures, -1).sum(axis=2)
+    own = additional.own.values
     polynomials = Functions(run.measured.image_size[0], TREND_DEGREE)
     of_training = polynomials(run.measured.network.uv)
     of_tested = polynomials(network.uv[rows])

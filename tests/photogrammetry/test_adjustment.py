@@ -24,7 +24,10 @@ from scipy import optimize
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.calibration.robust_adjustment import adjusted_with_precision
+from fluoro_calib_ros.distortion.priors import gauge_precision
+from fluoro_calib_ros.distortion.series import Functions
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
 from fluoro_calib_ros.photogrammetry.adjustment import (
     SolverOptions,
     adjust,
@@ -465,6 +468,28 @@ def test_distant_start_values_give_the_same_solution():
     assert (
         np.max(np.abs(near.parameters.position_mm[0] - far.parameters.position_mm[0]) / sd) < 1e-2
     )
+
+
+def test_start_off_the_gauge_gives_the_same_solution():
+    """A large first decrease allows no steps with its normal matrix: outliers would keep points
+    that are lost on the way.
+    """
+    network, truth = rigs.small_network(exposures=6, targets=40, seed=5)
+    rng = np.random.default_rng(5)
+    false = rng.random(len(network.uv)) < 0.2
+    uv = network.uv.copy()
+    uv[false] += rng.normal(0, 25, (int(false.sum()), 2))
+    values = Functions((1024, 1024), 3)(uv)
+    count = 2 * values.shape[1]
+    prior = 1e-2 * np.eye(count) + gauge_precision(values, uv, truth.interior[0])
+    network = replace(network, uv=uv, additional=(AdditionalParameters(values, prior),))
+    start = replace(
+        rigs.disturbed(truth, degrees=0.3, mm=3.0), additional=(rng.normal(0, 1, count),)
+    )
+    near = adjust(network, replace(truth, additional=(np.zeros(count),)), noise=Noise(scale=0.3))
+    far = adjust(network, start, noise=Noise(scale=0.3))
+    assert near.converged and far.converged
+    assert far.cost == pytest.approx(near.cost, abs=1e-2)
 
 
 def test_running_out_of_steps_is_reported():

@@ -70,6 +70,10 @@ FEWER_MODES = 0.75  # part of the present modes from which fewer are worth a cha
 MODE_CHANGES = 3  # at most
 # Mean change of the logarithms of the variances of the signal that changes no correction visibly.
 SETTLED_PRIOR = 0.3
+# Times that a short field is searched, in renewals without visible change, and sines along the
+# image up to which it is: more of them have found one.
+MAX_SEARCHES = 3
+SEARCHED_MODES = 20
 SETTLED_VARIATION = 0.05  # relative change of the size of what differs between exposures
 MAX_VARYING_EXPOSURES = 60  # of a fluoroscope that can have terms of their own, to limit the time
 # Renewals without visible change after which the priors are held. Noise and signal would otherwise
@@ -141,7 +145,7 @@ class CollocationTerms(AdjustedTerms):
         self._variation_tested = modes == 0
         self._mode_changes = 0
         self._settled = 0
-        self._searched = [False] * len(self.sizes)
+        self._searches = [0] * len(self.sizes)
         self._start = self.zeros()
         if earlier is not None:
             self._continue(earlier, before)
@@ -349,8 +353,9 @@ class CollocationTerms(AdjustedTerms):
 
         prior = renewed(last, False)
         change = prior.signal.change(last.signal, functions.frequency) if functions.modes else 0.0
-        if functions.modes and change < SETTLED_PRIOR and not self._searched[f]:
-            self._searched[f] = True
+        cheap = 0 < functions.modes <= SEARCHED_MODES
+        if cheap and change < SETTLED_PRIOR and self._searches[f] < MAX_SEARCHES:
+            self._searches[f] += 1
             prior = renewed(last, True)
             change = prior.signal.change(last.signal, functions.frequency)
         self.priors[f] = prior

@@ -53,7 +53,7 @@ FINE_PX = 0.5
 # relative to the image, and the gain of the logarithm of the likelihood from which they exist.
 SEARCH_PX = 0.1
 SEARCH_REACH = (0.03, 0.06, 0.12)
-MIN_SEARCH_GAIN = 6.0
+MIN_SEARCH_GAIN = 3.0
 START_REACH = 0.15
 START_FINE_REACH = 0.06
 START_FINE_SHARE = 0.1  # of the standard deviation of the long field

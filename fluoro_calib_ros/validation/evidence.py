@@ -16,6 +16,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -31,6 +32,7 @@ from ..calibration.result import FluoroscopeCalibration
 from ..distortion.collocation import CollocationModel
 from ..distortion.exposure_terms import Variation, exposure_functions, is_determined, variation
 from ..distortion.registry import selectable_models
+from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from .check import Check
@@ -39,6 +41,9 @@ from .residual_tests import Residuals, ResidualTrend, common_trend, residuals_of
 # The calibration of a part has at most so many rounds: with few exposures it converges slowly, and
 # after these rounds without visible change.
 MAX_ROUNDS = 25
+MAX_LOST = (
+    0.03  # share of the image points of a part that may be rejected beside that of the whole
+)
 MIN_VARYING_EXPOSURES = 4  # with enough image points, to tell whether the distortion varies
 
 
@@ -179,11 +184,29 @@ class Evidence:
         if options.model == AUTO and len(kinds) == 1 and kinds <= set(selectable_models()):
             options = replace(options, model=kinds.pop())  # the one that is validated
         part = replace(self.request, frames=frames, options=options, principal_distance=distance)
-        starts = self.starts
-        if options.model == CollocationModel.kind:
-            starts = replace(starts, earlier=self.earlier)
         sd = {name: self.calibrations[name].image_sd for name in frames}
-        return calibrate_part(part, starts, sd, self.raise_if_cancelled)
+        if options.model == CollocationModel.kind:
+            starts = replace(self.starts, earlier=self.earlier)
+            with contextlib.suppress(DataError):
+                found = calibrate_part(part, starts, sd, self.raise_if_cancelled)
+                if not self._has_lost_points(found, frames):
+                    return found
+        # The gauge of the part is another one. Outliers can keep the exposures of a part from it
+        # where the distortion is large.
+        return calibrate_part(part, self.starts, sd, self.raise_if_cancelled)
+
+    def _has_lost_points(
+        self,
+        found: Mapping[str, FluoroscopeCalibration],
+        frames: Mapping[str, Sequence[Frame]],
+    ) -> bool:
+        """Whether a part rejects clearly more image points than the whole."""
+        for name, calibration in found.items():
+            kept = _share_of_inliers(calibration, frames[name])
+            of_whole = _share_of_inliers(self.calibrations[name], self.frames[name])
+            if kept < of_whole - MAX_LOST:
+                return True
+        return False
 
     def adjust(
         self,
@@ -200,6 +223,10 @@ class Evidence:
             self.request.known_orientations,
             self.starts,
         )
+
+
+def _share_of_inliers(calibration: FluoroscopeCalibration, frames: Sequence[Frame]) -> float:
+    return len(calibration.model.train_uv) / sum(len(frame.uv) for frame in frames)
 
 
 @dataclass(frozen=True)

@@ -51,6 +51,7 @@ FAR = 30.0  # standard deviations below zero
 AGREE_SD = 5.0
 AGREE_REACH = 3.0
 AGREE_WITH = 2
+AGREE_SIGNIFICANT = 1.5  # standard errors by which more pairs agree than are opposite
 LARGEST_SD = 40.0
 MIN_EXPOSURES = 3  # whose scatter is the standard error of a mean product
 
@@ -200,7 +201,8 @@ def sd_with_misfit(
 def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series) -> np.ndarray:
     """Standard deviations (33, 33) [px] on the grid of a series where rejected points agree.
 
-    They are the largest RMS residual of those nearby, and zero where there are none.
+    They are the largest RMS residual of those nearby, and zero where there are none, or where
+    chance explains that they agree.
     """
     out = np.zeros(series.sd.size)
     noise = float(np.sqrt(np.mean(inliers.residuals**2)))
@@ -213,8 +215,13 @@ def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series
     uv = rejected.uv[possible]
     i, j = cKDTree(uv).query_pairs(reach, output_type='ndarray').T
     r = rejected.residuals[possible]
-    agree = np.linalg.norm(r[i] - r[j], axis=1) < AGREE_SD * noise
-    agree &= rejected.exposure[possible[i]] != rejected.exposure[possible[j]]
+    apart = rejected.exposure[possible[i]] != rejected.exposure[possible[j]]
+    agree = apart & (np.linalg.norm(r[i] - r[j], axis=1) < AGREE_SD * noise)
+    # Chance makes as many pairs opposite as it makes agree.
+    opposite = apart & (np.linalg.norm(r[i] + r[j], axis=1) < AGREE_SD * noise)
+    pairs = np.count_nonzero(agree), np.count_nonzero(opposite)
+    if pairs[0] - pairs[1] <= AGREE_SIGNIFICANT * np.sqrt(sum(pairs)):
+        return out.reshape(series.sd.shape)
     number = np.bincount(np.concatenate([i[agree], j[agree]]), minlength=len(possible))
     found = np.flatnonzero(number >= AGREE_WITH)
     pixels = sd_grid_pixels(series.functions.image_size)

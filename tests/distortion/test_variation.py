@@ -165,6 +165,10 @@ def test_rejected_points_that_agree_are_an_error_of_the_correction():
     wrong = rng.normal(0, 20.0, (len(false), 2))
     nothing = sd_of_rejected(inliers, FittedPoints(uv[false], wrong, exposure[false]), series)
     assert (nothing > 0).mean() < 0.02
+    # Many of so small ones agree by chance.
+    small = wrong / np.linalg.norm(wrong, axis=1)[:, None] * 5 * NOISE
+    nothing = sd_of_rejected(inliers, FittedPoints(uv[false], small, exposure[false]), series)
+    assert not nothing.any()
     dent = np.flatnonzero(np.linalg.norm(uv - [600, 150], axis=1) < 40)
     residuals = np.array([1.5, -1.0]) + rng.normal(0, NOISE, (len(dent), 2))
     found = sd_of_rejected(inliers, FittedPoints(uv[dent], residuals, exposure[dent]), series)

@@ -59,6 +59,7 @@ from .self_calibration import self_calibrate
 MAX_REPEATS = 3  # of a calibration, to leave out exposures that do not fit
 EQUAL_WEIGHTS_NU = 100.0  # degrees of freedom from which weights of inliers hardly differ
 TOLERANCE_WITHOUT_CORRECTION = 1e-4  # its residuals are only reported
+ROUNDING = 1e-6  # of the information of object points, relative to that of the survey
 
 
 @dataclass(frozen=True)
@@ -550,7 +551,8 @@ def combined_targets(parts: Sequence[Targets], phantom: Phantom, weighted: bool 
 
     Every adjustment holds the survey. In the sum of their information it counts once, so the
     information of the survey is subtracted for every further adjustment; weighted False: none of
-    them holds the survey.
+    them holds the survey. Where the errors of a model make the points of an adjustment worse than
+    the survey, they add nothing to it.
     """
     if len(parts) == 1:
         return parts[0]
@@ -563,14 +565,23 @@ def combined_targets(parts: Sequence[Targets], phantom: Phantom, weighted: bool 
     further = ((seen - 1) * weighted)[:, None, None] * survey
     joint = [part.joint_covariance for part in parts if part.joint_covariance is not None]
     if weighted and len(joint) == len(parts):
-        return _combined_jointly(parts, joint, further, phantom)
-    information = -further
-    right = -(further @ phantom.xyz_mm[row, :, None])[..., 0]
+        together = _combined_jointly(parts, joint, further, phantom)
+        if together is not None:
+            return together
+    surveyed = weighted * survey
+    information = surveyed.copy()
+    right = (surveyed @ phantom.xyz_mm[row, :, None])[..., 0]
     for part in parts:
         at = np.searchsorted(target_id, part.target_id)
         own = np.linalg.inv(part.covariance)
-        information[at] += own
-        right[at] += (own @ part.xyz_mm[..., None])[..., 0]
+        value, vector = np.linalg.eigh(own - surveyed[at])
+        is_better = value > 0
+        better = (vector * (value * is_better)[:, None, :]) @ vector.transpose(0, 2, 1)
+        information[at] += better
+        # The point that the adjustment would find without the survey.
+        added = own @ part.xyz_mm[..., None] - (surveyed @ phantom.xyz_mm[row, :, None])[at]
+        inside = (vector * is_better[:, None, :]) @ vector.transpose(0, 2, 1)
+        right[at] += (inside @ added)[..., 0]
     covariance = np.linalg.inv(information)
     return Targets(target_id, (covariance @ right[..., None])[..., 0], covariance)
 
@@ -580,11 +591,12 @@ def _combined_jointly(
     joint: Sequence[np.ndarray],
     further: np.ndarray,
     phantom: Phantom,
-) -> Targets:
+) -> Targets | None:
     """Return one set of object points from their joint covariances.
 
-    The errors of few beads have much in common: the datum, which is the same survey in every
-    part. Information of single beads would count it once a part.
+    None where the points of an adjustment are worse than the survey. The errors of few beads have
+    much in common: the datum, which is the same survey in every part. Information of single beads
+    would count it once a part.
 
     Parameters
     ----------
@@ -608,6 +620,10 @@ def _combined_jointly(
         own = np.linalg.inv(covariance)
         information[np.ix_(at.ravel(), at.ravel())] += own
         right[at.ravel()] += own @ part.xyz_mm.ravel()
+    survey = np.repeat(1 / phantom.sd_mm[phantom.index(target_id)] ** 2, 3)
+    relative = information / np.sqrt(np.outer(survey, survey))
+    if np.linalg.eigvalsh(relative)[0] < 1 - ROUNDING:
+        return None
     found = np.linalg.inv(information)
     blocks = found.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
     return Targets(target_id, (found @ right).reshape(n, 3), blocks, found)

@@ -776,6 +776,27 @@ def test_combined_targets_count_the_datum_once():
     np.testing.assert_allclose(both.xyz_mm.ravel(), truth @ right, rtol=1e-10)
 
 
+@pytest.mark.parametrize('is_joint', [False, True])
+def test_points_that_are_worse_than_the_survey_add_nothing_to_it(is_joint):
+    """As those of a model that cannot follow the distortion are."""
+    phantom = replace(
+        PHANTOM, target_id=np.arange(1, 6), xyz_mm=PHANTOM.xyz_mm[:5], sd_mm=np.full(5, 0.1)
+    )
+    good = np.full(5, 0.005)
+    bad = np.full(5, 0.05)
+    parts = []
+    for variance in (bad, bad, good):
+        blocks = variance[:, None, None] * np.eye(3)
+        joint = np.diag(np.repeat(variance, 3)) if is_joint else None
+        parts.append(Targets(phantom.target_id, phantom.xyz_mm + 0.1, blocks, joint))
+    alone = combined_targets(parts[:2], phantom)
+    np.testing.assert_allclose(alone.covariance, 0.01 * np.broadcast_to(np.eye(3), (5, 3, 3)))
+    np.testing.assert_allclose(alone.xyz_mm, phantom.xyz_mm)
+    with_good = combined_targets(parts, phantom)
+    np.testing.assert_allclose(with_good.covariance, parts[2].covariance)
+    np.testing.assert_allclose(with_good.xyz_mm, parts[2].xyz_mm)
+
+
 # ---- Anderson acceleration
 
 

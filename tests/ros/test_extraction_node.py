@@ -317,7 +317,7 @@ def test_markers_of_the_simulator_are_followed(graph):
 
 def test_markers_are_followed_in_both_views_together(graph, calibrated):
     """With the calibrations of both fluoroscopes; a missing view of an exposure is no obstacle."""
-    rate = 0.5
+    rate = 0.2  # a busy machine renders a view in seconds; one that is an exposure late is lost
     tracking = simulate_tracking(virtual_rig(1), 6.0, rate, 1, 0.0)
     markers = graph.directory / 'markers.csv'
     write_observations_csv(markers, {name: tracking.frames[name][:1] for name in NAMES})

@@ -219,7 +219,7 @@ def adjust_with_terms(
         if final:
             break
         factor = noise.information_factor(result.q)
-        if matrix is None or factor < NEARLY_ONE:
+        if matrix is None or factor < NEARLY_ONE or terms.needs_solution:
             matrix = factorize(
                 network, normal_equations(network, result.parameters, zero, noise, factor)
             )

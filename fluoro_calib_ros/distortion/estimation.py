@@ -104,6 +104,8 @@ class AdjustedTerms(ABC):
         Decrease of the cost that the last adjustment may leave.
     noise_tolerance : float
         Relative change of the scale of the noise at which the terms may settle.
+    needs_solution : bool
+        Whether terms are renewed with the normal matrix at a solution, not with one near it.
     values : list of ndarray
         Functions at the image points of each fluoroscope, (N, m) or (N, 2, p).
     """
@@ -111,6 +113,7 @@ class AdjustedTerms(ABC):
     intermediate_tolerance: float
     final_tolerance = FINAL_TOLERANCE
     noise_tolerance = SETTLED
+    needs_solution = False
     values: list[np.ndarray]
 
     @abstractmethod

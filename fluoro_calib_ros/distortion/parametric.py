@@ -73,6 +73,7 @@ class StepwiseTerms(AdjustedTerms):
     """
 
     intermediate_tolerance = LOOSE  # the tests of significance need a solution
+    needs_solution = True
 
     def __init__(self, problem: AdjustmentProblem) -> None:
         self.network = problem.network

@@ -58,7 +58,10 @@ def node_server():
 def _graph(request, directory):
     graph = Graph(directory, request.getfixturevalue('node_server'))
     request.node.graphs = [*getattr(request.node, 'graphs', ()), graph]
-    yield graph
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in graph.environment.items():  # of commands that a test runs beside it
+            patch.setenv(name, value)
+        yield graph
     graph.close()
 
 

@@ -60,13 +60,13 @@ class NodeServer:
         self._statuses = {}
         self._started = []
 
-    def start(self, node, arguments, log):
+    def start(self, node, arguments, log, environment):
         """Start a node, and return its ForkedNode."""
         Path(log).touch()
         request = {
             'module': f'{PACKAGE}.{node}',
             'arguments': [str(argument) for argument in arguments],
-            'environment': dict(os.environ),
+            'environment': environment,
             'log': str(log),
         }
         self._socket.sendall(json.dumps(request).encode() + b'\n')

@@ -28,6 +28,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+import rclpy
 from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.action import SelfCalibrate
@@ -50,6 +51,7 @@ from fluoro_calib_msgs.srv import (
 )
 from rcl_interfaces.srv import GetParameterTypes
 from rclpy.action import ActionClient
+from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
@@ -101,13 +103,17 @@ def has_stale_ports(domain):
     return any(f'fastrtps_port{port}' in names for port in range(first, first + 250))
 
 
+_next_domain = itertools.count(os.getpid())
+
+
 def free_domain():
     """Return an unused ROS domain of this machine, and the open lock file that reserves it.
 
-    A domain in which a killed process has left ports in shared memory comes last: Fast DDS may
-    take them for broken ones, and large messages are then lost.
+    The domain used last comes up again last, and behind all others one in which a killed process
+    has left ports in shared memory: Fast DDS may take them for broken ones, and messages are lost.
     """
-    domains = [1 + (os.getpid() + i) % 100 for i in range(100)]
+    first = next(_next_domain)
+    domains = [1 + (first + i) % 100 for i in range(100)]
     for domain in sorted(domains, key=has_stale_ports):
         path = Path(tempfile.gettempdir()) / f'fluoro_calib_test_domain_{domain}.lock'
         lock = open(path, 'a')  # noqa: SIM115 the lock is held by the caller
@@ -123,6 +129,13 @@ def free_domain():
     raise RuntimeError('all ROS domains from 1 to 100 are in use on this machine')
 
 
+def lost_ports(name, pid):
+    """Return a line with the ports of Fast DDS that a process uses although they were removed."""
+    maps = Path(f'/proc/{pid}/maps').read_text().splitlines()
+    lost = {line.split()[-2] for line in maps if 'fastrtps_port' in line and 'deleted' in line}
+    return f'{name}: {", ".join(sorted(lost)) or "none"}'
+
+
 def entry_point(node):
     """Return the command that runs a node, or the command line fluoro-calib."""
     module = 'fluoro_calib_ros.cli' if node == 'cli' else f'fluoro_calib_ros.nodes.{node}'
@@ -132,7 +145,7 @@ def entry_point(node):
 class Process:
     """A command as a process of its own; its output is in .log."""
 
-    def __init__(self, command, path):
+    def __init__(self, command, path, environment=None):
         self.path = path
         with open(path, 'wb') as out:
             self._process = subprocess.Popen(
@@ -141,7 +154,7 @@ class Process:
                 stdout=out,
                 stderr=out,
                 start_new_session=True,
-                env={**os.environ, 'PYTHONFAULTHANDLER': '1'},
+                env={**os.environ, **(environment or {}), 'PYTHONFAULTHANDLER': '1'},
             )
 
     @property
@@ -187,13 +200,16 @@ class Process:
 class ForkedProcess(Process):
     """A node as a process that is forked from the NodeServer."""
 
-    def __init__(self, server, node, arguments, path):
+    def __init__(self, server, node, arguments, path, environment):
         self.path = path
-        self._process = server.start(node, arguments, path)
+        self._process = server.start(node, arguments, path, {**os.environ, **environment})
 
 
 class Graph:
-    """Nodes and a client in a namespace of their own.
+    """Nodes and a client in a ROS domain and a namespace of their own.
+
+    No graph uses the ports of one that has just ended: Fast DDS removes those in shared memory at
+    the end of a process, and a node that opens one meanwhile may lose all messages to it.
 
     .fork: whether nodes are forked from a process that has loaded their modules; else each is the
     command of a user.
@@ -207,7 +223,11 @@ class Graph:
         self.namespace = f'/rig{next(self._numbers)}'
         self.directory = directory
         self.processes = []
-        self.client = Client(self.namespace)
+        domain, self._lock = free_domain()
+        self.environment = {'ROS_DOMAIN_ID': str(domain)}
+        self._context = Context()
+        rclpy.init(args=[], context=self._context, domain_id=domain)
+        self.client = Client(self.namespace, self._context)
 
     def start(self, node, parameters=None, remaps=None, wait=True):
         """Start a node with parameters and remaps; returns its Process once the client is
@@ -224,9 +244,9 @@ class Graph:
             arguments += ['-r', f'{key}:={value}']
         log = self.directory / f'{number}_{node}.log'
         if self.fork:
-            process = ForkedProcess(self._server, node, arguments, log)
+            process = ForkedProcess(self._server, node, arguments, log, self.environment)
         else:
-            process = Process(entry_point(node) + arguments, log)
+            process = Process(entry_point(node) + arguments, log, self.environment)
         self.processes.append(process)
         if wait:
             self.client.connect(node, process)
@@ -288,13 +308,16 @@ class Graph:
 
         end: whether the nodes are aborted, so that their logs show where the threads are.
         """
+        running = {p.path.stem: p.pid for p in self.processes if p.running}
+        ports = '\n'.join(map(lost_ports, ['client', *running], [os.getpid(), *running.values()]))
         for process in self.processes if end else ():
             process.abort()
         heard = [
             (key, f'{status.message}\n' + '\n'.join(f'{v.key}: {v.value}' for v in status.values))
             for key, status in self.client.statuses.items()
         ]
-        return heard + [(f'log of {p.path.name}', p.log) for p in self.processes]
+        logs = [(f'log of {p.path.name}', p.log) for p in self.processes]
+        return [*heard, ('ports in shared memory that were removed while in use', ports), *logs]
 
     def close(self):
         running = [p for p in self.processes if p.running]
@@ -303,17 +326,19 @@ class Graph:
         for process in running:
             process.end()
         self.client.close()
+        rclpy.shutdown(context=self._context)
+        self._lock.close()
 
 
 class Client(Node):
     """A user of the graph; messages[topic] collects the messages since listen(topic)."""
 
-    def __init__(self, namespace):
-        super().__init__('client', namespace=namespace)
+    def __init__(self, namespace, context):
+        super().__init__('client', namespace=namespace, context=context)
         self.messages = {}
         self.statuses = {}
         self.feedback = []
-        self._spinner = SingleThreadedExecutor()
+        self._spinner = SingleThreadedExecutor(context=context)
         self._spinner.add_node(self)
         self._callers = {}
         for service, kind in SERVICES.items():

@@ -27,7 +27,7 @@ def test_session_is_run_from_the_dashboard(graph, exposures, tmp_path, monkeypat
     node = graph.calibration_node(tmp_path / 'out', collect='request', phantm='mistyped')
     client = graph.client
     assert 'there is no parameter phantm, it has no effect; did you mean phantom?' in node.log
-    watch = SessionClient(graph.namespace)
+    watch = SessionClient(graph.namespace, graph.client.context)
     client._spinner.add_node(watch)
     pictures = []
     client.create_subscription(Image, 'a/coverage', pictures.append, latched_qos())

@@ -32,6 +32,7 @@ from fluoro_calib_msgs.action import SelfCalibrate
 from fluoro_calib_msgs.msg import CalibrationStatus
 from fluoro_calib_msgs.srv import Capture, Orient, Reset
 from rclpy.action import ActionClient
+from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
@@ -70,8 +71,8 @@ class SessionClient(Node):
     them apart.
     """
 
-    def __init__(self, namespace: str | None = None) -> None:
-        super().__init__('watch', namespace=namespace)
+    def __init__(self, namespace: str | None = None, context: Context | None = None) -> None:
+        super().__init__('watch', namespace=namespace, context=context)
         self._lock = threading.RLock()
         self._fluoroscopes: dict[str, FluoroscopeState] = {}
         self._followed: set[str] = set()

@@ -189,6 +189,15 @@ class _Solver:
 
 
 @dataclass(frozen=True)
+class _Step:
+    """A step as `BorderedFactor.solve` gives it, and the decrease of F that it predicts."""
+
+    x_blocks: np.ndarray
+    x_rest: np.ndarray
+    predicted: float
+
+
+@dataclass(frozen=True)
 class _Problem:
     """What an adjustment minimises: the cost of a network for a correction and a noise model."""
 
@@ -229,8 +238,8 @@ class _Problem:
         system = replace(solver.system, block_right=block_right, rest_right=rest_right)
         return replace(solver, system=system)
 
-    def step(self, iterate: _Iterate, solver: _Solver) -> tuple[Parameters, float]:
-        """Parameters after a step, and the decrease of F that it predicts."""
+    def step(self, solver: _Solver) -> _Step:
+        """The step that the normal equations give."""
         system = solver.system
         x_blocks, x_rest = solver.factor.solve(
             system.block_right[..., None], system.rest_right[:, None]
@@ -238,11 +247,17 @@ class _Problem:
         x_blocks = x_blocks[..., 0]
         x_rest = x_rest[:, 0]
         predicted = system.predicted_decrease(x_blocks, x_rest, solver.mu)
-        # The robustly weighted normal matrix is larger than the Fisher information. With heavy
-        # tails, stretched steps converge in a third of the iterations.
+        return _Step(x_blocks, x_rest, predicted)
+
+    def after(self, iterate: _Iterate, step: _Step) -> _Iterate:
+        """Iterate after a step.
+
+        The robustly weighted normal matrix is larger than the Fisher information. With heavy
+        tails, stretched steps converge in a third of the iterations.
+        """
         stretch = 1 / self.noise.information_factor(iterate.q)
-        step = self.elimination.to_unknowns(stretch * x_blocks, stretch * x_rest)
-        return self.network.parameters_after(iterate.parameters, step), predicted
+        x = self.elimination.to_unknowns(stretch * step.x_blocks, stretch * step.x_rest)
+        return self.evaluate(self.network.parameters_after(iterate.parameters, x))
 
 
 class _NielsenDamping:
@@ -304,21 +319,21 @@ class _LevenbergMarquardt:
             self._system = self._problem.linearise(self.current.parameters)
         try:
             solver = self._problem.factorize(self._system, self._damping.mu)
-            moved, predicted = self._problem.step(self.current, solver)
+            step = self._problem.step(solver)
         except (np.linalg.LinAlgError, ValueError):
             self.finished = self._damping.refuse()
             return
-        trial = self._problem.evaluate(moved)
+        trial = self._problem.after(self.current, step)
         if self._is_worse(trial):
-            self.converged = self._is_negligible(predicted)
+            self.converged = self._is_negligible(step.predicted)
             self.finished = self.converged or self._damping.refuse()
             return
-        self._damping.accept((self.current.cost - trial.cost) / max(predicted, 1e-300))
+        self._damping.accept((self.current.cost - trial.cost) / max(step.predicted, 1e-300))
         if not self._problem.network.relative:
             self.used = solver
             self._last = solver if self._problem.is_large else None
-        self._rate = predicted / self._predicted
-        self._accept(trial, predicted)
+        self._rate = step.predicted / self._predicted
+        self._accept(trial, step.predicted)
 
     def _repeat(self, solver: _Solver) -> bool:
         """Take a step with the factors of the last one; False where they do not serve.
@@ -328,21 +343,22 @@ class _LevenbergMarquardt:
         Problems", Springer 2011, 2.1.2).
         """
         solver = self._problem.at(self.current.parameters, solver)
-        moved, predicted = self._problem.step(self.current, solver)
+        step = self._problem.step(solver)
         slow = min(SLOWER * self._rate, REPEATED_SLOW)
         limit = REPEATED_DECREASE * self._problem.network.n_image_points
-        if predicted > min(max(REPEATED, slow) * self._predicted, limit):
+        # Where an exposure had almost no weight, the step may be of any size, even infinite.
+        if not step.predicted <= min(max(REPEATED, slow) * self._predicted, limit):
             return False
-        trial = self._problem.evaluate(moved)
+        trial = self._problem.after(self.current, step)
         if self._is_worse(trial):
-            self.converged = self._is_negligible(predicted)
+            self.converged = self._is_negligible(step.predicted)
             self.finished = self.converged
             return self.converged
-        self._accept(trial, predicted)
+        self._accept(trial, step.predicted)
         return True
 
     def _is_worse(self, trial: _Iterate) -> bool:
-        return trial.cost > self.current.cost + ROUNDING * abs(self.current.cost)
+        return not trial.cost <= self.current.cost + ROUNDING * abs(self.current.cost)
 
     def _is_negligible(self, predicted: float) -> bool:
         limit = min(self._tolerance, NEGLIGIBLE_DECREASE)

@@ -68,13 +68,17 @@ class BorderedSystem:
         return replace(self, blocks=blocks, rest=rest)
 
     def predicted_decrease(self, x_blocks: np.ndarray, x_rest: np.ndarray, mu: float) -> float:
-        """Decrease of the cost that a step damped by mu makes in the linearised problem."""
-        undamped = np.sum(x_blocks * self.block_right) + np.sum(x_rest * self.rest_right)
-        damping = mu * (
-            np.einsum('ki,kii,ki', x_blocks, self.blocks, x_blocks)
-            + np.sum(x_rest * x_rest * np.diag(self.rest))
-        )
-        return float((undamped + damping) / 2)
+        """Decrease of the cost that a step damped by mu makes in the linearised problem.
+
+        Not finite where the step is too large for it.
+        """
+        with np.errstate(over='ignore', invalid='ignore'):
+            undamped = np.sum(x_blocks * self.block_right) + np.sum(x_rest * self.rest_right)
+            damping = mu * (
+                np.einsum('ki,kii,ki', x_blocks, self.blocks, x_blocks)
+                + np.sum(x_rest * x_rest * np.diag(self.rest))
+            )
+            return float((undamped + damping) / 2)
 
     def singular_schur_complement(self) -> np.ndarray:
         """Schur complement (q, q) of the rest by pseudo-inverses: the blocks may be singular."""

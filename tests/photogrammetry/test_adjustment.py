@@ -492,6 +492,23 @@ def test_start_off_the_gauge_gives_the_same_solution():
     assert far.cost == pytest.approx(near.cost, abs=1e-2)
 
 
+@pytest.mark.parametrize('seed', range(56, 60))
+def test_an_exposure_without_weight_causes_no_overflow(seed):
+    """Its weights change by hundreds of orders of magnitude between two steps."""
+    network, truth = rigs.small_network(exposures=6, targets=40, seed=seed)
+    rng = np.random.default_rng(seed)
+    values = Functions((1024, 1024), 3)(network.uv)
+    count = 2 * values.shape[1]
+    network = replace(network, additional=(AdditionalParameters(values, 1e-4 * np.eye(count)),))
+    position = truth.position_mm.copy()
+    position[0] += rng.normal(0, 15, 3)
+    start = replace(truth, position_mm=position, additional=(rng.normal(0, 6, count),))
+    with warnings.catch_warnings():
+        warnings.simplefilter('error')
+        result = adjust(network, start, noise=Noise(scale=0.3, nu=200.0, gross=0.01))
+    assert np.isfinite(result.cost)
+
+
 def test_running_out_of_steps_is_reported():
     network, truth = rigs.small_network(**MANY_TARGETS)
     result = adjust(

@@ -112,7 +112,7 @@ def _summary(results, good, known):
             lines.append(
                 f'- NSE of the {name} (model auto): mean {np.mean(values):.2f}, median '
                 f'{np.median(values):.2f}, {inside} of {len(values)} cases within {HONEST[0]} to '
-                f'{HONEST[1]}.'
+                f'{HONEST[1]}.{_significance(automatic, f"{name}_nse", by_case)}'
             )
     verdicts = [judge(r, known[r['case']]) for r in good]
     counts = {name: verdicts.count(name) for name in ('right', 'wrong', 'open')}
@@ -129,6 +129,26 @@ def _summary(results, good, known):
         if 'said' in r:
             lines.append(f'  - refused: {r["case"]} (seed {r["seed"]}): {r["said"]}')
     return '\n'.join(lines)
+
+
+def _significance(results, key, by_case):
+    """Sentence on the scatter between the seeds, and on the cases that it does not explain."""
+    logs = {name: np.log([r[key] for r in results if r['case'] == name]) for name in by_case}
+    freedom = sum(len(values) - 1 for values in logs.values())
+    if not freedom:
+        return ''
+    squares = sum(np.sum((values - values.mean()) ** 2) for values in logs.values())
+    scatter = np.sqrt(squares / freedom)
+    low, high = np.log(HONEST)
+    far = [
+        name
+        for name, values in logs.items()
+        if max(low - values.mean(), values.mean() - high) > 2 * scatter / np.sqrt(len(values))
+    ]
+    return (
+        f' The seeds of a case scatter by a factor of {np.exp(scatter):.2f}; outside by more than '
+        f'two standard errors (geometric means): {", ".join(far) or "none"}.'
+    )
 
 
 def _by_case(results, key):

@@ -88,12 +88,16 @@ class DistanceComparison:
     ----------
     rmse_mm, expected_mm : float
         RMS difference from the survey, and its expectation [mm].
+    freedom : float
+        Degrees of freedom of the chi-square distribution that the squared RMS difference has,
+        nearly.
     scale, scale_sd : float
         Scale of the images relative to the survey - 1, and its standard deviation.
     """
 
     rmse_mm: float
     expected_mm: float
+    freedom: float
     scale: float
     scale_sd: float
 
@@ -242,8 +246,31 @@ def distances(beads: Beads) -> DistanceComparison:
     error = np.linalg.norm(found, axis=1) - length
     scale, scale_sd = _scale(beads)
     return DistanceComparison(
-        float(np.sqrt(np.mean(error**2))), float(np.sqrt(np.mean(variance))), scale, scale_sd
+        float(np.sqrt(np.mean(error**2))),
+        float(np.sqrt(np.mean(variance))),
+        _degrees_of_freedom(direction, total),
+        scale,
+        scale_sd,
     )
+
+
+def _degrees_of_freedom(direction: np.ndarray, covariance: np.ndarray) -> float:
+    """Return those of the sum of squared errors of all distances between n beads.
+
+    It is a quadratic form e^T A e of the errors e of the beads, with covariance C, and distributed
+    nearly as chi-square with (tr AC)^2 / tr (AC)^2 degrees of freedom (Box, "Some theorems on
+    quadratic forms", Annals of Mathematical Statistics 25, 1954). direction (n (n - 1) / 2, 3):
+    of the distances, as numpy.triu_indices orders them; covariance (n, 3, 3).
+    """
+    n = len(covariance)
+    i, j = np.triu_indices(n, 1)
+    form = np.zeros((n, n, 3, 3))
+    form[i, j] = -direction[:, :, None] * direction[:, None, :]
+    form += form.transpose(1, 0, 2, 3)
+    form[np.arange(n), np.arange(n)] = -form.sum(axis=1)
+    product = form @ covariance
+    trace = np.einsum('iiaa', product)
+    return float(trace**2 / np.sum(product * product.transpose(1, 0, 3, 2)))
 
 
 def _rays(job: CalibrationResult, frames: Mapping[str, Sequence[Frame]]) -> Rays:

@@ -33,9 +33,11 @@ MARGIN = (
     0.13  # over the expectation, with GOOD_EXPOSURES; it grows as the root of their number falls
 )
 EXPOSURE_LIMIT = 1.6  # times the expectation
-# Robust standard deviations of the logarithms over all exposures that an exposure may stand out
-# by: where the noise differs from exposure to exposure, much of it in one is no fault of that one.
-EXPOSURE_SCATTER = 3.5
+# Robust standard deviations of the logarithms over all exposures that one of many exposures may
+# stand out by; n exposures add SCATTER_OF_FEW / n. Where the noise differs from exposure to
+# exposure, much of it in one is no fault of that one.
+EXPOSURE_SCATTER = 4.0
+SCATTER_OF_FEW = 20.0
 MIN_NOISE = 0.05  # part of the squared residuals in sample that is noise, whatever the trend
 
 
@@ -159,10 +161,12 @@ def exposure_limit(ratio: np.ndarray) -> float:
 
     ratio (m,): of all exposures; half of them or fewer are at fault. The scatter of their
     logarithms is the median absolute deviation, times 1.4826 (Huber, "Robust Statistics", 1981).
+    The largest of 6 to 100 normal deviates exceeds the limit in 0.5 to 1.5 % of samples.
     """
     size = np.log(ratio)
     scatter = 1.4826 * np.median(np.abs(size - np.median(size)))
-    return float(max(EXPOSURE_LIMIT, np.exp(EXPOSURE_SCATTER * scatter)))
+    factor = EXPOSURE_SCATTER + SCATTER_OF_FEW / len(ratio)
+    return float(max(EXPOSURE_LIMIT, np.exp(factor * scatter)))
 
 
 HELD_OUT = Subject(check_held_out, steps=FOLDS)

@@ -115,3 +115,7 @@ def test_noise_that_differs_between_exposures_accuses_none():
         ratio = np.exp(rng.uniform(np.log(0.1), np.log(0.6), 15))
         ratio /= np.median(ratio)
         assert ratio.max() < exposure_limit(ratio)
+    for count in (6, 15, 60):
+        ratios = np.exp(rng.normal(0, 0.3, (2000, count)))
+        accused = [max(ratio) / np.median(ratio) > exposure_limit(ratio) for ratio in ratios]
+        assert np.mean(accused) < 0.02

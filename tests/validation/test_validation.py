@@ -435,6 +435,28 @@ def test_distances_give_scale_and_precision():
     assert compare_with_survey(replace(beads, survey_sd_mm=np.full(n, 0.02)))[1].passed is False
 
 
+def test_distances_of_few_beads_scatter_as_expected():
+    """Good surveys of a small phantom fail by chance as rarely as those of a large one."""
+    rng = np.random.default_rng(1)
+    n = 20
+    survey = rng.uniform(-60, 60, (n, 3))
+    factor = 0.1 * rng.normal(size=(n, 3, 3))
+    covariance = factor @ factor.transpose(0, 2, 1)
+
+    def beads(factor):
+        error = (factor @ rng.normal(size=(n, 3, 1)))[:, :, 0]
+        return Beads(
+            np.arange(n), survey + error, covariance, np.full(n, 4), survey, np.full(n, 1e-6)
+        )
+
+    found = [distances(beads(factor)) for _ in range(1000)]
+    square = np.array([d.rmse_mm**2 / d.expected_mm**2 for d in found])
+    assert np.var(square) == pytest.approx(2 / found[0].freedom, rel=0.15)
+    checks = [compare_with_survey(beads(factor))[1].passed for _ in range(300)]
+    assert checks.count(False) <= 4
+    assert compare_with_survey(beads(1.5 * factor))[1].passed is False
+
+
 def test_too_few_beads():
     none = Beads(
         np.arange(2),

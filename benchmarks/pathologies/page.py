@@ -133,21 +133,21 @@ def _summary(results, good, known):
 
 def _significance(results, key, by_case):
     """Sentence on the scatter between the seeds, and on the cases that it does not explain."""
-    logs = {name: np.log([r[key] for r in results if r['case'] == name]) for name in by_case}
-    freedom = sum(len(values) - 1 for values in logs.values())
+    values = {name: [r[key] for r in results if r['case'] == name] for name in by_case}
+    freedom = sum(len(of_case) - 1 for of_case in values.values())
     if not freedom:
         return ''
-    squares = sum(np.sum((values - values.mean()) ** 2) for values in logs.values())
-    scatter = np.sqrt(squares / freedom)
-    low, high = np.log(HONEST)
-    far = [
-        name
-        for name, values in logs.items()
-        if max(low - values.mean(), values.mean() - high) > 2 * scatter / np.sqrt(len(values))
-    ]
+    # The logarithms scatter alike in all cases; their mean is not that of the values.
+    squares = sum(len(of_case) * np.var(np.log(of_case)) for of_case in values.values())
+    scatter = np.sqrt(np.exp(squares / freedom) - 1)
+    far = []
+    for name, of_case in values.items():
+        margin = 2 * scatter / np.sqrt(len(of_case))
+        if not HONEST[0] / (1 + margin) <= by_case[name] <= HONEST[1] / max(1 - margin, 0.1):
+            far.append(name)
     return (
-        f' The seeds of a case scatter by a factor of {np.exp(scatter):.2f}; outside by more than '
-        f'two standard errors (geometric means): {", ".join(far) or "none"}.'
+        f' The seeds of a case scatter by {100 * scatter:.0f} %; outside by more than two '
+        f'standard errors: {", ".join(far) or "none"}.'
     )
 
 

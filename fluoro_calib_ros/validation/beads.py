@@ -112,7 +112,8 @@ def compare_with_survey(
     )
     return [
         judge('beads', '', finding, has_trend),
-        _check_distances(beads.without(beads.target_id[wrong]), has_trend),
+        # A bead that is in place without one of its rays has a false match and tells nothing.
+        _check_distances(beads.without(beads.target_id[suspects]), has_trend),
     ]
 
 

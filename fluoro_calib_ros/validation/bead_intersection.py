@@ -242,35 +242,36 @@ def distances(beads: Beads) -> DistanceComparison:
     length = np.linalg.norm(surveyed, axis=1)
     direction = surveyed / np.maximum(length, 1e-9)[:, None]
     total = beads.total_covariance
-    variance = _variance_along(direction, total[i]) + _variance_along(direction, total[j])
+    variance = np.stack([_variance_along(direction, total[k]) for k in (i, j)])
     error = np.linalg.norm(found, axis=1) - length
     scale, scale_sd = _scale(beads)
     return DistanceComparison(
         float(np.sqrt(np.mean(error**2))),
-        float(np.sqrt(np.mean(variance))),
-        _degrees_of_freedom(direction, total),
+        float(np.sqrt(np.mean(variance.sum(axis=0)))),
+        _degrees_of_freedom(direction, total, variance),
         scale,
         scale_sd,
     )
 
 
-def _degrees_of_freedom(direction: np.ndarray, covariance: np.ndarray) -> float:
+def _degrees_of_freedom(
+    direction: np.ndarray, covariance: np.ndarray, variance: np.ndarray
+) -> float:
     """Return those of the sum of squared errors of all distances between n beads.
 
     It is a quadratic form e^T A e of the errors e of the beads, with covariance C, and distributed
     nearly as chi-square with (tr AC)^2 / tr (AC)^2 degrees of freedom (Box, "Some theorems on
-    quadratic forms", Annals of Mathematical Statistics 25, 1954). direction (n (n - 1) / 2, 3):
-    of the distances, as numpy.triu_indices orders them; covariance (n, 3, 3).
+    quadratic forms", Annals of Mathematical Statistics 25, 1954). A has the blocks -d d^T for
+    directions d (n (n - 1) / 2, 3) of distances, as numpy.triu_indices orders them, and their sums
+    in the diagonal. covariance (n, 3, 3); variance (2, n (n - 1) / 2): d^T C d of both beads.
     """
-    n = len(covariance)
-    i, j = np.triu_indices(n, 1)
-    form = np.zeros((n, n, 3, 3))
-    form[i, j] = -direction[:, :, None] * direction[:, None, :]
-    form += form.transpose(1, 0, 2, 3)
-    form[np.arange(n), np.arange(n)] = -form.sum(axis=1)
-    product = form @ covariance
-    trace = np.einsum('iiaa', product)
-    return float(trace**2 / np.sum(product * product.transpose(1, 0, 3, 2)))
+    diagonal = np.zeros_like(covariance)
+    products = direction[:, :, None] * direction[:, None, :]
+    for index in np.triu_indices(len(covariance), 1):
+        np.add.at(diagonal, index, products)
+    own = diagonal @ covariance
+    squares = 2 * np.sum(variance[0] * variance[1]) + np.sum(own * own.transpose(0, 2, 1))
+    return float(np.sum(variance) ** 2 / squares)
 
 
 def _rays(job: CalibrationResult, frames: Mapping[str, Sequence[Frame]]) -> Rays:

@@ -169,7 +169,11 @@ class CollocationTerms(AdjustedTerms):
             rings = RINGS if functions.modes else 0
             functions, matrix = functions.as_rings(series.coefficients, TREND_DEGREE, rings)
             self._set_functions(f, functions)
-            self.priors.append(prior or self._prior_of(f, matrix, before.noise.scale))
+            if prior is None:
+                prior = self._prior_of(f, matrix, before.noise.scale)
+            else:
+                self._searches[f] = MAX_SEARCHES  # done where this prior was estimated
+            self.priors.append(prior)
             start.append(matrix.ravel())
         self._start = tuple(start)
 

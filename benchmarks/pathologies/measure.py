@@ -26,6 +26,7 @@ from .scene import NAMES
 RESECTION_STEPS = 6
 INTERSECTION_STEPS = 4
 GRID = 31
+SAMPLE = 1000  # image points whose joint covariance is used
 COVER = 1.96  # standard deviations of a 95 % interval
 
 
@@ -160,6 +161,7 @@ def claims(scene, result):
     out = _statistics('correction', error, np.broadcast_to(sd, error.shape))
     out['correction_px'] = float(np.sqrt(np.mean(error**2)))
     out['correction_sd_px'] = float(np.sqrt(np.mean(found.sd[inside] ** 2)))
+    out['correction_freedom'] = independent_errors(run, model)
     good = ~np.isin(result.targets.target_id - 1, scene.displaced)
     offset = result.targets.xyz_mm - scene.true_mm[result.targets.target_id - 1]
     sd = np.sqrt(np.diagonal(result.targets.covariance, axis1=1, axis2=2))
@@ -169,6 +171,27 @@ def claims(scene, result):
     offset = np.stack([e.position_mm for e in exposures]) - true_sources
     out |= _statistics('sources', offset, np.stack([e.sd_mm for e in exposures]))
     return out
+
+
+def independent_errors(run, model):
+    """Number of independent errors in the claimed covariance of a correction, at image points.
+
+    An NSE of so many errors scatters as chi squared over its degrees of freedom (Box 1954, Theorem
+    3.1). None for a model that is not estimated in the adjustment.
+    """
+    network = run.measured.network
+    additional = network.additional[0] if network.additional else None
+    if additional is None or additional.functions.ndim != 2 or run.stated is not None:
+        return None
+    covariance = run.precision.additional[0]
+    rows = np.arange(len(additional.functions))[:: len(additional.functions) // SAMPLE + 1]
+    values = additional.functions[rows]
+    scaled = values / model.evaluate(network.uv[network.rows(0)][rows]).sd[:, None]
+    m = values.shape[1]
+    parts = covariance[: 2 * m, : 2 * m].reshape(2, m, 2, m)
+    blocks = [[scaled @ parts[i, :, j] @ scaled.T for j in (0, 1)] for i in (0, 1)]
+    normalised = np.block(blocks)
+    return float(np.trace(normalised) ** 2 / np.sum(normalised**2))
 
 
 def _statistics(name, error, sd):

@@ -15,11 +15,13 @@
 """The page docs/pathologies.md from the results."""
 
 import numpy as np
+from scipy.stats import chi2
 
 MAX_RATIO = 1.15
 MAX_NSE = 1.5
 HONEST = (0.8, 1.25)
 WORST = 5
+TAIL = 0.01  # of the distribution of an NSE
 
 TEXT = """# Pathologies
 
@@ -39,8 +41,9 @@ with a standard deviation of 0.1 mm. Model: {model}.
 - **stereo**: the same for points intersected from both fluoroscopes, with noise, in mm.
 - **NSE**: mean of (error / claimed standard deviation)^2 of the correction (grid within the
   calibrated area, in the gauge of the calibration), the object points and the sources of
-  fluoroscope a; 1 is honest. One calibration has few independent source errors: their NSE
-  scatters by about 0.7 for a seed.
+  fluoroscope a; 1 is honest. A calibration has few independent errors, so that its NSE scatters:
+  that of the sources by about 0.7, that of the correction as chi squared over its degrees of
+  freedom, which follow from the claimed covariance (Box 1954).
 - **cover**: share [%] of errors within the claimed 95 % interval, in the same order.
 - **verdict** on fluoroscope a: right where it is `pass` with ratio <= {max_ratio} and NSE of the
   correction <= {max_nse}, or not `pass` otherwise; where the phantom or its survey is faulty,
@@ -114,6 +117,7 @@ def _summary(results, good, known):
                 f'{np.median(values):.2f}, {inside} of {len(values)} cases within {HONEST[0]} to '
                 f'{HONEST[1]}.{_significance(automatic, f"{name}_nse", by_case)}'
             )
+    lines += _beyond_scatter(automatic)
     verdicts = [judge(r, known[r['case']]) for r in good]
     counts = {name: verdicts.count(name) for name in ('right', 'wrong', 'open')}
     if any(counts.values()):
@@ -149,6 +153,25 @@ def _significance(results, key, by_case):
         f' The seeds of a case scatter by {100 * scatter:.0f} %; outside by more than two '
         f'standard errors: {", ".join(far) or "none"}.'
     )
+
+
+def _beyond_scatter(results):
+    """Line on the NSE of corrections that their own claimed covariances do not explain."""
+    known = [r for r in results if r.get('correction_freedom')]
+    if not known:
+        return []
+    freedom = np.array([r['correction_freedom'] for r in known])
+    nse = np.array([r['correction_nse'] for r in known])
+    low, high = (chi2.ppf(p, freedom) / freedom for p in (TAIL, 1 - TAIL))
+    above = sorted({r['case'] for r, is_above in zip(known, nse > high) if is_above})
+    return [
+        f'- Independent errors of a correction: median {np.median(freedom):.0f}, least '
+        f'{freedom.min():.0f}; the NSE of the median scatters by '
+        f'{100 * np.sqrt(2 / np.median(freedom)):.0f} %. Of {len(known)} calibrations, '
+        f'{np.sum(nse > high)} have an NSE above the {100 * (1 - TAIL):.0f} % point of their '
+        f'scatter ({", ".join(above) or "none"}), {np.sum(nse < low)} one below the '
+        f'{100 * TAIL:.0f} % point; {TAIL * len(known):.1f} each are expected.'
+    ]
 
 
 def _by_case(results, key):

@@ -24,12 +24,14 @@ W makes residuals of them, plus what the errors of the survey contribute (Foerst
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from fluoro_calib_ros.calibration.joint_precision import SolvedNetwork
 from fluoro_calib_ros.calibration.rounds import SelfCalibration
 from fluoro_calib_ros.distortion.collocation import RINGS, TREND_DEGREE
-from fluoro_calib_ros.distortion.series import Functions
+from fluoro_calib_ros.distortion.series import Functions, without_absent_bands
 from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
 from fluoro_calib_ros.photogrammetry.collinearity import project_with_jacobian
 
@@ -124,8 +126,8 @@ def _functions(run: SelfCalibration) -> Functions:
     model = run.models[run.measured.fluoroscopes[0]]
     if model.series is None:
         raise ValueError('the model is not collocation')
-    modes = model.series.functions.modes
-    return Functions(run.measured.image_size[0], TREND_DEGREE, modes, RINGS if modes else 0)
+    functions, _ = without_absent_bands(model.series.functions, model.series.coefficients)
+    return replace(functions, degree=TREND_DEGREE, rings=RINGS if functions.modes else 0)
 
 
 def _additional(run: SelfCalibration) -> AdditionalParameters:

@@ -50,7 +50,8 @@ from .priors import (
     prior_precision,
     starting_prior,
 )
-from .series import Functions, Series, sd_over_image
+from .ripples import ripples_of, shown_ripples
+from .series import Functions, Series, sd_over_image, without_absent_bands
 from .series_model import SeriesModel
 
 if TYPE_CHECKING:
@@ -143,6 +144,7 @@ class CollocationTerms(AdjustedTerms):
         self.values: list[np.ndarray] = []
         self.exposure_terms: list[ExposureTerms | None] = [None] * len(self.sizes)
         self._variation_tested = modes == 0
+        self._ripples_searched = modes == 0
         self._mode_changes = 0
         self._settled = 0
         self._searches = [0] * len(self.sizes)
@@ -161,6 +163,7 @@ class CollocationTerms(AdjustedTerms):
     def _continue(self, earlier: EarlierTerms, before: Adjustment) -> None:
         """Start with earlier series, and with the priors that are most likely for them."""
         self._variation_tested = not earlier.is_varying
+        self._ripples_searched = True  # those of the earlier series are kept
         self.final_tolerance = CONTINUED_TOLERANCE
         self._mode_changes = 1  # those of the earlier series are not the first
         start = []
@@ -168,6 +171,7 @@ class CollocationTerms(AdjustedTerms):
             functions = series.functions
             rings = RINGS if functions.modes else 0
             functions, matrix = functions.as_rings(series.coefficients, TREND_DEGREE, rings)
+            functions, matrix = without_absent_bands(functions, matrix)
             self._set_functions(f, functions)
             if prior is None:
                 prior = self._prior_of(f, matrix, before.noise.scale)
@@ -188,6 +192,8 @@ class CollocationTerms(AdjustedTerms):
         coefficients = matrix.ravel()
         sd = max(float(np.std(self.values[f] @ matrix.T)), MIN_START_SD_PX)
         start = starting_prior(self.functions[f], sd)
+        ripples = ripples_of(self.functions[f], matrix)
+        start = replace(start, signal=replace(start.signal, ripples=ripples))
         return most_likely_prior(
             self.functions[f], information, information @ coefficients, self.gauges[f], start
         )
@@ -238,7 +244,7 @@ class CollocationTerms(AdjustedTerms):
         values = coefficients[own].reshape(2, -1)
         if has_rings(functions, self.priors[f]):
             return Series(*functions.as_polynomials(values), sd)
-        plain = replace(functions, rings=0)
+        plain = replace(functions, rings=0, absent=())
         return Series(plain, plain.converted(functions, values.ravel()).reshape(2, -1), sd)
 
     def left_out(self, f: int) -> LeftOut | None:
@@ -284,12 +290,17 @@ class CollocationTerms(AdjustedTerms):
             for f in range(len(self.functions))
         ]
         modes = [modes for modes, _ in found]
-        present_modes = [functions.modes for functions in self.functions]
+        present_modes = [functions.complete for functions in self.functions]
         if modes != present_modes and self._mode_changes < MODE_CHANGES:
             self._mode_changes += 1
             self._settled = 0
             return False, self._with_modes(modes, coefficients)
         settled = all(steady for _, steady in found)
+        if settled and not self._ripples_searched:
+            # Ripples may pass for a change between exposures.
+            self._ripples_searched = True
+            if self._add_ripples(adjustment):
+                return False, self._with_modes(present_modes, coefficients)
         if settled and not self._variation_tested:
             self._variation_tested = True
             if self._add_exposure_terms(adjustment):
@@ -315,19 +326,39 @@ class CollocationTerms(AdjustedTerms):
         """
         modes = []
         for f, functions in enumerate(self.functions):
-            rows = self.network.rows(f)
-            rows = rows[adjustment.inliers[rows]]
-            points = FittedPoints(
-                self.network.uv[rows], adjustment.residuals[rows], self.network.exposure[rows]
+            missing = functions.complete < MAX_MODES and has_common_error(
+                self._fitted_points(f, adjustment)
             )
-            missing = functions.modes < MAX_MODES and has_common_error(points)
-            modes.append(MAX_MODES if missing else functions.modes)
+            modes.append(MAX_MODES if missing else functions.complete)
             if missing:
-                signal = self.priors[f].signal.with_ripples(max(self.sizes[f]))
+                signal = self.priors[f].signal.with_short_field(max(self.sizes[f]))
                 self.priors[f] = replace(self.priors[f], signal=signal)
-        if modes == [functions.modes for functions in self.functions]:
+        if modes == [functions.complete for functions in self.functions]:
             return None
         return self._with_modes(modes, coefficients)
+
+    def _add_ripples(self, adjustment: Adjustment) -> bool:
+        """Add ripples that residuals show in few bands of frequencies; True if any."""
+        added = False
+        for f, functions in enumerate(self.functions):
+            points = self._fitted_points(f, adjustment)
+            if not has_common_error(points):
+                continue
+            found = shown_ripples(self.sizes[f], points.uv, points.residuals, functions.complete)
+            if found is not None:
+                signal = self.priors[f].signal
+                signal = replace(signal, ripples=found.joined(signal.ripples))
+                self.priors[f] = replace(self.priors[f], signal=signal)
+                added = True
+        return added
+
+    def _fitted_points(self, f: int, adjustment: Adjustment) -> FittedPoints:
+        """Inliers of fluoroscope f."""
+        rows = self.network.rows(f)
+        rows = rows[adjustment.inliers[rows]]
+        return FittedPoints(
+            self.network.uv[rows], adjustment.residuals[rows], self.network.exposure[rows]
+        )
 
     def _renew_prior(
         self, f: int, network: Network, matrix: FactorizedNormalMatrix, coefficients: np.ndarray
@@ -389,22 +420,30 @@ class CollocationTerms(AdjustedTerms):
         if not functions.modes:
             return 0
         m = len(functions)
+        complete = functions.complete
         level = float(np.mean(np.diagonal(information)[functions.trend : m]))
         numbers = np.arange(MIN_MODES, MAX_MODES + 1)
-        variance = self.priors[f].signal.variance(numbers * functions.frequency_of_mode)
+        variance = self.priors[f].signal.density(numbers * functions.frequency_of_mode)
         enough = numbers[variance * level < NEGLIGIBLE]
         wanted = int(enough[0]) if len(enough) else MAX_MODES
-        kept = FEWER_MODES * functions.modes <= wanted <= functions.modes
-        return functions.modes if kept and self._mode_changes else wanted
+        kept = FEWER_MODES * complete <= wanted <= complete
+        return complete if kept and self._mode_changes else wanted
 
     def _with_modes(
         self, modes: list[int], coefficients: tuple[np.ndarray, ...]
     ) -> tuple[np.ndarray, ...]:
-        """Use these numbers of modes; return the coefficients for them."""
+        """Use all sines up to these numbers of modes, and those of ripples.
+
+        Returns the coefficients for them.
+        """
         out = []
         for f, functions in enumerate(self.functions):
+            ripples = self.priors[f].signal.ripples
+            bands = ripples.bands if ripples is not None else ()
+            highest = max((modes[f], *bands))
+            absent = tuple(b for b in range(modes[f] + 1, highest) if b not in bands)
             self._set_functions(
-                f, Functions(self.sizes[f], TREND_DEGREE, modes[f], functions.rings)
+                f, Functions(self.sizes[f], TREND_DEGREE, highest, functions.rings, absent)
             )
             end = 2 * len(functions)
             series = self.functions[f].converted(functions, coefficients[f][:end])

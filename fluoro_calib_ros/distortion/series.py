@@ -60,12 +60,16 @@ class Functions:
     rings : int
         Number of radial polynomials R of the degrees 5, 7, ... (see `terms.ring_coefficients`),
         each with the functions x R(r) / r and y R(r) / r; r is 1 at the corners of the image.
+    absent : tuple of int
+        Bands whose sines are left out. The band of a sine is its frequency over that of one half
+        wave along the longer side, rounded.
     """
 
     image_size: tuple[int, int]
     degree: int
     modes: int = 0
     rings: int = 0
+    absent: tuple[int, ...] = ()
 
     @cached_property
     def powers(self) -> list[tuple[int, int]]:
@@ -79,7 +83,10 @@ class Functions:
         i, j = np.meshgrid(
             np.arange(1, self.modes + 1), np.arange(1, self.modes + 1), indexing='ij'
         )
-        keep = np.hypot(i / extent[0], j / extent[1]) <= (self.modes + 0.5) / MARGIN
+        number = MARGIN * np.hypot(i / extent[0], j / extent[1])
+        keep = number <= self.modes + 0.5
+        if self.absent:
+            keep &= ~np.isin(np.rint(number), self.absent)
         return np.stack([i[keep], j[keep]], axis=1)
 
     @cached_property
@@ -92,10 +99,20 @@ class Functions:
         """Angular frequency [1/px] of one half wave along the longer side."""
         return np.pi / (MARGIN * max(self.image_size))
 
+    @cached_property
+    def band(self) -> np.ndarray:
+        """Band (s,) of each sine."""
+        return np.rint(self.frequency / self.frequency_of_mode).astype(int)
+
+    @property
+    def complete(self) -> int:
+        """Number of the bands below the first that is left out."""
+        return min((self.modes, *(band - 1 for band in self.absent)))
+
     @property
     def highest(self) -> float:
-        """Angular frequency [1/px] up to which there are sines."""
-        return (self.modes + 0.5) * self.frequency_of_mode
+        """Angular frequency [1/px] up to which no sine is left out."""
+        return (self.complete + 0.5) * self.frequency_of_mode
 
     def __len__(self) -> int:
         return self.trend + len(self._sines)
@@ -236,6 +253,22 @@ class Series:
             * (SD_GRID - 1)
         )
         return map_coordinates(self.sd, place[:, ::-1].T, order=1, mode='nearest')
+
+
+def without_absent_bands(
+    functions: Functions, coefficients: np.ndarray
+) -> tuple[Functions, np.ndarray]:
+    """Leave out the bands of sines whose coefficients are all zero.
+
+    Returns the functions that remain, and their coefficients (2, m).
+    """
+    sizes = np.abs(coefficients[:, functions.trend :]).sum(axis=0)
+    present = np.unique(functions.band[sizes > 0])
+    absent = tuple(int(band) for band in np.setdiff1d(functions.band, present))
+    if not absent or not len(present):
+        return functions, coefficients
+    out = replace(functions, absent=absent)
+    return out, out.converted(functions, coefficients.ravel()).reshape(2, -1)
 
 
 def packed(series: Series | None) -> tuple[int, int, np.ndarray, np.ndarray]:

@@ -32,6 +32,8 @@ import numpy as np
 from scipy.linalg import lapack, solve_triangular
 from scipy.special import j0
 
+from .ripples import Ripples
+
 # Smoothness nu of the long field: its range, and the median and the standard deviation of its
 # logarithm before it is estimated. It tells how much of the signal the sines leave out.
 SMOOTHNESS_RANGE = (1.0, 4.0)
@@ -57,10 +59,12 @@ MIN_SEARCH_GAIN = 3.0
 START_REACH = 0.15
 START_FINE_REACH = 0.06
 START_FINE_SHARE = 0.1  # of the standard deviation of the long field
-RIPPLES_PX = 0.2  # standard deviation of ripples that residuals show, to start with
-RIPPLES_REACH = 0.03
+SHOWN_PX = 0.2  # standard deviation of a short field that residuals show, to start with
+SHOWN_REACH = 0.03
 MAX_STEP = 0.8  # of the logarithm of a standard deviation or length
 STEPS = 4  # of the likelihood in one renewal
+RIPPLE_STEPS = 2  # of the variances of ripples in one renewal
+MIN_DETERMINED = 1e-3  # least number of coefficients that a sum counts as determined
 # Frequencies of a quadrature, from the lowest to so many times it.
 QUADRATURE = 120
 SHORTEST = 30.0
@@ -72,7 +76,8 @@ RIDGE = 0.05  # least damping: added to the expected curvature, it keeps what ha
 class Signal:
     """Standard deviations [px] and correlation lengths [px] of the long and the short field.
 
-    smoothness: nu of the long field.
+    smoothness: nu of the long field. ripples: further variances of the sines of some bands; they
+    are no part of the fields.
     """
 
     sd: float
@@ -80,6 +85,7 @@ class Signal:
     fine_sd: float = 0.0
     fine_reach: float = 1.0
     smoothness: float = SMOOTHNESS
+    ripples: Ripples | None = None
 
     @property
     def fields(self) -> tuple[tuple[float, float, float], ...]:
@@ -88,17 +94,25 @@ class Signal:
         fine = (self.fine_sd, self.fine_reach, FINE_SMOOTHNESS)
         return (long, fine) if self.fine_sd else (long,)
 
-    def _density(self, frequency: np.ndarray) -> np.ndarray:
+    def density(self, frequency: np.ndarray) -> np.ndarray:
+        """Variances (s,) of the coefficients by the fields alone."""
         return np.sum([spectral_density(frequency, *field) for field in self.fields], axis=0)
 
     def variance(self, frequency: np.ndarray) -> np.ndarray:
         """Prior variances (s,) of the coefficients of sines of frequency (s,) [1/px]."""
-        return np.maximum(self._density(frequency), MIN_VARIANCE)
+        return np.maximum(self.density(frequency) + self.of_ripples(frequency), MIN_VARIANCE)
+
+    def of_ripples(self, frequency: np.ndarray) -> np.ndarray:
+        """Parts (s,) of these variances that are those of the ripples."""
+        if self.ripples is None:
+            return np.zeros_like(frequency)
+        return self.ripples.variance(frequency)
 
     def sd_beyond(self, frequency: float) -> float:
         """Standard deviation [px] of the part of the signal with larger frequencies [1/px].
 
-        It is the integral of the spectral density over the plane outside of a circle.
+        It is the integral of the spectral density of the fields over the plane outside of a
+        circle: the sines of ripples are all in the series.
         """
         variance = 0.0
         for sd, reach, nu in self.fields:
@@ -112,12 +126,12 @@ class Signal:
         Ripples shorter than the distance of image points hardly show in products of neighbours.
         """
         f = frequency * np.geomspace(1, SHORTEST, QUADRATURE)
-        weight = self._density(f) * f**2  # f df on a geometric grid
+        weight = self.density(f) * f**2  # f df on a geometric grid
         return j0(np.outer(distance, f)) @ weight / np.sum(weight)
 
-    def with_ripples(self, side: float) -> Signal:
+    def with_short_field(self, side: float) -> Signal:
         """Return a signal with a short field to start with; side: of the image [px]."""
-        return replace(self, fine_sd=RIPPLES_PX, fine_reach=RIPPLES_REACH * side)
+        return replace(self, fine_sd=SHOWN_PX, fine_reach=SHOWN_REACH * side)
 
     def change(self, other: Signal, frequency: np.ndarray) -> float:
         """Mean change of the logarithms of the variances at frequency (s,) from another signal."""
@@ -216,6 +230,8 @@ def most_likely_signal(
     Signal
     """
     cost, found = _more_likely(signal, coefficients, side)
+    if found.ripples is not None:
+        found = _with_likely_ripples(found, found.ripples, coefficients)
     if not search:
         return found
     for reach in SEARCH_REACH:
@@ -236,7 +252,7 @@ def _more_likely(
     """Return cost and signal after some steps of Fisher scoring."""
     low, high = _ranges(side)
     at = np.clip(_parameters(signal), low, high)
-    here = _likelihood(at, coefficients)
+    here = _likelihood(at, coefficients, ripples=signal.ripples)
     if here is None:
         return np.inf, signal
     damping = RIDGE
@@ -244,7 +260,7 @@ def _more_likely(
         step = np.linalg.solve(here.curvature + damping * np.eye(len(at)), -here.slopes)
         step = step / max(1.0, np.max(np.abs(step)) / MAX_STEP)
         trial = np.clip(at + step, low, high)
-        there = _likelihood(trial, coefficients, here.cost)
+        there = _likelihood(trial, coefficients, here.cost, signal.ripples)
         if there is None or there.cost > here.cost:
             damping *= 30
             continue
@@ -254,7 +270,39 @@ def _more_likely(
         damping = max(RIDGE, damping / 10)
         if gain < MIN_GAIN:
             break
-    return here.cost, Signal(*(float(value) for value in np.exp(at)))
+    return here.cost, _signal(at, signal.ripples)
+
+
+def _signal(at: np.ndarray, ripples: Ripples | None) -> Signal:
+    """Signal with these logarithms (5,) of its parameters."""
+    sd, reach, fine_sd, fine_reach, smoothness = (float(value) for value in np.exp(at))
+    return Signal(sd, reach, fine_sd, fine_reach, smoothness, ripples)
+
+
+def _with_likely_ripples(
+    signal: Signal, ripples: Ripples, coefficients: SignalEquations
+) -> Signal:
+    """Return the signal with ripples of a larger marginal likelihood (MacKay 1992).
+
+    The variance of a band is the square sum of its coefficients over the number of those that the
+    observations determine.
+    """
+    frequency = coefficients.frequency
+    band = ripples.band(frequency)
+    for _ in range(RIPPLE_STEPS):
+        variance = np.tile(signal.variance(frequency), 2)
+        found = _posterior(variance, coefficients)
+        if found is None:
+            return signal
+        mean, square = (np.sum(a.reshape(2, -1), axis=0) for a in (found.mean**2, found.variance))
+        determined = np.clip(2 - square / variance[: len(frequency)], MIN_DETERMINED, 2)
+        count = len(ripples.variances)
+        sums = [np.bincount(band, a, count)[:count] for a in (mean, determined)]
+        fields = signal.density(np.arange(count) * ripples.width)
+        values = np.maximum(sums[0] / np.maximum(sums[1], MIN_DETERMINED) - fields, MIN_VARIANCE)
+        ripples = ripples.with_variances(values)
+        signal = replace(signal, ripples=ripples)
+    return signal
 
 
 def _ranges(side: float) -> tuple[np.ndarray, np.ndarray]:
@@ -273,17 +321,27 @@ def _ranges(side: float) -> tuple[np.ndarray, np.ndarray]:
     )
 
 
-def _likelihood(
-    at: np.ndarray, coefficients: SignalEquations, limit: float = np.inf
-) -> _Likelihood | None:
-    """Return the likelihood at logarithms (5,) of the parameters.
+@dataclass(frozen=True)
+class _Posterior:
+    """Coefficients of the sines, with a prior.
+
+    cost: negative logarithm of the marginal likelihood, without constants; mean and variance
+    (2 s,): of the coefficients.
+    """
+
+    cost: float
+    mean: np.ndarray
+    variance: np.ndarray
+
+
+def _posterior(
+    variance: np.ndarray, coefficients: SignalEquations, limit: float = np.inf
+) -> _Posterior | None:
+    """Return the posterior for prior variances (2 s,).
 
     None where there is none, or where its cost is found to be above a limit.
     """
-    signal = Signal(*np.exp(at))
-    frequency = coefficients.frequency
     columns = coefficients.columns
-    variance = np.tile(signal.variance(frequency), 2)
     matrix = coefficients.information.copy(order='F')
     matrix[columns, columns] += 1 / variance
     factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=1)
@@ -298,12 +356,30 @@ def _likelihood(
     if failed:
         return None
     # Columns are contiguous, and what is above the diagonal is zero.
-    square = np.sum(np.square(inverse, out=inverse), axis=0)[columns]  # posterior variances
+    return _Posterior(float(cost), mean, np.sum(np.square(inverse, out=inverse), axis=0)[columns])
+
+
+def _likelihood(
+    at: np.ndarray,
+    coefficients: SignalEquations,
+    limit: float = np.inf,
+    ripples: Ripples | None = None,
+) -> _Likelihood | None:
+    """Return the likelihood at logarithms (5,) of the parameters, with given ripples.
+
+    None where there is none, or where its cost is found to be above a limit.
+    """
+    signal = _signal(at, ripples)
+    frequency = coefficients.frequency
+    variance = np.tile(signal.variance(frequency), 2)
+    found = _posterior(variance, coefficients, limit)
+    if found is None:
+        return None
     slopes = np.tile(_slopes(signal, frequency), (2, 1))
-    determined = np.clip(1 - square / variance, 0, 1)
+    determined = np.clip(1 - found.variance / variance, 0, 1)
     likelihood = _Likelihood(
-        float(cost),
-        slopes.T @ (1 - (mean**2 + square) / variance) / 2,
+        found.cost,
+        slopes.T @ (1 - (found.mean**2 + found.variance) / variance) / 2,
         (slopes * (determined**2)[:, None]).T @ slopes / 2,
     )
     return _with_priors(likelihood, at, np.pi / frequency.min())

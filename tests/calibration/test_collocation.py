@@ -33,8 +33,9 @@ from fluoro_calib_ros.calibration.initial_network import measured_network
 from fluoro_calib_ros.calibration.model_choice import better_model
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.robust_adjustment import adjusted_with_precision, start_noise
+from fluoro_calib_ros.distortion.collocation import CollocationTerms, EarlierTerms
 from fluoro_calib_ros.distortion.estimation import AdjustmentProblem
-from fluoro_calib_ros.distortion.gauge import GaugeKind
+from fluoro_calib_ros.distortion.gauge import GaugeKind, gauge_basis
 from fluoro_calib_ros.distortion.priors import (
     Prior,
     gauge_precision,
@@ -43,6 +44,7 @@ from fluoro_calib_ros.distortion.priors import (
     starting_prior,
 )
 from fluoro_calib_ros.distortion.registry import MODELS, create_model
+from fluoro_calib_ros.distortion.ripples import Ripples, shown_ripples
 from fluoro_calib_ros.distortion.series import (
     SD_GRID,
     Functions,
@@ -51,6 +53,7 @@ from fluoro_calib_ros.distortion.series import (
     sd_grid_pixels,
     sd_over_image,
     unpacked,
+    without_absent_bands,
 )
 from fluoro_calib_ros.distortion.signal import (
     Signal,
@@ -193,6 +196,25 @@ def test_rings_exist_where_the_distortion_has_them(amplitude):
     assert has_rings(functions, prior) == (amplitude > 0)
     # The spiral and what is like affinity and shear do not exist.
     assert (prior.trend[[15, 16, 17]] < 1e-6).all()
+
+
+def test_bands_of_sines_can_be_left_out():
+    """What remains are the sines of the other bands, and the series with zeros is the same."""
+    every = Functions(SIZE, 3, 12)
+    some = replace(every, absent=(5, 6, 7, 8, 9))
+    assert (every.complete, some.complete) == (12, 4)
+    assert set(some.band) == {2, 3, 4, 10, 11, 12}
+    uv = pixels(50)
+    coefficients = np.random.default_rng(0).normal(0, 1, (2, len(some)))
+    whole = every.converted(some, coefficients.ravel()).reshape(2, -1)
+    expected = some(uv) @ coefficients.T
+    np.testing.assert_allclose(every(uv) @ whole.T, expected, rtol=0, atol=1e-12)
+    functions, found = without_absent_bands(every, whole)
+    assert functions == some
+    np.testing.assert_array_equal(found, coefficients)
+    for full in (every, Functions(SIZE, 3)):
+        kept, _ = without_absent_bands(full, np.ones((2, len(full))))
+        assert kept == full
 
 
 def test_packing_of_a_series_is_exact():
@@ -397,6 +419,46 @@ def test_a_signal_of_two_scales_is_found_from_the_observations():
     assert prior.signal.sd_beyond(0.0) == pytest.approx(
         np.hypot(prior.signal.sd, prior.signal.fine_sd)
     )
+
+
+def plane_wave(uv, wavelength):
+    """Displacements (n, 2) [px] of a plane wave, 0.3 px along u and 0.2 px along v."""
+    return np.sin(2 * np.pi / wavelength * (uv @ [0.6, 0.8]))[:, None] * [0.3, -0.2]
+
+
+@pytest.mark.parametrize('wavelength', [60.0, 80.0, 150.0])
+def test_residuals_show_the_band_of_ripples(wavelength):
+    """Noise as large shows none, nor do ripples for which the series has sines."""
+    uv = pixels(1500, 4, (1024, 1024))
+    noise = np.random.default_rng(6).normal(0, 0.25, uv.shape)
+    assert shown_ripples((1024, 1024), uv, noise, 10) is None
+    found = shown_ripples((1024, 1024), uv, noise + plane_wave(uv, wavelength), 10)
+    band = 2 * 1.3 * 1024 / wavelength
+    assert min(found.bands) < band < max(found.bands)
+    assert len(found.bands) <= 9
+    assert shown_ripples((1024, 1024), uv, noise + plane_wave(uv, wavelength), 48) is None
+
+
+def test_prior_of_ripples_is_estimated():
+    """A long field and a band of short waves: a covariance function that falls with the frequency
+    has no such gap. The variances of the band within a fifth in the mean.
+    """
+    functions = Functions((1024, 1024), -1, 22, absent=tuple(range(11, 20)))
+    width = functions.frequency_of_mode
+    uv = pixels(2000, 3, (1024, 1024))
+
+    def ripples(variance):
+        return Ripples(width, (*[0.0] * 20, variance, variance, variance))
+
+    there = Signal(1.0, 600.0, ripples=ripples(300.0))
+    information, right = drawn_field(functions, Prior(there, np.zeros(0)), 2, uv, 0.25)
+    prior = Prior(Signal(0.5, 300.0, 1e-3, 200.0, ripples=ripples(30.0)), np.zeros(0))
+    for _ in range(5):
+        prior = most_likely_prior(functions, information, right, np.zeros_like(information), prior)
+    found = prior.signal.variance(width * np.array([20.0, 21.0, 22.0]))
+    assert found.mean() == pytest.approx(300.0, rel=0.2)
+    assert prior.signal.ripples.bands == (20, 21, 22)
+    assert prior.signal.density(width * 20.0) < 10.0
 
 
 def test_expert_terms_and_gauge_are_independent():
@@ -637,6 +699,43 @@ def test_stepwise_selects_the_true_terms():
         rig_with(lambda field: replace(smooth(field), pincushion=0.0, spiral=0.0)), 'parametric'
     )
     assert state.selected[0].sum() <= 1
+
+
+class Woven(DistortionField):
+    """A distortion with ripples of 75 px."""
+
+    def __call__(self, uv):
+        """Corrections (n, 2) [px] of observed pixels uv (n, 2)."""
+        return super().__call__(uv) + plane_wave(np.asarray(uv, dtype=float), 75.0)
+
+
+@pytest.mark.long
+def test_ripples_of_one_wavelength_are_corrected():
+    """They are shorter than the shortest sine that a smooth field gets. Without them, 0.25 px
+    would be left.
+    """
+    field = None
+
+    def woven(plain):
+        nonlocal field
+        field = Woven(**vars(plain))
+        return field
+
+    run, state = whole(rig_with(woven), 'collocation', 15)
+    uv = run.measured.network.uv[run.after.inliers]
+    model = run.models['a']
+    error = model.predict(uv) - field(uv)
+    basis = gauge_basis(uv, run.after.parameters.interior[0]).reshape(2 * len(uv), -1)
+    error = error.ravel() - basis @ np.linalg.lstsq(basis, error.ravel(), rcond=None)[0]
+    assert np.sqrt(np.mean(error**2)) < 0.11
+    assert np.sqrt(np.mean(model.evaluate(uv).sd ** 2)) < 0.13
+    # Calibrations of parts continue with these sines, not with all that are as long.
+    problem = AdjustmentProblem(
+        run.measured.network, run.measured.image_size, run.before, (GaugeKind.FULL,)
+    )
+    parts = CollocationTerms(problem, earlier=EarlierTerms([model.series], [None], False))
+    assert parts.functions == state.functions
+    assert parts.priors[0].signal.ripples.bands == state.priors[0].signal.ripples.bands
 
 
 @pytest.mark.long

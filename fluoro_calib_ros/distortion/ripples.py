@@ -1,0 +1,128 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Ripples: a part of the signal within a few bands of spatial frequency.
+
+A weave, a moire pattern or the seams of fibre plates repeat with a wavelength. A covariance
+function of Matern's family has to hold all longer waves, too, to hold such ripples; a series for
+it has as many sines. The periodogram of the residuals (Scargle, "Studies in astronomical time
+series analysis II", ApJ 263, 1982) shows which few bands of frequencies there are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .series import MARGIN, Functions
+
+# Sines along the image that are looked at: ripples shorter than 53 px on 1024 px.
+SEARCHED_BANDS = 50
+# Standard deviations by which the mean power of a band with ripples exceeds that of noise.
+SIGNIFICANT = 5.0
+INDEPENDENT = 1 / MARGIN**2  # part of the sines, over their rectangle, that the image can tell
+BESIDE = 1  # bands next to one with ripples that are used, too: the image ends, and waves do not
+LEAST_EXCESS = 0.1  # power that a band starts with, over that of noise
+CHUNK = 5_000  # image points for which the sines are evaluated at once
+
+
+@dataclass(frozen=True)
+class Ripples:
+    """Prior variances of the sines of bands of frequencies.
+
+    width: of a band [1/px]; variances: [px^2] of the bands 0, 1, ..., zero where there are none.
+    """
+
+    width: float
+    variances: tuple[float, ...]
+
+    @property
+    def bands(self) -> tuple[int, ...]:
+        """Bands in which there are ripples."""
+        return tuple(band for band, variance in enumerate(self.variances) if variance > 0)
+
+    def band(self, frequency: np.ndarray) -> np.ndarray:
+        """Band (s,) of frequency (s,) [1/px]."""
+        return np.rint(frequency / self.width).astype(int)
+
+    def variance(self, frequency: np.ndarray) -> np.ndarray:
+        """Variances (s,) of sines of frequency (s,) [1/px]."""
+        band = self.band(frequency)
+        inside = band < len(self.variances)
+        return np.where(inside, np.asarray(self.variances)[np.where(inside, band, 0)], 0.0)
+
+    def with_variances(self, variances: np.ndarray) -> Ripples:
+        """Return ripples in the same bands with these variances (n,), of all bands."""
+        own = np.where(np.asarray(self.variances) > 0, variances, 0.0)
+        return replace(self, variances=tuple(float(value) for value in own))
+
+    def joined(self, other: Ripples | None) -> Ripples:
+        """Return ripples with the bands of another, too; the variances of both add."""
+        if other is None:
+            return self
+        count = max(len(self.variances), len(other.variances))
+        both = [np.pad(r.variances, (0, count - len(r.variances))) for r in (self, other)]
+        return replace(self, variances=tuple(float(value) for value in np.sum(both, axis=0)))
+
+
+def ripples_of(functions: Functions, coefficients: np.ndarray) -> Ripples | None:
+    """Ripples of a series that has them, as its coefficients (2, m) show them, or None."""
+    if not functions.absent:
+        return None
+    count = functions.modes + 1
+    squares = np.mean(coefficients[:, functions.trend :] ** 2, axis=0)
+    number = np.maximum(np.bincount(functions.band, minlength=count), 1)
+    variances = np.bincount(functions.band, squares, count) / number
+    variances[: functions.complete + 1] = 0.0
+    return Ripples(functions.frequency_of_mode, tuple(float(value) for value in variances))
+
+
+def shown_ripples(
+    image_size: tuple[int, int], uv: np.ndarray, residuals: np.ndarray, complete: int
+) -> Ripples | None:
+    """Return the ripples that residuals show beyond the sines of a series, or None.
+
+    Parameters
+    ----------
+    image_size : (int, int)
+        Width and height of the image [px].
+    uv, residuals : (n, 2) ndarray
+        Image points and their residuals [px].
+    complete : int
+        Bands up to which the series has all sines.
+    """
+    functions = Functions(image_size, -1, SEARCHED_BANDS)
+    products = np.zeros((len(functions), 2))
+    squares = np.zeros(len(functions))
+    for start in range(0, len(uv), CHUNK):
+        rows = slice(start, start + CHUNK)
+        values = functions(uv[rows])
+        products += values.T @ residuals[rows]
+        squares += np.einsum('nm,nm->m', values, values)
+    noise = float(np.mean(residuals**2))
+    power = np.mean(products**2, axis=1) / (squares * noise)
+    number = np.maximum(np.bincount(functions.band), 1)
+    excess = np.bincount(functions.band, power) / number - 1
+    bands = np.arange(len(number))
+    # The power of a sine has a standard deviation of one: it is a mean of two squares.
+    shown = (excess > SIGNIFICANT / np.sqrt(INDEPENDENT * number)) & (bands > complete)
+    if not shown.any():
+        return None
+    used = np.convolve(shown, np.ones(2 * BESIDE + 1), 'same') > 0
+    used &= (bands > complete) & (bands <= SEARCHED_BANDS)
+    variances = np.maximum(excess, LEAST_EXCESS) * noise / float(np.mean(squares))
+    return Ripples(
+        functions.frequency_of_mode, tuple(float(v) for v in np.where(used, variances, 0.0))
+    )

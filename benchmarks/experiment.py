@@ -272,7 +272,7 @@ class Scene:
         if key not in self._tested:
             frames = self._frames(self.recording, known, lambda i: i % self._every != 0)
             sensors = {
-                f.name: KnownSensor(f.interior, np.zeros_like if known else f.distortion)
+                f.name: KnownSensor(f.interior, _correction(None if known else f.distortion))
                 for f in self.rig.fluoroscopes
             }
             self._tested[key] = network_of_known_sensors(
@@ -320,6 +320,13 @@ class Scene:
             ]
         )
         return np.sqrt(np.concatenate([np.mean(points**2, axis=0), np.mean(sources**2, axis=0)]))
+
+
+def _correction(distortion: DistortionField | None) -> Callable[[Frame], np.ndarray]:
+    """Correction of the image points of a frame; None: they are free of distortion."""
+    if distortion is None:
+        return lambda frame: np.zeros_like(frame.uv)
+    return lambda frame: distortion(frame.uv)
 
 
 def _undistorted(frame: Frame, uv: np.ndarray) -> Frame:

@@ -264,7 +264,8 @@ def points_rmse(
     The survey has little weight, so that the points follow the images.
     """
     weak = replace(rig.phantom, sd_mm=WEAK_SURVEY * rig.phantom.sd_mm)
-    measured = network_of_known_sensors({'a': frames}, weak, {'a': KnownSensor(interior, predict)})
+    sensor = KnownSensor(interior, lambda frame: predict(frame.uv))
+    measured = network_of_known_sensors({'a': frames}, weak, {'a': sensor})
     network = measured.network
     after, _ = adjusted_with_precision(
         network, measured.start, predict(network.uv), start_noise('student_t')

@@ -204,13 +204,19 @@ def calibrate_with_known_orientations(
 
 
 def correct(
-    calibration: FluoroscopeCalibration, uv: ArrayLike, sigma: ArrayLike | None = None
+    calibration: FluoroscopeCalibration,
+    uv: ArrayLike,
+    sigma: ArrayLike | None = None,
+    angle: ArrayLike | None = None,
 ) -> CorrectedPoints:
     """Remove the distortion from observed image points.
 
     uv (n, 2) are observed pixels, sigma (n,) their standard deviations [px], by default that of
-    the calibration.
+    the calibration. angle: of the C-arm [rad], a number or (n,), where the correction changes with
+    it.
     """
     return calibration.correct(
-        np.asarray(uv, dtype=float), None if sigma is None else np.asarray(sigma, dtype=float)
+        np.asarray(uv, dtype=float),
+        None if sigma is None else np.asarray(sigma, dtype=float),
+        angle=angle,
     )

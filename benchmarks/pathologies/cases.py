@@ -52,6 +52,10 @@ class Case:
         'free', 'turntable' or 'narrow'; largest shift [mm]; least share of the beads in an image.
     wander : float
         Change of the distortion between exposures [px].
+    arm : float
+        Change of the distortion with the angle of the C-arm [px], which differs in every exposure.
+    angle_known : bool
+        Whether the exposures come with that angle.
     blind : callable, optional
         True where the image, in coordinates 0 to 1, shows no beads.
     sigma_known : bool
@@ -88,6 +92,8 @@ class Case:
     spread: float = 75.0
     min_seen: float = 0.45
     wander: float = 0.0
+    arm: float = 0.0
+    angle_known: bool = True
     blind: Callable | None = None
     sigma_known: bool = False
     options: dict = field(default_factory=dict)
@@ -175,6 +181,11 @@ CASES = (
     Case('varying 1 px', 'varying', wander=1.0, faulty=True),
     Case('varying 1 px 30 exposures', 'varying', wander=1.0, exposures=30, faulty=True),
     Case('varying 2 px', 'varying', wander=2.0, faulty=True),
+    # Distortion that changes with the angle of the C-arm.
+    Case('turning 1 px', 'turning', arm=1.0),
+    Case('turning 3 px', 'turning', arm=3.0),
+    Case('turning 3 px 30 exposures', 'turning', arm=3.0, exposures=30),
+    Case('turning 1 px, angle unknown', 'turning', arm=1.0, angle_known=False, faulty=True),
     # Survey and phantom.
     Case('survey 0.5 mm', 'survey', survey_sd=0.5),
     Case('survey 0.01 mm', 'survey', survey_sd=0.01),

@@ -218,4 +218,25 @@ class Wander:
         return self.size / 0.9 * out
 
 
+@dataclass(frozen=True)
+class Turning:
+    """Change of a distortion with the angle of a C-arm, of a size [px] at the rim.
+
+    The field of the earth, fixed in the room, turns in the frame of the image; the arm adds a
+    part of twice the angle.
+    """
+
+    size: float
+    angle: float  # rad
+
+    def draw(self, rng):
+        """Patterns along and across the field, and of the arm; see `Wander`."""
+        return [Wander(1.0).draw(rng) for _ in range(3)]
+
+    def __call__(self, drawn, x):
+        wander = Wander(self.size)
+        factors = (np.cos(self.angle), np.sin(self.angle), 0.3 * np.cos(2 * self.angle + 0.7))
+        return sum(factor * wander(pattern, x) for factor, pattern in zip(factors, drawn))
+
+
 BASE = (CurvedScreen(12), Magnetic(3), Bumps(12, 110, 0.9), ThinPlate(9, 0.8))

@@ -26,6 +26,8 @@ from .scene import NAMES
 RESECTION_STEPS = 6
 INTERSECTION_STEPS = 4
 GRID = 31
+ANGLES = 4  # of the C-arm at which a correction is compared with the truth
+MIN_POINTS = 6  # of a test pose
 SAMPLE = 1000  # image points whose joint covariance is used
 COVER = 1.96  # standard deviations of a 95 % interval
 
@@ -79,28 +81,34 @@ def intersect(rays, exteriors, points):
 def out_of_sample(scene, corrected, seed):
     """RMS error [px] of noise-free test points and RMS error [mm] of stereo points with noise.
 
-    corrected(f, observed) returns rays (n, 2), c and bool (n,) of the points that are used.
+    corrected(f, observed, angle) returns rays (n, 2), c and bool (n,) of the points that are used;
+    angle is that of the C-arm [rad].
     """
     rng = np.random.default_rng([seed, 5])
     sd = scene.case.noise.sd
     squares = []
     errors = []
-    for pose in scene.test_poses:
+    for pose, angle in zip(scene.test_poses, scene.test_angles):
         rays = []
         exteriors = []
         used = np.ones(len(scene.true_mm), dtype=bool)
         for f, camera in enumerate(scene.cameras):
-            observed = camera.distortion.observed(camera.ideal(scene.true_mm, pose))
+            here = camera.at(scene.case, angle)
+            observed = here.distortion.observed(camera.ideal(scene.true_mm, pose))
             on = ((observed > 0) & (observed < scene.case.side - 1)).all(axis=1)
-            ray, c, inside = corrected(f, observed)
+            ray, c, inside = corrected(f, observed, angle)
             on &= inside
             used &= on
+            if on.sum() < MIN_POINTS:  # the angle of the C-arm is beyond those that are calibrated
+                break
             exterior = resect(ray[on], scene.true_mm[on], *camera.exterior(pose))
             x = (scene.true_mm - exterior[1]) @ exterior[0].T
             if f == 0:
                 squares.append(((ray - x[:, :2] / x[:, 2:])[on] * c) ** 2)
             rays.append(ray + rng.normal(0, sd, ray.shape) / c)
             exteriors.append(exterior)
+        if len(rays) < len(scene.cameras):
+            continue
         found = intersect([r[used] for r in rays], exteriors, scene.true_mm[used])
         errors.append(found - scene.true_mm[used])
     return (
@@ -114,15 +122,16 @@ def ratios(scene, result, oracle, seed):
     models = [result.calibrations[name] for name in NAMES]
     inside_of = {}
 
-    def calibrated(f, observed):
-        found = models[f].model.evaluate(np.clip(observed, 0, scene.case.side - 1))
+    def calibrated(f, observed, angle):
+        angle = angle if scene.case.angle_known else None
+        found = models[f].correction(np.clip(observed, 0, scene.case.side - 1), angle)
         xp, yp, c = models[f].interior
         inside_of.setdefault(f, []).append(~found.outside)
         return (observed - found.duv - [xp, yp]) / c, c, ~found.outside
 
-    def known(f, observed):
+    def known(f, observed, angle):
         xp, yp, c = oracle[f]
-        correction = scene.cameras[f].distortion.correction(observed)
+        correction = scene.cameras[f].at(scene.case, angle).distortion.correction(observed)
         return (observed - correction - [xp, yp]) / c, c, inside_of[f].pop(0)
 
     image, stereo = out_of_sample(scene, calibrated, seed)
@@ -141,26 +150,18 @@ def claims(scene, result):
     camera = scene.cameras[0]
     run = result.runs[name]
     # A regression is orthogonal to the gauge over the image points it is fitted to, not all.
-    uv = run.measured.network.uv[run.trained]
-    model = result.calibrations[name].model
-    known = {id(uv): camera.distortion.correction(uv)}  # what the fit of the gauge asks again
-
-    def correction(pixels):
-        return known[id(pixels)] if id(pixels) in known else camera.distortion.correction(pixels)
-
-    truth = Truth(camera.interior, correction)
-    interior = run.after.parameters.interior[0]
-    _, _, true = truth_in_gauge(truth, uv, interior, model.predict(uv))
-    side = scene.case.side
-    axis = np.linspace(0, side - 1, GRID)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    found = model.evaluate(grid)
-    inside = ~found.outside
-    error = (found.duv - true(grid))[inside]
-    sd = found.sd[inside, None]
-    out = _statistics('correction', error, np.broadcast_to(sd, error.shape))
+    network = run.measured.network
+    uv = network.uv[run.trained]
+    calibration = result.calibrations[name]
+    model = calibration.model
+    found = [
+        _errors_at(scene, calibration, uv, angle)
+        for angle in (_test_angles(scene, calibration) if scene.case.arm else [None])
+    ]
+    error, sd = (np.concatenate(parts) for parts in zip(*found))
+    out = _statistics('correction', error, np.broadcast_to(sd[:, None], error.shape))
     out['correction_px'] = float(np.sqrt(np.mean(error**2)))
-    out['correction_sd_px'] = float(np.sqrt(np.mean(found.sd[inside] ** 2)))
+    out['correction_sd_px'] = float(np.sqrt(np.mean(sd**2)))
     out['correction_freedom'] = independent_errors(run, model)
     good = ~np.isin(result.targets.target_id - 1, scene.displaced)
     offset = result.targets.xyz_mm - scene.true_mm[result.targets.target_id - 1]
@@ -171,6 +172,31 @@ def claims(scene, result):
     offset = np.stack([e.position_mm for e in exposures]) - true_sources
     out |= _statistics('sources', offset, np.stack([e.sd_mm for e in exposures]))
     return out
+
+
+def _errors_at(scene, calibration, uv, angle):
+    """Errors (n, 2) and stated sd (n,) of a correction within the calibrated area, at an angle.
+
+    uv: image points to which it was fitted. Angle None: the C-arm does not turn.
+    """
+    camera = scene.cameras[0].at(scene.case, angle)
+    axis = np.linspace(0, scene.case.side - 1, GRID)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    grid = grid[~calibration.model.outside(grid)]
+    found = calibration.correction(grid, angle if scene.case.angle_known else None)
+    both = np.concatenate([uv, grid])
+    true = camera.distortion.correction(both)
+    here = calibration.correction(uv, angle if scene.case.angle_known else None).duv
+    known = {id(uv): true[: len(uv)], id(grid): true[len(uv) :]}
+    truth = Truth(camera.interior, lambda pixels: known[id(pixels)])
+    _, _, in_gauge = truth_in_gauge(truth, uv, calibration.interior, here)
+    return found.duv - in_gauge(grid), found.sd
+
+
+def _test_angles(scene, calibration):
+    """Angles at which a correction is compared with the truth: some of the calibrated range."""
+    field = calibration.angle_field
+    return [a for a in scene.test_angles if field is None or field.covers(a)][:ANGLES]
 
 
 def independent_errors(run, model):

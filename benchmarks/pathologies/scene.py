@@ -14,7 +14,7 @@
 
 """Exposures of a case: two fluoroscopes, a phantom, its survey, poses and image points."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -22,12 +22,13 @@ from scipy.spatial.transform import Rotation
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 
-from .fields import Distortion, Wander
+from .fields import Distortion, Turning, Wander
 
 BETWEEN = np.deg2rad(80)  # angle between the axes of the fluoroscopes
 NAMES = ('a', 'b')
 EDGE = 0.5  # distance [px] of image points from the edge of the image
 MAX_TRIES = 40  # poses that are drawn until one shows the phantom
+ARM = np.deg2rad(90)  # largest angle of the C-arm, either way
 NARROW = np.deg2rad(5)
 
 
@@ -40,6 +41,20 @@ class Camera:
     rotation: np.ndarray
     source: np.ndarray
     distortion: Distortion
+    turning: list | None = None
+
+    def at(self, case, angle):
+        """Camera at an angle [rad] of the C-arm."""
+        if angle is None:
+            return self
+        return replace(
+            self,
+            distortion=Distortion(
+                (*self.distortion.parts, Turning(case.arm, angle)),
+                (*self.distortion.drawn, self.turning),
+                self.distortion.side,
+            ),
+        )
 
     def exterior(self, pose):
         """Rotation phantom -> sensor and source in the phantom [mm] for a pose."""
@@ -82,6 +97,8 @@ class Scene:
     images: list
     test_poses: list
     displaced: np.ndarray
+    angles: list
+    test_angles: list
 
     def frames(self):
         """Frames for the calibration, by fluoroscope."""
@@ -98,6 +115,7 @@ class Scene:
                     image.observed,
                     (self.case.side, self.case.side),
                     sigma,
+                    angle=self.angles[image.number - 1] if self.case.angle_known else None,
                 )
             )
         return out
@@ -121,12 +139,24 @@ def draw(case, seed):
     cameras = tuple(_camera(case, rng, f) for f in range(2))
     images = []
     poses = []
+    angles = _angles(case, rng, case.exposures)
     for number in range(1, case.exposures + 1):
         pose = _pose(case, rng, cameras, true_mm, number)
         poses.append(pose)
-        images += [_image(case, rng, f, cameras[f], true_mm, pose, number) for f in range(2)]
+        here = [camera.at(case, angles[number - 1]) for camera in cameras]
+        images += [_image(case, rng, f, here[f], true_mm, pose, number) for f in range(2)]
     tests = [_pose(case, rng, cameras, true_mm, n) for n in range(1, case.tests + 1)]
-    return Scene(case, cameras, true_mm, phantom, poses, images, tests, displaced)
+    test_angles = _angles(case, rng, case.tests)
+    return Scene(
+        case, cameras, true_mm, phantom, poses, images, tests, displaced, angles, test_angles
+    )
+
+
+def _angles(case, rng, count):
+    """Angles [rad] of the C-arm in exposures, None where it does not turn."""
+    if not case.arm:
+        return [None] * count
+    return [float(angle) for angle in rng.uniform(-ARM, ARM, count)]
 
 
 def _camera(case, rng, f):
@@ -145,7 +175,8 @@ def _camera(case, rng, f):
         offset = np.append(np.asarray(case.principal) * side / 1024 / interior[2], 0)
         tilt = Rotation.from_rotvec([-offset[1], offset[0], 0]).as_matrix() @ tilt
     distortion = Distortion.of(case.parts, rng, side)
-    return Camera(NAMES[f], interior, tilt @ looking, source, distortion)
+    turning = Turning(case.arm, 0.0).draw(rng) if case.arm else None
+    return Camera(NAMES[f], interior, tilt @ looking, source, distortion, turning)
 
 
 def _pose(case, rng, cameras, true_mm, number):

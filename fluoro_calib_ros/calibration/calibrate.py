@@ -730,5 +730,6 @@ def _calibration(
         stamp_ns=max(frame.stamp_ns for frame in frames),
         frame_id=frames[0].frame_id,
         source_digest=digest,
+        angle_field=run.angle_fields.get(name),
         seconds=seconds,
     )

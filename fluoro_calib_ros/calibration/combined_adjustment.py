@@ -95,6 +95,10 @@ def calibrate_by_adjustment(
             measured.network, before, terms, max_rounds, report, raise_if_cancelled
         )
         precise = precision(network, after)
+        fields = {
+            name: terms.fit_angles(f, after, precise)
+            for f, name in enumerate(measured.fluoroscopes)
+        }
         between = {
             name: terms.variance_between_exposures(f, network, after, precise)
             for f, name in enumerate(measured.fluoroscopes)
@@ -116,6 +120,7 @@ def calibrate_by_adjustment(
         tuple(history.rounds),
         converged,
         between_exposures=between,
+        angle_fields={name: found for name, found in fields.items() if found is not None},
     )
 
 

@@ -21,6 +21,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..exposures.frame import Frame, angles_of
 from ..exposures.phantom import Phantom
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
@@ -54,11 +55,24 @@ def network_of_calibrations(
     are known {fluoroscope: KnownOrientation}. starts: of an earlier adjustment of the frames.
     Raises DataError as `measured_network`.
     """
-    sensors = {
-        name: KnownSensor(calibrations[name].interior, calibrations[name].model.predict)
-        for name in frames
-    }
+    sensors = {name: _sensor(calibrations[name]) for name in frames}
     return network_of_known_sensors(frames, phantom, sensors, raise_if_cancelled, known, starts)
+
+
+def _sensor(calibration: FluoroscopeCalibration) -> KnownSensor:
+    """Return interior orientation and correction of a calibration."""
+
+    def correction(frame: Frame) -> np.ndarray:
+        if calibration.angle_field is None:
+            return calibration.model.predict(frame.uv)
+        return calibration.correction(frame.uv, frame.angle).duv
+
+    return KnownSensor(calibration.interior, correction)
+
+
+def _angles(measured: Measured, rows: np.ndarray) -> np.ndarray:
+    """Angle [rad] of the C-arm for image points (r,), NaN where it is unknown."""
+    return angles_of(measured.frames)[measured.network.exposure[rows]]
 
 
 def held_corrections(
@@ -74,7 +88,7 @@ def held_corrections(
     sigma = network.sigma.copy()
     for f, name in enumerate(measured.fluoroscopes):
         rows = network.rows(f)
-        found = calibrations[name].model.evaluate(network.uv[rows])
+        found = calibrations[name].correction(network.uv[rows], _angles(measured, rows))
         correction[rows] = found.duv
         sigma[rows] = np.hypot(sigma[rows], found.sd / calibrations[name].sigma0)
     return correction, replace(network, sigma=sigma)

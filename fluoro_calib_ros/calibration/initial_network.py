@@ -24,7 +24,7 @@ import numpy as np
 from ..distortion.priors import Prior
 from ..distortion.series import Series
 from ..errors import DataError
-from ..exposures.frame import Frame, validate_frame
+from ..exposures.frame import Frame, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.exterior_prior import HELD_SD_MM, HELD_SD_RAD, ExteriorPrior
 from ..photogrammetry.known_orientation import KnownOrientation
@@ -95,16 +95,25 @@ class Measured:
     untilted: tuple[bool, ...] = ()
     known: Known = field(default_factory=dict)
 
+    @property
+    def angles(self) -> list[np.ndarray]:
+        """Angles (e,) of the C-arm [rad] in the exposures of each fluoroscope; NaN: unknown."""
+        network = self.network
+        exposures = [
+            np.unique(network.exposure[network.rows(f)]) for f in range(len(self.fluoroscopes))
+        ]
+        return [angles_of(self.frames[j] for j in own) for own in exposures]
+
 
 @dataclass(frozen=True)
 class KnownSensor:
     """A fluoroscope whose interior orientation (3,) [px] and correction are known.
 
-    predict: correction (n, 2) [px] at pixels (n, 2).
+    correction: of the n image points of a frame, (n, 2) [px].
     """
 
     interior: np.ndarray
-    predict: Callable[[np.ndarray], np.ndarray]
+    correction: Callable[[Frame], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -332,20 +341,24 @@ def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
     )
 
 
+def _no_correction(frame: Frame) -> np.ndarray:
+    return np.zeros_like(frame.uv)
+
+
 def _place_all(
     task: _Task, name: str, frames: Sequence[Frame]
 ) -> tuple[list[Resection | None], np.ndarray, list[str]]:
     """Known orientations of the frames of one fluoroscope; returns as _resect_all."""
     known = task.known[name]
     sensor = None if task.sensors is None else task.sensors[name]
-    predict = np.zeros_like if sensor is None else sensor.predict
+    correction = _no_correction if sensor is None else sensor.correction
     interior = known.interior if sensor is None else np.asarray(sensor.interior)
     found: list[Resection | None] = []
     for frame in frames:
         xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
         found.append(
             resection_at(
-                known.rotation, known.position_mm, xyz, frame.uv - predict(frame.uv), interior
+                known.rotation, known.position_mm, xyz, frame.uv - correction(frame), interior
             )
         )
     return found, interior, _reject_misfits(frames, found)
@@ -358,7 +371,7 @@ def _start_all(
     assert task.starts is not None
     sensor = None if task.sensors is None else task.sensors[name]
     earlier = task.starts.earlier
-    predict = np.zeros_like if sensor is None else sensor.predict
+    correction = _no_correction if sensor is None else sensor.correction
     interior = task.starts.interior[name] if sensor is None else np.asarray(sensor.interior)
     found: list[Resection | None] = []
     for frame in frames:
@@ -370,7 +383,7 @@ def _start_all(
             continue
         # The sensor may have another gauge than that of the earlier adjustment.
         found.append(
-            refine_resection(xyz, frame.uv - predict(frame.uv), interior, rotation, position)
+            refine_resection(xyz, frame.uv - correction(frame), interior, rotation, position)
         )
     return found, interior, _reject_misfits(frames, found)
 
@@ -434,13 +447,13 @@ def _resect_all(
     failure.
     """
     sensor = None if task.sensors is None else task.sensors[name]
-    predict = np.zeros_like if sensor is None else sensor.predict
+    correction = _no_correction if sensor is None else sensor.correction
     views = []
     for frame in frames:
         if task.raise_if_cancelled is not None:
             task.raise_if_cancelled()
         xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
-        views.append(view_of(frame, xyz, frame.uv - predict(frame.uv)))
+        views.append(view_of(frame, xyz, frame.uv - correction(frame)))
     sentences = [f'{_exposure(view.frame)}: {view.error}' for view in views if view.error]
     if len(sentences) == len(views):
         raise DataError(sentences[0])

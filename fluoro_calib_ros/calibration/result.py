@@ -24,7 +24,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..distortion.base import CorrectionModel
+from ..distortion.angle_field import AngleField, packed_angles
+from ..distortion.base import Correction, CorrectionModel
 from ..distortion.grid import CorrectionGrid
 from ..distortion.series import packed
 from ..distortion.status import CorrectionStatus
@@ -83,6 +84,8 @@ class FluoroscopeCalibration:
         Optical frame in ROS.
     source_digest : str
         SHA-256 of observations and phantom.
+    angle_field : AngleField or None
+        Change of the correction with the angle of the C-arm; None: there is none.
     seconds : float
         Time the calibration took; NaN where it was read from a file.
     calibration_id : str
@@ -111,6 +114,7 @@ class FluoroscopeCalibration:
     stamp_ns: int
     frame_id: str
     source_digest: str
+    angle_field: AngleField | None = None
     seconds: float = field(default=np.nan, compare=False)
     calibration_id: str = field(init=False)
 
@@ -143,6 +147,9 @@ class FluoroscopeCalibration:
             digest.update(
                 np.concatenate([[degree, modes], coefficients.ravel(), sd.ravel()]).tobytes()
             )
+        if self.angle_field is not None:
+            for array in packed_angles(self.angle_field):
+                digest.update(array.tobytes())
         digest.update(f'{self.fluoroscope}/{self.model.kind}/{self.source_digest}'.encode())
         return digest
 
@@ -180,8 +187,28 @@ class FluoroscopeCalibration:
         """Build what the first correction needs, so that no frame waits for it."""
         _ = self.grid
 
+    def correction(self, uv: ArrayLike, angle: ArrayLike | None = None) -> Correction:
+        """Return the Correction of the model at pixels uv (n, 2).
+
+        angle: of the C-arm [rad], a number or (n,); None or NaN where it is unknown.
+        """
+        found = self.model.evaluate(uv)
+        if self.angle_field is None:
+            return found
+        angle = np.nan if angle is None else angle
+        duv, variance = self.angle_field.change(uv, angle)
+        return Correction(
+            found.duv + duv,
+            np.sqrt(np.maximum(found.sd**2 + variance, 0)),
+            found.outside | ~self.angle_field.covers(angle),
+        )
+
     def correct(
-        self, uv: ArrayLike, sigma: ArrayLike | None = None, exact: bool = False
+        self,
+        uv: ArrayLike,
+        sigma: ArrayLike | None = None,
+        exact: bool = False,
+        angle: ArrayLike | None = None,
     ) -> CorrectedPoints:
         """Return the corrected image points of observed pixels.
 
@@ -194,6 +221,8 @@ class FluoroscopeCalibration:
         exact : bool
             True for the model itself instead of its grid, which differs by grid.error_px and is
             OUTSIDE up to a cell before the calibrated area ends.
+        angle : float or (n,) array_like, optional
+            Of the C-arm [rad], for a correction that changes with it; None or NaN: it is unknown.
 
         Returns
         -------
@@ -203,26 +232,55 @@ class FluoroscopeCalibration:
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         sigma = None if sigma is None else np.asarray(sigma, dtype=float)
         if exact:
-            return self._correct_exactly(uv, self.image_sd if sigma is None else sigma)
-        u, v, total, _, status = self.correct_arrays(uv[:, 0], uv[:, 1], sigma)
+            return self._correct_exactly(uv, self.image_sd if sigma is None else sigma, angle)
+        u, v, total, _, status = self.correct_arrays(uv[:, 0], uv[:, 1], sigma, angle)
         return CorrectedPoints(np.stack([u, v], axis=1), total, status)
 
     def correct_arrays(
-        self, u: np.ndarray, v: np.ndarray, sigma: np.ndarray | None = None
+        self,
+        u: np.ndarray,
+        v: np.ndarray,
+        sigma: np.ndarray | None = None,
+        angle: ArrayLike | None = None,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Correct arrays u, v and sigma (n,) of floats, with the least overhead.
 
-        Returns corrected u and v, their standard deviation, that of the correction alone [px], and
-        status, each (n,). The numbers are those of `correct`.
+        angle: of the C-arm [rad], a number or (n,); None or NaN where it is unknown. Returns
+        corrected u and v, their standard deviation, that of the correction alone [px], and status,
+        each (n,). The numbers are those of `correct`.
         """
         (du, dv, sd), status = self.grid.look_up(u, v)
+        if self.angle_field is not None:
+            self._add_angle(self.angle_field, (u, v), (du, dv, sd), status, angle)
         np.subtract(u, du, out=du)
         np.subtract(v, dv, out=dv)
         total = sd * sd
         total += self.image_sd**2 if sigma is None else sigma * sigma
         return du, dv, np.sqrt(total, out=total), sd, status
 
-    def _correct_exactly(self, uv: np.ndarray, sigma: np.ndarray | float) -> CorrectedPoints:
+    @staticmethod
+    def _add_angle(
+        field: AngleField,
+        uv: tuple[np.ndarray, np.ndarray],
+        correction: tuple[np.ndarray, np.ndarray, np.ndarray],
+        status: np.ndarray,
+        angle: ArrayLike | None,
+    ) -> None:
+        """Add to a correction and its status, in place, what an angle changes."""
+        on = np.flatnonzero(status != CorrectionStatus.INVALID)
+        angle = np.asarray(np.nan if angle is None else angle, dtype=float)
+        angle = angle[on] if angle.ndim else angle
+        duv, variance = field.change(np.column_stack([uv[0][on], uv[1][on]]), angle)
+        du, dv, sd = correction
+        du[on] += duv[:, 0]
+        dv[on] += duv[:, 1]
+        sd[on] = np.sqrt(np.maximum(sd[on] ** 2 + variance, 0))
+        beyond = np.broadcast_to(~field.covers(angle), on.shape)
+        status[on[beyond]] = CorrectionStatus.OUTSIDE
+
+    def _correct_exactly(
+        self, uv: np.ndarray, sigma: np.ndarray | float, angle: ArrayLike | None
+    ) -> CorrectedPoints:
         """Correct by the model itself."""
         good = points_on_image(uv, self.image_size)
         out = CorrectedPoints(
@@ -230,13 +288,30 @@ class FluoroscopeCalibration:
             np.full(len(uv), np.nan),
             np.full(len(uv), CorrectionStatus.INVALID, dtype=np.uint8),
         )
-        correction = self.model.evaluate(uv[good])
+        if angle is not None and np.ndim(angle):
+            angle = np.asarray(angle)[good]
+        correction = self.correction(uv[good], angle)
         out.uv[good] = uv[good] - correction.duv
         out.sigma[good] = np.sqrt(np.broadcast_to(sigma, len(uv))[good] ** 2 + correction.sd**2)
         out.status[good] = np.where(
             correction.outside, CorrectionStatus.OUTSIDE, CorrectionStatus.OK
         )
         return out
+
+
+def at_common_angle(
+    uv: ArrayLike, one: FluoroscopeCalibration, other: FluoroscopeCalibration
+) -> tuple[Correction, Correction]:
+    """Return two corrections at pixels uv (n, 2), which can be compared.
+
+    Corrections that change with the angle of a C-arm are those at the same angle, the one of the
+    exposures of one that the other has come nearest to.
+    """
+    fields = (one.angle_field, other.angle_field)
+    angle = None
+    if fields[0] is not None and fields[1] is not None:
+        angle = fields[0].nearest_common(fields[1])
+    return one.correction(uv, angle), other.correction(uv, angle)
 
 
 def digest_of_sources(frames: Iterable[Frame], phantom: Phantom) -> str:
@@ -247,6 +322,7 @@ def digest_of_sources(frames: Iterable[Frame], phantom: Phantom) -> str:
         digest.update(np.array([frame.number, *frame.image_size], dtype=np.int64).tobytes())
         digest.update(frame.target_id.astype(np.int64).tobytes() + frame.uv.tobytes())
         digest.update(b'' if frame.sigma is None else frame.sigma.tobytes())
+        digest.update(b'' if frame.angle is None else np.array([frame.angle]).tobytes())
     digest.update(
         phantom.target_id.astype(np.int64).tobytes()
         + phantom.xyz_mm.tobytes()

@@ -21,6 +21,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..distortion.angle_field import AngleField
 from ..distortion.base import CorrectionModel
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.precision import Precision
@@ -87,6 +88,8 @@ class SelfCalibration:
     between_exposures : mapping of str to float
         Variance [px^2] by which the distortion differs between exposures, without what
         orientations absorb, of the fluoroscopes where it does.
+    angle_fields : mapping of str to AngleField
+        Of the fluoroscopes whose distortion changes with the angle of the C-arm.
     """
 
     measured: Measured
@@ -100,6 +103,7 @@ class SelfCalibration:
     converged: bool
     stated: Precision | None = None
     between_exposures: Mapping[str, float] = field(default_factory=dict)
+    angle_fields: Mapping[str, AngleField] = field(default_factory=dict)
 
     @property
     def claims(self) -> Precision:

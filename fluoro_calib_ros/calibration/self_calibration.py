@@ -124,7 +124,9 @@ def _continued(
     start = Adjustment(
         measured.start, residuals, q, earlier.noise, np.inf, 0, False, network.exposure
     )
-    problem = AdjustmentProblem(network, measured.image_size, start, gauges_of(measured, options))
+    problem = AdjustmentProblem(
+        network, measured.image_size, start, gauges_of(measured, options), measured.angles
+    )
     names = measured.fluoroscopes
     terms = CollocationTerms(
         problem,
@@ -171,7 +173,9 @@ class _Job:
     def problem(self) -> AdjustmentProblem:
         """What terms in the adjustment are made for."""
         measured = self.measured
-        return AdjustmentProblem(measured.network, measured.image_size, self.before, self.gauges)
+        return AdjustmentProblem(
+            measured.network, measured.image_size, self.before, self.gauges, measured.angles
+        )
 
     def by_model(
         self, source: ModelSource, progress: Callable[[Round], None] | None

@@ -33,6 +33,7 @@ from scipy.linalg import block_diag
 
 from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional
+from .angle_field import AngleField, AngleFit, SeriesWithExposures, can_be_fitted, fit_angles
 from .estimation import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
 from .exposure_terms import (
     ExposureTerms,
@@ -137,12 +138,14 @@ class CollocationTerms(AdjustedTerms):
         self.network = problem.network
         self.gauge_kinds = problem.gauges
         self.sizes = problem.image_sizes
+        self.angles = problem.angles or [np.zeros(0)] * len(self.sizes)
         self.interior = before.parameters.interior
         self.functions: list[Functions] = []
         self.priors: list[Prior] = []
         self.gauges: list[np.ndarray] = []
         self.values: list[np.ndarray] = []
         self.exposure_terms: list[ExposureTerms | None] = [None] * len(self.sizes)
+        self._angle_fits: list[AngleFit | None] = [None] * len(self.sizes)
         self._variation_tested = modes == 0
         self._ripples_searched = modes == 0
         self._mode_changes = 0
@@ -247,6 +250,31 @@ class CollocationTerms(AdjustedTerms):
         plain = replace(functions, rings=0, absent=())
         return Series(plain, plain.converted(functions, values.ravel()).reshape(2, -1), sd)
 
+    def fit_angles(self, f: int, adjustment: Adjustment, precise: Precision) -> AngleField | None:
+        """See `AdjustedTerms`."""
+        own = self.exposure_terms[f]
+        covariance = precise.additional[f]
+        angles = self.angles[f]
+        if own is None or covariance is None or not can_be_fitted(angles):
+            return None
+        estimated = SeriesWithExposures(
+            self.functions[f],
+            self.network.uv[self.network.rows(f)],
+            own,
+            coefficients_of(adjustment)[f],
+            covariance,
+        )
+        fit = fit_angles(estimated, angles)
+        self._angle_fits[f] = fit
+        return None if fit is None else fit.field
+
+    def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
+        """See `AdjustedTerms`; beside a field of the angle, that which belongs to it."""
+        fit = self._angle_fits[f]
+        if fit is None:
+            return super().fitted_series(f, adjustment, precise)
+        return self.series(f, fit.coefficients, fit.covariance)
+
     def left_out(self, f: int) -> LeftOut | None:
         """The signal beyond the sines of fluoroscope f."""
         functions = self.functions[f]
@@ -265,7 +293,8 @@ class CollocationTerms(AdjustedTerms):
         if own is None or covariance is None:
             return 0.0
         last = slice(-own.count, None)
-        return variance_between_exposures(
+        fit = self._angle_fits[f]
+        return (1.0 if fit is None else fit.remaining) * variance_between_exposures(
             network,
             adjustment,
             f,
@@ -408,6 +437,10 @@ class CollocationTerms(AdjustedTerms):
             core = adjustment.inliers[rows]
             found = variation(adjustment.residuals[rows][core], exposure[core], functions[core])
             if found.is_varying and len(np.unique(exposure)) <= MAX_VARYING_EXPOSURES:
+                if can_be_fitted(self.angles[f]):
+                    functions = exposure_functions(
+                        self.network.uv[rows], size, self.interior[f], with_interior=True
+                    )
                 self.exposure_terms[f] = ExposureTerms(functions, exposure, found.size_px)
         return any(own is not None for own in self.exposure_terms)
 

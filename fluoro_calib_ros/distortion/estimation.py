@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from ..photogrammetry.elimination import FactorizedNormalMatrix
     from ..photogrammetry.network import Network
     from ..photogrammetry.precision import Precision
+    from .angle_field import AngleField
     from .series import Series
 
 MIN_TRAINING = 60  # inliers of a fluoroscope that a correction model needs
@@ -59,12 +60,16 @@ class AdjustmentProblem:
         Adjustment of the network without correction.
     gauges : sequence of GaugeKind
         What the orientation of each fluoroscope can express.
+    angles : sequence of (e,) ndarray, optional
+        Angles of the C-arm [rad] in the exposures of each fluoroscope, in the order of the
+        network; NaN where unknown. None: all are unknown.
     """
 
     network: Network
     image_sizes: Sequence[tuple[int, int]]
     before: Adjustment
     gauges: Sequence[GaugeKind]
+    angles: Sequence[np.ndarray] | None = None
 
 
 @dataclass(frozen=True)
@@ -143,6 +148,14 @@ class AdjustedTerms(ABC):
 
     def left_out(self, f: int) -> LeftOut | None:
         """What the series of fluoroscope f leaves out by design; None: nothing."""
+        return None
+
+    def fit_angles(self, f: int, adjustment: Adjustment, precise: Precision) -> AngleField | None:
+        """Fit what differs between the exposures of fluoroscope f to the angles of the C-arm.
+
+        The series and the variance between exposures are then those beside this field. None: there
+        is no such field.
+        """
         return None
 
     def variance_between_exposures(

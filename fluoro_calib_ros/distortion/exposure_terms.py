@@ -29,7 +29,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..photogrammetry.additional_parameters import GroupedFunctions
-from .gauge import gauge_basis
+from .gauge import GaugeKind, gauge_basis
 from .series import Functions
 from .terms import trend_transformation
 
@@ -39,6 +39,7 @@ TREND_DEGREE = 3
 # distortions have 0.4 to 0.8 (docs/pathologies.md).
 VARYING = 0.85
 MIN_VARIANCE = 1e-8  # px^2
+INTERIOR = 3  # principal point and principal distance
 ORIENTATION = 6  # unknowns of an exposure
 MIN_POINTS = 30  # of an exposure whose terms are tested
 
@@ -65,19 +66,30 @@ class Variation:
 
 
 def exposure_functions(
-    uv: np.ndarray, image_size: tuple[int, int], interior: np.ndarray
+    uv: np.ndarray,
+    image_size: tuple[int, int],
+    interior: np.ndarray,
+    with_interior: bool = False,
 ) -> np.ndarray:
     """Values (N, 2, 14) of the terms at pixels uv (N, 2), orthogonal and with an RMS of one.
 
-    They are orthogonal to the gauge about interior (3,), which orientations absorb.
+    They are orthogonal to the gauge about interior (3,), which orientations absorb. with_interior:
+    three further terms are what a turn of the sensor does not absorb of the gauge, a change of the
+    interior orientation.
     """
     to_terms, count = trend_transformation(TREND_DEGREE)
     as_polynomials = np.linalg.inv(to_terms)[:, :count].reshape(2, -1, count)
     values = np.einsum('nm,amt->nat', Functions(image_size, TREND_DEGREE)(uv), as_polynomials)
     gauge = gauge_basis(uv, interior)
     both = np.concatenate([gauge, values], axis=2).reshape(2 * len(uv), -1)
-    q, _ = np.linalg.qr(both)
-    return q[:, gauge.shape[2] :].reshape(len(uv), 2, count) * np.sqrt(2 * len(uv))
+    q = np.linalg.qr(both)[0][:, gauge.shape[2] :]
+    if with_interior:
+        turns = gauge_basis(uv, interior, GaugeKind.TURNS).reshape(2 * len(uv), -1)
+        turns = np.linalg.qr(turns)[0]
+        flat = gauge.reshape(2 * len(uv), -1)
+        left = flat - turns @ (turns.T @ flat)
+        q = np.hstack([q, np.linalg.svd(left, full_matrices=False)[0][:, :INTERIOR]])
+    return q.reshape(len(uv), 2, -1) * np.sqrt(2 * len(uv))
 
 
 def is_determined(exposure: np.ndarray, fewest: int) -> bool:
@@ -125,8 +137,9 @@ class ExposureTerms:
     ----------
     functions : GroupedFunctions
         At the image points; the groups are the exposures.
-    variance : (14,) ndarray
-        Variance of the coefficients of each term over the exposures [px^2].
+    variance : (t,) ndarray
+        Variance of the coefficients of each term over the exposures [px^2]; t: 14, or 17 with a
+        change of the interior orientation.
     """
 
     def __init__(self, functions: np.ndarray, exposure: np.ndarray, size_px: float) -> None:
@@ -143,7 +156,7 @@ class ExposureTerms:
 
     @property
     def values(self) -> np.ndarray:
-        """Functions (N, 2, 14 e) at the image points; zero but for those of the own exposure."""
+        """Functions (N, 2, t e) at the image points; zero but for those of the own exposure."""
         own = self.functions
         out = np.zeros((len(own.group), 2, self.exposures, own.values.shape[2]))
         out[np.arange(len(own.group)), :, own.group] = own.values
@@ -151,7 +164,7 @@ class ExposureTerms:
 
     @property
     def precision(self) -> np.ndarray:
-        """Prior precisions (14 e,) of the coefficients."""
+        """Prior precisions (t e,) of the coefficients."""
         return np.tile(1 / self.variance, self.exposures)
 
     @property
@@ -160,7 +173,7 @@ class ExposureTerms:
         return float(np.sqrt(np.sum(self.variance)))
 
     def renew(self, mean: np.ndarray, posterior: np.ndarray) -> None:
-        """Renew the variances from coefficients (14 e,) and their posterior variances (14 e,)."""
+        """Renew the variances from coefficients (t e,) and their posterior variances (t e,)."""
         mean = mean.reshape(self.exposures, -1)
         posterior = posterior.reshape(self.exposures, -1)
         determined = np.clip(1 - posterior / self.variance, 1e-6, 1).sum(axis=0)

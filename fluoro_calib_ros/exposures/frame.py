@@ -22,7 +22,7 @@ bag, a frame of a stream.
 
 from __future__ import annotations
 
-from collections.abc import Sized
+from collections.abc import Iterable, Sized
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -31,6 +31,8 @@ from numpy.typing import ArrayLike, NDArray
 from ..errors import DataError
 from .columns import first_repeated, is_positive
 from .phantom import Phantom
+
+MAX_ANGLE = 4 * np.pi  # two turns either way: more is no angle in radians
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,8 @@ class Frame:
         Time of the exposure [ns].
     frame_id : str
         Name of the optical frame.
+    angle : float or None
+        Angle of the C-arm [rad], None where it is unknown.
     """
 
     fluoroscope: str
@@ -63,6 +67,7 @@ class Frame:
     sigma: np.ndarray | None = None
     stamp_ns: int = 0
     frame_id: str = field(default='', compare=False)
+    angle: float | None = None
 
     def sorted(self) -> Frame:
         """Return the frame with its targets in ascending order.
@@ -80,6 +85,7 @@ class Frame:
             None if self.sigma is None else np.asarray(self.sigma, dtype=float)[order],
             int(self.stamp_ns),
             self.frame_id,
+            None if self.angle is None else float(self.angle),
         )
 
 
@@ -126,12 +132,25 @@ def _frame_error(frame: Frame, phantom: Phantom | None, image_size: tuple[int, i
     if frame.sigma is not None and len(frame.sigma) != len(ids):
         return length_error(ids, sigma=frame.sigma)
     return (
-        _finite_error(ids, uv)
+        angle_error(frame.angle)
+        or _finite_error(ids, uv)
         or ('' if frame.sigma is None else sigma_error(ids, frame.sigma))
         or _image_error(ids, uv, frame.image_size)
         or repeated_target_error(ids)
         or ('' if phantom is None else _phantom_error(ids, phantom))
     )
+
+
+def angle_error(angle: float | None) -> str:
+    """Return what is wrong with an angle of the C-arm [rad], '' for a valid or unknown one."""
+    if angle is None or abs(angle) <= MAX_ANGLE:
+        return ''
+    return f'the angle of the C-arm is {np.degrees(angle):g} degrees'
+
+
+def angles_of(frames: Iterable[Frame]) -> NDArray[np.float64]:
+    """Return the angles (e,) of the C-arm [rad], NaN where they are unknown."""
+    return np.array([np.nan if f.angle is None else f.angle for f in frames], dtype=float)
 
 
 def points_on_image(uv: ArrayLike, image_size: tuple[int, int]) -> NDArray[np.bool_]:

@@ -24,9 +24,11 @@ from typing import Any
 import numpy as np
 
 from ..calibration.result import FluoroscopeCalibration
+from ..distortion.angle_field import packed_angles, unpacked_angles
 from ..distortion.registry import model_from_arrays
 from ..distortion.series import MAX_DEGREE, MAX_MODES, packed
 from ..errors import DataError
+from ..exposures.frame import MAX_ANGLE
 from ..limits import (
     MAX_COINCIDENT,
     MAX_IMAGE_SIDE,
@@ -73,8 +75,12 @@ ARRAYS = {
     'stamp_ns': ArraySpec('int'),
     'frame_id': ArraySpec('text'),
     'source_digest': ArraySpec('text'),
+    'angles': ArraySpec('float', ('A',), maximum=MAX_ANGLE),
+    'angle_coefficients': ArraySpec('float', ('H', 2, 'T'), maximum=MAX_PX),
+    'angle_variances': ArraySpec('float', ('V', 'G', 'G'), maximum=MAX_PX**2),
 }
 COINCIDENT_PX = 1e-3
+_ANGLES = ('angles', 'angle_coefficients', 'angle_variances')
 _SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
 # Array of the file: entry of CorrectionModel.to_arrays.
 _MODEL_ENTRIES = {
@@ -82,13 +88,17 @@ _MODEL_ENTRIES = {
     'model_k': 'k',
     **{name: name for name in ('train_uv', 'train_duv', 'noise_px', 'bias_px', *_SERIES)},
 }
+_NO_ANGLES = dict(zip(_ANGLES, packed_angles(None)))
 LAYOUT = Layout(
     'a calibration',
     ARRAYS,
-    version=2,
-    readable=(1, 2),
-    # Version 1 did not have a series.
-    defaults={1: dict(zip(_SERIES, map(np.asarray, packed(None))))},
+    version=3,
+    readable=(1, 2, 3),
+    # Version 1 did not have a series, version 2 no angles.
+    defaults={
+        1: {**dict(zip(_SERIES, map(np.asarray, packed(None)))), **_NO_ANGLES},
+        2: _NO_ANGLES,
+    },
 )
 
 
@@ -119,9 +129,11 @@ def validated_arrays(where: object, calibration: FluoroscopeCalibration) -> dict
     have, such as NaN.
     """
     model = calibration.model.to_arrays()
-    values = {
+    values = dict(zip(_ANGLES, packed_angles(calibration.angle_field)))
+    values |= {
         name: model[_MODEL_ENTRIES[name]] if name in _MODEL_ENTRIES else getattr(calibration, name)
         for name in ARRAYS
+        if name not in _ANGLES
     }
     if not len(calibration.train_exposure):
         values['train_exposure'] = np.zeros(0, dtype=np.int64)  # an empty list would be float
@@ -167,9 +179,10 @@ def read_with_id(path: PathLike) -> tuple[FluoroscopeCalibration, str]:
     content = {entry: values.pop(name) for name, entry in _MODEL_ENTRIES.items()}
     try:
         model = model_from_arrays(content, values['image_size'])
+        field = unpacked_angles(values['image_size'], *(values.pop(name) for name in _ANGLES))
     except ValueError as error:
         raise DataError(f'{path}: {error}') from None
-    calibration = FluoroscopeCalibration(model=model, **values)
+    calibration = FluoroscopeCalibration(model=model, angle_field=field, **values)
     if identity not in (calibration.calibration_id, calibration.earlier_id):
         raise DataError(
             f'{path}: the content does not belong to its calibration_id {identity}, '

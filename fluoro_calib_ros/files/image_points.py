@@ -25,11 +25,12 @@ from ..calibration.result import CorrectedPoints, FluoroscopeCalibration
 from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 from ..exposures.columns import is_positive
-from ..exposures.frame import Frame
+from ..exposures.frame import MAX_ANGLE, Frame, angles_of
 from ..exposures.names import Names
 from .access import PathLike
 from .atomic import atomic_file
 from .csv_table import Block, format_float, read_blocks, write_rows
+from .observations import ANGLE
 
 STATUS = tuple(status.name for status in CorrectionStatus)
 ADDED_COLUMNS = ('u_corrected', 'v_corrected', 'sigma', 'status')
@@ -53,6 +54,8 @@ class PointsFile:
         [px], NaN where a cell is empty; None without such a column.
     fluoroscope : (n,) ndarray of str or None
         None without such a column.
+    angle : (n,) ndarray or None
+        Of the C-arm [rad], NaN where a cell is empty; None without such a column.
     """
 
     path: PathLike
@@ -62,6 +65,7 @@ class PointsFile:
     uv: np.ndarray
     sigma: np.ndarray | None
     fluoroscope: np.ndarray | None
+    angle: np.ndarray | None = None
 
     @property
     def added_columns(self) -> list[str]:
@@ -102,13 +106,15 @@ def points_of_frames(
         np.concatenate([f.uv for f in flat]),
         None,
         np.array([row[0] for row in rows]),
+        np.concatenate([np.repeat(a, len(f.uv)) for f, a in zip(flat, angles_of(flat))]),
     )
 
 
 def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> PointsFile:
     """Read a CSV file with the columns u, v [px], optionally fluoroscope and sigma, and others.
 
-    u and v may be empty; such a point will have the status INVALID. known are the ids of
+    A column angle_deg has the angle of the C-arm in degrees. u and v may be empty; such a point
+    will have the status INVALID. known are the ids of
     fluoroscopes that have names. Raises DataError that names row and cause.
     """
     known = known or {}
@@ -124,6 +130,7 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
         np.array([known.get(n, n) for block in blocks for n in block.strings('fluoroscope')])
         if 'fluoroscope' in header
         else None,
+        np.concatenate([_angle(block) for block in blocks]) if ANGLE in header else None,
     )
     for name in points.added_columns:
         if name in header:
@@ -141,6 +148,12 @@ def _sigma(block: Block) -> np.ndarray:
     sigma = block.floats_or_nan('sigma')
     block.require('sigma', np.isnan(sigma) | is_positive(sigma), 'not a finite number above 0')
     return sigma
+
+
+def _angle(block: Block) -> np.ndarray:
+    angle = np.radians(block.floats_or_nan(ANGLE))
+    block.require(ANGLE, np.isnan(angle) | (np.abs(angle) <= MAX_ANGLE), 'not an angle')
+    return angle
 
 
 def correct_points(
@@ -178,7 +191,8 @@ def correct_points(
         sigma = points.sigma
         if sigma is not None:
             sigma = np.where(np.isnan(sigma[rows]), calibration.image_sd, sigma[rows])
-        part = calibration.correct(points.uv[rows], sigma)
+        angle = None if points.angle is None else points.angle[rows]
+        part = calibration.correct(points.uv[rows], sigma, angle=angle)
         out.uv[rows] = part.uv
         out.sigma[rows] = part.sigma
         out.status[rows] = part.status

@@ -12,7 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Observations as CSV: `fluoroscope,exposure,target_id,u,v[,sigma]`, u, v and sigma in pixels.
+"""Observations as CSV: `fluoroscope,exposure,target_id,u,v[,sigma][,angle_deg]`.
+
+u, v and sigma are in pixels; angle_deg is the angle of the C-arm in degrees, the same in all rows
+of an exposure of a fluoroscope, or empty.
 
 Files of a lab may have names instead of ids in the first three columns.
 """
@@ -28,7 +31,7 @@ import numpy as np
 
 from ..errors import DataError
 from ..exposures.columns import first_repeated, is_positive
-from ..exposures.frame import Frame, points_on_image
+from ..exposures.frame import MAX_ANGLE, Frame, points_on_image
 from ..exposures.names import Names, safe_names, without_trivial
 from ..exposures.strays import few
 from .access import check_safe_name
@@ -36,6 +39,7 @@ from .atomic import atomic_file
 from .csv_table import Block, format_float, read_blocks, write_rows
 from .named_column import NamedColumn
 
+ANGLE = 'angle_deg'
 COLUMNS = ('fluoroscope', 'exposure', 'target_id', 'u', 'v')
 
 PathLike = str | os.PathLike[str]
@@ -54,6 +58,8 @@ class _Rows:
         [px]
     sigma : (n,) ndarray
         [px], NaN where unknown.
+    angle : (n,) ndarray
+        Of the C-arm [degrees], NaN where unknown.
     line : (n,) ndarray of int
         Number of the row in the file.
     """
@@ -63,6 +69,7 @@ class _Rows:
     target_id: np.ndarray
     uv: np.ndarray
     sigma: np.ndarray
+    angle: np.ndarray
     line: np.ndarray
 
     def __getitem__(self, rows: np.ndarray) -> _Rows:
@@ -189,19 +196,21 @@ def write_observations_csv(
 ) -> None:
     """Write frames, by fluoroscope or as a sequence, to a CSV file.
 
-    The file has a column sigma if any frame has sigma. Names are written instead of ids in a
-    column whose ids all have one. Raises DataError where the file cannot be written.
+    The file has a column sigma if any frame has sigma, and angle_deg if any has an angle. Names
+    are written instead of ids in a column whose ids all have one. Raises DataError where the file
+    cannot be written.
     """
     if isinstance(frames, Mapping):
         frames = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
     frames = list(frames)
     with_sigma = any(frame.sigma is not None for frame in frames)
+    with_angle = any(frame.angle is not None for frame in frames)
     labels = _labels(frames, names or Names())
     with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS + ('sigma',) * with_sigma])
+        write_rows(file, [COLUMNS + ('sigma',) * with_sigma + (ANGLE,) * with_angle])
         for frame in frames:
             check_safe_name(frame.fluoroscope, path)
-            write_rows(file, _csv_rows(frame, with_sigma, labels))
+            write_rows(file, _csv_rows(frame, with_sigma, with_angle, labels))
 
 
 @dataclass(frozen=True)
@@ -239,9 +248,15 @@ def _parse(block: Block, columns: _Columns) -> _Rows:
         sigma = block.floats_or_nan('sigma')
         is_empty = np.array([cell == '' for cell in block.strings('sigma')])
         block.require('sigma', is_empty | is_positive(sigma), 'not a finite number above 0')
+    angle = np.full(len(uv), np.nan)
+    if ANGLE in block:
+        angle = block.floats_or_nan(ANGLE)
+        block.require(
+            ANGLE, np.isnan(angle) | (np.abs(angle) <= np.degrees(MAX_ANGLE)), 'not an angle'
+        )
     code = np.array([codes[name] for name in names])
     exposure = columns.exposure.read(block)
-    return _Rows(code, exposure, columns.target.read(block), uv, sigma, block.lines)
+    return _Rows(code, exposure, columns.target.read(block), uv, sigma, angle, block.lines)
 
 
 def _concatenate(parts: Sequence[_Rows]) -> _Rows:
@@ -291,10 +306,25 @@ def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) 
         (int(width), int(height)),
         None if unknown.all() else rows.sigma,
         frame_id=f'{name}_optical',
+        angle=_angle(path, where, rows),
     )
 
 
-def _csv_rows(frame: Frame, with_sigma: bool, labels: _Labels) -> Iterator[list[Any]]:
+def _angle(path: PathLike, where: str, rows: _Rows) -> float | None:
+    """Return the angle [rad] of the rows of a frame, None without one. Raises DataError."""
+    differs = ~((rows.angle == rows.angle[0]) | np.isnan(rows.angle) & np.isnan(rows.angle[0]))
+    if differs.any():
+        row = np.argmax(differs)
+        raise DataError(
+            f'{path}, row {rows.line[row]}: {ANGLE} {where} is {rows.angle[row]:g}, '
+            f'but {rows.angle[0]:g} in row {rows.line[0]}'
+        )
+    return None if np.isnan(rows.angle[0]) else float(np.radians(rows.angle[0]))
+
+
+def _csv_rows(
+    frame: Frame, with_sigma: bool, with_angle: bool, labels: _Labels
+) -> Iterator[list[Any]]:
     fluoroscope = labels.fluoroscopes.get(frame.fluoroscope, frame.fluoroscope)
     exposure = labels.exposures.get(int(frame.number), int(frame.number))
     columns: list[Iterable[Any]] = [
@@ -304,4 +334,7 @@ def _csv_rows(frame: Frame, with_sigma: bool, labels: _Labels) -> Iterator[list[
     if with_sigma:
         sigma = np.full(len(frame.target_id), np.nan) if frame.sigma is None else frame.sigma
         columns.append(map(format_float, sigma))
+    if with_angle:
+        angle = np.nan if frame.angle is None else np.degrees(frame.angle)
+        columns.append([format_float(angle)] * len(frame.target_id))
     return ([fluoroscope, exposure, *cells] for cells in zip(*columns))

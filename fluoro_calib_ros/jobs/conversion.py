@@ -221,7 +221,7 @@ def _corrected(
             )
         out[name] = []
         for frame in frames:
-            points = calibrations[name].correct(frame.uv, frame.sigma)
+            points = calibrations[name].correct(frame.uv, frame.sigma, angle=frame.angle)
             kept = points.status != CorrectionStatus.INVALID
             out[name].append(
                 replace(

@@ -173,7 +173,7 @@ def _corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> Correc
     if error:
         raise DataError(f'{where}: {error}')
     u, v, sigma, correction_sd, status = calibration.correct_arrays(
-        frame.uv[:, 0], frame.uv[:, 1], frame.sigma
+        frame.uv[:, 0], frame.uv[:, 1], frame.sigma, frame.angle
     )
     uv = np.stack([u, v], axis=1)
     return CorrectedView(

@@ -91,6 +91,7 @@ def residuals_of(
     exposure = []
     target_id = []
     uv = []
+    angle = []
     computed = []
     for frame in frames:
         if frame.number not in poses:
@@ -103,6 +104,7 @@ def residuals_of(
         exposure.append(np.full(count, frame.number))
         target_id.append(ids)
         uv.append(frame.uv[known])
+        angle.append(np.full(count, np.nan if frame.angle is None else frame.angle))
         computed.append(
             project(
                 np.broadcast_to(rotation, (count, 3, 3)),
@@ -116,7 +118,7 @@ def residuals_of(
         none = np.zeros(0, dtype=int)
         return Residuals(none, none, empty, empty, empty, none.astype(bool))
     numbers, ids, observed, expected = map(np.concatenate, (exposure, target_id, uv, computed))
-    corrected = calibration.correct(observed, exact=True).uv
+    corrected = calibration.correct(observed, exact=True, angle=np.concatenate(angle)).uv
     inlier = np.array([pair not in outliers for pair in zip(numbers.tolist(), ids.tolist())])
     return Residuals(
         numbers, ids, observed, observed - expected, corrected - expected, inlier.astype(bool)

@@ -283,7 +283,7 @@ def _rays(job: CalibrationResult, frames: Mapping[str, Sequence[Frame]]) -> Rays
         for e in figures.exposures:
             frame = by_number[e.exposure]
             n = len(frame.target_id)
-            correction = calibration.model.evaluate(frame.uv)
+            correction = calibration.correction(frame.uv, frame.angle)
             sigma: np.ndarray | float = calibration.image_sd
             if frame.sigma is not None:
                 sigma = calibration.sigma0 * frame.sigma

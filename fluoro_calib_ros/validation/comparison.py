@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import chdtri
 
-from ..calibration.result import FluoroscopeCalibration
+from ..calibration.result import FluoroscopeCalibration, at_common_angle
 from ..distortion.gauge import gauge_basis
 from ..errors import DataError
 
@@ -112,7 +112,7 @@ def compare_calibrations(
         sizes = [f'{w} x {h} px' for w, h in (first.image_size, second.image_size)]
         raise DataError(f'fluoroscope {name}: the images are {sizes[0]} and {sizes[1]}')
     uv = _cells(first.image_size)
-    fields = [calibration.model.evaluate(uv) for calibration in (first, second)]
+    fields = at_common_angle(uv, first, second)
     common = ~(fields[0].outside | fields[1].outside)
     if common.sum() < MIN_COMMON:
         raise DataError(

@@ -117,7 +117,9 @@ class Evidence:
         calibration = self.calibrations[name]
         residuals = residuals_of(self.result, name, self.frames[name])
         inliers = residuals.inliers(calibration.image_sd)
-        claimed = float(np.sqrt(np.mean(calibration.model.evaluate(inliers.uv).sd ** 2)))
+        claimed = float(
+            np.sqrt(np.mean(calibration.correction(inliers.uv, inliers.angle).sd ** 2))
+        )
         return CommonTrend(inliers, common_trend(inliers, calibration.image_size), claimed)
 
     @cached_property
@@ -143,6 +145,8 @@ class Evidence:
         )
 
     def _is_varying(self, name: str) -> bool:
+        if self.calibrations[name].angle_field is not None:
+            return True
         found = self.variations[name]
         return found is not None and found.is_varying
 

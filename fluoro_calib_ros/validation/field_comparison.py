@@ -26,7 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..calibration.result import FluoroscopeCalibration
+from ..calibration.result import FluoroscopeCalibration, at_common_angle
 
 GRID = 24  # points across the image at which predictions are compared
 MIN_POINTS = 20  # of the grid inside both calibrated areas
@@ -98,7 +98,7 @@ def difference(
     removed. Returns None for an area that is too small.
     """
     grid = image_grid(one.image_size)
-    corrections = [c.model.evaluate(grid) for c in (one, other)]
+    corrections = at_common_angle(grid, one, other)
     both = ~(corrections[0].outside | corrections[1].outside)
     if both.sum() < MIN_POINTS:
         return None

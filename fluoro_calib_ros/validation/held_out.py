@@ -104,7 +104,7 @@ def _hold_out(
             )
         squared_outside = outside.capped(sd)
         squared_inside = inside.capped(sd)
-        predicted = 2 * calibrations[name].model.evaluate(outside.uv).sd ** 2
+        predicted = 2 * calibrations[name].correction(outside.uv, outside.angle).sd ** 2
         out[name] = []
         for row, number in enumerate(outside.numbers):
             points = outside.exposure == row

@@ -33,7 +33,7 @@ from scipy import special
 from scipy.spatial import cKDTree
 
 from ..calibration.calibrate import CalibrationResult
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, angles_of
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import INLIER_Q
 from ..photogrammetry.rotations import matrix_from_quaternion
@@ -80,6 +80,8 @@ class Residuals:
     target_id : (n,) ndarray of int
     numbers : (m,) ndarray of int
         Numbers of the exposures.
+    angles : (m,) ndarray
+        Angles of the C-arm [rad], NaN where they are unknown.
     """
 
     uv: np.ndarray
@@ -87,6 +89,12 @@ class Residuals:
     exposure: np.ndarray
     target_id: np.ndarray
     numbers: np.ndarray
+    angles: np.ndarray
+
+    @property
+    def angle(self) -> np.ndarray:
+        """Angle (n,) of the C-arm [rad] of each residual."""
+        return self.angles[self.exposure]
 
     def capped(self, sd: float) -> np.ndarray:
         """Return squared lengths (n,) [px^2], capped at the border of the core of the noise.
@@ -100,7 +108,12 @@ class Residuals:
         """Return the residuals in the core of noise of standard deviation sd [px]."""
         keep = np.sum(self.r**2, axis=1) <= INLIER_Q * sd**2
         return Residuals(
-            self.uv[keep], self.r[keep], self.exposure[keep], self.target_id[keep], self.numbers
+            self.uv[keep],
+            self.r[keep],
+            self.exposure[keep],
+            self.target_id[keep],
+            self.numbers,
+            self.angles,
         )
 
 
@@ -173,7 +186,7 @@ def residuals_of(job: CalibrationResult, name: str, frames: Sequence[Frame]) -> 
     frames : sequence of Frame
     """
     figures = job.fluoroscopes[name]
-    model = job.calibrations[name].model
+    calibration = job.calibrations[name]
     targets = job.targets
     by_number = {frame.number: frame.sorted() for frame in frames}
     uv = []
@@ -190,7 +203,8 @@ def residuals_of(job: CalibrationResult, name: str, frames: Sequence[Frame]) -> 
             figures.interior,
         )
         uv.append(frame.uv)
-        residuals.append(frame.uv - model.predict(frame.uv) - ideal)
+        correction = calibration.correction(frame.uv, frame.angle).duv
+        residuals.append(frame.uv - correction - ideal)
         ids.append(frame.target_id)
     return Residuals(
         np.concatenate(uv),
@@ -198,6 +212,7 @@ def residuals_of(job: CalibrationResult, name: str, frames: Sequence[Frame]) -> 
         np.repeat(np.arange(len(uv)), [len(part) for part in uv]),
         np.concatenate(ids),
         np.array([e.exposure for e in figures.exposures]),
+        angles_of(by_number[e.exposure] for e in figures.exposures),
     )
 
 

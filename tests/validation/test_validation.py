@@ -108,7 +108,8 @@ def noise(seed, exposures=12, count=120, sd=0.25, trend=lambda uv, e: 0.0):
     uv = rng.uniform(0, 1023, (exposures * count, 2))
     e = np.repeat(np.arange(exposures), count)
     r = rng.normal(0, sd, uv.shape) + trend(uv, e)
-    return Residuals(uv, r, e, np.zeros(len(e), dtype=int), np.arange(exposures))
+    numbers = np.arange(exposures)
+    return Residuals(uv, r, e, np.zeros(len(e), dtype=int), numbers, np.full(exposures, np.nan))
 
 
 # ---- the whole

@@ -371,8 +371,6 @@ class CollocationTerms(AdjustedTerms):
         added = False
         for f, functions in enumerate(self.functions):
             points = self._fitted_points(f, adjustment)
-            if not has_common_error(points):
-                continue
             found = shown_ripples(self.sizes[f], points.uv, points.residuals, functions.complete)
             if found is not None:
                 signal = self.priors[f].signal

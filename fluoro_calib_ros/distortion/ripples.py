@@ -35,7 +35,6 @@ SIGNIFICANT = 5.0
 INDEPENDENT = 1 / MARGIN**2  # part of the sines, over their rectangle, that the image can tell
 BESIDE = 1  # bands next to one with ripples that are used, too: the image ends, and waves do not
 LEAST_EXCESS = 0.1  # power that a band starts with, over that of noise
-CHUNK = 5_000  # image points for which the sines are evaluated at once
 
 
 @dataclass(frozen=True)
@@ -104,13 +103,7 @@ def shown_ripples(
         Bands up to which the series has all sines.
     """
     functions = Functions(image_size, -1, SEARCHED_BANDS)
-    products = np.zeros((len(functions), 2))
-    squares = np.zeros(len(functions))
-    for start in range(0, len(uv), CHUNK):
-        rows = slice(start, start + CHUNK)
-        values = functions(uv[rows])
-        products += values.T @ residuals[rows]
-        squares += np.einsum('nm,nm->m', values, values)
+    products, squares = functions.sums_of_sines(uv, residuals)
     noise = float(np.mean(residuals**2))
     power = np.mean(products**2, axis=1) / (squares * noise)
     number = np.maximum(np.bincount(functions.band), 1)

@@ -207,11 +207,25 @@ class Functions:
             out[:, len(self.powers) : self.trend : 2] = rings * x[:, None]
             out[:, len(self.powers) + 1 : self.trend : 2] = rings * y[:, None]
         if self.modes:
-            half = MARGIN * np.asarray(self.image_size) / 2
-            waves = [self._waves(a, extent) for a, extent in zip((x, y), half)]
+            of_x, of_y = self._waves_of_both(x, y)
             i, j = self._sines.T - 1
-            np.multiply(waves[0][:, i], waves[1][:, j], out=out[:, self.trend :])
+            np.multiply(of_x[:, i], of_y[:, j], out=out[:, self.trend :])
         return out
+
+    def sums_of_sines(self, uv: ArrayLike, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sums (s, k) of values (n, k) at pixels uv (n, 2) times the sines; (s,) of their squares.
+
+        A sine is a product of one along u and one along v: it takes no value at every pixel.
+        """
+        of_x, of_y = self._waves_of_both(*self._coordinates(uv))
+        i, j = self._sines.T - 1
+        sums = [(of_x.T @ (column[:, None] * of_y))[i, j] for column in values.T]
+        return np.stack(sums, axis=1), (np.square(of_x).T @ np.square(of_y))[i, j]
+
+    def _waves_of_both(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sines (n, modes) along u and along v."""
+        extent = MARGIN * np.asarray(self.image_size) / 2
+        return self._waves(x, extent[0]), self._waves(y, extent[1])
 
     def _waves(self, coordinate: np.ndarray, extent: float) -> np.ndarray:
         """Sines (n, modes) along one axis; extent: half the side of their rectangle [px]."""

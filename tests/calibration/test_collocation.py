@@ -209,6 +209,10 @@ def test_bands_of_sines_can_be_left_out():
     whole = every.converted(some, coefficients.ravel()).reshape(2, -1)
     expected = some(uv) @ coefficients.T
     np.testing.assert_allclose(every(uv) @ whole.T, expected, rtol=0, atol=1e-12)
+    sums, squares = some.sums_of_sines(uv, expected)
+    sines = some(uv)[:, some.trend :]
+    np.testing.assert_allclose(sums, sines.T @ expected, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(squares, np.sum(sines**2, axis=0), rtol=1e-9)
     functions, found = without_absent_bands(every, whole)
     assert functions == some
     np.testing.assert_array_equal(found, coefficients)
@@ -426,10 +430,14 @@ def plane_wave(uv, wavelength):
     return np.sin(2 * np.pi / wavelength * (uv @ [0.6, 0.8]))[:, None] * [0.3, -0.2]
 
 
-@pytest.mark.parametrize('wavelength', [60.0, 80.0, 150.0])
-def test_residuals_show_the_band_of_ripples(wavelength):
-    """Noise as large shows none, nor do ripples for which the series has sines."""
-    uv = pixels(1500, 4, (1024, 1024))
+@pytest.mark.parametrize(
+    'wavelength, count', [(60.0, 1500), (80.0, 1500), (150.0, 1500), (80.0, 600)]
+)
+def test_residuals_show_the_band_of_ripples(wavelength, count):
+    """Also where the distance of the points is half the wavelength. Noise as large shows none, nor
+    do ripples for which the series has sines.
+    """
+    uv = pixels(count, 4, (1024, 1024))
     noise = np.random.default_rng(6).normal(0, 0.25, uv.shape)
     assert shown_ripples((1024, 1024), uv, noise, 10) is None
     found = shown_ripples((1024, 1024), uv, noise + plane_wave(uv, wavelength), 10)

@@ -32,7 +32,7 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from ..photogrammetry.additional_parameters import AdditionalParameters
-from ..photogrammetry.precision import information_of_additional
+from ..photogrammetry.precision import information_of_additional, solved_additional
 from .angle_field import AngleField, AngleFit, SeriesWithExposures, can_be_fitted, fit_angles
 from .estimation import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
 from .exposure_terms import (
@@ -314,9 +314,9 @@ class CollocationTerms(AdjustedTerms):
         if self._settled == HELD_AFTER:
             return True, coefficients
         self.interior = adjustment.parameters.interior
+        solved = solved_additional(matrix, network, adjustment)
         found = [
-            self._renew_prior(f, network, matrix, coefficients[f])
-            for f in range(len(self.functions))
+            self._renew_prior(f, network, matrix, solved[f]) for f in range(len(self.functions))
         ]
         modes = [modes for modes, _ in found]
         present_modes = [functions.complete for functions in self.functions]

@@ -32,7 +32,7 @@ from .datum import Gauge, STransformation
 from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, factorize
 from .network import Network
 from .noise import Noise
-from .normal_equations import normal_equations
+from .normal_equations import normal_equations, right_sides
 from .relative_orientation import discrepancies_with_jacobian
 from .symmetric import square_of_lower
 from .unknowns import Parameters, UnknownVector
@@ -152,6 +152,35 @@ def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> np.ndar
         mixed = everything[np.ix_(others, own)]
         out = out - mixed.T @ np.linalg.solve(everything[np.ix_(others, others)], mixed)
     return out
+
+
+def solved_additional(
+    matrix: FactorizedNormalMatrix, network: Network, adjustment: Adjustment
+) -> tuple[np.ndarray, ...]:
+    """Coefficients (p,) of the additional parameters at the solution, by fluoroscope.
+
+    An adjustment ends where F hardly decreases any more. A coefficient whose prior variance is
+    small may then still be off by many times what the observations pull it, and its prior times
+    its value says little about that pull. One step with the normal matrix leads to the solution.
+
+    network has additional parameters, and only these correct its image points; matrix is its
+    normal matrix near the solution.
+    """
+    parameters = adjustment.parameters
+    if network.relative:
+        equations = normal_equations(network, parameters, 0.0, adjustment.noise)
+        right = UnknownVector(equations.e, equations.p, equations.g)
+    else:
+        right = right_sides(network, parameters, 0.0, adjustment.noise)
+    elimination = matrix.elimination
+    block_right, rest_right = elimination.right_sides(right)
+    found = matrix.factor.solve(block_right[..., None], rest_right[:, None])
+    step = elimination.to_unknowns(*found).globals[:, 0]
+    return tuple(
+        coefficients + step[columns]
+        for coefficients, columns in zip(parameters.additional, network.layout.additional)
+        if coefficients is not None
+    )
 
 
 def covariance_of_projection(

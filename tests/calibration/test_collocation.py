@@ -91,6 +91,7 @@ from fluoro_calib_ros.photogrammetry.precision import (
     covariance_of_projection,
     information_of_additional,
     precision,
+    solved_additional,
     variance_of_projection,
 )
 from fluoro_calib_ros.simulation.distortion import DistortionField
@@ -840,3 +841,24 @@ def test_claims_hold_for_unseen_exposures_where_the_distortion_varies():
     claimed = calibration.correct(table.uv[good], exact=True).sigma
     square = np.sum((table.residual[good] / claimed[:, None]) ** 2)
     assert 0.6 < square / np.sum(table.redundancy[good]) < 1.6
+
+
+@pytest.mark.parametrize('exposures', [4, 14])  # points or exposures are eliminated
+def test_coefficients_at_the_solution_of_an_adjustment_that_stopped_before(exposures):
+    """A coefficient that its prior nearly holds says what pulls it only at the solution."""
+    network, truth = rigs.small_network(exposures, 25, noise_px=0.3, nu=4.0, free=False)
+    functions = Functions((1024, 1024), 3)(network.uv)
+    count = 2 * functions.shape[1]
+    prior = np.diag(np.where(np.arange(count) % 2, 1e8, 1.0))
+    network = replace(network, additional=(AdditionalParameters(functions, prior),))
+    start = replace(truth, additional=(np.full(count, 0.5),))
+    noise = Noise(scale=0.3, nu=4.0)
+    stopped = adjust(network, start, noise=noise, options=SolverOptions(1.0))
+    exact = adjust(network, start, noise=noise, options=SolverOptions(1e-12))
+    equations = normal_equations(network, stopped.parameters, 0.0, noise, 0.75)
+    solved = solved_additional(factorize(network, equations), network, stopped)[0]
+    pulls = [prior @ c for c in (stopped.parameters.additional[0], solved)]
+    expected = prior @ exact.parameters.additional[0]
+    errors = [np.max(np.abs(pull - expected)) for pull in pulls]
+    assert errors[1] < 0.1 * errors[0]
+    assert errors[1] < 0.1 * np.max(np.abs(expected))

@@ -41,7 +41,7 @@ from .exposure_terms import (
     variation,
     without_exposure_terms,
 )
-from .exposure_variance import variance_between_exposures
+from .exposure_variance import estimates_beside_free_points, variance_between_exposures
 from .misfit import FittedPoints, LeftOut, has_common_error
 from .priors import (
     Prior,
@@ -315,6 +315,7 @@ class CollocationTerms(AdjustedTerms):
             return True, coefficients
         self.interior = adjustment.parameters.interior
         solved = solved_additional(matrix, network, adjustment)
+        self._renew_exposure_terms(network, adjustment)
         found = [
             self._renew_prior(f, network, matrix, solved[f]) for f in range(len(self.functions))
         ]
@@ -387,6 +388,21 @@ class CollocationTerms(AdjustedTerms):
             self.network.uv[rows], adjustment.residuals[rows], self.network.exposure[rows]
         )
 
+    def _renew_exposure_terms(self, network: Network, adjustment: Adjustment) -> None:
+        """Renew the variances of the terms of exposures."""
+        if all(own is None for own in self.exposure_terms):
+            return
+        estimates = estimates_beside_free_points(network, adjustment)
+        for own, functions, (mean, variance) in zip(
+            self.exposure_terms, self.functions, estimates
+        ):
+            if own is not None:
+                end = slice(2 * len(functions), None)
+                before = own.size_px
+                own.renew(mean[end], variance[end])
+                if abs(own.size_px - before) > SETTLED_VARIATION * before:
+                    self._settled = 0
+
     def _renew_prior(
         self, f: int, network: Network, matrix: FactorizedNormalMatrix, coefficients: np.ndarray
     ) -> tuple[int, bool]:
@@ -399,15 +415,9 @@ class CollocationTerms(AdjustedTerms):
         right = (information + present) @ coefficients
         own = self.exposure_terms[f]
         if own is not None:
-            posterior = np.linalg.inv(information + present)
-            end = slice(2 * len(functions), None)
-            before = own.size_px
-            own.renew(coefficients[end], np.diagonal(posterior)[end])
             information, right = without_exposure_terms(
                 information, right, own.precision, 2 * len(functions)
             )
-            if abs(own.size_px - before) > SETTLED_VARIATION * before:
-                self._settled = 0
 
         def renewed(prior: Prior, search: bool) -> Prior:
             gauge = self.gauges[f]

@@ -12,15 +12,17 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""How far the distortion of a later exposure differs from the common one.
+"""What the terms of exposures (see `exposure_terms`) are if the survey has errors in common.
 
-The variances of the terms of the exposures (see `exposure_terms`) have the largest likelihood
-under the survey, whose errors are taken to be independent. Errors that the survey has in common,
-such as a sheet that has shrunk in one direction, look like terms that change as the phantom is
-turned. Object points could absorb such terms, but not terms drawn from these variances. The size
-is therefore that of the part which neither orientations nor object points absorb; only the
-distribution over the terms is that of the variances: a variance component by the method of
-moments (Searle, Casella and McCulloch, "Variance Components", Wiley 1992, chapter 5).
+Errors of the survey are taken to be independent. Errors that it has in common, such as a sheet
+that is bent or has shrunk in one direction, look like terms that change as the phantom is turned:
+such terms are more likely than errors of so many points. Object points must not lend the terms
+their likelihood. The variances of the terms are therefore estimated with object points that are
+nearly free, by restricted likelihood (Patterson and Thompson, "Recovery of inter-block information
+when block sizes are unequal", Biometrika 58, 1971). How far the distortion of a later exposure
+differs is the size of the part which neither orientations nor object points absorb, a variance
+component by the method of moments (Searle, Casella and McCulloch, "Variance Components", Wiley
+1992, chapter 5).
 """
 
 from __future__ import annotations
@@ -36,10 +38,28 @@ from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.normal_equations import normal_equations
-from ..photogrammetry.precision import information_of_additional
+from ..photogrammetry.precision import information_of_additional, solved_additional
 from .exposure_terms import ExposureTerms
 
 UNUSED = 1e6  # factor of the standard deviation of an outlier
+NEARLY_FREE = 10.0  # factor of the standard deviations of the survey
+
+
+def estimates_beside_free_points(
+    network: Network, adjustment: Adjustment
+) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Coefficients (p,) and their variances (p,) by fluoroscope, with points that are nearly free.
+
+    network has additional parameters for each fluoroscope; it is linearised at the adjustment.
+    Raises numpy.linalg.LinAlgError where it does not determine them.
+    """
+    free = replace(network, survey_sd_mm=NEARLY_FREE * network.survey_sd_mm)
+    factor = adjustment.noise.information_factor(adjustment.q)
+    equations = normal_equations(free, adjustment.parameters, 0.0, adjustment.noise, factor)
+    matrix = factorize(free, equations)
+    means = solved_additional(matrix, free, adjustment)
+    informations = (information_of_additional(matrix, f) for f in range(len(means)))
+    return tuple((mean, np.diagonal(np.linalg.inv(one))) for mean, one in zip(means, informations))
 
 
 def variance_between_exposures(

@@ -21,10 +21,17 @@ import pytest
 import rigs
 
 from fluoro_calib_ros.distortion.exposure_terms import ExposureTerms, exposure_functions
-from fluoro_calib_ros.distortion.exposure_variance import variance_between_exposures
+from fluoro_calib_ros.distortion.exposure_variance import (
+    estimates_beside_free_points,
+    variance_between_exposures,
+)
+from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
-from fluoro_calib_ros.photogrammetry.collinearity import project_with_jacobian
+from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
+from fluoro_calib_ros.photogrammetry.elimination import factorize
 from fluoro_calib_ros.photogrammetry.noise import Noise
+from fluoro_calib_ros.photogrammetry.normal_equations import normal_equations
+from fluoro_calib_ros.photogrammetry.precision import information_of_additional
 
 SIZE = (1024, 1024)
 SIZE_PX = 0.5
@@ -92,3 +99,54 @@ def test_a_phantom_that_has_shrunk_is_no_variation(case):
     exact = np.zeros((terms.count, terms.count))
     got = variance_between_exposures(loose, found, 0, terms, coefficients, exact)
     assert got < 0.3 * mean_square_left(network, by_exterior, like_variation)
+
+
+def estimated_size(network, true):
+    """Size of the terms of exposures [px] after some renewals, and by estimates under the survey.
+
+    The errors of the survey are taken to be independent there.
+    """
+    sizes = []
+    for beside_free_points in (True, False):
+        functions = exposure_functions(network.uv, SIZE, true.interior[0])
+        terms = ExposureTerms(functions, network.exposure, SIZE_PX)
+        start = replace(true, additional=(np.zeros(terms.count),))
+        for _ in range(8):
+            own = AdditionalParameters(
+                np.zeros((len(network.uv), 0)), np.diag(terms.precision), terms.functions
+            )
+            varying = replace(network, additional=(own,))
+            found = adjust(varying, start, noise=Noise('gaussian', 0.3))
+            if beside_free_points:
+                mean, variance = estimates_beside_free_points(varying, found)[0]
+            else:
+                mean = found.parameters.additional[0]
+                matrix = factorize(
+                    varying, normal_equations(varying, found.parameters, 0.0, found.noise)
+                )
+                variance = np.diagonal(np.linalg.inv(information_of_additional(matrix, 0)))
+            terms.renew(mean, variance)
+        sizes.append(terms.size_px)
+    return sizes
+
+
+def test_a_bent_phantom_makes_no_terms_of_exposures():
+    network, true = rigs.small_network(EXPOSURES, 80, survey_sd_mm=0.05, free=False, seed=3)
+    x, y, z = true.points_mm.T / np.max(np.abs(true.points_mm))
+    bent = true.points_mm + 0.4 * np.stack([y * z, x * z, x * y], axis=1)
+    true = replace(true, points_mm=bent)
+    rng = np.random.default_rng(4)
+    noise = rng.normal(0, 0.3, network.uv.shape) * network.sigma[:, None]
+    uv = project(*network.per_image_point(true)) + noise
+    free, surveyed = estimated_size(replace(network, uv=uv), true)
+    assert free < 0.5 * surveyed
+
+
+def test_terms_of_exposures_are_found_beside_free_points(case):
+    network, found, _, _, terms = case
+    rng = np.random.default_rng(2)
+    coefficients = rng.normal(0, np.sqrt(np.tile(terms.variance, terms.exposures)))
+    varying = replace(network, uv=network.uv + terms.values @ coefficients)
+    free, surveyed = estimated_size(varying, found.parameters)
+    assert free == pytest.approx(SIZE_PX, rel=0.15)
+    assert surveyed == pytest.approx(SIZE_PX, rel=0.15)

@@ -112,6 +112,20 @@ class AngleField:
         h = harmonics(self.angles) - self._mean
         return h.T @ h / len(h)
 
+    @property
+    def range(self) -> tuple[float, float]:
+        """Least and largest angle of the exposures [rad]."""
+        return float(self.angles.min()), float(self.angles.max())
+
+    @property
+    def size_px(self) -> float:
+        """RMS of a coordinate of the change, over the image and the exposures [px]."""
+        fields = self._functions(sd_grid_pixels(self.image_size)) @ self.coefficients.transpose(
+            0, 2, 1
+        )
+        square = np.einsum('jna,jk,kna->', fields, self._spread, fields)
+        return float(np.sqrt(square / (2 * fields.shape[1])))
+
     def covers(self, angle: ArrayLike) -> np.ndarray:
         """Whether angles (...) [rad] are near a calibrated one; True where unknown (NaN)."""
         angle = np.asarray(angle, dtype=float)
@@ -147,10 +161,11 @@ class AngleField:
             return self._change_at(uv, float(angles))
         duv = np.zeros_like(uv)
         variance = np.zeros(len(uv))
-        values, group = np.unique(angles, return_inverse=True)  # NaN counts once
-        for number, value in enumerate(values):
-            rows = group == number
+        for value in np.unique(angles[~np.isnan(angles)]):
+            rows = angles == value
             duv[rows], variance[rows] = self._change_at(uv[rows], float(value))
+        rows = np.isnan(angles)
+        duv[rows], variance[rows] = self._change_at(uv[rows], np.nan)
         return duv, variance
 
     def _change_at(self, uv: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:

@@ -24,6 +24,7 @@ import numpy as np
 from ..calibration.adjustment_report import AdjustmentStatistics
 from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
 from ..calibration.constraints import RelativeOrientation
+from ..calibration.result import FluoroscopeCalibration
 from ..calibration.rounds import Round
 from ..drift.recording_watch import DriftVerdict
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -43,7 +44,8 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
         'created': job.created,
         'units': UNITS,
         'fluoroscopes': {
-            name: _fluoroscope(figures) for name, figures in job.fluoroscopes.items()
+            name: _fluoroscope(figures) | _angle(job.calibrations[name])
+            for name, figures in job.fluoroscopes.items()
         },
         'targets': [
             {'target_id': int(i), 'xyz_mm': xyz, 'sd_mm': sd}
@@ -137,6 +139,14 @@ def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
             for e in figures.exposures
         ],
     }
+
+
+def _angle(calibration: FluoroscopeCalibration) -> dict[str, Any]:
+    """Return the change of a correction with the angle of the C-arm, {} where there is none."""
+    field = calibration.angle_field
+    if field is None:
+        return {}
+    return {'angle': {'exposures_rad': field.angles, 'change_rms_px': field.size_px}}
 
 
 def _history(history: Mapping[str, Sequence[Round]]) -> list[dict[str, Any]]:

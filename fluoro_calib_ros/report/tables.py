@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
+from ..distortion.angle_field import AngleField
 from .text import TERMINAL_WIDTH, number_text
 
 # Widths of the columns of quantities and of fluoroscopes.
@@ -42,6 +43,8 @@ def summary_table(result: CalibrationResult, latency_ms: Mapping[str, float] | N
         columns = [_column(result, name) for name in names[start : start + per_block]]
         lines = []
         for label in columns[0]:
+            if label in _angle_rows(None) and all(c[label] == '-' for c in columns):
+                continue
             values = ''.join(column[label].rjust(COLUMN_WIDTH) for column in columns)
             lines.append((label.ljust(LABEL_WIDTH) + values).rstrip())
         blocks.append('\n'.join(lines))
@@ -83,7 +86,17 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
         'interior orientation': 'estimated' if calibration.interior_estimated else 'held',
         **_interior_rows(figures),
         'median sd of the correction [px]': number_text(float(np.median(correction_sd))),
+        **_angle_rows(calibration.angle_field),
         'calibration [s]': number_text(calibration.seconds, 1),
+    }
+
+
+def _angle_rows(field: AngleField | None) -> dict[str, str]:
+    if field is None:
+        return {'angles of the C-arm [deg]': '-', 'change with the angle, RMS [px]': '-'}
+    return {
+        'angles of the C-arm [deg]': ' to '.join(f'{np.degrees(a):.0f}' for a in field.range),
+        'change with the angle, RMS [px]': number_text(field.size_px),
     }
 
 

@@ -18,7 +18,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+
 from ..distortion.exposure_terms import VARYING
+from ..exposures.frame import angles_of
 from .check import Check, Finding, judge, more_exposures, not_made
 from .evidence import Evidence, Subject
 
@@ -55,10 +58,18 @@ def _check(evidence: Evidence, name: str) -> Check:
             f'{VARYING:.2f})',
             'a C-arm at another angle, a lens that was focused or zoomed, a source or detector '
             'that is not rigid, or a phantom that moved, was bent or is surveyed wrongly; '
-            f'{more_exposures(count)} at the angle and setting that are used, or calibrate each',
+            f'{more_exposures(count)} at the angle and setting that are used, or calibrate each'
+            + _how_to_give_angles(evidence, name),
         ),
         evidence.trends[name].is_significant,
     )
+
+
+def _how_to_give_angles(evidence: Evidence, name: str) -> str:
+    """What else helps where the angles of the C-arm are unknown."""
+    if np.isfinite(angles_of(evidence.frames[name])).all():
+        return ''
+    return '; or give the angle of the C-arm with each exposure (angle_deg, or joint_states)'
 
 
 VARIATION = Subject(check_variation)

@@ -138,8 +138,9 @@ def add_source(
         'source',
         type=Path,
         metavar='SOURCE',
-        help='bag (file or folder), CSV file fluoroscope,exposure,target_id,u,v[,sigma], or image '
-        'points of another program: XMALab 2-D points or project, .pho (docs/formats.md)' + more,
+        help='bag (file or folder), CSV file '
+        'fluoroscope,exposure,target_id,u,v[,sigma][,angle_deg], or image points of another '
+        'program: XMALab 2-D points or project, .pho (docs/formats.md)' + more,
     )
     group = parser.add_argument_group('input')
     group.add_argument('--image-size', type=image_size, metavar='WxH', help=image_size_help)

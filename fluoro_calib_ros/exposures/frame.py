@@ -56,7 +56,8 @@ class Frame:
     frame_id : str
         Name of the optical frame.
     angle : float or None
-        Angle of the C-arm [rad], None where it is unknown.
+        Angle of the C-arm [rad], None where it is unknown. It is rounded to a microdegree, so that
+        files in degrees give the same numbers.
     """
 
     fluoroscope: str
@@ -68,6 +69,10 @@ class Frame:
     stamp_ns: int = 0
     frame_id: str = field(default='', compare=False)
     angle: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.angle is not None:
+            object.__setattr__(self, 'angle', float(np.radians(angle_in_degrees(self.angle))))
 
     def sorted(self) -> Frame:
         """Return the frame with its targets in ascending order.
@@ -85,7 +90,7 @@ class Frame:
             None if self.sigma is None else np.asarray(self.sigma, dtype=float)[order],
             int(self.stamp_ns),
             self.frame_id,
-            None if self.angle is None else float(self.angle),
+            self.angle,
         )
 
 
@@ -139,6 +144,11 @@ def _frame_error(frame: Frame, phantom: Phantom | None, image_size: tuple[int, i
         or repeated_target_error(ids)
         or ('' if phantom is None else _phantom_error(ids, phantom))
     )
+
+
+def angle_in_degrees(angle: float) -> float:
+    """Return an angle [rad] in degrees, to a microdegree."""
+    return float(np.round(np.degrees(angle), 6))
 
 
 def angle_error(angle: float | None) -> str:

@@ -31,7 +31,7 @@ import numpy as np
 
 from ..errors import DataError
 from ..exposures.columns import first_repeated, is_positive
-from ..exposures.frame import MAX_ANGLE, Frame, points_on_image
+from ..exposures.frame import MAX_ANGLE, Frame, angle_in_degrees, points_on_image
 from ..exposures.names import Names, safe_names, without_trivial
 from ..exposures.strays import few
 from .access import check_safe_name
@@ -335,6 +335,6 @@ def _csv_rows(
         sigma = np.full(len(frame.target_id), np.nan) if frame.sigma is None else frame.sigma
         columns.append(map(format_float, sigma))
     if with_angle:
-        angle = np.nan if frame.angle is None else np.degrees(frame.angle)
+        angle = np.nan if frame.angle is None else angle_in_degrees(frame.angle)
         columns.append([format_float(angle)] * len(frame.target_id))
     return ([fluoroscope, exposure, *cells] for cells in zip(*columns))

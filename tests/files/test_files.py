@@ -18,12 +18,14 @@ import json
 import os
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
+from fluoro_calib_ros.distortion.angle_field import AngleField, packed_angles
 from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.errors import DataError
@@ -281,6 +283,16 @@ def test_observations_round_trip(tmp_path):
     assert (tmp_path / 'again.csv').read_bytes() == (tmp_path / 'o.csv').read_bytes()
 
 
+def test_angles_of_exposures_are_kept_to_the_bit(tmp_path):
+    frames = some_frames()
+    frames['a'] = [replace(f, angle=0.1 + f.number) for f in frames['a']]
+    write_observations_csv(tmp_path / 'o.csv', frames)
+    again = read_observations_csv(str(tmp_path / 'o.csv'), SIZE)
+    assert [f.angle for f in again['a']] == [f.angle for f in frames['a']]
+    assert [f.angle for f in again['b']] == [None] * len(frames['b'])
+    assert again['a'][0].angle == pytest.approx(0.1 + frames['a'][0].number, abs=1e-7)
+
+
 def test_observations_in_any_order_of_rows_and_columns(tmp_path):
     path = text_file(
         tmp_path,
@@ -317,10 +329,18 @@ def test_observations_require_the_image_size(tmp_path):
         ('a,1,3,1,2,nan', "row 4: sigma is 'nan', not a finite number above 0"),
         ('../a,0,3,1,2,', "row 4: the fluoroscope is called '../a'"),
         (',0,3,1,2,', "row 4: the fluoroscope is called ''"),
+        ('a,0,3,1,2,,9000', "row 4: angle_deg is '9000', not an angle"),
+        ('a,0,3,1,2,,x', "row 4: angle_deg is 'x', not a number"),
+        ('a,0,3,1,2,,12', 'angle_deg of fluoroscope a, exposure 0 is 12, but nan in row 2'),
     ],
 )
 def test_observation_errors_name_row_and_cause(tmp_path, row, sentence):
-    path = text_file(tmp_path, 'o.csv', OBSERVATIONS + f'a,0,1,1,2,\nb,0,2,1,2,\n{row}\n')
+    header = OBSERVATIONS
+    rows = f'a,0,1,1,2,\nb,0,2,1,2,\n{row}\n'
+    if row.count(',') == OBSERVATIONS.count(',') + 1:
+        header = OBSERVATIONS.replace('\n', ',angle_deg\n')
+        rows = rows.replace(',1,2,\n', ',1,2,,\n')
+    path = text_file(tmp_path, 'o.csv', header + rows)
     said = message_of(read_observations_csv, path, SIZE)
     assert said.startswith(path) and sentence in said
 
@@ -376,6 +396,26 @@ def test_calibration_round_trip_is_exact(tmp_path, calibration):
         assert getattr(one, name).tobytes() == getattr(two, name).tobytes()
 
 
+def some_angle_field():
+    rng = np.random.default_rng(4)
+    grids = rng.uniform(0, 0.01, (14, 33, 33))
+    return AngleField(SIZE, np.linspace(-1, 1, 9), rng.normal(0, 1, (4, 2, 10)), grids)
+
+
+def test_calibration_that_changes_with_an_angle_is_kept_to_the_bit(tmp_path):
+    calibration = some_calibration(angle_field=some_angle_field())
+    assert calibration.calibration_id != some_calibration().calibration_id
+    again = load_calibration(save_calibration(tmp_path, calibration))
+    assert again.calibration_id == calibration.calibration_id
+    for one, two in zip(
+        packed_angles(calibration.angle_field), packed_angles(again.angle_field), strict=True
+    ):
+        assert one.tobytes() == two.tobytes()
+    pixels = np.random.default_rng(1).uniform(0, 1000, (50, 2))
+    one, two = (c.correct(pixels, angle=0.3) for c in (calibration, again))
+    assert one.uv.tobytes() == two.uv.tobytes()
+
+
 def test_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
     first = Path(save_calibration(tmp_path / '1', some_calibration())).read_bytes()
     monkeypatch.setattr(time, 'time', lambda: 2_000_000_000.0)
@@ -389,7 +429,7 @@ def test_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
 def test_numpy_reads_the_file_without_pickle_and_every_array_is_documented(tmp_path):
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
         assert file.files == ['format_version', *ARRAYS]
-        assert file['format_version'] == 2
+        assert file['format_version'] == 3
         docs = Path(__file__).parents[2] / 'docs'
         document = (docs / 'calibration_file.md').read_text()
         for name in file.files:
@@ -416,7 +456,7 @@ class Bomb:
 @pytest.mark.parametrize(
     'arrays, sentence',
     [
-        ({'format_version': np.array(7)}, 'layout version 7, this program knows versions 1 to 2'),
+        ({'format_version': np.array(7)}, 'layout version 7, this program knows versions 1 to 3'),
         ({'format_version': np.array('1')}, 'format_version is not a whole number'),
         ({'format_version': None}, 'it has no array format_version'),
         ({'interior': None}, 'has no array interior'),
@@ -562,6 +602,17 @@ def test_points_are_corrected_and_other_columns_kept(tmp_path):
         'INVALID',
     ]
     assert outside[6] == 'OUTSIDE' and float(outside[3])
+
+
+def test_points_are_corrected_at_the_angle_of_their_row(tmp_path):
+    calibration = some_calibration(angle_field=some_angle_field())
+    _, one, two = corrected_rows(
+        tmp_path, 'u,v,angle_deg\n400,500,20\n400,500,\n', {'a': calibration}
+    )
+    for row, angle in ((one, np.radians(20)), (two, None)):
+        wanted = calibration.correct([[400, 500]], angle=angle)
+        assert list(map(float, row[3:6])) == pytest.approx([*wanted.uv[0], wanted.sigma[0]])
+    assert one[3] != two[3]
 
 
 def test_points_of_two_fluoroscopes_with_their_own_sigma(tmp_path):

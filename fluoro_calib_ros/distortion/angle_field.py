@@ -26,11 +26,13 @@ likelihood (MacKay, "Bayesian interpolation", Neural Computation 4, 1992).
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import lapack
 from scipy.ndimage import map_coordinates
 
 from .exposure_terms import MIN_VARIANCE, TREND_DEGREE, ExposureTerms
@@ -269,8 +271,15 @@ def can_be_fitted(angles: np.ndarray) -> bool:
 def fit_angles(estimated: SeriesWithExposures, angles: np.ndarray) -> AngleFit | None:
     """Return series and terms as a function of the angles (e,) [rad] of the exposures.
 
-    None where they do not explain the terms.
+    None where they do not explain the terms, or the terms are not determined.
     """
+    with suppress(np.linalg.LinAlgError):
+        return _fit(estimated, angles)
+    return None
+
+
+def _fit(estimated: SeriesWithExposures, angles: np.ndarray) -> AngleFit | None:
+    """See `fit_angles`; raises LinAlgError."""
     h = harmonics(angles) - harmonics(angles).mean(axis=0)
     c = 2 * len(estimated.functions)
     own = estimated.covariance[c:, c:]
@@ -331,15 +340,16 @@ class _Effects:
         vector = self.design.T @ right
         for _ in range(STEPS):
             variance = self._variance
-            covariance = np.linalg.inv(matrix + np.diag(1 / variance))
-            mean = covariance @ vector
-            determined = np.clip(1 - np.diagonal(covariance) / variance, 1e-6, 1)
+            root = _inverse_root(matrix + np.diag(1 / variance))
+            mean = root.T @ (root @ vector)
+            determined = np.clip(1 - np.sum(root**2, axis=0) / variance, 1e-6, 1)
             squares = np.bincount(self._factor_of, mean**2 / self._unit)
             last = self._factors
             self._factors = squares / np.bincount(self._factor_of, determined)
             if np.max(np.abs(self._factors - last)) < SETTLED * np.max(self._factors):
                 break
-        covariance = np.linalg.inv(matrix + np.diag(1 / self._variance))
+        root = _inverse_root(matrix + np.diag(1 / self._variance))
+        covariance = root.T @ root
         return covariance @ vector, covariance
 
     def explained(self, h: np.ndarray) -> float:
@@ -349,6 +359,15 @@ class _Effects:
         by_angle = float(np.mean(h**2, axis=0) @ of_harmonics)
         at_random = float(variance[self.count :].sum()) / len(h)
         return by_angle / (by_angle + at_random)
+
+
+def _inverse_root(matrix: np.ndarray) -> np.ndarray:
+    """Lower triangular matrix R with the inverse R^T R of a positive definite matrix."""
+    factor = np.asfortranarray(np.linalg.cholesky(matrix))
+    root, failed = lapack.dtrtri(factor, lower=1, overwrite_c=1)
+    if failed:
+        raise np.linalg.LinAlgError('the terms of the exposures are not determined')
+    return root
 
 
 def _field(

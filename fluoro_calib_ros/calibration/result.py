@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -29,6 +29,7 @@ from ..distortion.base import Correction, CorrectionModel
 from ..distortion.grid import CorrectionGrid
 from ..distortion.series import packed
 from ..distortion.status import CorrectionStatus
+from ..errors import DataError
 from ..exposures.frame import Frame, points_on_image
 from ..exposures.phantom import Phantom
 
@@ -202,6 +203,29 @@ class FluoroscopeCalibration:
             np.sqrt(np.maximum(found.sd**2 + variance, 0)),
             found.outside | ~self.angle_field.covers(angle),
         )
+
+    def at_angle(self, angle: float | None) -> FluoroscopeCalibration:
+        """Return the calibration at an angle [rad] of the C-arm, which does not change with it.
+
+        None, or a calibration that does not depend on the angle: the calibration as it is. Raises
+        DataError for an angle that is not calibrated.
+        """
+        field = self.angle_field
+        series = self.model.series
+        if field is None or angle is None or series is None:
+            return self
+        if not field.covers(angle):
+            low, high = np.degrees(field.range)
+            raise DataError(
+                f'fluoroscope {self.fluoroscope}: {np.degrees(angle):g} degrees is too far from '
+                f'the angles of the calibration, {low:.0f} to {high:.0f} degrees'
+            )
+        model = replace(
+            self.model,
+            train_duv=self.model.train_duv + field.change(self.model.train_uv, angle)[0],
+            series=field.added_to(series, angle),
+        )
+        return replace(self, model=model, angle_field=None)
 
     def correct(
         self,

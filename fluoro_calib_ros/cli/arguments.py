@@ -268,6 +268,22 @@ def add_calibration(parser: Parser) -> None:
     )
 
 
+def add_angle(parser: Parser, use: str) -> None:
+    """Add --angle-deg; use: what has this angle."""
+    parser.add_argument(
+        '--angle-deg',
+        type=number_in(-720, 720),
+        metavar='DEG',
+        help=f'angle of the C-arm {use}, for a calibration that depends on it (default: unknown, '
+        'the mean correction of its exposures)',
+    )
+
+
+def angle_of(arguments: argparse.Namespace) -> float | None:
+    """Angle of the C-arm [rad] that --angle-deg gives, None without it."""
+    return None if arguments.angle_deg is None else math.radians(arguments.angle_deg)
+
+
 def add_covariance(parser: Parser) -> None:
     """Add --covariance."""
     parser.add_argument(

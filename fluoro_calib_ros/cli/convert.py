@@ -21,7 +21,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ..errors import DataError
-from .arguments import UNITS, add_file_options, add_fluoroscopes, file_settings, image_size
+from .arguments import (
+    UNITS,
+    add_angle,
+    add_file_options,
+    add_fluoroscopes,
+    angle_of,
+    file_settings,
+    image_size,
+)
 from .output import print_notes, print_result
 
 NAME = 'convert'
@@ -89,6 +97,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='correct image points by the calibration before they are written',
     )
+    add_angle(parser, 'of the corrections that are written')
     parser.add_argument(
         '--rate',
         type=number_in(1e-6, MAX_RATE),
@@ -129,6 +138,7 @@ def run(arguments: argparse.Namespace) -> None:
             tuple(arguments.fluoroscopes or ()),
             file_settings(arguments, rate_hz=arguments.rate),
             arguments.out_units,
+            angle_of(arguments),
         )
     )
     print_notes(written.notes)

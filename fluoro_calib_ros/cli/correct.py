@@ -23,10 +23,12 @@ from typing import TYPE_CHECKING
 
 from ..errors import DataError
 from .arguments import (
+    add_angle,
     add_calibration,
     add_file_options,
     add_scheduler,
     add_workers,
+    angle_of,
     file_settings,
 )
 from .output import ProgressBar, print_note, print_notes, print_result
@@ -73,6 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default='linear',
         help='interpolation between the pixels of an image (default: linear)',
     )
+    add_angle(parser, 'of images, and of points without angle_deg')
     folders = parser.add_argument_group('folders of images and videos')
     folders.add_argument(
         '--recursive', action='store_true', help='correct the folders in SOURCE, too'
@@ -126,7 +129,7 @@ def _correct_points(
     settings = file_settings(arguments, image_size=size, fluoroscopes=names)
     points, notes = read_point_table(arguments.source, arguments.calibration, settings)
     print_notes(notes)
-    corrected = correct_points(points, calibrations)
+    corrected = correct_points(points, calibrations, angle_of(arguments))
     write_points(arguments.out, points, corrected)
     counts = {
         name: int((corrected.status == status).sum())
@@ -156,6 +159,9 @@ def _correct_images(
             f'{", ".join(calibrations)}: choose one with --fluoroscope'
         )
     (calibration,) = calibrations.values()
+    if calibration.angle_field is not None and arguments.angle_deg is None:
+        print_note(f'{source}: corrected with the mean over the angles, --angle-deg is not given')
+    calibration = calibration.at_angle(angle_of(arguments))
     request = ImageCorrectionRequest(
         source,
         arguments.out,

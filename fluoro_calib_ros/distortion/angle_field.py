@@ -36,7 +36,7 @@ from scipy.linalg import lapack
 from scipy.ndimage import map_coordinates
 
 from .exposure_terms import MIN_VARIANCE, TREND_DEGREE, ExposureTerms
-from .series import SD_GRID, Functions, sd_grid_pixels
+from .series import SD_GRID, Functions, Series, sd_grid_pixels
 
 ORDERS = 2  # harmonics of the angle
 HARMONICS = 2 * ORDERS
@@ -169,6 +169,19 @@ class AngleField:
         rows = np.isnan(angles)
         duv[rows], variance[rows] = self._change_at(uv[rows], np.nan)
         return duv, variance
+
+    def added_to(self, series: Series, angle: float) -> Series:
+        """Return a series at an angle [rad], with its standard deviations there."""
+        weights = harmonics(angle) - self._mean
+        change = np.tensordot(weights, self.coefficients, axes=1)
+        functions = series.functions
+        _, variance = self._change_at(sd_grid_pixels(self.image_size), angle)
+        return Series(
+            functions,
+            series.coefficients
+            + functions.converted(self._functions, change.ravel()).reshape(2, -1),
+            np.sqrt(np.maximum(series.sd**2 + variance.reshape(series.sd.shape), 0)),
+        )
 
     def _change_at(self, uv: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
         values = self._functions(uv)

@@ -157,11 +157,14 @@ def _angle(block: Block) -> np.ndarray:
 
 
 def correct_points(
-    points: PointsFile, calibrations: Mapping[str, FluoroscopeCalibration]
+    points: PointsFile,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    angle: float | None = None,
 ) -> CorrectedPoints:
     """Correct image points with the calibrations of their fluoroscopes.
 
-    A point without sigma has that of the calibration. Raises DataError for a fluoroscope without
+    A point without sigma has that of the calibration, one without an angle that of angle [rad].
+    Raises DataError for a fluoroscope without
     calibration, and for a file without the column fluoroscope where there are several
     calibrations.
     """
@@ -191,8 +194,10 @@ def correct_points(
         sigma = points.sigma
         if sigma is not None:
             sigma = np.where(np.isnan(sigma[rows]), calibration.image_sd, sigma[rows])
-        angle = None if points.angle is None else points.angle[rows]
-        part = calibration.correct(points.uv[rows], sigma, angle=angle)
+        angles = np.full(len(rows), np.nan if points.angle is None else points.angle[rows])
+        if angle is not None:
+            angles[np.isnan(angles)] = angle
+        part = calibration.correct(points.uv[rows], sigma, angle=angles)
         out.uv[rows] = part.uv
         out.sigma[rows] = part.sigma
         out.status[rows] = part.status

@@ -88,6 +88,8 @@ class ConversionRequest:
         rows upwards for the source if it is of another program, else for what is written.
     out_units : {'mm', 'cm', 'm'} or None
         Unit of what is written.
+    angle : float or None
+        Angle of the C-arm [rad] of corrections that are written; None: their mean over exposures.
     """
 
     source: str | os.PathLike[str]
@@ -100,6 +102,7 @@ class ConversionRequest:
     fluoroscopes: Sequence[str] = ()
     settings: FileSettings = field(default_factory=FileSettings)
     out_units: str | None = None
+    angle: float | None = None
 
 
 def kinds_written() -> tuple[str, ...]:
@@ -140,7 +143,7 @@ def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, 
     """Return the content of the source, and whether it is in the conventions of this package."""
     source = Path(request.source)
     if is_result_folder(source):
-        return result_content(source, settings, request.exposure), True
+        return result_content(source, settings, request.exposure, request.angle), True
     if request.exposure is not None:
         raise DataError(f'{source}: --exposure is for a result folder')
     if not registry_reads(source) and request.source_kind is None and is_bag(source):
@@ -241,10 +244,12 @@ def result_content(
     directory: str | os.PathLike[str],
     settings: FileSettings | None = None,
     exposure: int | None = None,
+    angle: float | None = None,
 ) -> Content:
     """Return the wanted parts of a result folder, of the fluoroscopes that settings name.
 
-    exposure: that whose exterior orientations the cameras have. Raises DataError.
+    exposure: that whose exterior orientations the cameras have; angle: that of the C-arm [rad] for
+    corrections that depend on it. Raises DataError.
     """
     directory = Path(directory)
     settings = settings or FileSettings()
@@ -263,7 +268,7 @@ def result_content(
         found['bodies'] = _phantom_poses(directory, stations, orientation)
     if 'lookups' in wanted:
         names = select_calibrations(calibrations, settings.fluoroscopes or calibrations, directory)
-        found['lookups'] = {name: _lookup(c) for name, c in names.items()}
+        found['lookups'] = {name: _lookup(c.at_angle(angle)) for name, c in names.items()}
     if 'survey' in wanted and (directory / PHANTOM_FILE).exists():
         found['survey'] = read_phantom(directory / PHANTOM_FILE)
     if 'observations' in wanted and (directory / OBSERVATIONS).exists():

@@ -31,6 +31,7 @@ from fluoro_calib_ros.distortion.angle_field import (
 )
 from fluoro_calib_ros.distortion.series import SD_GRID, Functions
 from fluoro_calib_ros.distortion.status import CorrectionStatus
+from fluoro_calib_ros.errors import DataError
 from tests.rigs import calibrated, exposures, rig
 
 SIZE = (800, 600)
@@ -227,6 +228,21 @@ def test_points_are_corrected_at_their_angle():
     each = calibration.correct(uv, angle=[angle, np.nan, angle])
     np.testing.assert_allclose(each.uv[0], looked_up.uv[0])
     np.testing.assert_allclose(each.uv[1], unknown.uv[1])
+
+
+def test_calibration_at_an_angle_gives_the_same_corrections_without_one():
+    calibration = turning().calibrations['a']
+    uv = np.random.default_rng(3).uniform(100, 900, (50, 2))
+    angle = np.deg2rad(-25)
+    at_angle = calibration.at_angle(angle)
+    assert at_angle.angle_field is None
+    assert at_angle.calibration_id != calibration.calibration_id
+    one, two = calibration.correct(uv, exact=True, angle=angle), at_angle.correct(uv, exact=True)
+    np.testing.assert_allclose(one.uv, two.uv, atol=1e-9)
+    np.testing.assert_allclose(one.sigma, two.sigma, atol=1e-3)
+    assert calibration.at_angle(None) is calibration
+    with pytest.raises(DataError, match='180 degrees is too far from the angles'):
+        calibration.at_angle(np.pi)
 
 
 def test_points_at_an_angle_that_was_not_calibrated_are_outside():

@@ -45,6 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument('--set', action='append', choices=list(READERS), help='this set only')
     parser.add_argument('--mrcal', metavar='PYTHON', help='interpreter that can import mrcal')
     parser.add_argument('--no-verdict', action='store_true', help='do not validate')
+    parser.add_argument('--seed', type=int, default=1, help='of the random halves (1)')
+    parser.add_argument('--note', default='', help='a paragraph for the summary of the page')
     parser.add_argument('--results', type=Path, help='JSON file that keeps the results by set')
     parser.add_argument('--out', type=Path, help=f'the page; default {PAGE} with all sets')
     arguments = parser.parse_args(argv)
@@ -64,11 +66,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             except OSError as error:
                 print(f'{error}: use --download, or --data FOLDER', file=sys.stderr)
                 return 1
-            results[name] = measure(data, arguments.mrcal, not arguments.no_verdict)
+            results[name] = measure(
+                data, arguments.mrcal, not arguments.no_verdict, arguments.seed
+            )
             print(json.dumps(results[name]), file=sys.stderr)
             if kept:
                 kept.write_text(json.dumps(results, indent=1))
-    text = page([results[name] for name in READERS if name in results])
+    text = page([results[name] for name in READERS if name in results], arguments.note)
     target = arguments.out or (None if arguments.set else PAGE)
     if target is None:
         print(text)

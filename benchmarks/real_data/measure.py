@@ -260,11 +260,11 @@ def _test_claims(
         fold.nse_correlated = float(np.sum(table.residual[kept] ** 2) / expected)
 
 
-def measure(data: DataSet, mrcal: str | None, validated: bool) -> dict[str, Any]:
-    """Return the results of a set as plain values."""
+def measure(data: DataSet, mrcal: str | None, validated: bool, seed: int = 1) -> dict[str, Any]:
+    """Return the results of a set as plain values; seed: of its random halves."""
     folds = [
         measure_fold(data, training, tested, mrcal, validated and k == 0)
-        for k, (training, tested) in enumerate(splits(data.frames))
+        for k, (training, tested) in enumerate(splits(data.frames, seed))
     ]
     return {
         'name': data.name,

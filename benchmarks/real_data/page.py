@@ -85,11 +85,12 @@ are not part of this project; `--download` fetches them.
 - The names of the networks 2 and 3 of DBAT are interchanged; here the photographs tell the camera.
 - Every third exposure of aicon is used, to limit the time.
 - canon40d and camcal differ between exposures, mostly by an affinity and a shear: by 0.3 px and
-  0.15 px, at a noise of 0.15 px and 0.03 px, and hardly less where the survey is given ten times
-  its standard deviation (0cc82c7). A common affinity and shear from nine or ten such exposures
-  are uncertain, and Brown's model has no shear: over twelve random halves (seeds 1 to 6) the ratio
-  inside is 1.05 for canon40d and 0.99 for camcal. With both terms held at zero it is 1.02 for
-  canon40d, but 1.07 for camcal; image intensifiers need them, so they stay.
+  0.15 px, at a noise of 0.15 px and 0.03 px, and hardly less where the survey is given ten or
+  twenty times its standard deviation (fd78dd5). A common affinity and shear from nine or ten such
+  exposures are uncertain, and Brown's model has no shear: over twelve random halves (seeds 1 to 6,
+  0cc82c7) the ratio inside is 1.05 for canon40d and 0.99 for camcal. With both terms held at zero
+  it is 1.02 for canon40d, but 1.07 for camcal; image intensifiers need them, so they stay.
+
 ## Inside the calibrated area
 
 Root of the mean square of both directions [px]; the last row has the geometric mean of the ratios

@@ -185,7 +185,8 @@ CASES = (
     Case('turning 1 px', 'turning', arm=1.0),
     Case('turning 3 px', 'turning', arm=3.0),
     Case('turning 3 px 30 exposures', 'turning', arm=3.0, exposures=30),
-    Case('turning 1 px, angle unknown', 'turning', arm=1.0, angle_known=False, faulty=True),
+    Case('turning 1 px, angle unknown', 'turning', arm=1.0, angle_known=False),
+    Case('turning 3 px, angle unknown', 'turning', arm=3.0, angle_known=False, faulty=True),
     # Survey and phantom.
     Case('survey 0.5 mm', 'survey', survey_sd=0.5),
     Case('survey 0.01 mm', 'survey', survey_sd=0.01),

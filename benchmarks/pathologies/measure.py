@@ -155,8 +155,7 @@ def claims(scene, result):
     calibration = result.calibrations[name]
     model = calibration.model
     found = [
-        _errors_at(scene, calibration, uv, angle)
-        for angle in (_test_angles(scene, calibration) if scene.case.arm else [None])
+        _errors_at(scene, calibration, uv, angle) for angle in _test_angles(scene, calibration)
     ]
     error, sd = (np.concatenate(parts) for parts in zip(*found))
     out = _statistics('correction', error, np.broadcast_to(sd[:, None], error.shape))
@@ -177,25 +176,29 @@ def claims(scene, result):
 def _errors_at(scene, calibration, uv, angle):
     """Errors (n, 2) and stated sd (n,) of a correction within the calibrated area, at an angle.
 
-    uv: image points to which it was fitted. Angle None: the C-arm does not turn.
+    uv: image points to which it was fitted. Angle None: unknown, the truth is the mean over the
+    exposures.
     """
-    camera = scene.cameras[0].at(scene.case, angle)
     axis = np.linspace(0, scene.case.side - 1, GRID)
     grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     grid = grid[~calibration.model.outside(grid)]
-    found = calibration.correction(grid, angle if scene.case.angle_known else None)
+    camera = scene.cameras[0]
     both = np.concatenate([uv, grid])
-    true = camera.distortion.correction(both)
-    here = calibration.correction(uv, angle if scene.case.angle_known else None).duv
+    angles = scene.angles if angle is None and scene.case.arm else [angle]
+    true = np.mean([camera.at(scene.case, a).distortion.correction(both) for a in angles], axis=0)
+    found = calibration.correction(both, angle)
     known = {id(uv): true[: len(uv)], id(grid): true[len(uv) :]}
     truth = Truth(camera.interior, lambda pixels: known[id(pixels)])
-    _, _, in_gauge = truth_in_gauge(truth, uv, calibration.interior, here)
-    return found.duv - in_gauge(grid), found.sd
+    on_grid = slice(len(uv), None)
+    _, _, in_gauge = truth_in_gauge(truth, uv, calibration.interior, found.duv[: len(uv)])
+    return found.duv[on_grid] - in_gauge(grid), found.sd[on_grid]
 
 
 def _test_angles(scene, calibration):
-    """Angles at which a correction is compared with the truth: some of the calibrated range."""
+    """Angles at which a correction is compared with the truth; None: it is unknown."""
     field = calibration.angle_field
+    if not (scene.case.arm and scene.case.angle_known):
+        return [None]
     return [a for a in scene.test_angles if field is None or field.covers(a)][:ANGLES]
 
 

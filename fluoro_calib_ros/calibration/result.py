@@ -291,7 +291,8 @@ class FluoroscopeCalibration:
         angle: ArrayLike | None,
     ) -> None:
         """Add to a correction and its status, in place, what an angle changes."""
-        on = np.flatnonzero(status != CorrectionStatus.INVALID)
+        valid = status != int(CorrectionStatus.INVALID)
+        on = slice(None) if valid.all() else np.flatnonzero(valid)
         angle = np.asarray(np.nan if angle is None else angle, dtype=float)
         angle = angle[on] if angle.ndim else angle
         duv, variance = field.change(np.column_stack([uv[0][on], uv[1][on]]), angle)
@@ -299,8 +300,9 @@ class FluoroscopeCalibration:
         du[on] += duv[:, 0]
         dv[on] += duv[:, 1]
         sd[on] = np.sqrt(np.maximum(sd[on] ** 2 + variance, 0))
-        beyond = np.broadcast_to(~field.covers(angle), on.shape)
-        status[on[beyond]] = CorrectionStatus.OUTSIDE
+        beyond = ~field.covers(angle)
+        if beyond.any():
+            status[on] = np.where(beyond, CorrectionStatus.OUTSIDE, status[on])
 
     def _correct_exactly(
         self, uv: np.ndarray, sigma: np.ndarray | float, angle: ArrayLike | None

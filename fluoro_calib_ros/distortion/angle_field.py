@@ -46,6 +46,9 @@ MAX_DISTANCE = np.deg2rad(15)  # of an angle from the next one that was calibrat
 MIN_ANGLES = 4  # with different fields, to tell them from chance
 MIN_SPREAD = np.deg2rad(2)  # of the angles
 MIN_SIZE = 1e-6  # mean square of the harmonics
+TERMS = (TREND_DEGREE + 1) * (TREND_DEGREE + 2) // 2  # of a polynomial of two variables
+# Of the arrays that `packed_angles` gives; None: as many as there are exposures.
+PACKED_SHAPES = (None, (HARMONICS, 2, TERMS), (VARIANCES, SD_GRID, SD_GRID))
 STEPS = 60  # of the variances
 SETTLED = 1e-3  # relative change of the variances
 MIN_SHARE = 0.05  # of what differs between exposures that the angle explains, else it is no cause
@@ -56,6 +59,25 @@ def harmonics(angle: ArrayLike) -> np.ndarray:
     multiple = np.asarray(angle, dtype=float)[..., None] * np.arange(1, ORDERS + 1)
     both = np.stack([np.cos(multiple), np.sin(multiple)], axis=-1)
     return both.reshape(*both.shape[:-2], HARMONICS)
+
+
+@dataclass(frozen=True)
+class _Change:
+    """What an angle adds to a correction.
+
+    Attributes
+    ----------
+    coefficients : (4, k, 2, 4) ndarray
+        Of x^i y^j, in the order i, field, u or v, j: the change, then fields of what is unknown.
+    variance : (33, 33) ndarray
+        On the grid of the standard deviation [px^2].
+    scatters : bool
+        Whether there are fields of what is unknown.
+    """
+
+    coefficients: np.ndarray
+    variance: np.ndarray
+    scatters: bool
 
 
 @dataclass(frozen=True)
@@ -184,21 +206,53 @@ class AngleField:
         )
 
     def _change_at(self, uv: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
-        values = self._functions(uv)
-        if np.isnan(angle):
-            weights = np.zeros(HARMONICS)
-            products = self._spread
-        else:
+        found = self._unknown if np.isnan(angle) else self._known(angle)
+        values = self._values(uv, found.coefficients)
+        variance = self._at(uv, found.variance)
+        if found.scatters:
+            variance = variance + np.einsum('nka,nka->n', values[:, 1:], values[:, 1:]) / 2
+        return values[:, 0], variance
+
+    def _known(self, angle: float) -> _Change:
+        """Return the change at an angle; that of the last one is kept: arms stand still."""
+        last = self.__dict__.get('_last')
+        if last is None or last[0] != angle:
             weights = harmonics(angle) - self._mean
-            products = np.outer(weights, weights)
-        factors = np.concatenate(
-            [2 * weights, [products[j, k] * (1 if j == k else 2) for j, k in PAIRS]]
-        )
-        variance = self._at(uv, np.tensordot(factors, self.variances, axes=1))
-        if np.isnan(angle):
-            fields = values @ self.coefficients.transpose(0, 2, 1)
-            variance = variance + np.einsum('jna,jk,kna->n', fields, products, fields) / 2
-        return values @ np.tensordot(weights, self.coefficients, axes=1).T, variance
+            last = angle, self._change(weights, np.outer(weights, weights), weights[None])
+            self.__dict__['_last'] = last  # as a whole, for other threads
+        found: _Change = last[1]
+        return found
+
+    @cached_property
+    def _unknown(self) -> _Change:
+        """The change at an unknown angle: none, and the scatter over all exposures."""
+        size, axes = np.linalg.eigh(self._spread)
+        roots = axes.T * np.sqrt(np.maximum(size, 0))[:, None]
+        weights = np.zeros(HARMONICS)
+        return self._change(weights, self._spread, np.vstack([weights, roots]))
+
+    def _change(self, weights: np.ndarray, products: np.ndarray, fields: np.ndarray) -> _Change:
+        """Return a change from weights of the harmonics, their products, and those of fields."""
+        j, k = np.transpose(PAIRS)
+        factors = np.concatenate([2 * weights, products[j, k] * np.where(j == k, 1, 2)])
+        coefficients = np.tensordot(fields, self.coefficients, axes=1)
+        square = np.zeros((TREND_DEGREE + 1, *coefficients.shape[:2], TREND_DEGREE + 1))
+        for term, (x, y) in enumerate(self._functions.powers):
+            square[x, :, :, y] = coefficients[:, :, term]
+        variance = np.tensordot(factors, self.variances, axes=1)
+        return _Change(square, variance, len(fields) > 1)
+
+    def _values(self, uv: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        """Values (n, k, 2) of k fields, from the coefficients of a `_Change`."""
+        side = max(self.image_size) / 2
+        powers = np.empty((TREND_DEGREE + 1, len(uv), 2))
+        powers[0] = 1
+        powers[1] = (uv - (np.asarray(self.image_size) - 1) / 2) / side
+        for order in range(2, TREND_DEGREE + 1):
+            np.multiply(powers[order - 1], powers[1], out=powers[order])
+        by_y = powers[:, :, 0].T @ coefficients.reshape(TREND_DEGREE + 1, -1)
+        by_y = by_y.reshape(len(uv), *coefficients.shape[1:])
+        return np.einsum('nkay,yn->nka', by_y, powers[:, :, 1])
 
     def _at(self, uv: np.ndarray, grid: np.ndarray) -> np.ndarray:
         """Values (n,) of a grid (33, 33) over the image at pixels uv (n, 2), interpolated."""

@@ -23,6 +23,7 @@ from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
 from fluoro_calib_ros.cli import main
+from fluoro_calib_ros.distortion.angle_field import PACKED_SHAPES, AngleField
 from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
 from fluoro_calib_ros.photogrammetry.network import Network
@@ -180,3 +181,21 @@ def pincushion(name: str, image_size: tuple[int, int]) -> FluoroscopeCalibration
         image_size=image_size,
         train_exposure=np.zeros(len(uv), dtype=np.int64),
     )
+
+
+def turning(
+    calibration: FluoroscopeCalibration, degrees: float = 60.0, size_px: float = 1.0
+) -> FluoroscopeCalibration:
+    """Return a calibration whose correction also changes with an angle, as of a C-arm.
+
+    Calibrated are angles of up to +-degrees; size_px: of the coefficients of each harmonic.
+    """
+    _, coefficients, variances = PACKED_SHAPES
+    rng = np.random.default_rng(5)
+    field = AngleField(
+        calibration.image_size,
+        np.deg2rad(np.linspace(-degrees, degrees, 9)),
+        rng.normal(0, size_px, coefficients),
+        rng.uniform(0, 1e-3, variances),
+    )
+    return replace(calibration, angle_field=field)

@@ -31,6 +31,9 @@ from ..errors import DataError
 
 PACKAGE = 'fluoro_calib_msgs'
 TARGET_OBSERVATIONS = f'{PACKAGE}/msg/TargetObservations'
+FLUOROSCOPE_CALIBRATION = f'{PACKAGE}/msg/FluoroscopeCalibration'
+# Fields that were added at the end of a message: those of an earlier definition do not have them.
+ADDED = {FLUOROSCOPE_CALIBRATION: ('angles', 'angle_coefficients', 'angle_variances')}
 PADDING = 4  # bytes at the end of a message that Fast DDS reserves for an empty float64[]
 MAX_PADDING = 10 * PADDING  # of a message with ten of them
 SEPARATOR = '=' * 80  # between the definitions of a schema
@@ -100,16 +103,54 @@ def to_cdr(message: Any, msg_type: str) -> bytes:
 def from_cdr(data: bytes, msg_type: str) -> Any:
     """Return CDR as a message dataclass. Raises DataError for other bytes.
 
+    Fields that a message of an earlier definition does not have are empty.
+
     Fast DDS reserves four bytes for the alignment of each empty sequence of float64, such as a
     sigma that is not given, and leaves them at the end. rosbags takes that for another message.
     """
-    message_class(msg_type)
+    kind = message_class(msg_type)
     try:
-        return typestore().deserialize_cdr(data, msg_type)
+        return _read_cdr(typestore(), data, msg_type)
+    except DataError:
+        if msg_type not in ADDED:
+            raise
+        earlier = _read_cdr(_earlier_typestore(), data, msg_type)
+    added = {name: np.zeros(0) for name in ADDED[msg_type]}
+    known = [f.name for f in dataclasses.fields(earlier) if f.init]
+    return kind(**{name: getattr(earlier, name) for name in known}, **added)
+
+
+def present_cdr(data: bytes, msg_type: str) -> bytes:
+    """Return a message, also one of an earlier definition, as CDR of the present definition.
+
+    Raises DataError for other bytes.
+    """
+    return to_cdr(from_cdr(data, msg_type), msg_type)
+
+
+def earlier_text(msg_type: str) -> str:
+    """Return the definition of a type without the fields that were added since."""
+    lines = _package_texts()[msg_type].splitlines(keepends=True)
+    return ''.join(line for line in lines if (line.split() + ['', ''])[1] not in ADDED[msg_type])
+
+
+@cache
+def _earlier_typestore() -> Typestore:
+    """Return the typestore with the earlier definitions of the types in ADDED."""
+    store = get_typestore(Stores.ROS2_JAZZY)
+    for name, text in _package_texts().items():
+        store.register(get_types_from_msg(earlier_text(name) if name in ADDED else text, name))
+    return store
+
+
+def _read_cdr(store: Typestore, data: bytes, msg_type: str) -> Any:
+    """Return CDR as a message dataclass of a typestore. Raises DataError for other bytes."""
+    try:
+        return store.deserialize_cdr(data, msg_type)
     except Exception as error:  # generated code raises almost anything for damaged bytes
         for padding in range(PADDING, MAX_PADDING + 1, PADDING):
             with suppress(Exception):
-                message = typestore().deserialize_cdr(data[:-padding], msg_type)
+                message = store.deserialize_cdr(data[:-padding], msg_type)
                 if padding <= PADDING * _count_empty(message):
                     return message
         raise DataError(f'the content is not a {msg_type} ({error})') from None

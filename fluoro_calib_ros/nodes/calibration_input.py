@@ -22,12 +22,15 @@ from typing import Any
 
 from fluoro_calib_msgs.msg import FluoroscopeCalibration
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 
 from ..calibration import result as calibration_result
 from ..errors import DataError
 from ..limits import read_limits
-from .messages.fluoroscope_calibration import calibration_from_message, message_from_calibration
+from .messages.fluoroscope_calibration import (
+    calibration_from_message,
+    decode_fluoroscope_calibration,
+    message_from_calibration,
+)
 from .runtime.discovery import publisher_conflict
 from .runtime.errors import one_line
 from .runtime.qos import latched_qos
@@ -141,7 +144,7 @@ class CalibrationInput:
             )
             return
         try:
-            message = deserialize_message(data, FluoroscopeCalibration)
+            message = decode_fluoroscope_calibration(data)
         except DECODING_ERRORS:
             self._refuse(name, f'the message on topic {name}/calibration cannot be decoded')
             return

@@ -20,13 +20,17 @@ from typing import Any
 
 import numpy as np
 from fluoro_calib_msgs.msg import FluoroscopeCalibration
+from rclpy.serialization import deserialize_message
 
+from ...bags.definitions import FLUOROSCOPE_CALIBRATION, present_cdr
 from ...calibration import result as calibration_result
+from ...distortion.angle_field import PACKED_SHAPES, AngleField, packed_angles, unpacked_angles
 from ...distortion.base import CorrectionModel
 from ...distortion.registry import model_from_arrays
 from ...distortion.series import SD_GRID
 from ...errors import DataError
 from ...files.calibration import check_model_content, validated_arrays
+from ..runtime.stream_reader import DECODING_ERRORS
 from .fields import (
     float64_field,
     nanoseconds_from_stamp,
@@ -51,6 +55,20 @@ SAME_NAME = (
     'seconds',
     'source_digest',
 )
+ANGLES = ('angles', 'angle_coefficients', 'angle_variances')
+
+
+def decode_fluoroscope_calibration(data: bytes) -> FluoroscopeCalibration:
+    """Read a message from its bytes, also one of an earlier definition, which had no angles.
+
+    Raises one of DECODING_ERRORS for damaged bytes.
+    """
+    try:
+        return deserialize_message(data, FluoroscopeCalibration)
+    except DECODING_ERRORS:
+        return deserialize_message(
+            present_cdr(bytes(data), FLUOROSCOPE_CALIBRATION), FluoroscopeCalibration
+        )
 
 
 def message_from_calibration(
@@ -69,6 +87,8 @@ def message_from_calibration(
     message.rmse_after_u, message.rmse_after_v = (float(x) for x in calibration.rmse_after)
     for name in SAME_NAME:
         setattr(message, name, getattr(calibration, name))
+    for name, values in zip(ANGLES, packed_angles(calibration.angle_field), strict=True):
+        setattr(message, name, float64_field(values.ravel()))
     message.calibration_id = calibration.calibration_id
     return message
 
@@ -104,6 +124,7 @@ def content_of_calibration(
         rmse_after=np.array([message.rmse_after_u, message.rmse_after_v]),
         stamp_ns=nanoseconds_from_stamp(message.header.stamp),
         frame_id=message.header.frame_id,
+        angle_field=_angle_field_of(message, where),
         **{name: getattr(message, name) for name in SAME_NAME},
     )
     validated_arrays(where, calibration)
@@ -168,3 +189,20 @@ def _series_content(message: FluoroscopeCalibration) -> dict[str, Any]:
         'series_coefficients': np.array([message.series_u, message.series_v]),
         'series_sd': sd.reshape(SD_GRID, SD_GRID) if len(sd) == SD_GRID**2 else sd[None],
     }
+
+
+def _angle_field_of(message: FluoroscopeCalibration, where: str) -> AngleField | None:
+    """Return the angle field of a message, if any. Raises DataError, beginning with `where`."""
+    arrays = [np.array(getattr(message, name), dtype=float) for name in ANGLES]
+    if not any(map(len, arrays)):
+        return None
+    for name, values, shape in zip(ANGLES, arrays, PACKED_SHAPES, strict=True):
+        if shape is not None and len(values) != np.prod(shape):
+            raise DataError(
+                f'{where}: {name} has {len(values)} values, {np.prod(shape)} are expected'
+            )
+    shaped = [a if shape is None else a.reshape(shape) for a, shape in zip(arrays, PACKED_SHAPES)]
+    try:
+        return unpacked_angles((message.image_width, message.image_height), *shaped)
+    except ValueError as error:
+        raise DataError(f'{where}: {error}') from None

@@ -92,8 +92,13 @@ def decode_target_observations(data: bytes) -> ObservedFrame:
     )
 
 
-def frame_from_observed(observed: ObservedFrame, fluoroscope: str) -> Frame:
-    """Return the Frame of a message. Raises DataError for arrays of different lengths."""
+def frame_from_observed(
+    observed: ObservedFrame, fluoroscope: str, angle: float | None = None
+) -> Frame:
+    """Return the Frame of a message; angle: of the C-arm [rad], None where it is unknown.
+
+    Raises DataError for arrays of different lengths.
+    """
     try:
         target_id, uv, sigma = stack_image_points(
             np.frombuffer(observed.target_id, np.uint32), observed.u, observed.v, observed.sigma
@@ -111,6 +116,7 @@ def frame_from_observed(observed: ObservedFrame, fluoroscope: str) -> Frame:
         sigma,
         NS_PER_S * observed.sec + observed.nanosec,
         observed.frame_id,
+        angle,
     )
 
 

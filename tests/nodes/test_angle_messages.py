@@ -1,0 +1,156 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Angles in messages: the angle field of a calibration, earlier definitions, joint states."""
+
+import numpy as np
+import pytest
+import rigs
+from builtin_interfaces.msg import Time
+from rclpy.serialization import serialize_message
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from sensor_msgs.msg import JointState
+
+from fluoro_calib_ros.bags.definitions import (
+    ADDED,
+    FLUOROSCOPE_CALIBRATION,
+    earlier_text,
+    from_cdr,
+    present_cdr,
+)
+from fluoro_calib_ros.distortion.angle_field import packed_angles
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
+    ANGLES,
+    calibration_from_message,
+    decode_fluoroscope_calibration,
+    message_from_calibration,
+)
+from fluoro_calib_ros.nodes.messages.joint_state import decode_joint_state
+
+# Of FluoroscopeCalibration before it had angles (REP-2016).
+EARLIER_HASH = 'RIHS01_0f953840578d8b58b031c13ce41212b81930fc2fb1ab721e149235d7490eaf4a'
+
+
+@pytest.fixture(scope='module')
+def plain():
+    return rigs.calibrated('a', 5, model='collocation').calibrations['a']
+
+
+@pytest.fixture(scope='module')
+def turning(plain):
+    return rigs.turning(plain)
+
+
+def earlier_store():
+    store = get_typestore(Stores.ROS2_JAZZY)
+    store.register(
+        get_types_from_msg(earlier_text(FLUOROSCOPE_CALIBRATION), FLUOROSCOPE_CALIBRATION)
+    )
+    return store
+
+
+def earlier_bytes(calibration):
+    """Return a message as it was before there were angles."""
+    present = from_cdr(
+        serialize_message(message_from_calibration(calibration)), FLUOROSCOPE_CALIBRATION
+    )
+    store = earlier_store()
+    kind = store.types[FLUOROSCOPE_CALIBRATION]
+    added = ADDED[FLUOROSCOPE_CALIBRATION]
+    fields = {n: v for n, v in vars(present).items() if n not in added and n != '__msgtype__'}
+    return bytes(store.serialize_cdr(kind(**fields), FLUOROSCOPE_CALIBRATION))
+
+
+def test_angle_field_of_a_message_is_the_same_to_the_last_bit(turning):
+    data = serialize_message(message_from_calibration(turning))
+    found = calibration_from_message(decode_fluoroscope_calibration(data))
+    assert found.calibration_id == turning.calibration_id
+    for one, other in zip(packed_angles(found.angle_field), packed_angles(turning.angle_field)):
+        assert np.array_equal(one, other)
+    uv = np.random.default_rng(0).uniform(100, 800, (50, 2))
+    for angle in (0.3, None):
+        one, other = found.correct(uv, angle=angle), turning.correct(uv, angle=angle)
+        assert np.array_equal(one.uv, other.uv) and np.array_equal(one.sigma, other.sigma)
+
+
+def test_calibration_without_angles_has_empty_arrays(plain):
+    message = message_from_calibration(plain)
+    assert not any(len(getattr(message, name)) for name in ANGLES)
+    assert calibration_from_message(message).angle_field is None
+
+
+@pytest.mark.parametrize(
+    'name, values, said',
+    [
+        ('angle_coefficients', [0.0] * 79, 'angle_coefficients has 79 values, 80 are expected'),
+        ('angle_coefficients', [], 'angle_coefficients has 0 values, 80 are expected'),
+        ('angle_variances', [0.0] * 33, 'angle_variances has 33 values, 15246 are expected'),
+        ('angles', [], 'angles of an angle field'),
+        ('angles', [np.nan] * 5, 'angles of an angle field are not all finite'),
+        ('angles', [90.0] * 5, 'angles'),
+        ('angle_coefficients', [1e300] * 80, 'angle_coefficients'),
+    ],
+)
+def test_damaged_angles_are_refused_in_one_sentence(turning, name, values, said):
+    message = message_from_calibration(turning)
+    setattr(message, name, values)
+    with pytest.raises(DataError, match=said) as refused:
+        calibration_from_message(message)
+    assert '\n' not in str(refused.value)
+
+
+def test_changed_angles_do_not_match_the_id(turning):
+    message = message_from_calibration(turning)
+    message.angles[0] += 1e-9
+    with pytest.raises(DataError, match='does not match its id'):
+        calibration_from_message(message)
+
+
+def test_earlier_definition_is_the_one_that_was_recorded():
+    assert earlier_store().hash_rihs01(FLUOROSCOPE_CALIBRATION) == EARLIER_HASH
+
+
+@pytest.mark.parametrize(
+    'model, padding', [('collocation', 0), ('knn', 0), ('knn', 4), ('none', 0), ('none', 4)]
+)
+def test_message_of_the_earlier_definition_is_read(model, padding):
+    calibration = rigs.calibrated('a', 5, model=model).calibrations['a']
+    # Each empty sequence of float64 may leave four bytes at the end, of any content.
+    data = earlier_bytes(calibration) + b'\xff' * padding
+    found = calibration_from_message(decode_fluoroscope_calibration(data))
+    assert found.calibration_id == calibration.calibration_id
+    offline = from_cdr(data, FLUOROSCOPE_CALIBRATION)
+    assert offline.calibration_id == calibration.calibration_id and not len(offline.angles)
+    assert from_cdr(present_cdr(data, FLUOROSCOPE_CALIBRATION), FLUOROSCOPE_CALIBRATION)
+
+
+def test_truncated_messages_are_refused(turning, plain):
+    for data in (
+        serialize_message(message_from_calibration(turning)),
+        earlier_bytes(plain),
+    ):
+        for length in (len(data) // 2, len(data) - 9, 20, 3, 0):
+            with pytest.raises((ValueError, RuntimeError)):
+                calibration_from_message(decode_fluoroscope_calibration(data[:length]))
+
+
+def test_joint_state_is_read():
+    message = JointState(name=['table', 'carm'], position=[0.1, -0.7])
+    message.header.stamp = Time(sec=12, nanosec=34)
+    state = decode_joint_state(serialize_message(message))
+    assert state.stamp_ns == 12 * 10**9 + 34
+    assert list(state.names) == ['table', 'carm'] and list(state.positions) == [0.1, -0.7]
+    with pytest.raises((ValueError, RuntimeError)):
+        decode_joint_state(serialize_message(message)[:20])

@@ -63,6 +63,12 @@ PARAMETERS = (
     ),
     Argument('rig_frame', '', 'name of the rig frame on /tf_static'),
     Argument('principal_distance', '', 'principal distance, to some 10 %, for from_images [px]'),
+    Argument(
+        'angle_joint',
+        '',
+        'joint on joint_states whose position is the angle of the C-arm, or one for each '
+        'fluoroscope, e.g. a:frontal,b:lateral',
+    ),
     Argument('autostart', '', 'false: a lifecycle manager configures and activates the nodes'),
 )
 SWITCHES = (
@@ -95,8 +101,8 @@ OTHERS = (
 RIG = ('fluoroscopes', 'calibration_directory', 'autostart')
 OF_NODE = {
     'extraction_node': ('phantom', 'fluoroscopes', 'autostart', 'principal_distance'),
-    'calibration_node': ('phantom', *RIG, 'rig_frame'),
-    'correction_node': RIG,
+    'calibration_node': ('phantom', *RIG, 'rig_frame', 'angle_joint'),
+    'correction_node': (*RIG, 'angle_joint'),
     'reconstruction_node': (*RIG, 'rig_frame'),
     'image_node': RIG,
 }
@@ -123,7 +129,14 @@ def nodes_of_rig(context):
 
     def node(executable, parameters, needed=False):
         given = {name: yaml.safe_load(text) for name, text in parameters.items() if text}
-        for name in ('phantom', 'calibration_directory', 'rig_frame', 'bag', 'folder'):
+        for name in (
+            'phantom',
+            'calibration_directory',
+            'rig_frame',
+            'angle_joint',
+            'bag',
+            'folder',
+        ):
             if name in given:
                 given[name] = parameters[name]  # also where it reads like a number
         for name in ('rate', 'principal_distance'):
@@ -165,7 +178,11 @@ def nodes_of_rig(context):
             )
         )
     if values['record']:
-        recorded = {'folder': values['record'], 'topics': values['record_topics']}
+        recorded = {
+            'folder': values['record'],
+            'topics': values['record_topics'],
+            'angle_joint': values['angle_joint'],
+        }
         actions.append(node('recorder_node', recorded))
     if values['bag']:
         bag = {'bag': values['bag'], 'topics': values['bag_topics'], 'rate': values['bag_rate']}

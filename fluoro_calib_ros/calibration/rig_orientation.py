@@ -378,6 +378,7 @@ def _mean_frame(frames: Sequence[Frame], image_sd: float) -> Frame:
         total[matched] ** -0.5,
         last.stamp_ns,
         last.frame_id,
+        last.angle,
     )
 
 

@@ -27,6 +27,7 @@ from ..options import Option, declared
 
 if TYPE_CHECKING:
     from ..exchange.content import FileSettings
+    from ..exposures.angles import AngleOptions
     from ..jobs.sources import BagSelection
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
@@ -172,6 +173,41 @@ def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> No
         metavar='S',
         help=f'{tolerance.description}, with --pair-by stamp [s] (default: {tolerance.default})',
     )
+    add_angle_options(group)
+
+
+def add_angle_options(parser: Parser) -> None:
+    """Add where the angle of the C-arm in the exposures of a bag comes from."""
+    from ..exposures.angles import AngleOptions
+
+    options = declared(AngleOptions)
+    parser.add_argument(
+        '--angle-joint',
+        type=_angle_joint,
+        default='',
+        metavar='JOINT',
+        help='joint of the joint states in a bag whose position is the angle of the C-arm, or one '
+        'for each fluoroscope: A:JOINT,B:JOINT (default: no angle)',
+    )
+    add_option(parser, options['angle_max_age'], metavar='S')
+
+
+def angle_options(arguments: argparse.Namespace) -> AngleOptions:
+    """Return the options of `add_angle_options`."""
+    from ..exposures.angles import AngleOptions
+
+    return AngleOptions(arguments.angle_joint, arguments.angle_max_age)
+
+
+def _angle_joint(text: str) -> str:
+    """Return the option angle_joint as it is, if it is valid."""
+    from ..exposures.angles import joints_by_fluoroscope
+
+    try:
+        joints_by_fluoroscope(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return text
 
 
 def bag_selection(arguments: argparse.Namespace, pairing: bool = True) -> BagSelection:
@@ -179,7 +215,13 @@ def bag_selection(arguments: argparse.Namespace, pairing: bool = True) -> BagSel
     from ..jobs.sources import BagSelection
 
     pair_by = arguments.pair_by if pairing else 'frame_number'
-    return BagSelection(arguments.start, arguments.end, pair_by, arguments.pair_tolerance)
+    return BagSelection(
+        arguments.start,
+        arguments.end,
+        pair_by,
+        arguments.pair_tolerance,
+        angle_options(arguments),
+    )
 
 
 def add_file_options(parser: argparse.ArgumentParser) -> None:

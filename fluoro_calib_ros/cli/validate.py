@@ -22,11 +22,13 @@ from pathlib import Path
 
 from ..errors import DataError
 from .arguments import (
+    add_angle_options,
     add_collect,
     add_file_options,
     add_fluoroscopes,
     add_phantom,
     add_result_folder,
+    angle_options,
     file_settings,
     image_size,
     result_folder,
@@ -55,6 +57,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='image size of a file given as --source [px] (default: that of the calibration)',
     )
     add_fluoroscopes(parser, 'validate')
+    add_angle_options(parser)
     add_collect(parser, 'a bag given as --source')
     add_file_options(parser)
 
@@ -72,7 +75,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..files.calibration_request import read_request
     from ..files.names import read_names
     from ..files.validation import validation_document, write_validation
-    from ..jobs.sources import read_calibrations, read_source, read_survey
+    from ..jobs.sources import BagSelection, read_calibrations, read_source, read_survey
     from ..report.verdict import verdict_text
     from ..validation.verdict import validate
 
@@ -86,6 +89,7 @@ def run(arguments: argparse.Namespace) -> None:
             fluoroscopes=arguments.fluoroscopes,
             collect=arguments.collect,
             settings=file_settings(arguments, names=known),
+            selection=BagSelection(angles=angle_options(arguments)),
         )
         print_notes(recording.notes)
         print_unpaired(arguments.source, recording.unpaired)

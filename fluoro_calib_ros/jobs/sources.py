@@ -23,11 +23,13 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from ..bags.joint_states import joint_topics, with_angles
 from ..bags.reader import read_frames
 from ..calibration.result import FluoroscopeCalibration
 from ..errors import DataError
 from ..exchange import registry
 from ..exchange.content import PARTS, Content, FileSettings
+from ..exposures.angles import AngleOptions
 from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
 from ..exposures.names import Names
@@ -76,12 +78,15 @@ class BagSelection:
     pair_by : {'frame_number', 'stamp'}
     tolerance_s : float
         Largest difference between the stamps of an exposure [s].
+    angles : AngleOptions
+        Which joint gives the angle of the C-arm.
     """
 
     start_s: float | None = None
     end_s: float | None = None
     pair_by: str = 'frame_number'
     tolerance_s: float = PairingOptions.tolerance_s
+    angles: AngleOptions = field(default_factory=AngleOptions)
 
     def check_file(self, path: object) -> None:
         """Raise DataError where a file without times is to be selected from by time."""
@@ -89,6 +94,11 @@ class BagSelection:
             raise DataError(
                 f'{path}: a time window and the pairing by stamp need a bag, this file does not '
                 'contain the times of its exposures'
+            )
+        if self.angles.angle_joint:
+            raise DataError(
+                f'{path}: the angle of a joint needs a bag; a CSV file has the angles in a column '
+                'angle_deg'
             )
 
     def frames(self, path: object, found: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]]:
@@ -242,7 +252,8 @@ def read_source(
     if bag:
         contents = read_frames(path, validate)
         found = selection.frames(path, contents.frames)
-        content = Content(notes=contents.notes)
+        found, notes = with_angles(path, found, selection.angles)
+        content = Content(notes=(*contents.notes, *notes))
     else:
         selection.check_file(path)
         settings = replace(settings, image_size=image_size, fluoroscopes=tuple(fluoroscopes or ()))
@@ -355,7 +366,31 @@ def read_calibrated_source(
         selection=selection,
     )
     select_calibrations(calibrations, recording.frames, directory)
-    return recording, calibrations
+    unknown = _unknown_angles(path, recording.frames, calibrations, selection)
+    return replace(recording, notes=(*recording.notes, *unknown)), calibrations
+
+
+def _unknown_angles(
+    path: str | os.PathLike[str],
+    frames: Mapping[str, Sequence[Frame]],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    selection: BagSelection | None,
+) -> Iterable[str]:
+    """Yield a sentence for each fluoroscope whose correction needs angles that are unknown."""
+    for name, each in frames.items():
+        count = sum(frame.angle is None for frame in each)
+        if calibrations[name].angle_field is None or not count:
+            continue
+        hint = ''
+        if not (selection and selection.angles.angle_joint) and is_bag(path):
+            topics = joint_topics(path)
+            if topics:
+                hint = f'; name the joint on {", ".join(topics)} with --angle-joint'
+        yield (
+            f'{path}: the correction of fluoroscope {name} depends on the angle of the C-arm, '
+            f'which is unknown for {count} of {len(each)} frames: they get the mean over the '
+            f'angles, with its larger standard deviation{hint}'
+        )
 
 
 def read_point_table(

@@ -52,6 +52,7 @@ from ..calibration.options import CalibrationOptions
 from ..calibration.request import CalibrationRequest
 from ..calibration.rounds import Round
 from ..errors import DataError
+from ..exposures.angles import AngleOptions
 from ..exposures.collector import StillOptions
 from ..exposures.frame import Frame
 from ..exposures.names import Names
@@ -74,8 +75,10 @@ from ..limits import CollectLimits
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..validation.check import Validation
+from .angle_input import AngleInput
 from .exposure_input import Collected, CollectOptions, ExposureInput
 from .messages.calibration_status import FluoroscopeProgress, message_from_progress
+from .messages.fields import NS_PER_S
 from .messages.fluoroscope_calibration import message_from_calibration
 from .messages.image import colour_message
 from .messages.self_calibration import (
@@ -166,8 +169,9 @@ _PAIRING = ParameterGroup(
 _CALIBRATION = ParameterGroup(
     CalibrationOptions, {name: name for name in _OF_REQUESTS}, settable=_OF_REQUESTS
 )
+_ANGLES = ParameterGroup(AngleOptions)
 _LIMITS = ParameterGroup(CollectLimits)
-PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION, _LIMITS, READ_LIMITS)
+PARAMETERS = (_NODE, _STILL, _PAIRING, _CALIBRATION, _ANGLES, _LIMITS, READ_LIMITS)
 
 
 class Cancelled(Exception):
@@ -201,6 +205,7 @@ class CalibrationNode(StreamNode):
         self._still = _STILL.declare(self)
         self._pairing = _PAIRING.declare(self)
         self._options = _CALIBRATION.declare(self)
+        self._angle_options = _ANGLES.declare(self)
         self._limits = _LIMITS.declare(self)
         self.autostart = self._settings.autostart
         self._names = self._settings.fluoroscopes
@@ -220,6 +225,7 @@ class CalibrationNode(StreamNode):
         self._fluoroscopes = {name: _Fluoroscope(name) for name in self._names}
         self._load_fault = ''
         self._save_fault = ''
+        self._angles = AngleInput(self._angle_options, self._names, self.limited_logger)
         self._exposures = ExposureInput(
             self._names,
             self._phantom,
@@ -345,14 +351,14 @@ class CalibrationNode(StreamNode):
 
     def create_readers(self) -> None:
         """Receive the observations of all fluoroscopes in one thread."""
-        reader = self.create_reader(
-            FaultHandlers(
-                self._on_undecodable,
-                self._on_lost_frame,
-                self.fail,
-                self._on_too_large,
-            )
+        faults = FaultHandlers(
+            self._on_undecodable,
+            self._on_lost_frame,
+            self.fail,
+            self._on_too_large,
         )
+        reader = self.create_reader(self._angles.guarded(faults))
+        self._angles.subscribe(reader)
         for name in self._names:
             reader.subscribe(
                 TargetObservations,
@@ -420,7 +426,11 @@ class CalibrationNode(StreamNode):
     # -- observations, in the thread of the streams
 
     def _on_frame(self, name: str, frame: ObservedFrame, _: Mapping[str, int]) -> None:
-        self._exposures.add(name, frame)
+        stamp_ns = NS_PER_S * frame.sec + frame.nanosec
+        needed = bool(self._angle_options.angle_joint)
+        self._exposures.add(
+            name, frame, lambda: self._angles.of_frame(name, stamp_ns, needed=needed)
+        )
 
     def _on_pair(self, pair: Mapping[str, Frame]) -> None:
         self._orientation.add(pair)
@@ -802,7 +812,11 @@ class CalibrationNode(StreamNode):
             self._status_outputs[fluoroscope.name].publish(message_from_progress(progress, stamp))
             self._publish_coverage(progress, collected)
             fault = incompatible.get(f'{fluoroscope.name}/{OBSERVATIONS}', '')
-            statuses.append(self._diagnose(fluoroscope, progress, collected, fault))
+            unknown = self._angles.status(fluoroscope.name, incompatible)
+            status = self._diagnose(fluoroscope, progress, collected, fault)
+            if unknown and status.level == OK:
+                status = replace(status, level=unknown[0], message=unknown[1])
+            statuses.append(status)
         return statuses
 
     def _publish_coverage(self, progress: FluoroscopeProgress, collected: Collected) -> None:
@@ -860,6 +874,7 @@ class CalibrationNode(StreamNode):
                 'frames unpaired': progress.frames_unpaired,
                 'last fault': self._exposures.streams[fluoroscope.name].refusals.last_fault,
                 'calibration': progress.calibration_id,
+                **self._angles.values(fluoroscope.name),
             },
         )
 

@@ -68,7 +68,7 @@ class CorrectingNode(StreamNode):
     """Node that corrects a stream of each fluoroscope with its newest calibration.
 
     Nothing is corrected before the first calibration. Subclasses set the class attributes and
-    override prepare(), on_calibration_ready(), make_stream() and extra_values().
+    override prepare(), on_calibration_ready(), make_stream(), extra_values() and extra_verdict().
 
     Attributes
     ----------
@@ -113,6 +113,12 @@ class CorrectingNode(StreamNode):
     def extra_values(self, stream: Any, prepared: Any) -> dict[str, object]:
         """Return further values for the diagnostics of a fluoroscope."""
         return {}
+
+    def extra_verdict(
+        self, stream: Any, prepared: Any, incompatible: Mapping[str, str]
+    ) -> tuple[bytes, str] | None:
+        """Return level and message of a fault of a subclass in a stream that is corrected."""
+        return None
 
     def reset(self) -> None:
         """Start counting from zero."""
@@ -215,4 +221,8 @@ class CorrectingNode(StreamNode):
         stalled = stream.stall.message(stream.received)
         if stalled:
             return WARN, stalled
-        return stream.refusals.refusal_status() or (OK, 'correcting')
+        return (
+            stream.refusals.refusal_status()
+            or self.extra_verdict(stream, self.prepared(stream.name), incompatible)
+            or (OK, 'correcting')
+        )

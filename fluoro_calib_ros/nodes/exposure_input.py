@@ -37,6 +37,10 @@ from .runtime.logging import Logger, RateLimitedLogger
 from .runtime.refusals import RefusalLog
 
 
+def _no_angle() -> None:
+    """Return that an angle is unknown."""
+
+
 @dataclass(frozen=True)
 class CollectOptions:
     """How exposures are collected.
@@ -216,15 +220,21 @@ class ExposureInput:
 
     # -- the thread of the streams
 
-    def add(self, name: str, observed: ObservedFrame) -> None:
-        """Take a frame: drop it, refuse it, or validate, pair and perhaps collect it."""
+    def add(
+        self, name: str, observed: ObservedFrame, angle: Callable[[], float | None] = _no_angle
+    ) -> None:
+        """Take a frame: drop it, refuse it, or validate, pair and perhaps collect it.
+
+        angle: called for that of the C-arm [rad], None where it is unknown, of a frame that shows
+        the phantom.
+        """
         stream = self.streams[name]
         stream.received += 1
         if self._phantom is None or observed.target_id == stream.other_targets:
             return
         try:
             with self._lock:
-                frame = self._validated(stream, observed, self._phantom)
+                frame = self._validated(stream, observed, self._phantom, angle)
                 if frame is not None:
                     for pair in self._pairer.add(frame):
                         self._collect(pair)
@@ -244,7 +254,11 @@ class ExposureInput:
         stream.refusals.refuse_too_large(topic, size)
 
     def _validated(
-        self, stream: ObservationStream, observed: ObservedFrame, phantom: Phantom
+        self,
+        stream: ObservationStream,
+        observed: ObservedFrame,
+        phantom: Phantom,
+        angle: Callable[[], float | None],
     ) -> Frame | None:
         """Return a valid frame, None where it does not show the phantom. Raises DataError."""
         ids = np.frombuffer(observed.target_id, np.uint32)
@@ -257,7 +271,7 @@ class ExposureInput:
                     f'as frame {observed.frame_number}, are ignored'
                 )
             return None
-        frame = frame_from_observed(observed, stream.name).sorted()
+        frame = frame_from_observed(observed, stream.name, angle()).sorted()
         validate_frame(frame, phantom, stream.image_size)
         if len(frame.target_id) < MIN_TARGETS_OF_EXPOSURE:
             raise DataError(

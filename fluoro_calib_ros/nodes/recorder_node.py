@@ -37,6 +37,7 @@ from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
 from .runtime.stream_reader import FaultHandlers, StreamReader
 
 DISCOVERY_S = 0.1  # period in which new topics are looked for
+JOINT_STATES = 'joint_states'
 DEPTH = 1000  # messages that wait for the reading thread, of one topic
 LATCHED_DEPTH = 100  # messages of latched topics that are kept for the next file
 
@@ -47,6 +48,11 @@ class RecorderParameters:
 
     folder: str = option('', 'folder of the new bag, which must not exist')
     topics: tuple[str, ...] = option(('',), 'topics to record; empty: all')
+    angle_joint: str = option(
+        '',
+        'joint of the C-arm, as for the correction node: where it is set, joint_states is '
+        'recorded beside topics',
+    )
 
 
 _NODE = ParameterGroup(RecorderParameters)
@@ -69,7 +75,10 @@ class RecorderNode(ParameterNode):
         except DataError as error:
             raise StartError(str(error)) from None
         self.failed = False
-        self._wanted = {self.resolve_topic_name(topic) for topic in self._settings.topics if topic}
+        topics = [topic for topic in self._settings.topics if topic]
+        if topics and self._settings.angle_joint:
+            topics.append(JOINT_STATES)
+        self._wanted = {self.resolve_topic_name(topic) for topic in topics}
         self._topics: dict[str, str] = {}  # type by topic
         self._passed_over: set[str] = set()
         self._limited_logger = RateLimitedLogger(self.get_logger())

@@ -1,0 +1,233 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Angle of the C-arm in an exposure: where a joint was when it was taken.
+
+The rule is the same live and for a bag. The angle of an exposure is the position of the joint in
+its last state at or before the stamp of the exposure, if that state is no older than
+`angle_max_age`; else it is unknown. Stamps decide, not the order in which messages arrive. There
+is no interpolation: the state after an exposure comes later than the exposure itself, and no
+frame waits for it.
+"""
+
+from __future__ import annotations
+
+import math
+from array import array
+from bisect import bisect_left, bisect_right
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..options import option, validate_options
+from .frame import MAX_ANGLE, angle_in_degrees
+
+CAPACITY = 10_000  # states of a joint that a live track keeps
+
+
+@dataclass(frozen=True)
+class AngleOptions:
+    """Where the angle of the C-arm comes from. Raises ValueError for what cannot be."""
+
+    angle_joint: str = option(
+        '',
+        'joint whose position is the angle of the C-arm, or one for each fluoroscope, such as '
+        'a:frontal,b:lateral; empty: no angle',
+    )
+    angle_max_age: float = option(
+        0.5,
+        'longest time from the last state of the joint to an exposure; after it the angle is '
+        'unknown',
+        minimum=0.0,
+        maximum=1e6,
+        unit='s',
+    )
+
+    def __post_init__(self) -> None:
+        validate_options(self)
+        joints_by_fluoroscope(self.angle_joint)
+
+    def joints(self, fluoroscopes: Iterable[str]) -> dict[str, str]:
+        """Return the joint of each fluoroscope that has one.
+
+        Raises ValueError where a joint is given for another fluoroscope.
+        """
+        names = tuple(fluoroscopes)
+        given = joints_by_fluoroscope(self.angle_joint)
+        if isinstance(given, str):
+            return dict.fromkeys(names, given) if given else {}
+        for name in given:
+            if name not in names:
+                raise ValueError(
+                    f'angle_joint: there is no fluoroscope {name!r}, only {", ".join(names)}'
+                )
+        return given
+
+    def tracks(self, fluoroscopes: Iterable[str], capacity: int | None = CAPACITY) -> JointAngles:
+        """Return what follows the joints of fluoroscopes. Raises ValueError."""
+        return JointAngles(self.joints(fluoroscopes), self.angle_max_age, capacity)
+
+
+def joints_by_fluoroscope(text: str) -> str | dict[str, str]:
+    """Return the joint of all fluoroscopes, or one for each, from an option.
+
+    'carm' is of all, 'a:frontal,b:lateral' of each. Raises ValueError.
+    """
+    if ':' not in text:
+        if ',' in text:
+            raise ValueError(f'angle_joint: {text!r} is neither a joint nor like a:joint,b:joint')
+        return text.strip()
+    joints: dict[str, str] = {}
+    for part in text.split(','):
+        name, _, joint = (word.strip() for word in part.partition(':'))
+        if not name or not joint or name in joints:
+            raise ValueError(f'angle_joint: {text!r} is not like a:joint,b:joint')
+        joints[name] = joint
+    return joints
+
+
+class AngleTrack:
+    """Positions of a joint by stamp.
+
+    A position that is not finite, or is no angle in radians, counts as unknown.
+
+    Parameters
+    ----------
+    max_age_s : float
+        Of the state that gives an angle [s].
+    capacity : int or None
+        States that are kept, the newest; None: all. A state before all that are kept means that
+        the clock was set back, and the track begins again.
+
+    Attributes
+    ----------
+    late : int
+        States that were added after an angle at or after their stamp had been asked for: it would
+        have been another one.
+    """
+
+    def __init__(self, max_age_s: float, capacity: int | None = CAPACITY) -> None:
+        self._max_age_ns = round(max_age_s * 1e9)
+        self._capacity = capacity
+        self._is_cut = False
+        self._stamps = array('q')
+        self._angles = array('d')
+        self._asked: int | None = None
+        self.late = 0
+
+    def add(self, stamp_ns: int, angle: float) -> None:
+        """Add a state: angle [rad], rounded as that of a `Frame`.
+
+        A second one with the same stamp replaces the first.
+        """
+        angle = float(np.radians(angle_in_degrees(angle)))
+        if not abs(angle) <= MAX_ANGLE:
+            angle = math.nan
+        if self._is_cut and stamp_ns < self._stamps[0]:
+            self._clear()
+        place = len(self._stamps)
+        if place and stamp_ns <= self._stamps[-1]:
+            place = bisect_left(self._stamps, stamp_ns)
+            if self._stamps[place] == stamp_ns:
+                self._angles[place] = angle
+                return
+        self.late += self._asked is not None and stamp_ns <= self._asked
+        self._stamps.insert(place, stamp_ns)
+        self._angles.insert(place, angle)
+        if self._capacity is not None and len(self._stamps) > self._capacity:
+            half = len(self._stamps) // 2
+            del self._stamps[:half]
+            del self._angles[:half]
+            self._is_cut = True
+
+    def at(self, stamp_ns: int) -> float | None:
+        """Return the angle at a time [rad], None where it is unknown."""
+        self._asked = stamp_ns
+        place = bisect_right(self._stamps, stamp_ns) - 1
+        if place < 0 or stamp_ns - self._stamps[place] > self._max_age_ns:
+            return None
+        angle = self._angles[place]
+        return None if math.isnan(angle) else angle
+
+    def doubt(self, stamp_ns: int) -> str:
+        """Return why the angle at a time is unknown, '' where it is known."""
+        if not self._stamps:
+            return 'it has no state yet'
+        place = bisect_right(self._stamps, stamp_ns) - 1
+        if place < 0:
+            return 'it has no state at or before the stamp of the exposure'
+        age_ns = stamp_ns - self._stamps[place]
+        if age_ns > self._max_age_ns:
+            return (
+                f'its last state is {age_ns * 1e-9:.3f} s older than the exposure, more than '
+                f'angle_max_age, {self._max_age_ns * 1e-9:g} s'
+            )
+        if math.isnan(self._angles[place]):
+            return f'its position is no angle between -{MAX_ANGLE:.2f} and {MAX_ANGLE:.2f} rad'
+        return ''
+
+    def _clear(self) -> None:
+        self._is_cut = False
+        self._stamps = array('q')
+        self._angles = array('d')
+        self._asked = None
+
+
+class JointAngles:
+    """Angles of the C-arms of fluoroscopes, from the states of their joints.
+
+    Parameters
+    ----------
+    joints : mapping of str to str
+        Joints by fluoroscope; several may have the same one.
+    max_age_s, capacity
+        See `AngleTrack`.
+    """
+
+    def __init__(
+        self, joints: Mapping[str, str], max_age_s: float, capacity: int | None = CAPACITY
+    ) -> None:
+        self.joints = dict(joints)
+        self._tracks = {joint: AngleTrack(max_age_s, capacity) for joint in joints.values()}
+
+    def add(self, stamp_ns: int, names: Sequence[str], positions: Sequence[float]) -> None:
+        """Add the states of joints: positions [rad], empty where they are not told.
+
+        Other joints are ignored.
+        """
+        if len(positions) != len(names):
+            return
+        for name, position in zip(names, positions):
+            track = self._tracks.get(name)
+            if track is not None:
+                track.add(stamp_ns, float(position))
+
+    def at(self, fluoroscope: str, stamp_ns: int) -> float | None:
+        """Return the angle of a fluoroscope at a time [rad], None where it is unknown."""
+        joint = self.joints.get(fluoroscope)
+        return None if joint is None else self._tracks[joint].at(stamp_ns)
+
+    def late(self, fluoroscope: str) -> int:
+        """Return the number of states that came after an exposure that needed them."""
+        joint = self.joints.get(fluoroscope)
+        return 0 if joint is None else self._tracks[joint].late
+
+    def doubt(self, fluoroscope: str, stamp_ns: int) -> str:
+        """Return a clause that says why an angle is unknown, '' where it is known."""
+        joint = self.joints.get(fluoroscope)
+        if joint is None:
+            return 'parameter angle_joint names no joint'
+        reason = self._tracks[joint].doubt(stamp_ns)
+        return f'joint {joint}: {reason}' if reason else ''

@@ -1,0 +1,174 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Angles of the C-arms, from the states of their joints on joint_states."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from typing import NamedTuple
+
+import numpy as np
+from sensor_msgs.msg import JointState
+
+from ..exposures.angles import AngleOptions
+from .messages.joint_state import JointStates, decode_joint_state
+from .runtime.diagnostics import WARN
+from .runtime.errors import StartError
+from .runtime.logging import RateLimitedLogger
+from .runtime.qos import observations_qos
+from .runtime.stream_reader import FaultHandlers, StreamReader
+
+TOPIC = 'joint_states'
+MAX_BYTES = 1_000_000  # of a message
+
+
+class Asked(NamedTuple):
+    """An exposure whose angle was asked for: its stamp [ns], and the angle [rad] or None."""
+
+    stamp_ns: int
+    angle: float | None
+
+
+class AngleInput:
+    """Receives the states of joints, in the thread of the streams, and gives angles to frames.
+
+    Without a joint it subscribes to nothing, and all angles are unknown.
+
+    Parameters
+    ----------
+    options : AngleOptions
+    names : iterable of str
+        Fluoroscopes.
+    logger : RateLimitedLogger
+
+    Raises
+    ------
+    StartError
+        For a joint of a fluoroscope that there is not.
+    """
+
+    def __init__(
+        self, options: AngleOptions, names: Iterable[str], logger: RateLimitedLogger
+    ) -> None:
+        try:
+            self._angles = options.tracks(names)
+        except ValueError as error:
+            raise StartError(f'parameter {error}') from None
+        self._logger = logger
+        self._received = 0
+        self._refused = 0
+        self._asked: dict[str, Asked] = {}
+        self._unknown = dict.fromkeys(names, 0)  # exposures
+        self._seen = dict.fromkeys(names, 0)  # of them, when the status was asked for last
+        self._doubted: set[str] = set()
+
+    def subscribe(self, reader: StreamReader) -> None:
+        """Receive the states with the streams of a reader."""
+        if self._angles.joints:
+            reader.subscribe(
+                JointState,
+                TOPIC,
+                self._on_state,
+                observations_qos(),
+                decode_joint_state,
+                MAX_BYTES,
+            )
+
+    def guarded(self, faults: FaultHandlers) -> FaultHandlers:
+        """Return the handlers of a reader, but for faults of the states of joints."""
+
+        def undecodable(topic: str) -> None:
+            if topic == TOPIC:
+                self._refuse(f'a message on {TOPIC} cannot be decoded')
+            else:
+                faults.undecodable(topic)
+
+        def callback_error(topic: str, error: Exception) -> None:
+            if topic == TOPIC:
+                self._refuse(f'a message on {TOPIC} is lost by an internal error: {error!r}')
+            else:
+                faults.callback_error(topic, error)
+
+        def too_large(topic: str, size: int) -> None:
+            if topic == TOPIC:
+                self._refuse(f'a message on {TOPIC} has {size} bytes, more than are read')
+            elif faults.too_large is not None:
+                faults.too_large(topic, size)
+
+        return FaultHandlers(undecodable, callback_error, faults.reader_error, too_large)
+
+    def of_frame(self, name: str, stamp_ns: int, needed: bool) -> float | None:
+        """Return the angle of an exposure [rad], None where it is unknown.
+
+        needed: whether something depends on it, so that an unknown one is counted and logged.
+        """
+        angle = self._angles.at(name, stamp_ns)
+        self._asked[name] = Asked(stamp_ns, angle)
+        if angle is not None:
+            self._doubted.discard(name)
+        elif needed:
+            self._unknown[name] += 1
+            if name not in self._doubted:
+                self._doubted.add(name)
+                self._logger.warning(f'fluoroscope {name}: {self._doubt(name)}')
+        return angle
+
+    def values(self, name: str) -> dict[str, object]:
+        """Return the values of a fluoroscope for the diagnostics, none where it has no joint."""
+        if name not in self._angles.joints and not self._unknown[name]:
+            return {}
+        asked = self._asked.get(name)
+        known = asked is not None and asked.angle is not None
+        return {
+            'angle [deg]': f'{math.degrees(asked.angle):.3f}' if known else '',  # type: ignore
+            'frames without angle': self._unknown[name],
+            'joint states received': self._received,
+            'joint states late': self._angles.late(name),
+            'joint states refused': self._refused,
+        }
+
+    def status(self, name: str, incompatible: Mapping[str, str]) -> tuple[bytes, str] | None:
+        """Return the status of a fluoroscope some of whose new frames had no angle, else None.
+
+        incompatible: messages about publishers that are not received, by topic.
+        """
+        before, self._seen[name] = self._seen[name], self._unknown[name]
+        if self._unknown[name] == before:
+            return None
+        return WARN, incompatible.get(TOPIC) or self._doubt(name)
+
+    def _doubt(self, name: str) -> str:
+        """Return why the angle of the last exposure is unknown, or of some before it."""
+        asked = self._asked[name]
+        reason = self._angles.doubt(name, asked.stamp_ns) or 'some exposures had none'
+        return f'the angle of the C-arm is unknown: {reason}'
+
+    def _on_state(self, state: JointStates, _: Mapping[str, int]) -> None:
+        self._angles.add(*state)
+        self._received += 1
+
+    def _refuse(self, reason: str) -> None:
+        self._refused += 1
+        self._logger.warning(reason)
+
+
+def beyond_text(angle: float, calibrated: np.ndarray) -> str:
+    """Return a sentence about an angle [rad] that is far from all calibrated ones."""
+    nearest = calibrated[np.abs(np.angle(np.exp(1j * (calibrated - angle)))).argmin()]
+    return (
+        f'the angle of the C-arm, {math.degrees(angle):.1f} degrees, is far from all calibrated '
+        f'ones, the nearest is {math.degrees(nearest):.1f} degrees'
+    )

@@ -1,0 +1,161 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Angles of the C-arm in frames of a bag, from joint states."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import tests.rigs as rigs
+from fluoro_calib_ros.bags.definitions import message_class
+from fluoro_calib_ros.bags.joint_states import JOINT_STATE
+from fluoro_calib_ros.bags.writer import BagWriter
+from fluoro_calib_ros.calibration.rig_orientation import standing_frames
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.angles import AngleOptions
+from fluoro_calib_ros.files.calibration import save_calibration
+from fluoro_calib_ros.jobs.sources import BagSelection, read_calibrated_source, read_source
+
+START_NS = 10**18
+STEP_NS = 40_000_000
+
+
+def joint_state(stamp_ns, names, positions):
+    time = message_class('builtin_interfaces/msg/Time')(*divmod(stamp_ns, 10**9))
+    header = message_class('std_msgs/msg/Header')(time, '')
+    empty = np.zeros(0)
+    return message_class(JOINT_STATE)(header, names, np.asarray(positions, float), empty, empty)
+
+
+def frames_of(name, count=5):
+    return [
+        replace(frame, number=k, stamp_ns=START_NS + k * STEP_NS)
+        for k, frame in enumerate(rigs.exposures()[name][:count])
+    ]
+
+
+def write_bag(path, states, frames=None):
+    """Write frames of a and b, then states (topic, stamp, names, positions): out of order."""
+    with BagWriter(path) as writer:
+        for frame in frames or (*frames_of('a'), *frames_of('b')):
+            writer.write_frame(frame)
+        for topic, stamp_ns, names, positions in states:
+            message = joint_state(stamp_ns, names, positions)
+            writer.write(topic, JOINT_STATE, message, START_NS + 10**10)
+    return path
+
+
+def with_joint(text, **options):
+    return BagSelection(angles=AngleOptions(text, **options))
+
+
+STATES = [
+    ('/joint_states', START_NS + k * STEP_NS - 1, ['table', 'carm'], [2.0, 0.1 * k])
+    for k in range(4)
+]
+
+
+def test_frames_get_the_position_of_the_last_state_before_them(tmp_path):
+    bag = write_bag(tmp_path / 'bag', STATES)
+    recording = read_source(bag, selection=with_joint('carm'))
+    for name in 'ab':
+        angles = [frame.angle for frame in recording.frames[name]]
+        assert angles == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.3], abs=1e-8)
+    assert not recording.notes
+
+
+def test_each_fluoroscope_has_its_own_joint_on_any_topic(tmp_path):
+    other = [('/rig/b/states', s, ['lateral'], [-p[1]]) for _, s, _, p in STATES]
+    bag = write_bag(tmp_path / 'bag', [*STATES, *other])
+    frames = read_source(bag, selection=with_joint('a:carm,b:lateral')).frames
+    assert [f.angle for f in frames['b']] == [-f.angle for f in frames['a']]
+    frames = read_source(bag, selection=with_joint('b:lateral')).frames
+    assert {f.angle for f in frames['a']} == {None}
+
+
+def test_frames_whose_angle_is_unknown_are_counted(tmp_path):
+    bag = write_bag(tmp_path / 'bag', STATES[:2])
+    recording = read_source(bag, selection=with_joint('carm', angle_max_age=0.05))
+    angles = [f.angle for f in recording.frames['a']]
+    assert angles[:3] == pytest.approx([0.0, 0.1, 0.1], abs=1e-8)
+    assert angles[3:] == [None, None]
+    assert len(recording.notes) == 2
+    assert (
+        '2 of 5 frames of fluoroscope a have no angle, the first is frame 3'
+        in (recording.notes[0])
+    )
+    assert 'more than angle_max_age, 0.05 s' in recording.notes[0]
+
+
+@pytest.mark.parametrize(
+    'states, joint, said',
+    [
+        ([], 'carm', 'the bag has no joint states'),
+        (STATES, 'c-arm', "the bag has no joint 'c-arm', only carm, table"),
+        (STATES, 'c:carm', "there is no fluoroscope 'c', only a, b"),
+        (
+            [*STATES, ('/other/joint_states', START_NS, ['carm'], [1.0])],
+            'carm',
+            "joint 'carm' is on the topics /joint_states, /other/joint_states",
+        ),
+    ],
+)
+def test_what_is_not_in_the_bag_is_said(tmp_path, states, joint, said):
+    bag = write_bag(tmp_path / 'bag', states)
+    with pytest.raises(DataError, match=said):
+        read_source(bag, selection=with_joint(joint))
+
+
+def test_joint_for_a_file_is_refused():
+    with pytest.raises(DataError, match='a CSV file has the angles in a column angle_deg'):
+        read_source('points.csv', image_size=(9, 9), selection=with_joint('carm'))
+
+
+def test_correction_without_the_angle_it_needs_is_noted(tmp_path):
+    bag = write_bag(tmp_path / 'bag', STATES, frames_of('a'))
+    turning = rigs.turning(rigs.calibrated('a', 5, model='none').calibrations['a'])
+    save_calibration(tmp_path / 'result', turning)
+    recording, _ = read_calibrated_source(bag, tmp_path / 'result')
+    (note,) = recording.notes
+    assert 'depends on the angle of the C-arm, which is unknown for 5 of 5 frames' in note
+    assert 'name the joint on /joint_states with --angle-joint' in note
+    recording, _ = read_calibrated_source(bag, tmp_path / 'result', selection=with_joint('carm'))
+    assert not recording.notes
+
+
+@pytest.mark.parametrize('count', [1, 2])
+def test_frames_of_a_standing_phantom_keep_their_angle(count):
+    calibration = rigs.calibrated('a', 5, model='none').calibrations['a']
+    frame = replace(rigs.exposures()['a'][0], angle=0.4)
+    found = standing_frames({'a': [frame] * count}, {'a': calibration})
+    assert found['a'].angle == frame.angle == pytest.approx(0.4)
+
+
+def test_command_line_reads_the_angles_of_a_bag(tmp_path, capsys):
+    frames = [
+        replace(frame, number=k, stamp_ns=START_NS + k * STEP_NS)
+        for k, frame in enumerate(rigs.exposures()['a'])
+    ]
+    states = [
+        ('/joint_states', frame.stamp_ns, ['carm'], [0.05 * k]) for k, frame in enumerate(frames)
+    ]
+    bag = write_bag(tmp_path / 'bag', states, frames)
+    recording = read_source(bag, selection=with_joint('carm'))
+    angles = [f.angle for f in recording.frames['a']]
+    assert angles == pytest.approx([0.05 * k for k in range(len(frames))], abs=1e-8)
+    bad = ['calibrate', str(bag), '--phantom', 'p', '--out', 'o', '--angle-joint', 'a:']
+    assert rigs.run(*bad) == 2
+    assert 'is not like a:joint,b:joint' in capsys.readouterr().err

@@ -36,6 +36,7 @@ BYTES_OF_HEAD = 4096  # of a message of image points: header and names
 BYTES_OF_POINT = 41  # at most: an id, four numbers and a status, and their padding
 # Calibrations and orientations of the rig, in files and messages.
 MAX_IMAGE_SIDE = 32_000  # px: OpenCV holds whole pixels in 16 bits
+MAX_ANGLES = 10_000  # of the exposures of a calibration
 MAX_CORNERS = 1000  # of the calibrated area
 MAX_NEIGHBOURS = 1000
 MAX_COINCIDENT = 1000  # training points on one place

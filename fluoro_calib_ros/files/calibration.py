@@ -30,6 +30,7 @@ from ..distortion.series import MAX_DEGREE, MAX_MODES, packed
 from ..errors import DataError
 from ..exposures.frame import MAX_ANGLE
 from ..limits import (
+    MAX_ANGLES,
     MAX_COINCIDENT,
     MAX_IMAGE_SIDE,
     MAX_NEIGHBOURS,
@@ -75,7 +76,7 @@ ARRAYS = {
     'stamp_ns': ArraySpec('int'),
     'frame_id': ArraySpec('text'),
     'source_digest': ArraySpec('text'),
-    'angles': ArraySpec('float', ('A',), maximum=MAX_ANGLE),
+    'angles': ArraySpec('float', ('A',), maximum=MAX_ANGLE, longest=MAX_ANGLES),
     'angle_coefficients': ArraySpec('float', ('H', 2, 'T'), maximum=MAX_PX),
     'angle_variances': ArraySpec('float', ('V', 'G', 'G'), maximum=MAX_PX**2),
 }

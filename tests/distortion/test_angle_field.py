@@ -14,11 +14,12 @@
 
 """Distortion that changes with the angle of a C-arm."""
 
-import functools
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from rigs import calibrated, exposures, rig
+from turning_rig import CHANGE_PX, recording, turned, turning
 
 from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.distortion.angle_field import (
@@ -32,11 +33,9 @@ from fluoro_calib_ros.distortion.angle_field import (
 from fluoro_calib_ros.distortion.series import SD_GRID, Functions
 from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.errors import DataError
-from tests.rigs import calibrated, exposures, rig
 
 SIZE = (800, 600)
 ANGLES = np.deg2rad([-80.0, -50.0, -35.0, -10.0, 5.0, 30.0, 60.0, 85.0])
-CHANGE_PX = 2.0
 
 
 def field(seed=0):
@@ -130,42 +129,6 @@ def test_damaged_content_is_refused(name):
 
 
 # ---- on the virtual rig: a field that turns with the C-arm
-
-
-def turned(uv, angle, size):
-    """Change (n, 2) [px] of the distortion at pixels uv (n, 2) with an angle."""
-    x, y = ((uv - (np.asarray(size) - 1) / 2) / (max(size) / 2)).T
-    spiral = (x * x + y * y)[:, None] * np.column_stack([-y, x])
-    bend = np.column_stack([x * x, -y * y]) * y[:, None]
-    return CHANGE_PX * (np.cos(angle) * spiral + np.sin(angle) * bend)
-
-
-@functools.cache
-def recording(known=True):
-    """Frames of 24 exposures at angles, 16 for the calibration and 8 for the test."""
-    rng = np.random.default_rng(5)
-    out = []
-    for frame in exposures(24, seed=11)['a']:
-        angle = float(rng.uniform(-1.4, 1.4))
-        uv = frame.uv + turned(frame.uv, angle, frame.image_size)
-        width, height = frame.image_size
-        on = ((uv > 0) & (uv < [width - 1, height - 1])).all(axis=1)
-        out.append(
-            replace(
-                frame,
-                target_id=frame.target_id[on],
-                uv=uv[on],
-                sigma=None if frame.sigma is None else frame.sigma[on],
-                angle=angle if known else None,
-            )
-        )
-    return out[:16], out[16:]
-
-
-@functools.cache
-def turning(known=True):
-    """Calibration of these exposures."""
-    return calibrate({'a': recording(known)[0]}, rig().phantom)
 
 
 def rmse_of_test(calibration, frames):

@@ -1,0 +1,61 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Exposures of the virtual rig whose distortion turns with a C-arm."""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+from rigs import exposures, rig
+
+from fluoro_calib_ros.calibration.calibrate import calibrate
+
+CHANGE_PX = 2.0
+
+
+def turned(uv, angle, size):
+    """Change (n, 2) [px] of the distortion at pixels uv (n, 2) with an angle."""
+    x, y = ((uv - (np.asarray(size) - 1) / 2) / (max(size) / 2)).T
+    spiral = (x * x + y * y)[:, None] * np.column_stack([-y, x])
+    bend = np.column_stack([x * x, -y * y]) * y[:, None]
+    return CHANGE_PX * (np.cos(angle) * spiral + np.sin(angle) * bend)
+
+
+@functools.cache
+def recording(known=True):
+    """Frames of 24 exposures at angles, 16 for the calibration and 8 for the test."""
+    rng = np.random.default_rng(5)
+    out = []
+    for frame in exposures(24, seed=11)['a']:
+        angle = float(rng.uniform(-1.4, 1.4))
+        uv = frame.uv + turned(frame.uv, angle, frame.image_size)
+        width, height = frame.image_size
+        on = ((uv > 0) & (uv < [width - 1, height - 1])).all(axis=1)
+        out.append(
+            replace(
+                frame,
+                target_id=frame.target_id[on],
+                uv=uv[on],
+                sigma=None if frame.sigma is None else frame.sigma[on],
+                angle=angle if known else None,
+            )
+        )
+    return out[:16], out[16:]
+
+
+@functools.cache
+def turning(known=True):
+    """Calibration of these exposures."""
+    return calibrate({'a': recording(known)[0]}, rig().phantom)

@@ -1,0 +1,42 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Verdict on calibrations of a C-arm that turns."""
+
+import pytest
+from rigs import rig
+from turning_rig import recording, turning
+
+from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.validation.verdict import validate
+
+
+def verdict(known):
+    """Verdict on the calibration with known or unknown angles."""
+    request = CalibrationRequest({'a': recording(known)[0]}, rig().phantom)
+    return validate(request, turning(known).calibrations)
+
+
+@pytest.mark.long
+def test_calibration_with_known_angles_passes():
+    found = verdict(known=True)
+    assert found.verdict == 'pass', found.findings
+
+
+@pytest.mark.long
+def test_calibration_with_unknown_angles_fails_and_is_told_to_give_them():
+    found = verdict(known=False)
+    assert found.verdict == 'fail'
+    assert [c.name for c in found.checks if c.name == 'variation' and c.passed is False]
+    assert any('angle_deg' in finding for finding in found.findings)

@@ -20,7 +20,7 @@ import math
 import time
 from collections.abc import Callable
 
-from rich.console import Group
+from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 from textual.app import App, ComposeResult
@@ -214,11 +214,16 @@ class Dashboard(App[None]):
     def show(self) -> None:
         """Show the present state."""
         state = self._session.state()
-        self.query_one('#session', Static).update(session_text(state))
+        self._update('#session', session_text(state))
         if self._note and time.monotonic() > self._confirm_until:
             self._note = ''
         lines = [*state.log, *([self._note] if self._note else [])]
-        self.query_one('#log', Static).update(Text('\n'.join(map(plain, lines[-LOG_LINES:]))))
+        self._update('#log', Text('\n'.join(map(plain, lines[-LOG_LINES:]))))
+
+    def _update(self, selector: str, content: RenderableType) -> None:
+        """Update a widget; while the application ends, it may be gone before the timer is."""
+        for widget in self.query(selector).results(Static):
+            widget.update(content)
 
     def action_ask(self, request: str) -> None:
         """Ask the session for something."""

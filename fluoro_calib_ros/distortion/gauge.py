@@ -40,7 +40,9 @@ from enum import Enum
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
 
+from ..photogrammetry.rotations import matrix_from_vector
 from .terms import CUBIC, cubic_terms, polynomial_coefficients, polynomial_powers
 
 
@@ -60,6 +62,7 @@ class GaugeKind(Enum):
 
 
 UNIT_PX = 512.0  # of the image coordinates in the basis; any fixed length would do
+TURN_STEP = 1e-3  # rad, as large as a pixel of the principal point for the search of both
 
 
 def gauge_basis(
@@ -138,3 +141,49 @@ def _cubic_terms(uv: ArrayLike, interior: np.ndarray) -> np.ndarray:
     powers = np.stack([x**i * y**j for i, j in polynomial_powers(CUBIC)], axis=1)
     terms = [polynomial_coefficients(CUBIC, parts) for parts in cubic_terms().values()]
     return np.stack([powers @ term.T for term in terms], axis=2)
+
+
+def interior_about(
+    centre: np.ndarray, uv: np.ndarray, correction: np.ndarray, interior: np.ndarray
+) -> np.ndarray:
+    """Interior orientation (3,) [px] in the gauge about another principal point.
+
+    A sensor that is turned by R and has another camera matrix K' sees the same rays where the
+    corrected image is that of the homography K' R K^-1 (Hartley and Zisserman, "Multiple View
+    Geometry", 2003, 8.4). To second order, a turn with its shift d of the principal point
+    stretches the image by d^2/c^2: a correction with a large affine part is orthogonal to the
+    gauge about a near principal point, and about far ones, with which it may be smaller.
+
+    Parameters
+    ----------
+    centre : (2,) ndarray
+        The other principal point [px].
+    uv : (n, 2) ndarray
+        Pixels.
+    correction : (n, 2) ndarray
+        Corrections there [px].
+    interior : (3,) ndarray
+        xp, yp, c [px] that belong to these corrections.
+
+    Returns
+    -------
+    (3,) ndarray
+
+    Raises
+    ------
+    ValueError
+        If there is none: the corrections are no numbers, or image points come to lie behind.
+    """
+    rays = np.column_stack([(uv - correction - interior[:2]) / interior[2], np.ones(len(uv))])
+    reference = np.array([*centre, interior[2]])
+
+    def misclosure(x: np.ndarray) -> np.ndarray:
+        turned = rays @ matrix_from_vector(x[3:]).T
+        if not (turned[:, 2] > 0).all():
+            raise ValueError('no orientation about this principal point')
+        ideal = x[:2] + x[2] * turned[:, :2] / turned[:, 2:]
+        return gauge_coefficients(uv, uv - ideal, reference)
+
+    start = np.concatenate([interior, np.zeros(3)])
+    scale = [1.0, 1.0, 1.0, TURN_STEP, TURN_STEP, TURN_STEP]
+    return least_squares(misclosure, start, x_scale=scale).x[:3]

@@ -27,6 +27,9 @@ import numpy as np
 
 from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
 from ..calibration.request import CalibrationRequest
+from ..calibration.result import FluoroscopeCalibration
+from ..distortion.gauge import interior_about
+from ..distortion.series import sd_grid_pixels
 from ..exposures.frame import Frame
 from .inputs import wrong_unit
 
@@ -47,7 +50,7 @@ def implausible(request: CalibrationRequest, result: CalibrationResult) -> list[
             _wrong_misfit(figures, frames),
             _few_inliers(figures),
             _wrong_distance(figures, request),
-            _wrong_interior(figures),
+            _wrong_interior(figures, result.calibrations[name]),
         ]
         out += [f'fluoroscope {name}: {sentence}' for sentence in sentences if sentence]
     return out
@@ -86,7 +89,7 @@ def _wrong_distance(figures: FluoroscopeResult, request: CalibrationRequest) -> 
     return wrong_unit(float(np.median(distances)), request.phantom)
 
 
-def _wrong_interior(figures: FluoroscopeResult) -> str:
+def _wrong_interior(figures: FluoroscopeResult, calibration: FluoroscopeCalibration) -> str:
     """An interior orientation that is not determined, or outside of anything built."""
     xp, yp, c = figures.interior
     sd = figures.interior_sd
@@ -96,11 +99,34 @@ def _wrong_interior(figures: FluoroscopeResult) -> str:
             f'the interior orientation is not determined: principal distance {c:.0f} px with a '
             f'standard deviation of {sd[2]:.0f} px, principal point within {max(sd[:2]):.0f} px'
         )
-    middle = (np.array(figures.image_size) - 1) / 2
-    offset = float(np.linalg.norm(np.array([xp, yp]) - middle))
+    if _off_centre(figures.interior, figures.image_size) <= MAX_OFF_CENTRE * side:
+        return ''
+    xp, yp, _ = _interior_about_middle(calibration)
+    offset = _off_centre(np.array([xp, yp]), figures.image_size)
     if offset > MAX_OFF_CENTRE * side:
         return (
             f'the principal point ({xp:.0f}, {yp:.0f}) is {offset:.0f} px from the middle of the '
             'image: wrong target ids, a wrong image size, or another phantom'
         )
     return ''
+
+
+def _off_centre(interior: np.ndarray, image_size: tuple[int, int]) -> float:
+    """Distance [px] of a principal point from the middle of the image."""
+    return float(np.linalg.norm(interior[:2] - (np.array(image_size) - 1) / 2))
+
+
+def _interior_about_middle(calibration: FluoroscopeCalibration) -> np.ndarray:
+    """Interior orientation (3,) [px] with a correction in the gauge about the middle of the image.
+
+    A strong affine distortion can move the principal point far away, and its correction with it.
+    """
+    pixels = sd_grid_pixels(calibration.image_size)
+    pixels = pixels[~calibration.model.outside(pixels)]
+    middle = (np.array(calibration.image_size) - 1) / 2
+    try:
+        return interior_about(
+            middle, pixels, calibration.model.predict(pixels), calibration.interior
+        )
+    except (ValueError, np.linalg.LinAlgError):
+        return calibration.interior

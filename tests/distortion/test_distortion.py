@@ -25,7 +25,12 @@ from sklearn.neighbors import KNeighborsRegressor
 
 from fluoro_calib_ros.distortion.cross_validation import CrossValidation
 from fluoro_calib_ros.distortion.estimation import TrainingPoints, exposure_folds
-from fluoro_calib_ros.distortion.gauge import GaugeKind, gauge_basis, gauge_coefficients
+from fluoro_calib_ros.distortion.gauge import (
+    GaugeKind,
+    gauge_basis,
+    gauge_coefficients,
+    interior_about,
+)
 from fluoro_calib_ros.distortion.knn import KnnModel
 from fluoro_calib_ros.distortion.local_linear import LocalLinearModel
 from fluoro_calib_ros.distortion.neighbour_regression import NeighbourRegression
@@ -346,6 +351,21 @@ def test_candidates_are_limited_by_the_training_points():
 
 
 # ---- gauge
+
+
+def test_interior_in_the_gauge_about_another_principal_point():
+    """A turned sensor with a far principal point is the same camera with another correction."""
+    axis = np.linspace(0, 1023, 12)
+    uv = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    near = np.array([500.0, 530.0, 3800.0])
+    far = np.array([-300.0, 1300.0, 3600.0])
+    turned = np.column_stack([(uv - near[:2]) / near[2], np.ones(len(uv))])
+    turned = turned @ matrix_from_vector([0.2, 0.2, 0.01]).T
+    correction = uv - far[:2] - far[2] * turned[:, :2] / turned[:, 2:]
+    found = interior_about(near[:2], uv, correction, far)
+    assert found == pytest.approx(near, abs=1e-4)
+    with pytest.raises(ValueError, match=r'no orientation|finite|NaN'):
+        interior_about(near[:2], uv, correction + np.nan, far)
 
 
 def test_gauge_is_the_effect_of_a_change_of_orientation():

@@ -308,6 +308,15 @@ def test_wide_angle_is_no_wrong_unit(distance, extent, sentence):
     assert bool(found) == bool(sentence)
 
 
+def test_stretched_image_is_accepted():
+    """A far principal point, with a turn of the sensor, takes up the stretch to second order."""
+    stretched = mapped(lambda uv: 511.5 + (uv - 511.5) * [0.99, 0.91])
+    outcome = run_calibration(CalibrationRequest({'a': stretched}, PHANTOM, CalibrationOptions()))
+    figures = outcome.result.fluoroscopes['a']
+    assert abs(figures.interior[0] - 511.5) > 1024
+    assert max(figures.rmse_after) < 0.2
+
+
 def test_few_wrong_exposures_are_left_out_and_named():
     wrong = simulate_exposures(virtual_rig(2), 2, 9).frames['a']
     mixed = frames(8) + [replace(f, number=f.number + 100) for f in wrong]

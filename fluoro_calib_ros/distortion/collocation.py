@@ -42,7 +42,7 @@ from .exposure_terms import (
     without_exposure_terms,
 )
 from .exposure_variance import estimates_beside_free_points, variance_between_exposures
-from .misfit import FittedPoints, LeftOut, has_common_error
+from .misfit import LARGEST_SD, FittedPoints, LeftOut, areas_of_rejected, has_common_error
 from .priors import (
     Prior,
     gauge_precision,
@@ -350,22 +350,75 @@ class CollocationTerms(AdjustedTerms):
     def _add_sines(
         self, adjustment: Adjustment, coefficients: tuple[np.ndarray, ...]
     ) -> tuple[np.ndarray, ...] | None:
-        """Use all sines where residuals show ripples that the present ones are too long for.
+        """Use all sines where residuals show what the present ones are too long for.
 
-        Returns the coefficients for them, None where the residuals show nothing.
+        They do so by an error that is common to all exposures, or by rejected image points that
+        agree. Returns the coefficients for them, None where the residuals show nothing.
         """
         modes = []
+        present = [functions.complete for functions in self.functions]
+        taken_back = [self._agreeing(f, adjustment) for f in range(len(self.functions))]
+        corrections = self._corrections(coefficients)
         for f, functions in enumerate(self.functions):
-            missing = functions.complete < MAX_MODES and has_common_error(
-                self._fitted_points(f, adjustment)
+            missing = functions.complete < MAX_MODES and (
+                len(taken_back[f]) > 0 or has_common_error(self._fitted_points(f, adjustment))
             )
             modes.append(MAX_MODES if missing else functions.complete)
             if missing:
                 signal = self.priors[f].signal.with_short_field(max(self.sizes[f]))
                 self.priors[f] = replace(self.priors[f], signal=signal)
-        if modes == [functions.complete for functions in self.functions]:
+        if modes == present and not any(len(rows) for rows in taken_back):
             return None
-        return self._with_modes(modes, coefficients)
+        out = list(self._with_modes(modes, coefficients))
+        for f, rows in enumerate(taken_back):
+            if len(rows):
+                own = self.network.rows(f)
+                used = adjustment.inliers[own]
+                used[rows] = True
+                values = adjustment.residuals[own] + corrections[f]
+                out[f] = self._followed(f, values, used, adjustment.noise.scale)
+        return tuple(out)
+
+    def _corrections(self, coefficients: tuple[np.ndarray, ...]) -> list[np.ndarray]:
+        """Corrections (n, 2) [px] of the image points of each fluoroscope by the series."""
+        return [
+            values @ own[: 2 * values.shape[1]].reshape(2, -1).T
+            for values, own in zip(self.values, coefficients)
+        ]
+
+    def _agreeing(self, f: int, adjustment: Adjustment) -> np.ndarray:
+        """Rows, of those of fluoroscope f, of rejected image points that agree."""
+        rows = self.network.rows(f)
+        noise = adjustment.noise.scale * self.network.sigma[rows]
+        small = np.sum(adjustment.residuals[rows] ** 2, axis=1) < (LARGEST_SD * noise) ** 2
+        rejected = np.flatnonzero(~adjustment.inliers[rows] & small)
+        at = rows[rejected]
+        points = FittedPoints(
+            self.network.uv[at], adjustment.residuals[at], self.network.exposure[at]
+        )
+        areas = areas_of_rejected(points, self.network.point[at], self.sizes[f])
+        found = [area.rows for area in areas if area.size_px > area.limit_px]
+        return rejected[np.unique(np.concatenate(found))] if found else rejected[:0]
+
+    def _followed(self, f: int, values: np.ndarray, used: np.ndarray, scale: float) -> np.ndarray:
+        """Coefficients that follow the values (n, 2) [px] of the image points that are used (n,).
+
+        The robust adjustment goes on from there: at a solution that rejects image points they have
+        no weight, however many they are. Orientations are taken to be known, which is near enough
+        to start with. scale: of the noise.
+        """
+        rows = self.network.rows(f)
+        weighted = self.values[f] / (scale * self.network.sigma[rows])[:, None]
+        weighted = weighted * used[:, None]
+        information = block_diag(*[weighted.T @ weighted] * 2)
+        observed = values / (scale * self.network.sigma[rows])[:, None]
+        right = (weighted.T @ observed).T.ravel()
+        prior = most_likely_prior(
+            self.functions[f], information, right, self.gauges[f], self.priors[f], True
+        )
+        self.priors[f] = prior
+        precision = information + self.gauges[f] + prior_precision(self.functions[f], prior)
+        return np.linalg.solve(precision, right)
 
     def _add_ripples(self, adjustment: Adjustment) -> bool:
         """Add ripples that residuals show in few bands of frequencies; True if any."""

@@ -53,6 +53,12 @@ AGREE_REACH = 3.0
 AGREE_WITH = 2
 AGREE_SIGNIFICANT = 1.5  # standard errors by which more pairs agree than are opposite
 LARGEST_SD = 40.0
+# Areas in which they are looked at together: cells that overlap by half, so many side by side,
+# with image points of so many targets that agree in so many exposures.
+CELLS = 8
+MIN_TARGETS = 6
+MIN_AGREEING_EXPOSURES = 3
+FALSE_ALARM = 2e-3  # chance that false matches agree in any of the areas
 MIN_EXPOSURES = 3  # whose scatter is the standard error of a mean product
 
 
@@ -68,6 +74,19 @@ class FittedPoints:
     residuals: np.ndarray
     exposure: np.ndarray
     redundancy: np.ndarray | float = 1.0
+
+
+@dataclass(frozen=True)
+class RejectedArea:
+    """Rejected image points of an area.
+
+    size_px: length of their mean residual; limit_px: that which false matches hardly exceed in any
+    of the areas; rows: the image points.
+    """
+
+    size_px: float
+    limit_px: float
+    rows: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -231,6 +250,37 @@ def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series
         near = np.linalg.norm(pixels - uv[row], axis=1) < max(reach, cell)
         out[near] = np.maximum(out[near], size[possible[row]] / np.sqrt(2))
     return out.reshape(series.sd.shape)
+
+
+def areas_of_rejected(
+    rejected: FittedPoints, target: np.ndarray, image_size: tuple[int, int]
+) -> list[RejectedArea]:
+    """Return the areas with enough rejected image points, of targets (n,), to see what they share.
+
+    False matches have residuals of any direction (Rayleigh's test; Mardia and Jupp, "Directional
+    Statistics", 2000, 6.3, here with the lengths). What a correction does not follow gives those
+    of one place the same. The image points of one target count once: its survey may be wrong.
+    """
+    cell = np.asarray(image_size) / CELLS
+    found = []
+    if len(target) < MIN_TARGETS:
+        return []
+    for corner in np.ndindex(2 * CELLS - 1, 2 * CELLS - 1):
+        at = (rejected.uv + 0.5) / cell - np.array(corner) / 2
+        rows = np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
+        _, place = np.unique(target[rows], return_inverse=True)
+        number = np.bincount(place)
+        if len(number) < MIN_TARGETS:
+            continue
+        r = rejected.residuals[rows]
+        of_target = np.stack([np.bincount(place, r[:, i]) / number for i in (0, 1)], axis=1)
+        mean = of_target.mean(axis=0)
+        along = np.bincount(rejected.exposure[rows], r @ mean)
+        agree = np.count_nonzero(along > 0) >= MIN_AGREEING_EXPOSURES
+        chance = np.sqrt(np.sum(of_target**2)) / len(of_target)
+        found.append((float(np.linalg.norm(mean)) if agree else 0.0, float(chance), rows))
+    factor = np.sqrt(np.log(len(found) / FALSE_ALARM)) if found else 0.0  # Bonferroni
+    return [RejectedArea(size, chance * factor, rows) for size, chance, rows in found]
 
 
 def _variance_left_out(products: _Products, series: Series, left_out: LeftOut) -> float:

@@ -36,7 +36,14 @@ from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from .check import Check
-from .residual_tests import Residuals, ResidualTrend, common_trend, residuals_of
+from .residual_tests import (
+    RejectedTrend,
+    Residuals,
+    ResidualTrend,
+    common_trend,
+    rejected_trend,
+    residuals_of,
+)
 
 # The calibration of a part has at most so many rounds: with few exposures it converges slowly, and
 # after these rounds without visible change.
@@ -59,11 +66,14 @@ class CommonTrend:
     claimed_sd : float
         Standard deviation that the calibration claims for its correction [px]: an error of this
         size is no fault.
+    rejected : RejectedTrend or None
+        What rejected image points have in common; None where they are few everywhere.
     """
 
     inliers: Residuals
     trend: ResidualTrend
     claimed_sd: float
+    rejected: RejectedTrend | None = None
 
     @property
     def limit(self) -> float:
@@ -120,7 +130,9 @@ class Evidence:
         claimed = float(
             np.sqrt(np.mean(calibration.correction(inliers.uv, inliers.angle).sd ** 2))
         )
-        return CommonTrend(inliers, common_trend(inliers, calibration.image_size), claimed)
+        size = calibration.image_size
+        rejected = rejected_trend(residuals.rejected(calibration.image_sd), size)
+        return CommonTrend(inliers, common_trend(inliers, size), claimed, rejected)
 
     @cached_property
     def starts(self) -> StartValues:

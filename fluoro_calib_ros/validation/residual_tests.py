@@ -33,6 +33,7 @@ from scipy import special
 from scipy.spatial import cKDTree
 
 from ..calibration.calibrate import CalibrationResult
+from ..distortion.misfit import LARGEST_SD, FittedPoints, areas_of_rejected
 from ..exposures.frame import Frame, angles_of
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.noise import INLIER_Q
@@ -106,7 +107,14 @@ class Residuals:
 
     def inliers(self, sd: float) -> Residuals:
         """Return the residuals in the core of noise of standard deviation sd [px]."""
-        keep = np.sum(self.r**2, axis=1) <= INLIER_Q * sd**2
+        return self._part(np.sum(self.r**2, axis=1) <= INLIER_Q * sd**2)
+
+    def rejected(self, sd: float) -> Residuals:
+        """Return the residuals beyond that core which a distortion may have left."""
+        q = np.sum(self.r**2, axis=1) / sd**2
+        return self._part((q > INLIER_Q) & (q < LARGEST_SD**2))
+
+    def _part(self, keep: np.ndarray) -> Residuals:
         return Residuals(
             self.uv[keep],
             self.r[keep],
@@ -131,6 +139,25 @@ class CellTrend(NamedTuple):
     size: float
     limit: float
     place: np.ndarray
+
+
+class RejectedTrend(NamedTuple):
+    """What the rejected image points about one place have in common.
+
+    Attributes
+    ----------
+    size, limit : float
+        Length of their mean residual; that which chance hardly exceeds [px].
+    place : (2,) ndarray
+        Their mean place [px].
+    points : int
+        Number of them.
+    """
+
+    size: float
+    limit: float
+    place: np.ndarray
+    points: int
 
 
 @dataclass(frozen=True)
@@ -237,6 +264,21 @@ def change_of_trend(residuals: Residuals, image_size: tuple[int, int]) -> Residu
     squared, limit = _mean_and_limit(joins, same, CHANGE.false_alarm)
     # Halves that differ by t leave residuals of t/2 on both sides of their mean.
     return _trend(4 * squared, 4 * limit, _worst_cell(residuals, image_size, later, CHANGE))
+
+
+def rejected_trend(rejected: Residuals, image_size: tuple[int, int]) -> RejectedTrend | None:
+    """Test whether rejected image points of different exposures agree about some place.
+
+    Returns the place where it is most significant; None where rejected points are few everywhere.
+    """
+    points = FittedPoints(rejected.uv, rejected.r, rejected.exposure)
+    areas = areas_of_rejected(points, rejected.target_id, image_size)
+    if not areas:
+        return None
+    worst = max(areas, key=lambda area: area.size_px / area.limit_px)
+    return RejectedTrend(
+        worst.size_px, worst.limit_px, rejected.uv[worst.rows].mean(axis=0), len(worst.rows)
+    )
 
 
 def _joins(residuals: Residuals, neighbours: int) -> Joins:

@@ -12,7 +12,10 @@
 # See the License for the specific language governing permissions and
 # limitations under the License.
 
-"""Checks 'whiteness', 'worst_area' and 'drift': residuals have no trend, and it did not change."""
+"""Checks 'whiteness', 'worst_area' and 'drift': residuals have no trend, and it did not change.
+
+An area also fails where image points of different exposures were rejected though they agree.
+"""
 
 from __future__ import annotations
 
@@ -24,7 +27,7 @@ from ..distortion.base import CorrectionModel
 from .check import Check, Finding, judge, more_exposures
 from .evidence import CommonTrend, Evidence, Subject
 from .field_comparison import describe_place
-from .residual_tests import change_of_trend
+from .residual_tests import RejectedTrend, change_of_trend
 
 # Standard deviations of the correction by which the mean residual of an area may be off.
 CLAIMED_SD = 3.0
@@ -74,6 +77,9 @@ def _advice(requested: str, model: CorrectionModel, count: int) -> str:
 
 
 def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
+    rejected = common.rejected
+    if rejected is not None and rejected.size > rejected.limit:
+        return _rejected_area(evidence, name, rejected)
     trend = common.trend
     calibration = evidence.calibrations[name]
     claimed = max(float(calibration.model.evaluate(trend.place[None]).sd[0]), common.claimed_sd)
@@ -89,6 +95,27 @@ def _worst_area(evidence: Evidence, name: str, common: CommonTrend) -> Check:
             f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose '
             'another model',
             trend.place,
+        ),
+    )
+
+
+def _rejected_area(evidence: Evidence, name: str, rejected: RejectedTrend) -> Check:
+    """Check that fails because image points are rejected though they agree."""
+    size = evidence.calibrations[name].image_size
+    return judge(
+        'worst_area',
+        name,
+        Finding(
+            rejected.size,
+            rejected.limit,
+            'px',
+            f'fluoroscope {name}: {rejected.points} image points of different exposures were '
+            f'rejected as false matches, but agree: {rejected.size:.2f} px on average at '
+            f'{describe_place(rejected.place, size)}',
+            'the correction model does not follow the distortion there; '
+            f'{more_exposures(len(evidence.frames[name]))} that show beads there, or choose a '
+            'model with neighbours (--model hybrid)',
+            rejected.place,
         ),
     )
 

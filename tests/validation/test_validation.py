@@ -49,6 +49,7 @@ from fluoro_calib_ros.validation.residual_tests import (
     Residuals,
     change_of_trend,
     common_trend,
+    rejected_trend,
     residuals_of,
 )
 from fluoro_calib_ros.validation.verdict import validate, validate_or_report
@@ -112,6 +113,16 @@ def noise(seed, exposures=12, count=120, sd=0.25, trend=lambda uv, e: 0.0):
     return Residuals(uv, r, e, np.zeros(len(e), dtype=int), numbers, np.full(exposures, np.nan))
 
 
+def rejected(direction, targets=12):
+    """Twelve rejected image points about one place, of four exposures; direction (12,) [rad]."""
+    rng = np.random.default_rng(1)
+    uv = rng.uniform(300, 350, (12, 2))
+    r = 2.5 * np.column_stack([np.cos(direction), np.sin(direction)])
+    e = np.repeat(np.arange(4), 3)
+    target_id = np.arange(12) % targets
+    return Residuals(uv, r, e, target_id, np.arange(4), np.full(4, np.nan))
+
+
 # ---- the whole
 
 
@@ -135,6 +146,18 @@ def test_distortion_without_a_model_fails():
     assert '--model auto' in found.findings[0] and not any(
         'survey of bead' in s for s in found.findings
     )
+
+
+def test_rejected_points_that_agree_are_no_false_matches():
+    """They show a distortion that is not followed, unless few targets have them."""
+    rng = np.random.default_rng(2)
+    found = rejected_trend(rejected(rng.normal(1.0, 0.3, 12)), SIZE)
+    assert found.size > found.limit and found.points == 12
+    assert np.linalg.norm(found.place - 325) < 25
+    for _ in range(20):
+        found = rejected_trend(rejected(rng.uniform(0, 2 * np.pi, 12)), SIZE)
+        assert found.size <= found.limit
+    assert rejected_trend(rejected(np.ones(12), targets=3), SIZE) is None
 
 
 def test_changing_distortion_fails_with_its_place():

@@ -65,6 +65,7 @@ TREND_DEGREE = 3  # pincushion, S-shape and spiral are cubic to first order (Gro
 RINGS = 2  # radial polynomials of degree 5 and 7: what a lens or a curved screen adds at the rim
 START_MODES = 16  # half waves along the image, until the signal is known
 MIN_MODES = 10
+TAKEN_BACK_MODES = 24  # to start with where rejected image points agree; more may follow
 MAX_MODES = 30  # the time grows with the sixth power
 # Prior variance times information of a sine below which the image points say nothing about it.
 NEGLIGIBLE = 0.2
@@ -363,7 +364,8 @@ class CollocationTerms(AdjustedTerms):
             missing = functions.complete < MAX_MODES and (
                 len(taken_back[f]) > 0 or has_common_error(self._fitted_points(f, adjustment))
             )
-            modes.append(MAX_MODES if missing else functions.complete)
+            wanted = TAKEN_BACK_MODES if len(taken_back[f]) else MAX_MODES
+            modes.append(max(wanted, functions.complete) if missing else functions.complete)
             if missing:
                 signal = self.priors[f].signal.with_short_field(max(self.sizes[f]))
                 self.priors[f] = replace(self.priors[f], signal=signal)

@@ -398,7 +398,12 @@ class CollocationTerms(AdjustedTerms):
         points = FittedPoints(
             self.network.uv[at], adjustment.residuals[at], self.network.exposure[at]
         )
-        areas = areas_of_rejected(points, self.network.point[at], self.sizes[f])
+        areas = areas_of_rejected(
+            points,
+            self.network.point[at],
+            self.network.uv[rows[adjustment.inliers[rows]]],
+            self.sizes[f],
+        )
         found = [area.rows for area in areas if area.size_px > area.limit_px]
         return rejected[np.unique(np.concatenate(found))] if found else rejected[:0]
 

@@ -33,6 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 from scipy.special import log_ndtr
+from scipy.stats import binom
 
 from .series import SD_GRID, Series, sd_grid_pixels
 
@@ -59,6 +60,10 @@ CELLS = 8
 MIN_TARGETS = 6
 MIN_AGREEING_EXPOSURES = 3
 FALSE_ALARM = 2e-3  # chance that false matches agree in any of the areas
+# The same where so many of the image points of an area are rejected that this is no chance, and
+# the limit of that.
+CLUSTERED_FALSE_ALARM = 0.05
+CLUSTERED = 1e-3
 MIN_EXPOSURES = 3  # whose scatter is the standard error of a mean product
 
 
@@ -253,18 +258,21 @@ def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series
 
 
 def areas_of_rejected(
-    rejected: FittedPoints, target: np.ndarray, image_size: tuple[int, int]
+    rejected: FittedPoints, target: np.ndarray, inliers: np.ndarray, image_size: tuple[int, int]
 ) -> list[RejectedArea]:
     """Return the areas with enough rejected image points, of targets (n,), to see what they share.
 
-    False matches have residuals of any direction (Rayleigh's test; Mardia and Jupp, "Directional
-    Statistics", 2000, 6.3, here with the lengths). What a correction does not follow gives those
-    of one place the same. The image points of one target count once: its survey may be wrong.
+    inliers (k, 2): the other image points [px]. False matches are as frequent in an area as in the
+    whole image, and have residuals of any direction (Rayleigh's test; Mardia and Jupp,
+    "Directional Statistics", 2000, 6.3, here with the lengths). What a correction does not follow
+    gives those of one place the same. The image points of one target count once: its survey may be
+    wrong.
     """
     cell = np.asarray(image_size) / CELLS
     found = []
     if len(target) < MIN_TARGETS:
         return []
+    rate = len(target) / (len(target) + len(inliers))
     for corner in np.ndindex(2 * CELLS - 1, 2 * CELLS - 1):
         at = (rejected.uv + 0.5) / cell - np.array(corner) / 2
         rows = np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
@@ -278,9 +286,16 @@ def areas_of_rejected(
         along = np.bincount(rejected.exposure[rows], r @ mean)
         agree = np.count_nonzero(along > 0) >= MIN_AGREEING_EXPOSURES
         chance = np.sqrt(np.sum(of_target**2)) / len(of_target)
-        found.append((float(np.linalg.norm(mean)) if agree else 0.0, float(chance), rows))
-    factor = np.sqrt(np.log(len(found) / FALSE_ALARM)) if found else 0.0  # Bonferroni
-    return [RejectedArea(size, chance * factor, rows) for size, chance, rows in found]
+        others = (inliers + 0.5) / cell - np.array(corner) / 2
+        total = len(rows) + int(((others >= 0) & (others < 1)).all(axis=1).sum())
+        by_chance = (2 * CELLS - 1) ** 2 * binom.sf(len(number) - 1, total, rate)
+        alarm = CLUSTERED_FALSE_ALARM if by_chance < CLUSTERED else FALSE_ALARM
+        size = float(np.linalg.norm(mean)) if agree else 0.0
+        found.append((size, float(chance), alarm, rows))
+    return [
+        RejectedArea(size, chance * float(np.sqrt(np.log(len(found) / alarm))), rows)  # Bonferroni
+        for size, chance, alarm, rows in found
+    ]
 
 
 def _variance_left_out(products: _Products, series: Series, left_out: LeftOut) -> float:

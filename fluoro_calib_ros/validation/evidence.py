@@ -131,7 +131,7 @@ class Evidence:
             np.sqrt(np.mean(calibration.correction(inliers.uv, inliers.angle).sd ** 2))
         )
         size = calibration.image_size
-        rejected = rejected_trend(residuals.rejected(calibration.image_sd), size)
+        rejected = rejected_trend(residuals.rejected(calibration.image_sd), inliers, size)
         return CommonTrend(inliers, common_trend(inliers, size), claimed, rejected)
 
     @cached_property

@@ -266,13 +266,15 @@ def change_of_trend(residuals: Residuals, image_size: tuple[int, int]) -> Residu
     return _trend(4 * squared, 4 * limit, _worst_cell(residuals, image_size, later, CHANGE))
 
 
-def rejected_trend(rejected: Residuals, image_size: tuple[int, int]) -> RejectedTrend | None:
+def rejected_trend(
+    rejected: Residuals, inliers: Residuals, image_size: tuple[int, int]
+) -> RejectedTrend | None:
     """Test whether rejected image points of different exposures agree about some place.
 
     Returns the place where it is most significant; None where rejected points are few everywhere.
     """
     points = FittedPoints(rejected.uv, rejected.r, rejected.exposure)
-    areas = areas_of_rejected(points, rejected.target_id, image_size)
+    areas = areas_of_rejected(points, rejected.target_id, inliers.uv, image_size)
     if not areas:
         return None
     worst = max(areas, key=lambda area: area.size_px / area.limit_px)

@@ -114,12 +114,13 @@ def noise(seed, exposures=12, count=120, sd=0.25, trend=lambda uv, e: 0.0):
 
 
 def rejected(direction, targets=12):
-    """Twelve rejected image points about one place, of four exposures; direction (12,) [rad]."""
+    """Image points (n,) about one place, of four exposures; direction (n,) of residuals [rad]."""
     rng = np.random.default_rng(1)
-    uv = rng.uniform(300, 350, (12, 2))
+    n = len(direction)
+    uv = rng.uniform(300, 350, (n, 2))
     r = 2.5 * np.column_stack([np.cos(direction), np.sin(direction)])
-    e = np.repeat(np.arange(4), 3)
-    target_id = np.arange(12) % targets
+    e = np.arange(n) % 4
+    target_id = np.arange(n) % targets
     return Residuals(uv, r, e, target_id, np.arange(4), np.full(4, np.nan))
 
 
@@ -151,13 +152,24 @@ def test_distortion_without_a_model_fails():
 def test_rejected_points_that_agree_are_no_false_matches():
     """They show a distortion that is not followed, unless few targets have them."""
     rng = np.random.default_rng(2)
-    found = rejected_trend(rejected(rng.normal(1.0, 0.3, 12)), SIZE)
+    others = rejected(np.ones(100))  # image points of the same place that fit
+    found = rejected_trend(rejected(rng.normal(1.0, 0.3, 12)), others, SIZE)
     assert found.size > found.limit and found.points == 12
     assert np.linalg.norm(found.place - 325) < 25
     for _ in range(20):
-        found = rejected_trend(rejected(rng.uniform(0, 2 * np.pi, 12)), SIZE)
+        found = rejected_trend(rejected(rng.uniform(0, 2 * np.pi, 12)), others, SIZE)
         assert found.size <= found.limit
-    assert rejected_trend(rejected(np.ones(12), targets=3), SIZE) is None
+    assert rejected_trend(rejected(np.ones(12), targets=3), others, SIZE) is None
+
+
+def test_few_rejected_points_that_agree_are_enough_where_nearly_all_of_a_place_are():
+    few = rejected(np.array([0.9, 1.0, 1.1, 1.0, 0.8, 1.2]))
+    elsewhere = rejected(np.ones(2000))
+    elsewhere = replace(elsewhere, uv=elsewhere.uv / 5)
+    found = rejected_trend(few, elsewhere, SIZE)
+    assert found.size > found.limit and found.points == 6
+    found = rejected_trend(few, rejected(np.ones(100)), SIZE)
+    assert found.size <= found.limit
 
 
 def test_changing_distortion_fails_with_its_place():

@@ -33,7 +33,8 @@ from scipy.linalg import block_diag
 
 from ..photogrammetry.additional_parameters import AdditionalParameters
 from ..photogrammetry.precision import information_of_additional, solved_additional
-from .angle_field import AngleField, AngleFit, SeriesWithExposures, can_be_fitted, fit_angles
+from .angle_field import AngleField
+from .angle_fit import AngleFit, SeriesWithExposures, can_be_fitted, fit_angles
 from .estimation import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
 from .exposure_terms import (
     ExposureTerms,

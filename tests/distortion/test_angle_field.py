@@ -27,9 +27,9 @@ from fluoro_calib_ros.distortion.angle_field import (
     MAX_DISTANCE,
     VARIANCES,
     AngleField,
-    can_be_fitted,
     harmonics,
 )
+from fluoro_calib_ros.distortion.angle_fit import can_be_fitted
 from fluoro_calib_ros.distortion.series import SD_GRID, Functions
 from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.errors import DataError

@@ -21,12 +21,16 @@ ros2 launch fluoro_calib_ros fluoro_calib.launch.py --show-args
 
 import os
 from dataclasses import dataclass
+from pathlib import Path
 
 import yaml
 from ament_index_python.packages import get_package_share_directory
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch_ros.actions import Node, SetParameter
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.files.rig_file import read_rig_file
 
 PACKAGE = 'fluoro_calib_ros'
 SWITCH = ['true', 'false']
@@ -86,6 +90,12 @@ SWITCHES = (
     Argument('respawn', 'false', 'true: restart a node that has failed', SWITCH),
 )
 OTHERS = (
+    Argument(
+        'rig',
+        '',
+        'rig.toml, whose fluoroscopes, phantom and angle_joint hold where these arguments are '
+        'empty',
+    ),
     Argument('namespace', '', 'namespace of the rig'),
     Argument('params_file', '', 'parameters of the nodes (default: config/fluoro_calib.yaml)'),
     Argument('log_level', 'info', 'debug, info, warn, error or fatal'),
@@ -100,11 +110,17 @@ OTHERS = (
 # Parameters of the nodes that launch arguments set.
 RIG = ('fluoroscopes', 'calibration_directory', 'autostart')
 OF_NODE = {
-    'extraction_node': ('phantom', 'fluoroscopes', 'autostart', 'principal_distance'),
+    'extraction_node': (
+        'phantom',
+        'fluoroscopes',
+        'autostart',
+        'principal_distance',
+        'angle_joint',
+    ),
     'calibration_node': ('phantom', *RIG, 'rig_frame', 'angle_joint'),
     'correction_node': (*RIG, 'angle_joint'),
     'reconstruction_node': (*RIG, 'rig_frame'),
-    'image_node': RIG,
+    'image_node': (*RIG, 'angle_joint'),
 }
 
 
@@ -118,12 +134,31 @@ def shut_down_if_not_started(event, context):
     return None
 
 
+def with_rig(values):
+    """Return the launch arguments with what the file of the argument rig says."""
+    if not values['rig']:
+        return values
+    try:
+        rig = read_rig_file(Path(values['rig']))
+    except DataError as error:
+        raise RuntimeError(str(error)) from None
+    found = {
+        'fluoroscopes': yaml.safe_dump(rig.fluoroscopes, default_flow_style=True).strip()
+        if rig.fluoroscopes
+        else '',
+        'phantom': str(rig.phantom.absolute()) if rig.phantom else '',
+        'angle_joint': rig.angle_joint or '',
+    }
+    return {**values, **{name: text for name, text in found.items() if not values[name]}}
+
+
 def nodes_of_rig(context):
     """Return the nodes with their parameters."""
     values = {
         argument.name: context.launch_configurations[argument.name]
         for argument in (*PARAMETERS, *SWITCHES, *OTHERS)
     }
+    values = with_rig(values)
     share = get_package_share_directory(PACKAGE)
     params_file = values['params_file'] or os.path.join(share, 'config', 'fluoro_calib.yaml')
 

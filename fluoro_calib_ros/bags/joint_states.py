@@ -55,18 +55,32 @@ def with_angles(
         For a bag without this joint, with states of it on several topics or damaged ones, and for
         a joint of another fluoroscope.
     """
-    try:
-        angles = options.tracks(frames, capacity=None)
-    except ValueError as error:
-        raise DataError(f'{source}: {error}') from None
+    angles = angles_in(source, frames, options)
     if not angles.joints:
         return {name: list(each) for name, each in frames.items()}, ()
-    _read_states(source, angles)
     out = {
         name: [replace(frame, angle=angles.at(name, frame.stamp_ns)) for frame in each]
         for name, each in frames.items()
     }
     return out, tuple(_notes(source, out, angles))
+
+
+def angles_in(source: PathLike, fluoroscopes: Iterable[str], options: AngleOptions) -> JointAngles:
+    """Return the angles of fluoroscopes by all joint states of a bag.
+
+    Raises DataError as with_angles.
+    """
+    try:
+        angles = options.tracks(fluoroscopes, capacity=None)
+    except ValueError as error:
+        raise DataError(f'{source}: {error}') from None
+    try:
+        if angles.joints:
+            _read_states(source, angles)
+    except DataError as error:
+        hint = "; the joint is that of rig.toml, --angle-joint '' leaves it out"
+        raise DataError(f'{error}{hint if options.of_rig else ""}') from None
+    return angles
 
 
 def _read_states(source: PathLike, angles: JointAngles) -> None:

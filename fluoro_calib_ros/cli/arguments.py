@@ -24,6 +24,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..limits import ReadLimits, use_read_limits
 from ..options import Option, declared
+from .rig import NAME, JointOfRig
 
 if TYPE_CHECKING:
     from ..exchange.content import FileSettings
@@ -187,7 +188,7 @@ def add_angle_options(parser: Parser) -> None:
         default='',
         metavar='JOINT',
         help='joint of the joint states in a bag whose position is the angle of the C-arm, or one '
-        'for each fluoroscope: A:JOINT,B:JOINT (default: no angle)',
+        f"for each fluoroscope: A:JOINT,B:JOINT; '' for none (default: that of {NAME}, else none)",
     )
     add_option(parser, options['angle_max_age'], metavar='S')
 
@@ -196,7 +197,8 @@ def angle_options(arguments: argparse.Namespace) -> AngleOptions:
     """Return the options of `add_angle_options`."""
     from ..exposures.angles import AngleOptions
 
-    return AngleOptions(arguments.angle_joint, arguments.angle_max_age)
+    joint = arguments.angle_joint
+    return AngleOptions(str(joint), arguments.angle_max_age, isinstance(joint, JointOfRig))
 
 
 def _angle_joint(text: str) -> str:
@@ -310,14 +312,16 @@ def add_calibration(parser: Parser) -> None:
     )
 
 
-def add_angle(parser: Parser, use: str) -> None:
+def add_angle(
+    parser: Parser, use: str, default: str = 'unknown, the mean correction of its exposures'
+) -> None:
     """Add --angle-deg; use: what has this angle."""
     parser.add_argument(
         '--angle-deg',
         type=number_in(-720, 720),
         metavar='DEG',
-        help=f'angle of the C-arm {use}, for a calibration that depends on it (default: unknown, '
-        'the mean correction of its exposures)',
+        help=f'angle of the C-arm {use}, for a calibration that depends on it (default: '
+        f'{default})',
     )
 
 

@@ -24,9 +24,11 @@ from ..errors import DataError
 from .arguments import (
     UNITS,
     add_angle,
+    add_angle_options,
     add_file_options,
     add_fluoroscopes,
     angle_of,
+    angle_options,
     file_settings,
     image_size,
 )
@@ -97,7 +99,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action='store_true',
         help='correct image points by the calibration before they are written',
     )
-    add_angle(parser, 'of the corrections that are written')
+    add_angle(
+        parser, 'of the corrections that are written, and of corrected points without angle_deg'
+    )
+    add_angle_options(parser)
     parser.add_argument(
         '--rate',
         type=number_in(1e-6, MAX_RATE),
@@ -139,6 +144,7 @@ def run(arguments: argparse.Namespace) -> None:
             file_settings(arguments, rate_hz=arguments.rate),
             arguments.out_units,
             angle_of(arguments),
+            angle_options(arguments),
         )
     )
     print_notes(written.notes)

@@ -23,18 +23,22 @@ from pathlib import Path
 from ..files.rig_file import NAME, RigFile, read_rig_file
 
 # Arguments whose default a rig.toml gives, by command; `out` is the key calibration.
-_SOURCE = ('fluoroscopes', 'image_size')
+_SOURCE = ('fluoroscopes', 'image_size', 'angle_joint')
 USED = {
-    'extract': ('phantom',),
+    'extract': ('phantom', 'angle_joint'),
     'calibrate': (*_SOURCE, 'phantom', 'out'),
     'adjust': (*_SOURCE, 'phantom', 'calibration'),
     'correct': ('calibration',),
-    'validate': ('calibration',),
+    'validate': ('calibration', 'angle_joint'),
     'report': ('calibration',),
     'orient': (*_SOURCE, 'phantom', 'calibration'),
     'reconstruct': (*_SOURCE, 'calibration'),
     'convert': _SOURCE,
 }
+
+
+class JointOfRig(str):
+    """Value of angle_joint that nobody has typed: not every source has these joints."""
 
 
 def find_rig(words: Sequence[str], command: str) -> RigFile | None:
@@ -73,6 +77,8 @@ def add_rig(parser: argparse.ArgumentParser, command: str, rig: RigFile | None) 
             continue
         key = 'calibration' if action.dest == 'out' else action.dest
         value = getattr(rig, key)
+        if value is not None and key == 'angle_joint':
+            value = JointOfRig(value)
         if value is not None:
             action.default = value
             action.required = False

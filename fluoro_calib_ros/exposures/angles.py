@@ -39,7 +39,11 @@ CAPACITY = 10_000  # states of a joint that a live track keeps
 
 @dataclass(frozen=True)
 class AngleOptions:
-    """Where the angle of the C-arm comes from. Raises ValueError for what cannot be."""
+    """Where the angle of the C-arm comes from. Raises ValueError for what cannot be.
+
+    of_rig: the joints are those of a whole rig (rig.toml), of which a recording may have some
+    fluoroscopes only, or no times.
+    """
 
     angle_joint: str = option(
         '',
@@ -54,20 +58,24 @@ class AngleOptions:
         maximum=1e6,
         unit='s',
     )
+    of_rig: bool = False
 
     def __post_init__(self) -> None:
         validate_options(self)
         joints_by_fluoroscope(self.angle_joint)
 
-    def joints(self, fluoroscopes: Iterable[str]) -> dict[str, str]:
+    def joints(self, fluoroscopes: Iterable[str], others: bool = False) -> dict[str, str]:
         """Return the joint of each fluoroscope that has one.
 
-        Raises ValueError where a joint is given for another fluoroscope.
+        Raises ValueError where a joint is given for another fluoroscope, unless there may be
+        others.
         """
         names = tuple(fluoroscopes)
         given = joints_by_fluoroscope(self.angle_joint)
         if isinstance(given, str):
             return dict.fromkeys(names, given) if given else {}
+        if self.of_rig or others:
+            return {name: joint for name, joint in given.items() if name in names}
         for name in given:
             if name not in names:
                 raise ValueError(

@@ -18,6 +18,7 @@
     image_size = [1024, 1024]     # width, height [px]
     phantom = "phantom.csv"
     calibration = "result"        # result folder of calibrate
+    angle_joint = "carm"          # joint of the C-arm; or {a = "frontal", b = "lateral"}
 
 All keys are optional; paths are relative to the folder of the file.
 """
@@ -38,7 +39,7 @@ else:
     import tomli as tomllib
 
 NAME = 'rig.toml'
-KEYS = ('fluoroscopes', 'image_size', 'phantom', 'calibration')
+KEYS = ('fluoroscopes', 'image_size', 'phantom', 'calibration', 'angle_joint')
 
 
 @dataclass(frozen=True)
@@ -53,6 +54,8 @@ class RigFile:
         Width and height [px].
     phantom, calibration : Path or None
         File with the phantom, and result folder.
+    angle_joint : str or None
+        Joint of the C-arm, or one for each fluoroscope, as the option of this name.
     """
 
     path: Path
@@ -60,6 +63,7 @@ class RigFile:
     image_size: tuple[int, int] | None = None
     phantom: Path | None = None
     calibration: Path | None = None
+    angle_joint: str | None = None
 
 
 def read_rig_file(path: Path) -> RigFile:
@@ -71,12 +75,14 @@ def read_rig_file(path: Path) -> RigFile:
     for key in document:
         if key not in KEYS:
             raise DataError(f'{path}, key {key}: unknown, there are {", ".join(KEYS)}')
+    names = _names(path, document.get('fluoroscopes'))
     return RigFile(
         path,
-        _names(path, document.get('fluoroscopes')),
+        names,
         _size(path, document.get('image_size')),
         _path(path, 'phantom', document.get('phantom')),
         _path(path, 'calibration', document.get('calibration')),
+        _joint(path, document.get('angle_joint'), names),
     )
 
 
@@ -96,6 +102,33 @@ def _size(path: Path, value: Any) -> tuple[int, int] | None:
     if not whole or len(value) != 2:
         raise DataError(f'{path}, key image_size: width and height [px], such as [1024, 1024]')
     return value[0], value[1]
+
+
+def _joint(path: Path, value: Any, names: list[str] | None) -> str | None:
+    """Return the option angle_joint; names: the fluoroscopes of the rig, None for any."""
+    from ..exposures.angles import joints_by_fluoroscope  # every command reads this module
+
+    if value is None:
+        return None
+    where = f'{path}, key angle_joint'
+    example = 'a joint, such as "carm", or one for each fluoroscope, such as {a = "frontal"}'
+    if isinstance(value, dict):
+        words = [*value, *value.values()]
+        if not words or not all(
+            isinstance(w, str) and w and not set(w) & set(':,') for w in words
+        ):
+            raise DataError(f'{where}: {example}')
+        value = ','.join(f'{name}:{joint}' for name, joint in value.items())
+    if not isinstance(value, str) or not value.strip():
+        raise DataError(f'{where}: {example}')
+    try:
+        joints = joints_by_fluoroscope(value)
+    except ValueError:
+        raise DataError(f'{where}: {example}') from None
+    for name in () if isinstance(joints, str) else joints:
+        if names is not None and name not in names:
+            raise DataError(f'{where}: there is no fluoroscope {name!r}, only {", ".join(names)}')
+    return value.strip()
 
 
 def _path(path: Path, key: str, value: Any) -> Path | None:

@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from ..bags.joint_states import with_angles
 from ..bags.reader import read_frames
 from ..calibration.result import FluoroscopeCalibration
 from ..distortion.status import CorrectionStatus
@@ -40,6 +41,7 @@ from ..exchange.content import (
     Written,
     camera_at,
 )
+from ..exposures.angles import AngleOptions
 from ..exposures.frame import Frame
 from ..files.calibration import SUFFIX, load_calibrations
 from ..files.calibration_request import OBSERVATIONS
@@ -89,7 +91,10 @@ class ConversionRequest:
     out_units : {'mm', 'cm', 'm'} or None
         Unit of what is written.
     angle : float or None
-        Angle of the C-arm [rad] of corrections that are written; None: their mean over exposures.
+        Angle of the C-arm [rad] of corrections that are written, and of corrected points without
+        an angle of their own; None: the mean over the exposures.
+    angles : AngleOptions
+        Which joint gives the angles of the frames of a bag.
     """
 
     source: str | os.PathLike[str]
@@ -103,6 +108,7 @@ class ConversionRequest:
     settings: FileSettings = field(default_factory=FileSettings)
     out_units: str | None = None
     angle: float | None = None
+    angles: AngleOptions = field(default_factory=AngleOptions)
 
 
 def kinds_written() -> tuple[str, ...]:
@@ -128,32 +134,66 @@ def convert(request: ConversionRequest) -> Written:
         size = known.image_size or next(iter(calibrations.values())).image_size
         names = read_names(request.calibration).merged(known.names)
         known = replace(known, image_size=size, names=names)
-    wanted = ('observations',) if request.kind == BAG else registry.FORMATS[request.kind].parts
+    wanted = _parts_written(request.kind)
     reading = replace(known, wanted=wanted, fluoroscopes=tuple(request.fluoroscopes))
     content, is_own = _read(request, reading)
     content = replace(content, names=known.names.merged(content.names))
     content = _selected(content, request)
     if request.corrected:
-        content = replace(content, observations=_corrected(content, calibrations, request.source))
+        observations, notes = _corrected(content, calibrations, request)
+        content = replace(content, observations=observations, notes=(*content.notes, *notes))
     written = _write(request, content, is_own)
-    return Written(written.paths, (*content.notes, *written.notes))
+    notes = _lost_angles(request, content.observations or {})
+    return Written(written.paths, (*content.notes, *written.notes, *notes))
 
 
 def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, bool]:
     """Return the content of the source, and whether it is in the conventions of this package."""
     source = Path(request.source)
+    from_bag = (
+        not is_result_folder(source)
+        and not registry_reads(source)
+        and request.source_kind is None
+        and is_bag(source)
+    )
+    if request.angles.angle_joint and not request.angles.of_rig and not from_bag:
+        raise DataError(f'{source}: the angle of a joint needs a bag, this is none')
     if is_result_folder(source):
         return result_content(source, settings, request.exposure, request.angle), True
     if request.exposure is not None:
         raise DataError(f'{source}: --exposure is for a result folder')
-    if not registry_reads(source) and request.source_kind is None and is_bag(source):
-        return Content(observations=read_frames(source).frames), True
+    if from_bag:
+        return _bag_content(source, request.angles), True
     content = registry.read(source, settings, request.source_kind)
     own = request.source_kind
     if own is None and source.is_file():
         found = registry.recognised(source)
         own = found.kind if found else ''
     return content, own in ('observations', 'phantom', 'points', 'grid')
+
+
+def _bag_content(source: Path, angles: AngleOptions) -> Content:
+    """Return the frames of a bag, with the angles of the C-arm. Raises DataError."""
+    contents = read_frames(source)
+    frames, notes = with_angles(source, contents.frames, angles)
+    return Content(observations=frames, notes=(*contents.notes, *notes))
+
+
+def _lost_angles(
+    request: ConversionRequest, observations: Mapping[str, Sequence[Frame]]
+) -> tuple[str, ...]:
+    """Return a note where angles of the C-arm are not in what was written."""
+    has_angle = any(frame.angle is not None for each in observations.values() for frame in each)
+    own = request.kind == 'observations'
+    if own or not has_angle or 'observations' not in _parts_written(request.kind):
+        return ()
+    return (
+        f'{request.out}: this format does not hold the angles of the C-arm, they are left out',
+    )
+
+
+def _parts_written(kind: str) -> tuple[str, ...]:
+    return ('observations',) if kind == BAG else registry.FORMATS[kind].parts
 
 
 def is_result_folder(path: Path) -> bool:
@@ -212,19 +252,30 @@ def _write(request: ConversionRequest, content: Content, is_own: bool) -> Writte
 
 
 def _corrected(
-    content: Content, calibrations: Mapping[str, FluoroscopeCalibration], where: object
-) -> dict[str, list[Frame]]:
-    """Return the frames of a content with the image points that could be corrected."""
+    content: Content,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    request: ConversionRequest,
+) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
+    """Return the frames of a content with the image points that could be corrected, and notes."""
     out: dict[str, list[Frame]] = {}
+    notes: list[str] = []
     for name, frames in (content.observations or {}).items():
         if name not in calibrations:
             raise DataError(
-                f'{where}: there is no calibration of fluoroscope {name!r}, only of '
+                f'{request.source}: there is no calibration of fluoroscope {name!r}, only of '
                 f'{", ".join(calibrations)}'
             )
         out[name] = []
+        unknown = sum(frame.angle is None for frame in frames)
+        if calibrations[name].angle_field is not None and unknown and request.angle is None:
+            notes.append(
+                f'{request.source}: the correction of fluoroscope {name} depends on the angle of '
+                f'the C-arm, which is unknown for {unknown} of {len(frames)} frames: they get the '
+                'mean over the angles, with its larger standard deviation'
+            )
         for frame in frames:
-            points = calibrations[name].correct(frame.uv, frame.sigma, angle=frame.angle)
+            angle = request.angle if frame.angle is None else frame.angle
+            points = calibrations[name].correct(frame.uv, frame.sigma, angle=angle)
             kept = points.status != CorrectionStatus.INVALID
             out[name].append(
                 replace(
@@ -234,7 +285,7 @@ def _corrected(
                     sigma=points.sigma[kept],
                 )
             )
-    return out
+    return out, tuple(notes)
 
 
 # ---- result folders
@@ -269,6 +320,12 @@ def result_content(
     if 'lookups' in wanted:
         names = select_calibrations(calibrations, settings.fluoroscopes or calibrations, directory)
         found['lookups'] = {name: _lookup(c.at_angle(angle)) for name, c in names.items()}
+        turning = [name for name, c in names.items() if c.angle_field is not None]
+        if turning and angle is None:
+            found['notes'] = (
+                f'{directory}: the corrections of {", ".join(turning)} depend on the angle of the '
+                'C-arm: lookup tables are the mean over the angles, --angle-deg is not given',
+            )
     if 'survey' in wanted and (directory / PHANTOM_FILE).exists():
         found['survey'] = read_phantom(directory / PHANTOM_FILE)
     if 'observations' in wanted and (directory / OBSERVATIONS).exists():

@@ -95,7 +95,7 @@ class BagSelection:
                 f'{path}: a time window and the pairing by stamp need a bag, this file does not '
                 'contain the times of its exposures'
             )
-        if self.angles.angle_joint:
+        if self.angles.angle_joint and not self.angles.of_rig:
             raise DataError(
                 f'{path}: the angle of a joint needs a bag; a CSV file has the angles in a column '
                 'angle_deg'

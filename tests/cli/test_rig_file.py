@@ -21,6 +21,7 @@ from pathlib import Path
 import pytest
 
 from fluoro_calib_ros.cli import COMMANDS, main, make_parser
+from fluoro_calib_ros.cli.arguments import angle_options
 from fluoro_calib_ros.cli.output import styled
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.files.rig_file import RigFile, read_rig_file
@@ -34,6 +35,12 @@ def rig(tmp_path):
         return path
 
     return write
+
+
+JOINTS = """
+fluoroscopes = ["a", "b"]
+angle_joint = {a = "frontal", b = "lateral"}
+"""
 
 
 def parsed(words, rig_file=None):
@@ -60,6 +67,36 @@ def test_rig_file_makes_flags_unnecessary(rig, tmp_path):
     assert arguments.out == Path('x') and arguments.fluoroscopes == ['c']
 
 
+READ_A_BAG = {
+    'extract': ['bag', '--fluoroscope', 'a', '--out', 'o.csv'],
+    'calibrate': ['bag', '--phantom', 'p.csv', '--out', 'o'],
+    'adjust': ['bag', '--phantom', 'p.csv', '--calibration', 'c', '--out', 'o'],
+    'validate': ['c', '--source', 'bag'],
+    'orient': ['bag', '--phantom', 'p.csv', '--calibration', 'c'],
+    'reconstruct': ['bag', '--calibration', 'c', '--out', 'o.csv'],
+    'convert': ['bag', '--to', 'observations', '--out', 'o.csv'],
+}
+
+
+@pytest.mark.parametrize('command', READ_A_BAG)
+def test_joints_of_the_rig_give_the_angle_in_every_command_that_reads_a_bag(rig, command):
+    content = read_rig_file(rig(JOINTS))
+    words = [command, *READ_A_BAG[command]]
+    options = angle_options(parsed(words, content))
+    assert options.joints(['a', 'b']) == {'a': 'frontal', 'b': 'lateral'}
+    assert options.joints(['a']) == {'a': 'frontal'}  # a recording of one of them
+    flag = angle_options(parsed([*words, '--angle-joint', 'carm'], content))
+    assert flag.joints(['a', 'b']) == dict.fromkeys('ab', 'carm') and not flag.of_rig
+    assert not angle_options(parsed([*words, '--angle-joint', ''], content)).joints(['a'])
+    assert not angle_options(parsed(words)).joints(['a'])
+
+
+def test_one_joint_of_the_rig_is_that_of_all_fluoroscopes(rig):
+    content = read_rig_file(rig('angle_joint = "carm"'))
+    assert content.angle_joint == 'carm'
+    assert read_rig_file(rig('angle_joint = "a:x,b:y"')).angle_joint == 'a:x,b:y'
+
+
 def test_what_the_rig_file_does_not_say_is_required_as_before(rig, capsys):
     with pytest.raises(SystemExit):
         parsed(['calibrate', 'points.csv'], RigFile(Path('rig.toml')))
@@ -77,6 +114,16 @@ def test_what_the_rig_file_does_not_say_is_required_as_before(rig, capsys):
         ('fluoroscopes = "a"', 'key fluoroscopes: a list of different names'),
         ('phantom = 3', 'key phantom: a path is a text'),
         ('phantom = ', 'this is no TOML'),
+        ('angle_joint = 3', 'key angle_joint: a joint, such as "carm", or one for each'),
+        ('angle_joint = ""', 'key angle_joint: a joint, such as'),
+        ('angle_joint = "a,b"', 'key angle_joint: a joint, such as'),
+        ('angle_joint = {}', 'key angle_joint: a joint, such as'),
+        ('angle_joint = {a = 1}', 'key angle_joint: a joint, such as'),
+        ('angle_joint = {a = "x:y"}', 'key angle_joint: a joint, such as'),
+        (
+            'fluoroscopes = ["a", "b"]\nangle_joint = {c = "x"}',
+            "key angle_joint: there is no fluoroscope 'c', only a, b",
+        ),
         ('a = ' + 5000 * '[', 'this is no TOML'),
     ],
 )

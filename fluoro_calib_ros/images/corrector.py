@@ -58,6 +58,9 @@ class ImageCorrector:
     interpolation : {'linear', 'cubic'}
     border : int
         Grey value where nothing was observed.
+    sources : (ndarray, ndarray), optional
+        Attributes source and status, where they are known; by default they are those of the
+        calibration, of a correction that depends on an angle the mean (see `angle_maps`).
 
     Attributes
     ----------
@@ -80,7 +83,11 @@ class ImageCorrector:
     """
 
     def __init__(
-        self, calibration: FluoroscopeCalibration, interpolation: str = 'linear', border: int = 0
+        self,
+        calibration: FluoroscopeCalibration,
+        interpolation: str = 'linear',
+        border: int = 0,
+        sources: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         if interpolation not in INTERPOLATIONS:
             raise DataError(
@@ -96,7 +103,7 @@ class ImageCorrector:
         self.shape = self.image_size[::-1]
         self.interpolation = interpolation
         self.border = border
-        self.source, self.status = _sources(calibration.grid, self.image_size)
+        self.source, self.status = sources or _sources(calibration.grid, self.image_size)
         self.mask = self.status != CorrectionStatus.INVALID
         self._empty = np.flatnonzero(~self.mask)
         high = np.array(self.image_size, dtype=np.float32)[:, None, None] - 1
@@ -184,7 +191,7 @@ def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> tuple[np.ndar
         observed, row_status = _invert_correction(grid, np.stack([u, v]).astype(float))
         source[:, rows] = observed.reshape(2, -1, width)
         status[rows] = row_status.reshape(-1, width)
-    status[_is_folded(source)] = CorrectionStatus.INVALID
+    status[is_folded(source)] = CorrectionStatus.INVALID
     source[:, status == CorrectionStatus.INVALID] = np.nan
     return source, status
 
@@ -192,7 +199,16 @@ def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> tuple[np.ndar
 def _invert_correction(
     grid: CorrectionGrid, undistorted: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Observed pixels (2, n) of undistorted ones (2, n) [px], and their status (n,).
+    """Observed pixels (2, n) of undistorted ones (2, n) [px], and their status (n,)."""
+    observed = iterated(grid, undistorted)
+    (du, dv, _), status = grid.look_up(*observed)  # off the image it is INVALID
+    error = np.abs(observed - (du, dv) - undistorted).max(axis=0)
+    status[~(error <= LIMIT_PX)] = CorrectionStatus.INVALID
+    return observed, status
+
+
+def iterated(grid: CorrectionGrid, undistorted: np.ndarray) -> np.ndarray:
+    """Observed pixels (2, n) of undistorted ones (2, n) [px], also where they do not converge.
 
     The iteration is observed = undistorted + (du, dv)(observed). Each step leaves the fraction of
     the error by which the correction changes per pixel, some hundredths. Off the image, the
@@ -211,13 +227,10 @@ def _invert_correction(
         active = active[np.abs(step).max(axis=0) > STEP_PX]
         if not len(active):
             break
-    (du, dv, _), status = grid.look_up(*observed)  # off the image it is INVALID
-    error = np.abs(observed - (du, dv) - undistorted).max(axis=0)
-    status[~(error <= LIMIT_PX)] = CorrectionStatus.INVALID
-    return observed, status
+    return observed
 
 
-def _is_folded(source: np.ndarray) -> np.ndarray:
+def is_folded(source: np.ndarray) -> np.ndarray:
     """Whether (h, w) the neighbours of a pixel are seen mirrored by the sources (2, h, w)."""
     right = np.diff(source, axis=2)[:, :-1]
     down = np.diff(source, axis=1)[:, :, :-1]

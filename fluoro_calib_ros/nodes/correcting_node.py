@@ -21,8 +21,11 @@ from collections.abc import Mapping
 from typing import Any, ClassVar
 
 from ..calibration.result import FluoroscopeCalibration
+from ..distortion.angle_field import AngleField
 from ..errors import DataError
+from ..exposures.angles import AngleOptions
 from ..files.calibration import load_calibrations
+from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
 from .runtime.diagnostics import ERROR, OK, WARN, LatencyWindow, Status
 from .runtime.errors import one_line
@@ -47,6 +50,8 @@ class Stream:
     stall : StallDetector
     latencies : LatencyWindow
         From the arrival of a message to the publication of its correction.
+    beyond : (float, AngleField) or None
+        Angle [rad] of a message since the last diagnostics that is far from all calibrated ones.
     """
 
     def __init__(self, name: str, item: str, logger: RateLimitedLogger) -> None:
@@ -57,6 +62,7 @@ class Stream:
         self.refusals = RefusalLog(item, logger)
         self.stall = StallDetector()
         self.latencies = LatencyWindow()
+        self.beyond: tuple[float, AngleField] | None = None
 
     def count_corrected(self, info: Mapping[str, int]) -> None:
         """Count a message that was corrected and published; info: see StreamReader.subscribe."""
@@ -67,8 +73,10 @@ class Stream:
 class CorrectingNode(StreamNode):
     """Node that corrects a stream of each fluoroscope with its newest calibration.
 
-    Nothing is corrected before the first calibration. Subclasses set the class attributes and
-    override prepare(), on_calibration_ready(), make_stream(), extra_values() and extra_verdict().
+    Nothing is corrected before the first calibration. A correction that depends on the angle of a
+    C-arm is that at the angle of the stamp, or the mean over the angles where that is unknown.
+    Subclasses set the class attributes and override prepare(), on_calibration_ready(),
+    make_stream(), make_angles() and extra_values().
 
     Attributes
     ----------
@@ -77,13 +85,18 @@ class CorrectingNode(StreamNode):
     subject : str
         What is subscribed to, in words.
     refusal_kinds : tuple of str
+    beyond : str
+        What becomes of the items at an angle far from all calibrated ones.
     topics : tuple of str
         What is subscribed to, below each fluoroscope.
+    angles : dict of str to AngleInput
+        Angles of the C-arms, by fluoroscope.
     """
 
     item: ClassVar[str] = ''
     subject: ClassVar[str] = ''
     refusal_kinds: ClassVar[tuple[str, ...]] = ()
+    beyond: ClassVar[str] = ''
     topics: tuple[str, ...] = ()
 
     def __init__(self, name: str) -> None:
@@ -91,9 +104,12 @@ class CorrectingNode(StreamNode):
         self.names: tuple[str, ...] = ()
         self._directory = ''
         self.streams: dict[str, Any] = {}
+        self.angle_options = AngleOptions()
+        self.angles: dict[str, AngleInput] = {}
 
-    def use_parameters(self, parameters: CalibratedParameters) -> None:
+    def use_parameters(self, parameters: CalibratedParameters, angles: AngleOptions) -> None:
         """Take the parameters that all these nodes have; subclasses call it in __init__."""
+        self.angle_options = angles
         self.autostart = parameters.autostart
         self._directory = parameters.calibration_directory
         self.names = parameters.fluoroscopes
@@ -102,6 +118,21 @@ class CorrectingNode(StreamNode):
     def make_stream(self, name: str) -> Stream:
         """Return the state of one fluoroscope before the first message."""
         return Stream(name, self.item, self.limited_logger)
+
+    def make_angles(self) -> dict[str, AngleInput]:
+        """Return what gives the angles of each fluoroscope; threads must not share one."""
+        angles = AngleInput(self.angle_options, self.names, self.limited_logger)
+        return dict.fromkeys(self.names, angles)
+
+    def angle_of(self, name: str, stamp_ns: int, field: AngleField | None) -> float | None:
+        """Return the angle [rad] of a message at its stamp, None where it is unknown.
+
+        field: what the correction changes with the angle.
+        """
+        angle = self.angles[name].of_frame(name, stamp_ns, needed=field is not None)
+        if field is not None and angle is not None and not field.covers(angle):
+            self.streams[name].beyond = angle, field
+        return angle
 
     def prepare(self, calibration: FluoroscopeCalibration) -> Any:
         """Prepare a calibration for use, and return it; called in a thread."""
@@ -114,15 +145,24 @@ class CorrectingNode(StreamNode):
         """Return further values for the diagnostics of a fluoroscope."""
         return {}
 
-    def extra_verdict(
-        self, stream: Any, prepared: Any, incompatible: Mapping[str, str]
+    def _angle_verdict(
+        self, stream: Any, incompatible: Mapping[str, str]
     ) -> tuple[bytes, str] | None:
-        """Return level and message of a fault of a subclass in a stream that is corrected."""
-        return None
+        """Return the status where an angle of the C-arm is unknown or was not calibrated."""
+        unknown = self.angles[stream.name].status(stream.name, incompatible)
+        beyond, stream.beyond = stream.beyond, None
+        if unknown:
+            level, reason = unknown
+            return level, f'{reason}; the mean correction over all angles is used'
+        if beyond is None:
+            return None
+        angle, field = beyond
+        return WARN, f'{beyond_text(angle, field.angles)}: {self.beyond}'
 
     def reset(self) -> None:
         """Start counting from zero."""
         self.streams = {name: self.make_stream(name) for name in self.names}
+        self.angles = self.make_angles()
 
     def prepared(self, name: str) -> Any:
         """Return the prepared calibration in use, None before the first one."""
@@ -197,6 +237,7 @@ class CorrectingNode(StreamNode):
             **stream.refusals.values(self.refusal_kinds),
             'last fault': stream.refusals.last_fault,
             **self.extra_values(stream, self.prepared(stream.name)),
+            **self.angles[stream.name].values(stream.name),
             **stream.latencies.values(),
         }
 
@@ -223,6 +264,6 @@ class CorrectingNode(StreamNode):
             return WARN, stalled
         return (
             stream.refusals.refusal_status()
-            or self.extra_verdict(stream, self.prepared(stream.name), incompatible)
+            or self._angle_verdict(stream, incompatible)
             or (OK, 'correcting')
         )

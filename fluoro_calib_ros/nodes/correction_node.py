@@ -28,14 +28,12 @@ from ..calibration.result import FluoroscopeCalibration
 from ..distortion.status import CorrectionStatus
 from ..exposures.angles import AngleOptions
 from ..limits import StreamLimits
-from .angle_input import AngleInput, beyond_text
 from .correcting_node import CorrectingNode, Stream
 from .frame_validation import OBSERVED_REFUSALS, FrameValidator
 from .messages.camera_info import message_of_corrected_stream
 from .messages.corrected_observations import encode_corrected_observations
 from .messages.fields import NS_PER_S
 from .messages.target_observations import ObservedFrame, decode_target_observations
-from .runtime.diagnostics import WARN
 from .runtime.logging import RateLimitedLogger
 from .runtime.main import run
 from .runtime.parameters import (
@@ -63,7 +61,6 @@ class _ObservationStream(Stream):
         self.validator = FrameValidator(name)
         self.invalid_points = 0
         self.stamp: tuple[int, int] | None = None  # seconds and nanoseconds of the newest frame
-        self.angle_beyond: float | None = None  # of a frame far from all calibrated angles [rad]
 
 
 class CorrectionNode(CorrectingNode):
@@ -72,19 +69,14 @@ class CorrectionNode(CorrectingNode):
     item = 'frame'
     subject = 'target observations'
     refusal_kinds = OBSERVED_REFUSALS
+    beyond = 'the points are OUTSIDE'
     topics = ('target_observations',)
 
     def __init__(self) -> None:
         super().__init__('correction_node')
         declare_read_limits(self)
         self._limits = _LIMITS.declare(self)
-        self._angle_options = _ANGLES.declare(self)
-        self.use_parameters(_NODE.declare(self))
-
-    def reset(self) -> None:
-        """Start counting from zero."""
-        super().reset()
-        self._angles = AngleInput(self._angle_options, self.names, self.limited_logger)
+        self.use_parameters(_NODE.declare(self), _ANGLES.declare(self))
 
     def make_stream(self, name: str) -> _ObservationStream:
         """Return the state of one fluoroscope before the first frame."""
@@ -104,8 +96,9 @@ class CorrectionNode(CorrectingNode):
 
     def create_readers(self) -> None:
         """Receive the observations of all fluoroscopes in one thread."""
-        reader = self.create_reader(self._angles.guarded(self.fault_handlers))
-        self._angles.subscribe(reader)
+        angles = self.angles[self.names[0]]  # one for all fluoroscopes
+        reader = self.create_reader(angles.guarded(self.fault_handlers))
+        angles.subscribe(reader)
         for name in self.names:
             reader.subscribe(
                 TargetObservations,
@@ -145,24 +138,7 @@ class CorrectionNode(CorrectingNode):
             'readers': self._corrected[stream.name].get_subscription_count(),
             'calibration': prepared.calibration_id if prepared else '',
             'grid error [px]': f'{prepared.grid.error_px:.4f}' if prepared else '',
-            **self._angles.values(stream.name),
         }
-
-    def extra_verdict(
-        self,
-        stream: _ObservationStream,
-        prepared: FluoroscopeCalibration,
-        incompatible: Mapping[str, str],
-    ) -> tuple[bytes, str] | None:
-        """Return the status where an angle of the C-arm is unknown or was not calibrated."""
-        unknown = self._angles.status(stream.name, incompatible)
-        if unknown:
-            level, reason = unknown
-            return level, f'{reason}; the mean correction over all angles is used'
-        beyond, stream.angle_beyond = stream.angle_beyond, None
-        if beyond is None or prepared.angle_field is None:
-            return None
-        return WARN, f'{beyond_text(beyond, prepared.angle_field.angles)}: the points are OUTSIDE'
 
     def _publish_info(self, name: str) -> None:
         calibration = self.prepared(name)
@@ -190,12 +166,8 @@ class CorrectionNode(CorrectingNode):
         except Refused as error:
             stream.refusals.refuse(error)
             return
-        field = calibration.angle_field
-        angle = self._angles.of_frame(
-            name, NS_PER_S * frame.sec + frame.nanosec, needed=field is not None
-        )
-        if field is not None and angle is not None and not field.covers(angle):
-            stream.angle_beyond = angle
+        stamp_ns = NS_PER_S * frame.sec + frame.nanosec
+        angle = self.angle_of(name, stamp_ns, calibration.angle_field)
         corrected = calibration.correct_arrays(*arrays, angle=angle)
         self._corrected[name].publish(
             encode_corrected_observations(frame, calibration.calibration_id, corrected)

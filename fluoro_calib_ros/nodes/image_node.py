@@ -15,7 +15,8 @@
 """Node that removes the distortion from the images of the fluoroscopes, live.
 
 A thread of its own receives and corrects the images of each fluoroscope. What takes time, the
-remap and the copies in and out of DDS, runs in parallel as far as Python's lock allows.
+remap and the copies in and out of DDS, runs in parallel as far as Python's lock allows. The thread
+also receives the joint states that give the angle of its C-arm.
 """
 
 from __future__ import annotations
@@ -30,10 +31,14 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from ..calibration.result import FluoroscopeCalibration
-from ..images.corrector import INTERPOLATIONS, ImageCorrector
+from ..exposures.angles import AngleOptions
+from ..images.angle_maps import AngleMaps
+from ..images.corrector import INTERPOLATIONS
 from ..options import option
+from .angle_input import AngleInput
 from .correcting_node import CorrectingNode, Stream
 from .messages.camera_info import message_of_corrected_stream
+from .messages.fields import NS_PER_S
 from .messages.image import (
     COMPRESSIONS,
     IMAGE_REFUSALS,
@@ -81,16 +86,17 @@ class ImageParameters(CalibratedParameters):
 
 
 _NODE = ParameterGroup(ImageParameters, settable=('compressed_format', 'jpeg_quality'))
-PARAMETERS = (_NODE, READ_LIMITS)
+_ANGLES = ParameterGroup(AngleOptions)
+PARAMETERS = (_NODE, _ANGLES, READ_LIMITS)
 
 
 class _PreparedCalibration:
-    """A calibration with its map of pixels."""
+    """A calibration with its maps of pixels."""
 
     def __init__(self, calibration: FluoroscopeCalibration, interpolation: str) -> None:
         calibration.prepare()
         self.calibration = calibration
-        self.corrector = ImageCorrector(calibration, interpolation)
+        self.maps = AngleMaps(calibration, interpolation)
         # Its header is replaced by that of each image.
         self.info = message_of_corrected_stream(calibration, Time())
 
@@ -110,6 +116,7 @@ class ImageNode(CorrectingNode):
     item = 'image'
     subject = 'images'
     refusal_kinds = IMAGE_REFUSALS
+    beyond = 'the correction of the images is extrapolated'
 
     def __init__(self) -> None:
         super().__init__('image_node')
@@ -117,7 +124,7 @@ class ImageNode(CorrectingNode):
         self._settings = _NODE.declare(self)
         self._inputs = INPUTS[self._settings.inputs]
         self.topics = tuple(topic for _, topic in self._inputs)
-        self.use_parameters(self._settings)
+        self.use_parameters(self._settings, _ANGLES.declare(self))
         _NODE.follow(self, self._use_settings)
         use_single_thread()
 
@@ -127,6 +134,13 @@ class ImageNode(CorrectingNode):
     def make_stream(self, name: str) -> _ImageStream:
         """Return the state of one fluoroscope before the first image."""
         return _ImageStream(name, self.item, self.limited_logger)
+
+    def make_angles(self) -> dict[str, AngleInput]:
+        """Return what gives the angles of each fluoroscope, in its own thread."""
+        return {
+            name: AngleInput(self.angle_options, self.names, self.limited_logger)
+            for name in self.names
+        }
 
     def create_outputs(self) -> None:
         """Make the outputs and subscribe to calibrations."""
@@ -146,8 +160,9 @@ class ImageNode(CorrectingNode):
 
     def create_readers(self) -> None:
         """Receive images, those of each fluoroscope in a thread of its own."""
-        for name in self.names:
-            reader = self.create_reader(self.fault_handlers)
+        for name, angles in self.angles.items():
+            reader = self.create_reader(angles.guarded(self.fault_handlers))
+            angles.subscribe(reader)
             for kind, topic in self._inputs:
                 reader.subscribe(
                     kind,
@@ -157,12 +172,12 @@ class ImageNode(CorrectingNode):
                 )
 
     def prepare(self, calibration: FluoroscopeCalibration) -> _PreparedCalibration:
-        """Return the calibration with its map of pixels."""
+        """Return the calibration with its maps of pixels."""
         return _PreparedCalibration(calibration, self._settings.interpolation)
 
     def on_calibration_ready(self, name: str, prepared: _PreparedCalibration) -> None:
         """Log that a calibration is in use."""
-        empty = int((~prepared.corrector.mask).sum())
+        empty = int((~prepared.maps.mean.mask).sum())
         self.get_logger().info(
             f'fluoroscope {name}: calibration {prepared.calibration.calibration_id} in use '
             f'({empty} pixels of the corrected image are empty)'
@@ -175,6 +190,7 @@ class ImageNode(CorrectingNode):
         return {
             'images compressed': stream.compressed,
             'calibration': prepared.calibration.calibration_id if prepared else '',
+            'maps made for angles': prepared.maps.built if prepared else 0,
         }
 
     def _on_image(
@@ -193,7 +209,11 @@ class ImageNode(CorrectingNode):
             stream.refusals.refuse(error)
             return
         out, pixels = stream.converter.prepare_output(message.header, encoding, image.shape)
-        prepared.corrector.correct(image, pixels)
+        stamp = message.header.stamp
+        angle = self.angle_of(
+            name, NS_PER_S * stamp.sec + stamp.nanosec, prepared.calibration.angle_field
+        )
+        prepared.maps.at(angle).correct(image, pixels)
         self._images[name].publish(out)  # copies the image
         prepared.info.header = message.header
         for output in self._infos[name]:

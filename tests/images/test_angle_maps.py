@@ -1,0 +1,125 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Maps of corrected images at the angles of a C-arm."""
+
+import functools
+
+import numpy as np
+import pytest
+import rigs
+
+from fluoro_calib_ros.distortion.status import CorrectionStatus
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.images.angle_maps import AngleMaps
+from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector
+from fluoro_calib_ros.simulation.bead_images import bead_image
+
+OK, OUTSIDE, INVALID = CorrectionStatus
+SIZE = (1024, 1024)
+ANGLES = (-0.9, -0.2, 0.3, 1.0)
+WORST_PX = 0.1  # beyond the calibrated area
+
+
+@functools.cache
+def calibration():
+    """A calibration that angles change by up to some 5 px."""
+    return rigs.turning(rigs.calibrated('a').calibrations['a'], size_px=0.4)
+
+
+@functools.cache
+def maps():
+    return AngleMaps(calibration())
+
+
+def errors(corrector, angle):
+    """Distances (n,) between pixels and their corrected sources, and the status (n,) there."""
+    v, u = np.nonzero(corrector.mask)
+    x, y, *_ = calibration().correct_arrays(*corrector.source[:, v, u].astype(float), None, angle)
+    return np.hypot(x - u, y - v), corrector.status[v, u]
+
+
+@pytest.mark.parametrize('angle', ANGLES)
+def test_sources_of_pixels_are_corrected_to_them_at_the_angle(angle):
+    corrector = maps().at(angle)
+    error, status = errors(corrector, maps().rounded(angle))
+    assert error[status == OK].max() < LIMIT_PX
+    assert error.max() < WORST_PX and np.quantile(error, 0.999) < LIMIT_PX
+    # Rounding the angle moves no pixel by more than that again.
+    exact, _ = errors(corrector, angle)
+    assert exact[status == OK].max() < 2 * LIMIT_PX
+    mean, _ = errors(corrector, None)
+    assert mean.max() > 1
+
+
+@pytest.mark.parametrize('interpolation', ['linear', 'cubic'])
+def test_image_is_that_of_the_calibration_at_the_angle(interpolation):
+    """The map of the direct way, by a lookup grid of its own and an iteration at every pixel."""
+    found = AngleMaps(calibration(), interpolation)
+    angle = found.rounded(0.7)
+    direct = ImageCorrector(calibration().at_angle(angle), interpolation)
+    uv = np.random.default_rng(1).uniform(60, 960, (80, 2))
+    image = bead_image(uv, SIZE, np.uint16)
+    difference = found.at(angle).correct(image).astype(int) - direct.correct(image)
+    both = found.at(angle).mask & direct.mask
+    assert (found.at(angle).mask != direct.mask).sum() < 200
+    scale = np.ptp(image.astype(int))
+    assert np.abs(difference[both]).max() < 0.02 * scale
+    away = found.mean.correct(image).astype(int) - direct.correct(image)
+    assert np.abs(away[both]).max() > 0.2 * scale
+
+
+def test_map_is_made_anew_only_where_a_pixel_moves():
+    found = AngleMaps(calibration())
+    step = found.step
+    angle = found.rounded(0.3)
+    first = found.at(angle)
+    for part in (-0.45, 0.45, 0.0):
+        assert found.at(angle + part * step) is first
+    assert found.built == 1
+    next_one = found.at(angle + step)
+    assert next_one is not first and found.built == 2
+    moved = np.abs(next_one.source - first.source)
+    assert 0 < np.nanquantile(moved, 0.99) < 3 * LIMIT_PX
+    # The same angle gives the same map, whatever was before.
+    again = found.at(angle)
+    assert np.array_equal(again.source, first.source, equal_nan=True)
+
+
+def test_unknown_angle_gives_the_mean():
+    mean = ImageCorrector(calibration())
+    found = maps().at(None)
+    assert np.array_equal(found.source, mean.source, equal_nan=True)
+    assert np.array_equal(found.status, mean.status)
+    built = maps().built
+    assert maps().at(None) is found and maps().built == built
+
+
+def test_angle_changes_nothing_where_the_correction_does_not_depend_on_it():
+    found = AngleMaps(rigs.calibrated('a').calibrations['a'])
+    assert found.at(0.3) is found.at(None) is found.mean
+    assert found.built == 0 and found.rounded(0.3) is None
+    still = rigs.turning(rigs.calibrated('a').calibrations['a'], size_px=0.0)
+    assert AngleMaps(still).at(0.3).source[0, 500, 500] == found.mean.source[0, 500, 500]
+
+
+def test_image_far_from_all_calibrated_angles_is_outside():
+    corrector = maps().at(np.deg2rad(80.0))
+    assert set(np.unique(corrector.status)) <= {OUTSIDE, INVALID}
+    assert corrector.mask.mean() > 0.9
+
+
+def test_unknown_interpolation_is_refused():
+    with pytest.raises(DataError, match='the interpolation is one of'):
+        AngleMaps(calibration(), 'none')

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -31,6 +31,17 @@ from .storage import PathLike
 IMAGE = 'sensor_msgs/msg/Image'
 COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
 PIXEL_TYPES = {'mono8': 'u1', '8UC1': 'u1', 'mono16': 'u2', '16UC1': 'u2'}
+
+
+class BagImage(NamedTuple):
+    """An image (h, w) of a bag, its place in words, and its stamp [ns], None where it is damaged.
+
+    In place of an image that cannot be read there is the DataError that says why.
+    """
+
+    place: str
+    image: np.ndarray | DataError
+    stamp_ns: int | None
 
 
 def image_topics(source: PathLike) -> dict[str, str]:
@@ -49,21 +60,20 @@ def image_topics(source: PathLike) -> dict[str, str]:
     return out
 
 
-def images_of_topic(source: PathLike, topic: str) -> Iterator[tuple[str, np.ndarray | DataError]]:
-    """Yield the images (h, w) of a topic with their places in words.
-
-    In place of an image that cannot be read there is the DataError that says why. Raises DataError
-    for a damaged bag.
-    """
+def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
+    """Yield the images of a topic. Raises DataError for a damaged bag."""
     kind = topics_of(source)[topic].type
     for number, message in enumerate(iterate_messages(source, [topic]), 1):
+        stamp_ns = None
         try:
             content = from_cdr(message.data, kind)
+            stamp = content.header.stamp
+            stamp_ns = stamp.sec * 10**9 + stamp.nanosec
             image = decode(content.data) if kind == COMPRESSED_IMAGE else _pixels(content)
         except DataError as error:
-            yield f'{source}, topic {topic}, message {number}', error
+            yield BagImage(f'{source}, topic {topic}, message {number}', error, stamp_ns)
         else:
-            yield f'{source}, topic {topic}, message {number}', image
+            yield BagImage(f'{source}, topic {topic}, message {number}', image, stamp_ns)
 
 
 def _pixels(message: Any) -> np.ndarray:

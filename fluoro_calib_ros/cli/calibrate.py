@@ -31,6 +31,7 @@ from .arguments import (
     add_phantom,
     add_scheduler,
     add_source,
+    angle_options,
     bag_selection,
     file_settings,
     number_in,
@@ -324,6 +325,7 @@ def _report(directory: Path) -> str | None:
 def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recording:
     """Return the observations of images. Raises DataError."""
     from ..jobs.extraction import recording_of_images
+    from ..jobs.image_sources import ImageAngles
 
     if survey is None:
         raise DataError(
@@ -338,4 +340,5 @@ def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
             arguments.principal_distance,
             arguments.scheduler,
             bar,
+            ImageAngles(angle_options(arguments)),
         )

@@ -23,10 +23,14 @@ from typing import TYPE_CHECKING, Any
 
 from ..errors import DataError
 from .arguments import (
+    add_angle,
+    add_angle_options,
     add_option,
     add_phantom,
     add_scheduler,
     add_workers,
+    angle_of,
+    angle_options,
     file_settings,
     names,
     number_in,
@@ -138,6 +142,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     options = declared(MarkerOptions)
     for option in ('shutter', 'gate', 'lost_after', 'search_every'):
         add_option(group, options[option])
+    angles = parser.add_argument_group('angle of a C-arm')
+    add_angle_options(angles)
+    add_angle(angles, 'of images that are in no bag', 'unknown')
     add_file_options(parser)
 
 
@@ -184,6 +191,7 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
     from ..files.extracted import write_extracted
     from ..files.folder import check_output_file
     from ..jobs.extraction import ExtractionRequest, run_extraction
+    from ..jobs.image_sources import ImageAngles
     from ..jobs.sources import read_survey
 
     fluoroscope = arguments.fluoroscope[0]
@@ -191,6 +199,8 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
     check_output_file(arguments.out, (*arguments.sources, arguments.phantom))
     survey = read_survey(arguments.phantom, file_settings(arguments))
     print_notes(survey.notes)
+    angles = ImageAngles(angle_options(arguments), angle_of(arguments))
+    angles.check(arguments.sources, arguments.fluoroscope)
     request = ExtractionRequest(
         arguments.sources,
         survey.phantom,
@@ -200,6 +210,7 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
         arguments.workers,
         arguments.scheduler,
         arguments.regular_grid,
+        angles,
     )
     with ProgressBar('extract') as bar:
         outcome = run_extraction(request, bar)
@@ -207,6 +218,7 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
     write_extracted(arguments.out, observed, survey.names.target_names())
     for result in outcome.refused:
         print_note(f'not used: {result.place}: {result.reason}')
+    print_notes(outcome.notes)
     print_result(arguments, _document(arguments.out, outcome), _text(arguments.out, outcome))
 
 
@@ -270,6 +282,7 @@ def _run_markers(arguments: argparse.Namespace) -> None:
                 f'fluoroscope {name}: {outcome.before[name]} images before exposure '
                 f'{results[0].exposure}, for which the markers are given, are not used'
             )
+    print_notes(outcome.notes)
     for text in _doubt_texts(outcome.spans(), request):
         print_note(text)
     print_result(
@@ -280,11 +293,14 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     """Read what is known of the markers and the fluoroscopes. Raises DataError."""
     from ..files.rig_orientation import load_orientation, orientation_path
+    from ..jobs.image_sources import ImageAngles
     from ..jobs.marker_extraction import MarkerRequest, sequences, shapes_of
     from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import read_calibrations, read_source, read_survey
     from ..radiographs.markers import MarkerOptions
 
+    angles = ImageAngles(angle_options(arguments), angle_of(arguments))
+    angles.check(arguments.sources, arguments.fluoroscope)
     sources, image_size = sequences(arguments.sources, arguments.fluoroscope)
     first: Mapping[str, list[Frame]] = {}
     target_names: Mapping[int, str] = {}
@@ -330,6 +346,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         shapes,
         arguments.overlay,
         target_names,
+        angles,
     )
 
 

@@ -14,7 +14,8 @@
 
 """Observations of images as CSV: `fluoroscope,exposure,target_id,u,v,sigma,overlapped`.
 
-Markers that were followed have a further column `doubtful`.
+Markers that were followed have a further column `doubtful`, and images with the angle of a C-arm
+have `angle_deg` as the last one.
 """
 
 from __future__ import annotations
@@ -24,11 +25,11 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
 
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, angle_in_degrees
 from .access import check_safe_name
 from .atomic import atomic_file
-from .csv_table import write_rows
-from .observations import COLUMNS
+from .csv_table import format_float, write_rows
+from .observations import ANGLE, COLUMNS
 
 DECIMALS = 4  # of a pixel, and of its standard deviation
 
@@ -42,10 +43,8 @@ def write_extracted(
 
     Beads with a name are written by it. Raises DataError where the file cannot be written.
     """
-    with atomic_file(path, 'w') as file:
-        write_rows(file, [(*COLUMNS, 'sigma', 'overlapped')])
-        for frame, overlapped in frames:
-            write_rows(file, _rows(path, frame, [overlapped], target_names))
+    flagged = [(frame, [overlapped]) for frame, overlapped in frames]
+    _write(path, flagged, ('overlapped',), target_names)
 
 
 def write_markers(
@@ -57,10 +56,24 @@ def write_markers(
 
     Markers with a name are written by it. Raises DataError where the file cannot be written.
     """
+    flagged = [(frame, [overlapped, doubtful]) for frame, overlapped, doubtful in frames]
+    _write(path, flagged, ('overlapped', 'doubtful'), target_names)
+
+
+def _write(
+    path: str | os.PathLike[str],
+    frames: Sequence[tuple[Frame, Sequence[np.ndarray]]],
+    flags: tuple[str, ...],
+    target_names: Mapping[int, str],
+) -> None:
+    """Write frames with their flags, and with the angle if any frame has one."""
+    with_angle = any(frame.angle is not None for frame, _ in frames)
     with atomic_file(path, 'w') as file:
-        write_rows(file, [(*COLUMNS, 'sigma', 'overlapped', 'doubtful')])
-        for frame, overlapped, doubtful in frames:
-            write_rows(file, _rows(path, frame, [overlapped, doubtful], target_names))
+        write_rows(file, [(*COLUMNS, 'sigma', *flags, *(ANGLE,) * with_angle)])
+        for frame, values in frames:
+            angle = '' if frame.angle is None else format_float(angle_in_degrees(frame.angle))
+            rows = _rows(path, frame, values, target_names)
+            write_rows(file, ([*row, angle] if with_angle else row for row in rows))
 
 
 def _rows(

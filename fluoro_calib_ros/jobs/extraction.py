@@ -39,6 +39,7 @@ from ..radiographs.matching import PhantomModel
 from ..radiographs.overlay import draw_overlay
 from ..radiographs.view import Lens, View
 from .image_sources import (
+    ImageAngles,
     ImageSources,
     SourceImage,
     fluoroscope_folders,
@@ -112,6 +113,8 @@ class ExtractionRequest:
         Address of a Dask scheduler whose workers extract, in place of processes.
     regular_grid : bool
         The phantom is a regular flat grid. Its place and turn are arbitrary by whole steps.
+    angles : ImageAngles
+        Angles of the C-arm.
     """
 
     sources: Sequence[Path]
@@ -122,14 +125,16 @@ class ExtractionRequest:
     workers: int = 0
     scheduler: str | None = None
     regular_grid: bool = False
+    angles: ImageAngles = field(default_factory=ImageAngles)
 
 
 @dataclass(frozen=True)
 class ExtractionOutcome:
-    """Results of all images of a fluoroscope, in the order of their exposures."""
+    """Results of all images of a fluoroscope, in the order of their exposures, and notes."""
 
     fluoroscope: str
     results: tuple[ImageResult, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def frames(self) -> list[Frame]:
@@ -178,7 +183,7 @@ def _extract(phantom: Phantom, task: _Task) -> list[ImageResult]:
             _check_size(image, task.lens)
             extraction = extract_beads(image, model, task.lens, near)
             near = extraction.nearby
-            result = _observed(result, extraction, phantom, task)
+            result = _observed(result, extraction, phantom, task, source.angle)
         except DataError as error:
             result = replace(result, reason=str(error))
         if task.overlay:
@@ -200,7 +205,11 @@ def _check_size(image: np.ndarray, lens: Lens) -> None:
 
 
 def _observed(
-    result: ImageResult, extraction: Extraction, phantom: Phantom, task: _Task
+    result: ImageResult,
+    extraction: Extraction,
+    phantom: Phantom,
+    task: _Task,
+    angle: float | None,
 ) -> ImageResult:
     """Return a result with observations."""
     frame = Frame(
@@ -210,6 +219,7 @@ def _observed(
         extraction.uv,
         task.lens.image_size,
         extraction.sigma,
+        angle=angle,
     )
     return replace(
         result,
@@ -246,7 +256,7 @@ def run_extraction(
     DataError
         For sources that cannot be read, and where no image gives observations.
     """
-    sources = open_sources(request.sources, request.fluoroscope)
+    sources = open_sources(request.sources, request.fluoroscope, request.angles)
     if request.regular_grid and FlatGrid.of(request.phantom.xyz_mm) is None:
         raise DataError('the phantom is no flat grid with rows and columns')
     if request.overlay is not None:
@@ -257,7 +267,9 @@ def run_extraction(
     if not any(result.frame is not None for result in results):
         raise DataError(_all_refused(results))
     results.sort(key=lambda result: result.exposure)
-    return ExtractionOutcome(request.fluoroscope, tuple(results))
+    angles = [result.frame.angle for result in results if result.frame is not None]
+    notes = request.angles.note(request.fluoroscope, angles)
+    return ExtractionOutcome(request.fluoroscope, tuple(results), notes)
 
 
 def _first_pass(
@@ -342,6 +354,7 @@ def recording_of_images(
     principal_distance_px: float | None = None,
     scheduler: str | None = None,
     progress: Progress | None = None,
+    angles: ImageAngles | None = None,
 ) -> Recording:
     """Extract the beads of all images of a rig.
 
@@ -357,6 +370,8 @@ def recording_of_images(
     scheduler : str, optional
         Address of a Dask scheduler.
     progress : callable, optional
+    angles : ImageAngles, optional
+        Angles of the C-arms.
 
     Returns
     -------
@@ -375,6 +390,8 @@ def recording_of_images(
             'images of several are expected in a folder for each'
         )
     names = list(fluoroscopes or known)
+    angles = angles or ImageAngles()
+    angles.check([source], [*names, *known])
     frames: dict[str, list[Frame]] = {}
     notes: list[str] = []
     for name in names:
@@ -387,10 +404,12 @@ def recording_of_images(
             name,
             principal_distance_px,
             scheduler=scheduler,
+            angles=angles,
         )
         outcome = run_extraction(request, progress)
         frames[name] = outcome.frames
         notes += [f'not used: {result.place}: {result.reason}' for result in outcome.refused]
+        notes += outcome.notes
     return Recording(frames, {}, survey.names, tuple(notes))
 
 

@@ -18,15 +18,17 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
 from ..bags.images import image_topics, images_of_topic
+from ..bags.joint_states import angles_in
 from ..bags.reader import topics_of
 from ..errors import DataError
+from ..exposures.angles import AngleOptions, JointAngles
 from ..files.image_formats import (
     EXPOSURE_SUFFIXES,
     READ_SUFFIXES,
@@ -52,12 +54,59 @@ class SourceImage:
         The error says why it cannot be read.
     frame : int or None
         Place in its video; None for an image that is of no video.
+    angle : float or None
+        Of the C-arm [rad], None where it is unknown.
     """
 
     exposure: int
     place: str
     image: np.ndarray | DataError
     frame: int | None = None
+    angle: float | None = None
+
+
+@dataclass(frozen=True)
+class ImageAngles:
+    """Angles of the C-arm in images.
+
+    Attributes
+    ----------
+    joints : AngleOptions
+        Joints whose states in a bag give the angle of its images.
+    angle : float or None
+        That of all other images [rad].
+    """
+
+    joints: AngleOptions = field(default_factory=AngleOptions)
+    angle: float | None = None
+
+    def check(self, sources: Sequence[Path], fluoroscopes: Iterable[str]) -> None:
+        """Raise DataError for a joint of another fluoroscope, or without a bag."""
+        try:
+            joints = self.joints.joints(fluoroscopes)
+        except ValueError as error:
+            raise DataError(f'{sources[0]}: {error}') from None
+        if joints and not self.joints.of_rig and not any(map(is_image_bag, sources)):
+            raise DataError(
+                f'{sources[0]}: the angle of a joint needs a bag, these images have no times'
+            )
+
+    def track(self, bag: Path, fluoroscope: str) -> JointAngles:
+        """Return the angles of a fluoroscope in a bag. Raises DataError for a missing joint."""
+        joints = self.joints.joints((fluoroscope,), others=True)
+        joint = joints.get(fluoroscope, '')
+        return angles_in(bag, (fluoroscope,), replace(self.joints, angle_joint=joint))
+
+    def note(self, fluoroscope: str, angles: Sequence[float | None]) -> tuple[str, ...]:
+        """Return a sentence where some images of a fluoroscope have no angle, but others do."""
+        count = sum(angle is None for angle in angles)
+        joint = self.joints.joints((fluoroscope,), others=True).get(fluoroscope)
+        if not joint or not count:
+            return ()
+        return (
+            f'fluoroscope {fluoroscope}: {count} of {len(angles)} images have no angle, there is '
+            f'no state of joint {joint} in the {self.joints.angle_max_age:g} s before them',
+        )
 
 
 @dataclass(frozen=True)
@@ -68,7 +117,9 @@ class ImageSources:
     images: Callable[[], Iterator[SourceImage]]
 
 
-def open_sources(sources: Sequence[Path], fluoroscope: str = '') -> ImageSources:
+def open_sources(
+    sources: Sequence[Path], fluoroscope: str = '', angles: ImageAngles | None = None
+) -> ImageSources:
     """Open images of one fluoroscope.
 
     An exposure has the number in the name of its file if all files have a different one, else its
@@ -87,7 +138,8 @@ def open_sources(sources: Sequence[Path], fluoroscope: str = '') -> ImageSources
             files.append(source)
     if not files:
         raise DataError('there are no images')
-    readers = [_reader(path, topics.get(path)) for path in files]
+    angles = angles or ImageAngles()
+    readers = [_reader(path, topics.get(path), fluoroscope, angles) for path in files]
     single = all(count == 1 for count, _ in readers)
     numbers = [_number(path) for path in files]
     numbered = single and None not in numbers and len(set(numbers)) == len(numbers)
@@ -96,9 +148,9 @@ def open_sources(sources: Sequence[Path], fluoroscope: str = '') -> ImageSources
         exposure = 0
         for path, (_, read), number in zip(files, readers, numbers):
             video = suffix_of(path) in VIDEO_SUFFIXES
-            for frame, (place, image) in enumerate(read()):
+            for frame, (place, image, angle) in enumerate(read()):
                 exposure = number if numbered and number is not None else exposure + 1
-                yield SourceImage(exposure, place, image, frame if video else None)
+                yield SourceImage(exposure, place, image, frame if video else None, angle)
 
     return ImageSources(sum(count for count, _ in readers), images)
 
@@ -168,26 +220,43 @@ def _topic(source: Path, fluoroscope: str) -> str:
     )
 
 
+_Placed = tuple[str, np.ndarray | DataError, float | None]  # place, image, angle
+
+
 def _reader(
-    path: Path, topic: str | None
-) -> tuple[int, Callable[[], Iterator[tuple[str, np.ndarray | DataError]]]]:
+    path: Path, topic: str | None, fluoroscope: str, angles: ImageAngles
+) -> tuple[int, Callable[[], Iterator[_Placed]]]:
     """Return the number of images of a file, and a function that reads them."""
     if topic is not None:
-        return topics_of(path)[topic].count, lambda: images_of_topic(path, topic)
+        return topics_of(path)[topic].count, _bag_reader(path, topic, fluoroscope, angles)
     try:
         count = open_images(path).count
     except DataError as error:
         if not os.path.exists(path):
             raise
         damaged = error
-        return 1, lambda: iter([(str(path), damaged)])
-    return count, lambda: _read(path)
+        return 1, lambda: iter([(str(path), damaged, None)])
+    return count, lambda: _read(path, angles.angle)
 
 
-def _read(path: Path) -> Iterator[tuple[str, np.ndarray | DataError]]:
+def _bag_reader(
+    path: Path, topic: str, fluoroscope: str, angles: ImageAngles
+) -> Callable[[], Iterator[_Placed]]:
+    """Return a function that reads the images of a bag. Raises DataError for a missing joint."""
+    track = angles.track(path, fluoroscope)
+
+    def read() -> Iterator[_Placed]:
+        for place, image, stamp_ns in images_of_topic(path, topic):
+            angle = None if stamp_ns is None else track.at(fluoroscope, stamp_ns)
+            yield place, image, angle if track.joints else angles.angle
+
+    return read
+
+
+def _read(path: Path, angle: float | None) -> Iterator[_Placed]:
     """Yield the images of a file; an error in place of what cannot be read ends it."""
     try:
         for place, image in open_images(path).images:
-            yield place, image.copy()
+            yield place, image.copy(), angle
     except DataError as error:
-        yield str(path), error
+        yield str(path), error, None

@@ -129,24 +129,33 @@ class PairFollower:
         )
 
     def extract(
-        self, images: Mapping[str, np.ndarray], number: int, overlays: Collection[str] = ()
+        self,
+        images: Mapping[str, np.ndarray],
+        number: int,
+        overlays: Collection[str] = (),
+        angles: Mapping[str, float | None] | None = None,
     ) -> dict[str, LiveObservations]:
         """Return the markers that are seen in the images of an exposure, by fluoroscope.
 
-        overlays names the fluoroscopes whose pictures are wanted. Never raises DataError.
+        overlays names the fluoroscopes whose pictures are wanted; angles are those of the C-arms
+        [rad], None where they are unknown. Never raises DataError.
         """
         start = time.perf_counter()
-        results = self._results(images, number, overlays)
+        results = self._results(images, number, overlays, angles)
         seconds = (time.perf_counter() - start) / max(len(results), 1)
         return {name: replace(result, seconds=seconds) for name, result in results.items()}
 
     def _results(
-        self, images: Mapping[str, np.ndarray], number: int, overlays: Collection[str]
+        self,
+        images: Mapping[str, np.ndarray],
+        number: int,
+        overlays: Collection[str],
+        angles: Mapping[str, float | None] | None,
     ) -> dict[str, LiveObservations]:
         if not self._begun and len(images) < len(self._pair.names):
             return {name: LiveObservations(reason='the other view is missing') for name in images}
         try:
-            exposure = self._pair.update(images, number)
+            exposure = self._pair.update(images, number, angles)
             if not self._begun:
                 self._check_start(exposure)
         except DataError as error:

@@ -51,6 +51,7 @@ from ..radiographs.markers import (
 )
 from .extraction import Progress
 from .image_sources import (
+    ImageAngles,
     ImageSources,
     SourceImage,
     fluoroscope_folders,
@@ -86,6 +87,8 @@ class MarkerRequest:
         Folder for pictures.
     target_names : mapping of int to str
         Names of markers, for pictures.
+    angles : ImageAngles
+        Angles of the C-arms.
     """
 
     sources: Mapping[str, Sequence[Path]]
@@ -97,15 +100,17 @@ class MarkerRequest:
     shapes: tuple[ClusterShape, ...] = ()
     overlay: Path | None = None
     target_names: Mapping[int, str] = field(default_factory=dict)
+    angles: ImageAngles = field(default_factory=ImageAngles)
 
 
 @dataclass(frozen=True)
 class MarkerImageResult:
-    """Markers of one image, and where it comes from."""
+    """Markers of one image, where it comes from, and the angle of its C-arm [rad]."""
 
     exposure: int
     place: str
     markers: MarkerFrame
+    angle: float | None = None
 
 
 @dataclass(frozen=True)
@@ -146,12 +151,15 @@ class MarkerOutcome:
     image_size : mapping of str to (int, int)
     before : mapping of str to int
         Images before the first one with given markers, which were not used.
+    notes : tuple of str
+        What a user has to know about the angles.
     """
 
     results: Mapping[str, tuple[MarkerImageResult, ...]]
     decisions: tuple[Decision, ...]
     image_size: Mapping[str, tuple[int, int]]
     before: Mapping[str, int]
+    notes: tuple[str, ...] = ()
 
     def frames(self) -> list[tuple[Frame, np.ndarray, np.ndarray]]:
         """Observations, with flags (n,) of overlapped markers and of doubtful ids."""
@@ -168,6 +176,7 @@ class MarkerOutcome:
                     found.uv,
                     self.image_size[name],
                     found.sigma,
+                    angle=result.angle,
                 )
                 out.append((frame, found.overlapped, found.doubtful))
         return out
@@ -276,7 +285,7 @@ def run_marker_extraction(
         without calibration.
     """
     names = list(request.sources)
-    sources = {name: open_sources(request.sources[name], name) for name in names}
+    sources = {name: open_sources(request.sources[name], name, request.angles) for name in names}
     if request.overlay is not None:
         make_folder(request.overlay)
     follower = _Follower(request)
@@ -345,7 +354,7 @@ class _Follower:
             for name, image in images.items()
         }
         if self._pair is not None:
-            found = self._pair.update(arrays, exposure)
+            found = self._pair.update(arrays, exposure, _angles_of(images))
             views = found.views
             self._decisions += found.decisions
             for decision in found.decisions:
@@ -358,7 +367,8 @@ class _Follower:
             view = views[name]
             if isinstance(image.image, DataError):
                 view = replace(view, reason=str(image.image))
-            self._results[name].append(MarkerImageResult(exposure, image.place, view))
+            result = MarkerImageResult(exposure, image.place, view, image.angle)
+            self._results[name].append(result)
 
     def _first_markers(
         self, images: Mapping[str, SourceImage], exposure: int
@@ -388,7 +398,11 @@ class _Follower:
             if len(whole) < len(arrays):
                 return {}
             return identify_markers(
-                whole, request.calibrations, request.orientation, request.shapes
+                whole,
+                request.calibrations,
+                request.orientation,
+                request.shapes,
+                _angles_of(images),
             )
         except DataError as error:
             self._reason = self._reason or str(error)
@@ -443,7 +457,30 @@ class _Follower:
             tuple(self._decisions),
             self._size,
             self._before,
+            tuple(self._notes()),
         )
+
+    def _notes(self) -> Iterator[str]:
+        """Yield what a user has to know about the angles."""
+        request = self._request
+        for name, results in self._results.items():
+            angles = [result.angle for result in results]
+            yield from request.angles.note(name, angles)
+            calibration = request.calibrations.get(name)
+            if calibration is None or calibration.angle_field is None:
+                continue
+            unknown = angles.count(None)
+            if unknown:
+                yield (
+                    f'the correction of fluoroscope {name} depends on the angle of the C-arm, '
+                    f'which is unknown for {unknown} of {len(angles)} images: markers are '
+                    'predicted by the mean over the angles'
+                )
+
+
+def _angles_of(images: Mapping[str, SourceImage]) -> dict[str, float | None]:
+    """Angles of the C-arms in the images of an exposure [rad], by fluoroscope."""
+    return {name: image.angle for name, image in images.items()}
 
 
 def _exposures(sources: Mapping[str, ImageSources]) -> Iterator[dict[str, SourceImage]]:

@@ -34,6 +34,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from ..drift.clusters import Cluster, parse_clusters
 from ..errors import DataError
+from ..exposures.angles import AngleOptions
 from ..exposures.frame import Frame
 from ..exposures.numbering import ExposureNumbers
 from ..exposures.pairing import PairingOptions
@@ -50,6 +51,7 @@ from ..jobs.service_process import ServiceProcess
 from ..jobs.sources import read_calibrations, read_source, read_survey
 from ..options import option
 from ..radiographs.markers import FirstMarkers, MarkerOptions
+from .angle_input import AngleInput
 from .image_node import INPUTS
 from .messages.fields import NS_PER_S
 from .messages.image import (
@@ -146,16 +148,21 @@ _FOLLOWING = ParameterGroup(
     MarkerOptions,
     {name: name for name in ('gate', 'shutter', 'lost_after', 'search_every')},
 )
-PARAMETERS = (_NODE, _PAIRING, _FOLLOWING, READ_LIMITS)
+_ANGLES = ParameterGroup(AngleOptions)
+PARAMETERS = (_NODE, _PAIRING, _FOLLOWING, _ANGLES, READ_LIMITS)
 
 
 @dataclass(frozen=True)
 class _Task:
-    """An image that waits: its number, message, and when it has arrived [ns, system clock]."""
+    """An image that waits.
+
+    Its number, message, when it has arrived [ns, system clock], and the angle of the C-arm [rad].
+    """
 
     number: int
     message: Image | CompressedImage
     received_ns: int
+    angle: float | None = None
 
 
 class _ImageStream:
@@ -226,7 +233,11 @@ class ExtractionNode(StreamNode):
         self._inputs = INPUTS[self._settings.inputs]
         self._make: Mapping[str, MakeExtractor] = {}
         self._pair: PairSettings | None = None
+        angles = _ANGLES.declare(self)
+        AngleInput(angles, self.names, self.limited_logger)  # refuses a joint of no fluoroscope
         self._prepare(_FOLLOWING.declare(self))
+        # Only predictions by calibrations need the angles; beads are found without.
+        self._angle_options = AngleOptions() if self._pair is None else angles
         self._threads: list[threading.Thread] = []
         self._processes: list[ServiceProcess] = []
         self._queue: ExposureQueue[_Task] = ExposureQueue(self.names, self._settings.queue_size)
@@ -297,6 +308,7 @@ class ExtractionNode(StreamNode):
         """Start counting from zero."""
         self.streams = {name: _ImageStream(name, self.limited_logger) for name in self.names}
         self._numbers = ExposureNumbers(self.names, self._tolerance_ns)
+        self._angles = AngleInput(self._angle_options, self.names, self.limited_logger)
 
     def create_outputs(self) -> None:
         """Make the outputs."""
@@ -310,13 +322,13 @@ class ExtractionNode(StreamNode):
 
     def create_readers(self) -> None:
         """Receive the images of all fluoroscopes in one thread, and number them."""
-        reader = self.create_reader(
-            FaultHandlers(
-                self._on_undecodable,
-                lambda topic, error: self._stream_of(topic).refusals.fail(topic, error),
-                self.fail,
-            )
+        faults = FaultHandlers(
+            self._on_undecodable,
+            lambda topic, error: self._stream_of(topic).refusals.fail(topic, error),
+            self.fail,
         )
+        reader = self.create_reader(self._angles.guarded(faults))
+        self._angles.subscribe(reader)
         for name in self.names:
             for kind, topic in self._inputs:
                 reader.subscribe(
@@ -378,10 +390,16 @@ class ExtractionNode(StreamNode):
         """Number an image and let it wait for the thread of its fluoroscope."""
         self.streams[name].received += 1
         stamp = message.header.stamp
-        number = self._numbers.number(name, NS_PER_S * stamp.sec + stamp.nanosec)
-        task = _Task(number, message, info['received_timestamp'])
+        stamp_ns = NS_PER_S * stamp.sec + stamp.nanosec
+        number = self._numbers.number(name, stamp_ns)
+        angle = self._angles.of_frame(name, stamp_ns, needed=self._needs_angle(name))
+        task = _Task(number, message, info['received_timestamp'], angle)
         for loser in self._queue.put(name, number, task):
             self.streams[loser].shed += 1
+
+    def _needs_angle(self, name: str) -> bool:
+        """Return whether predictions in the images of a fluoroscope depend on its angle."""
+        return self._pair is not None and self._pair.calibrations[name].angle_field is not None
 
     # -- the threads that extract
 
@@ -414,7 +432,8 @@ class ExtractionNode(StreamNode):
                 if not images:
                     continue
                 wanted = [name for name in images if self._is_overlay_wanted(name)]
-                for name, found in process(images, number, wanted).items():
+                angles = {name: tasks[name].angle for name in images}
+                for name, found in process(images, number, wanted, angles).items():
                     self._finish(self.streams[name], tasks[name], images[name], found)
             except Exception as error:  # this exposure is lost, the next ones are not
                 if queue.closed:
@@ -503,6 +522,7 @@ class ExtractionNode(StreamNode):
             'refusal of the last image': last.reason,
             'rate [Hz]': f'{stream.rate_hz:.1f}',
             'time of an image [ms]': f'{1e3 * stream.seconds / max(processed, 1):.0f}',
+            **self._angles.values(stream.name),
             **stream.latencies.values(),
         }
 
@@ -526,6 +546,10 @@ class ExtractionNode(StreamNode):
             return WARN, f'images come faster than they are extracted: {stream.shed} were shed'
         if stream.last is not None and stream.last.reason:
             return WARN, f'no observations in the last image: {stream.last.reason}'
+        unknown = self._angles.status(stream.name, incompatible)
+        if unknown:
+            level, reason = unknown
+            return level, f'{reason}; markers are predicted by the mean correction over all angles'
         return stream.refusals.refusal_status() or (OK, 'extracting')
 
 

@@ -25,11 +25,16 @@ STEPS = 3  # the correction changes slowly
 
 
 def project_observed(
-    orientation: RigOrientation, view: int, calibration: FluoroscopeCalibration, xyz: np.ndarray
+    orientation: RigOrientation,
+    view: int,
+    calibration: FluoroscopeCalibration,
+    xyz: np.ndarray,
+    angle: float | None = None,
 ) -> np.ndarray:
     """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm].
 
-    view is the row of the fluoroscope in the orientation. The correction is a function of the
+    view is the row of the fluoroscope in the orientation; angle that of its C-arm [rad], None
+    where it is unknown. The correction is a function of the
     observed pixel, so it is solved for by fixed-point iteration; where it is not defined, it is 0.
     """
     xp, yp, c = orientation.interior[view]
@@ -37,7 +42,9 @@ def project_observed(
     ideal = sensor[:, :2] * (c / sensor[:, 2:]) + np.array([xp, yp])
     observed = ideal
     for _ in range(STEPS):
-        u, v, _, _, _ = calibration.correct_arrays(observed[:, 0].copy(), observed[:, 1].copy())
+        u, v, _, _, _ = calibration.correct_arrays(
+            observed[:, 0].copy(), observed[:, 1].copy(), angle=angle
+        )
         step = ideal - np.stack([u, v], axis=1)
         observed = observed + np.where(np.isfinite(step), step, 0.0)
     return observed

@@ -68,6 +68,15 @@ class ClusterShape:
 
 
 @dataclass(frozen=True)
+class _Rig:
+    """Orientation and calibrations of two fluoroscopes, and the angles of their C-arms [rad]."""
+
+    orientation: RigOrientation
+    calibrations: Mapping[str, FluoroscopeCalibration]
+    angles: Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
 class _Fit:
     """Points (k,) of the members of a cluster, -1 for none, and how well they fit."""
 
@@ -84,6 +93,7 @@ def identify_markers(
     calibrations: Mapping[str, FluoroscopeCalibration],
     orientation: RigOrientation,
     shapes: Sequence[ClusterShape],
+    angles: Mapping[str, float | None] | None = None,
 ) -> dict[str, FirstMarkers]:
     """Find the markers of rigid clusters in the images of one exposure.
 
@@ -95,6 +105,8 @@ def identify_markers(
     orientation : RigOrientation
         Of these two.
     shapes : sequence of ClusterShape
+    angles : mapping of str to float or None, optional
+        Of the C-arms [rad], for corrections that change with them; None where they are unknown.
 
     Returns
     -------
@@ -107,6 +119,7 @@ def identify_markers(
         For a cluster that is not found, or fits in two ways.
     """
     names = list(orientation.fluoroscopes)
+    rig = _Rig(orientation, calibrations, angles or {})
     for name in names:
         check_image(images[name], calibrations[name].image_size)
     count = sum(len(shape.target_id) for shape in shapes)
@@ -115,7 +128,7 @@ def identify_markers(
     for scale in MARKER_SCALES:
         try:
             shadows = [_shadows(images[name], count, scale) for name in names]
-            return _identified(shadows, names, calibrations, orientation, shapes)
+            return _identified(shadows, rig, shapes)
         except DataError as error:
             reason = reason or error
     assert reason is not None
@@ -130,14 +143,10 @@ def _shadows(image: np.ndarray, count: int, scale: float) -> np.ndarray:
 
 
 def _identified(
-    shadows: Sequence[np.ndarray],
-    names: Sequence[str],
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    orientation: RigOrientation,
-    shapes: Sequence[ClusterShape],
+    shadows: Sequence[np.ndarray], rig: _Rig, shapes: Sequence[ClusterShape]
 ) -> dict[str, FirstMarkers]:
     """Find clusters among shadows of both views. Raises DataError."""
-    xyz, pairs = _points(shadows, names, calibrations, orientation)
+    xyz, pairs = _points(shadows, rig)
     fits: list[tuple[ClusterShape, _Fit]] = []
     free = np.ones(len(xyz), dtype=bool)
     for shape in sorted(shapes, key=lambda shape: -len(shape.target_id)):
@@ -147,19 +156,19 @@ def _identified(
         # A shadow is that of one marker, except where two lie behind each other.
         free &= ~(np.isin(pairs[:, 0], taken[:, 0]) & np.isin(pairs[:, 1], taken[:, 1]))
     return {
-        name: _first(view, name, fits, (xyz, pairs, shadows[view]), calibrations, orientation)
-        for view, name in enumerate(names)
+        name: _first(view, rig, fits, (xyz, pairs, shadows[view]))
+        for view, name in enumerate(rig.orientation.fluoroscopes)
     }
 
 
-def _points(
-    shadows: Sequence[np.ndarray],
-    names: Sequence[str],
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    orientation: RigOrientation,
-) -> tuple[np.ndarray, np.ndarray]:
+def _points(shadows: Sequence[np.ndarray], rig: _Rig) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) [mm] where rays of shadows meet, and the rows (n, 2) of these shadows."""
-    corrected = [calibrations[name].correct(uv) for name, uv in zip(names, shadows)]
+    orientation = rig.orientation
+    names = orientation.fluoroscopes
+    corrected = [
+        rig.calibrations[name].correct(uv, angle=rig.angles.get(name))
+        for name, uv in zip(names, shadows)
+    ]
     a, b = np.indices((len(shadows[0]), len(shadows[1]))).reshape(2, -1)
     uv = np.stack([corrected[0].uv[a], corrected[1].uv[b]])
     sigma = np.hypot(np.stack([corrected[0].sigma[a], corrected[1].sigma[b]]), SHADOW_SD_PX)
@@ -266,22 +275,21 @@ class _Search:
 
 def _first(
     view: int,
-    name: str,
+    rig: _Rig,
     fits: Sequence[tuple[ClusterShape, _Fit]],
     found: tuple[np.ndarray, np.ndarray, np.ndarray],
-    calibrations: Mapping[str, FluoroscopeCalibration],
-    orientation: RigOrientation,
 ) -> FirstMarkers:
     """Return the markers of a view; found are points, their pairs, and the shadows of the view."""
     xyz, pairs, shadows = found
-    calibration = calibrations[name]
+    name = rig.orientation.fluoroscopes[view]
+    calibration = rig.calibrations[name]
     ids = []
     places = []
     for shape, fit in fits:
         chosen = fit.point >= 0
         rotation, shift = fitted_pose(shape.xyz_mm[chosen], xyz[fit.point[chosen]])
         members = shape.xyz_mm @ rotation.T + shift
-        place = project_observed(orientation, view, calibration, members)
+        place = project_observed(rig.orientation, view, calibration, members, rig.angles.get(name))
         place[chosen] = shadows[pairs[fit.point[chosen], view]]
         width, height = calibration.image_size
         inside = ((place > 0) & (place < np.array([width - 1, height - 1]))).all(axis=1)

@@ -221,6 +221,9 @@ class MarkerPair:
         self._moves = np.zeros(n, dtype=int)
         self._age = np.zeros(n, dtype=int)
         self._frame = 0
+        # Of the C-arms [rad], in the last exposure and in the one before.
+        self._angles: Mapping[str, float | None] = {}
+        self._angles_before: Mapping[str, float | None] = {}
         self._evidence: dict[tuple[int, int, int], float] = defaultdict(float)
         self._kept: dict[tuple[int, int, int], int] = {}
         self._agreed = np.zeros((2, n), dtype=int)
@@ -228,7 +231,12 @@ class MarkerPair:
         self._seen_right = np.zeros((2, n), dtype=int)
         self._wrong = np.zeros((2, n), dtype=int)
 
-    def update(self, images: Mapping[str, np.ndarray | None], frame: int) -> PairFrame:
+    def update(
+        self,
+        images: Mapping[str, np.ndarray | None],
+        frame: int,
+        angles: Mapping[str, float | None] | None = None,
+    ) -> PairFrame:
         """Measure the markers of the next images.
 
         Parameters
@@ -237,6 +245,9 @@ class MarkerPair:
             By fluoroscope; one may be missing, after the first exposure.
         frame : int
             Number of the exposure, above that of the one before.
+        angles : mapping of str to float or None, optional
+            Of the C-arms [rad], by fluoroscope, for corrections that change with them; None where
+            they are unknown.
 
         Returns
         -------
@@ -256,6 +267,7 @@ class MarkerPair:
                     f'fluoroscope {name}: the image is {width} x {height} px, but the '
                     f'calibration is for {expected[0]} x {expected[1]} px'
                 )
+        self._angles_before, self._angles = self._angles, dict(angles or {})
         if self._frame:
             self._suggest(frame - self._frame)
         views = {
@@ -284,15 +296,20 @@ class MarkerPair:
             rows = rows[good[rows]]
             if not len(rows):
                 continue
-            uv = self._project(view, now[rows])
-            velocity = (uv - self._project(view, self._xyz[rows])) / frames
+            uv = self._project(view, now[rows], self._angles)
+            before = self._project(view, self._xyz[rows], self._angles_before)
+            velocity = (uv - before) / frames
             sd = PREDICTED_SD_PX * (frames + self._age[rows])
             tracker.suggest(self.target_id[rows], uv, velocity, sd)
 
-    def _project(self, view: int, xyz: np.ndarray) -> np.ndarray:
-        """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm]."""
-        calibration = self.calibrations[self.names[view]]
-        return project_observed(self._intersector.orientation, view, calibration, xyz)
+    def _project(
+        self, view: int, xyz: np.ndarray, angles: Mapping[str, float | None]
+    ) -> np.ndarray:
+        """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm] at angles [rad]."""
+        name = self.names[view]
+        return project_observed(
+            self._intersector.orientation, view, self.calibrations[name], xyz, angles.get(name)
+        )
 
     def _exposure(self, views: Mapping[str, MarkerFrame]) -> _Exposure:
         """Correct and intersect the markers of an exposure."""
@@ -306,7 +323,7 @@ class MarkerPair:
             rows = np.searchsorted(self.target_id, found.target_id)
             observed[view, rows] = found.uv
             u, v, total, _, _ = self.calibrations[name].correct_arrays(
-                found.uv[:, 0].copy(), found.uv[:, 1].copy(), found.sigma
+                found.uv[:, 0].copy(), found.uv[:, 1].copy(), found.sigma, self._angles.get(name)
             )
             corrected[view, rows] = np.stack([u, v], axis=1)
             sigma[view, rows] = np.hypot(total, SYSTEMATIC_PX)
@@ -338,7 +355,7 @@ class MarkerPair:
             known = np.isfinite(expected_mm).all(axis=1)
             place = np.full((len(known), 2), np.nan)
             if known.any():
-                place[known] = self._project(view, expected_mm[known])
+                place[known] = self._project(view, expected_mm[known], self._angles)
             out += self._by_cluster(view, exposure, place, frame)
         out += self._by_rays(exposure, np.isfinite(expected_mm).all(axis=1), frame)
         return tuple(out)

@@ -27,14 +27,18 @@ import pytest
 
 from fluoro_calib_ros.bags.definitions import message_class, to_cdr
 from fluoro_calib_ros.bags.images import COMPRESSED_IMAGE, IMAGE
+from fluoro_calib_ros.bags.joint_states import JOINT_STATE
 from fluoro_calib_ros.bags.writer import BagWriter
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.angles import AngleOptions
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.observations import read_observations_csv
 from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.images.codec import encode
-from fluoro_calib_ros.jobs.image_sources import contains_images, open_sources
+from fluoro_calib_ros.jobs.extraction import recording_of_images
+from fluoro_calib_ros.jobs.image_sources import ImageAngles, contains_images, open_sources
+from fluoro_calib_ros.jobs.sources import read_survey
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.bead_images import bead_image
 
@@ -271,3 +275,70 @@ def test_rendered_markers_are_followed(tmp_path, capsys):
         assert np.hypot(*(float(row[k]) - float(truth[k]) for k in 'uv')) < 1.0
     clusters = (rig / 'clusters.txt').read_text().splitlines()
     assert clusters[0].startswith('cluster_1: 1001 ')
+
+
+def image_bag(path: Path, numbers: tuple[int, ...] = (1, 2, 3)) -> Path:
+    """A bag with images of fluoroscope a, and states of a joint until the second of them."""
+    time = message_class('builtin_interfaces/msg/Time')
+    header = message_class('std_msgs/msg/Header')
+    with BagWriter(path) as bag:
+        for number in numbers:
+            data = np.frombuffer(encode(picture(number)[0], '.png'), np.uint8)
+            image = message_class(COMPRESSED_IMAGE)(header(time(number, 0), 'a'), 'png', data)
+            bag.write('/a/image_raw/compressed', COMPRESSED_IMAGE, image, number * 10**9)
+            if number <= 2:
+                state = message_class(JOINT_STATE)(
+                    header(time(number - 1, 900_000_000), ''),
+                    ['carm'],
+                    np.array([0.1 * number]),
+                    np.zeros(0),
+                    np.zeros(0),
+                )
+                bag.write('/joint_states', JOINT_STATE, state, number * 10**9)
+    return path
+
+
+def angles_in_table(folder: Path) -> list[float | None]:
+    frames = read_observations_csv(folder / 'out.csv', (SIZE, SIZE))['a']
+    return [None if f.angle is None else round(float(np.degrees(f.angle)), 4) for f in frames]
+
+
+def test_images_of_a_bag_have_the_angle_of_the_joint(folder, capsys):
+    image_bag(folder / 'bag')
+    extract(folder, 'bag', '--angle-joint', 'carm')
+    assert angles_in_table(folder) == [5.7296, 11.4592, None]
+    assert '1 of 3 images have no angle, there is no state of joint carm in the 0.5 s' in (
+        capsys.readouterr().err
+    )
+    extract(folder, 'bag', '--angle-joint', 'carm', '--angle-max-age', '2')
+    assert angles_in_table(folder) == [5.7296, 11.4592, 11.4592]
+    extract(folder, 'bag')
+    assert 'angle_deg' not in (folder / 'out.csv').read_text()
+    with pytest.raises(SystemExit):
+        extract(folder, 'bag', '--angle-joint', 'a:carm,b:other')
+    assert "angle_joint: there is no fluoroscope 'b', only a" in capsys.readouterr().err
+
+
+def test_images_of_files_have_the_angle_that_is_given(folder, capsys):
+    extract(folder, 'a', '--angle-deg', '-35')
+    assert angles_in_table(folder) == [-35.0, -35.0, -35.0]
+    with pytest.raises(SystemExit):
+        extract(folder, 'a', '--angle-joint', 'carm')
+    assert 'the angle of a joint needs a bag, these images have no times' in (
+        capsys.readouterr().err
+    )
+
+
+def test_calibrate_takes_the_angles_of_images_in_a_bag(folder):
+    bag = image_bag(folder / 'bag')
+    survey = read_survey(folder / 'phantom.csv')
+    angles = ImageAngles(AngleOptions('carm', 5.0))
+    recording = recording_of_images(bag, survey, angles=angles)
+    assert [f.angle for f in recording.frames['a']] == pytest.approx([0.1, 0.2, 0.2], abs=1e-8)
+    words = ['calibrate', str(bag), '--phantom', str(folder / 'phantom.csv'), '--model', 'none']
+    words += ['--out', str(folder / 'result'), '--angle-max-age', '5', '--angle-joint']
+    main([*words, 'carm'])
+    (folder / 'out.csv').write_bytes((folder / 'result' / 'observations.csv').read_bytes())
+    assert angles_in_table(folder) == [5.7296, 11.4592, 11.4592]
+    with pytest.raises(SystemExit):
+        main([*words, 'table'])

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import csv
 import json
+from collections.abc import Iterable
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -25,8 +26,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import rigs
 from rigs import run
 
+from fluoro_calib_ros.bags.definitions import message_class
+from fluoro_calib_ros.bags.images import COMPRESSED_IMAGE
+from fluoro_calib_ros.bags.joint_states import JOINT_STATE
+from fluoro_calib_ros.bags.writer import BagWriter
 from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
 from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.drift.clusters import Cluster
@@ -35,8 +41,11 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.files.calibration import save_calibration
 from fluoro_calib_ros.files.phantom import write_phantom
 from fluoro_calib_ros.files.rig_orientation import save_orientation
+from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.jobs.live_markers import PairSettings
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
+from fluoro_calib_ros.radiographs.marker_geometry import project_observed
+from fluoro_calib_ros.radiographs.marker_ids import ClusterShape, identify_markers
 from fluoro_calib_ros.radiographs.marker_overlay import draw_markers
 from fluoro_calib_ros.radiographs.marker_pair import Decision, MarkerPair, PairFrame, revise
 from fluoro_calib_ros.radiographs.markers import (
@@ -443,3 +452,191 @@ def test_pictures_show_ids_and_doubts():
     image = sequence()[1][5]['a'].image
     picture = draw_markers(image, replace(found, reason='why'), {int(found.target_id[0]): 'm1'})
     assert picture.shape[1] == 2 * SIZE and picture.dtype == np.uint8
+
+
+# ---- a correction that depends on the angle of the C-arm
+
+TURNED = 20  # exposures
+JOINT = {'a': 1.0, 'b': -1.0}  # the arms turn against each other
+
+
+def angle_at(name: str, number: int) -> float:
+    """Angle of the C-arm of a fluoroscope in an exposure [rad]."""
+    return JOINT[name] * (0.4 + 0.02 * number)
+
+
+@cache
+def turning() -> dict[str, FluoroscopeCalibration]:
+    """The calibrations, with a correction that an angle changes by some px."""
+    calibrations, _ = calibration()
+    return {name: rigs.turning(each, size_px=6.0) for name, each in calibrations.items()}
+
+
+@cache
+def turning_orientation() -> RigOrientation:
+    _, orientation = calibration()
+    ids = tuple(turning()[name].calibration_id for name in orientation.fluoroscopes)
+    return replace(orientation, calibration_ids=ids)
+
+
+@cache
+def turned_images() -> tuple[dict[str, np.ndarray], ...]:
+    """Images of the first exposures, distorted as at the angles of their C-arms."""
+    out = []
+    for number, of in enumerate(sequence()[1][:TURNED], 1):
+        distorted = {}
+        for name, image in of.items():
+            v, u = np.indices((SIZE, SIZE)).reshape(2, -1)
+            field = turning()[name].angle_field
+            change, _ = field.change(np.column_stack([u, v]), angle_at(name, number))
+            place = (np.column_stack([u, v]) - change).astype(np.float32).reshape(SIZE, SIZE, 2)
+            distorted[name] = cv2.remap(
+                image.image, place, None, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE
+            )
+        out.append(distorted)
+    return tuple(out)
+
+
+def displaced(name: str, number: int, uv: np.ndarray) -> np.ndarray:
+    """Where true image points (k, 2) of an exposure are seen at its angle."""
+    seen = uv
+    for _ in range(20):
+        seen = uv + turning()[name].angle_field.change(seen, angle_at(name, number))[0]
+    return seen
+
+
+def turned_first() -> dict[str, FirstMarkers]:
+    return {
+        name: FirstMarkers(given(name).target_id, displaced(name, 1, given(name).uv))
+        for name in 'ab'
+    }
+
+
+def angles_of_exposure(number: int) -> dict[str, float | None]:
+    return {name: angle_at(name, number) for name in 'ab'}
+
+
+def followed_while_turning(known: bool) -> list[PairFrame]:
+    pair = MarkerPair(
+        turning(),
+        turning_orientation(),
+        OPTIONS,
+        first=turned_first(),
+        clusters=followed_clusters(),
+    )
+    return [
+        pair.update(dict(images), number, angles_of_exposure(number) if known else None)
+        for number, images in enumerate(turned_images(), 1)
+    ]
+
+
+def decided(frames: Iterable[PairFrame]) -> list[tuple[str, str, tuple[int, ...]]]:
+    return [(d.kind, d.fluoroscope, d.target_id) for of in frames for d in of.decisions]
+
+
+def test_doubts_are_decided_at_the_angles_of_the_arms_as_without_distortion():
+    """By the mean over the angles, whose standard deviation is larger, they are not."""
+    assert np.abs(displaced('b', 1, given('b').uv) - given('b').uv).max() > 5
+    straight = decided(followed_in_both()[:TURNED])
+    at_angle = decided(followed_while_turning(True))
+    assert straight and set(straight) <= set(at_angle)
+    assert {kind for kind, *_ in at_angle} == {'confirmed'}
+    assert not decided(followed_while_turning(False))
+
+
+def test_points_are_projected_to_where_they_are_seen_at_an_angle():
+    xyz = np.random.default_rng(1).uniform(-10, 10, (20, 3))
+    for view, name in enumerate('ab'):
+        each = turning()[name]
+        ideal = project_observed(turning_orientation(), view, calibration()[0][name], xyz)
+        seen = project_observed(turning_orientation(), view, each, xyz, 0.7)
+        assert np.abs(seen - ideal).max() > 1
+        assert np.abs(each.correct(seen, angle=0.7).uv - ideal).max() < 0.01
+
+
+def cluster_shapes() -> tuple[ClusterShape, ...]:
+    ids, _ = sequence()
+    local = MovingMarkers(SCENE, SEED).local_mm
+    return ClusterShape('one', ids[:4], local[:4]), ClusterShape('two', ids[4:], local[4:])
+
+
+def test_markers_are_identified_by_their_shapes_at_the_angles_of_the_arms():
+    images = dict(turned_images()[1])
+    arguments = (images, turning(), turning_orientation(), cluster_shapes())
+    with pytest.raises(DataError, match='fit its shape'):
+        identify_markers(*arguments)
+    found = identify_markers(*arguments, angles_of_exposure(2))
+    ids, true = sequence()
+    for name in 'ab':
+        rows = np.searchsorted(ids, found[name].target_id)
+        away = found[name].uv - displaced(name, 2, true[1][name].uv)[rows]
+        assert np.median(np.linalg.norm(away, axis=1)) < 1.0
+
+
+def save_turning(folder: Path) -> None:
+    """Write the result folder of the fluoroscopes whose corrections depend on the angle."""
+    folder.mkdir()
+    for each in turning().values():
+        save_calibration(folder, each)
+    save_orientation(folder, turning_orientation())
+
+
+def write_turned_first(path: Path) -> None:
+    """Write the markers of the first exposure."""
+    with open(path, 'w') as file:
+        file.write('fluoroscope,exposure,target_id,u,v\n')
+        for name, first in turned_first().items():
+            for target, (u, v) in zip(first.target_id, first.uv):
+                file.write(f'{name},1,{target},{u:.6f},{v:.6f}\n')
+
+
+def test_command_follows_markers_at_the_angles_of_a_bag(tmp_path, capsys):
+    """The angles also stand in the table that it writes; without them a note says so."""
+    time = message_class('builtin_interfaces/msg/Time')
+    header = message_class('std_msgs/msg/Header')
+    with BagWriter(tmp_path / 'bag') as bag:
+        for number, images in enumerate(turned_images(), 1):
+            state = message_class(JOINT_STATE)(
+                header(time(number, 0), ''),
+                ['frontal', 'lateral'],
+                np.array([angle_at(name, number) for name in 'ab']),
+                np.zeros(0),
+                np.zeros(0),
+            )
+            bag.write('/joint_states', JOINT_STATE, state, number * 10**9)
+            for name, image in images.items():
+                message = message_class(COMPRESSED_IMAGE)(
+                    header(time(number, 1000), name),
+                    'png',
+                    np.frombuffer(encode(image, '.png'), np.uint8),
+                )
+                topic = f'/{name}/image_raw/compressed'
+                bag.write(topic, COMPRESSED_IMAGE, message, number * 10**9)
+    save_turning(tmp_path / 'result')
+    write_turned_first(tmp_path / 'first.csv')
+    words = ['extract', tmp_path / 'bag', '--markers', tmp_path / 'first.csv', '--json']
+    words += ['--calibration', tmp_path / 'result', '--fluoroscope', 'a,b', '--shutter', 0.4]
+    for cluster in followed_clusters():
+        words += ['--cluster', f'{cluster.name}: ' + ' '.join(map(str, cluster.target_id))]
+    words += ['--out', tmp_path / 'both.csv']
+    joints = ['--angle-joint', 'a:frontal,b:lateral']
+
+    def decisions(*more):
+        assert run(*words, *more) == 0
+        printed = capsys.readouterr()
+        found = json.loads(printed.out)['decisions']
+        return [(d['kind'], d['fluoroscope'], tuple(d['target_id'])) for d in found], printed.err
+
+    at_angle, said = decisions(*joints)
+    assert at_angle and {kind for kind, *_ in at_angle} == {'confirmed'}
+    assert 'depends on the angle' not in said
+    with open(tmp_path / 'both.csv', newline='') as file:
+        for row in csv.DictReader(file):
+            angle = angle_at(row['fluoroscope'], int(row['exposure']))
+            assert float(row['angle_deg']) == pytest.approx(np.degrees(angle), abs=1e-5)
+    by_mean, said = decisions()
+    assert not by_mean
+    assert (
+        'the correction of fluoroscope a depends on the angle of the C-arm, which is unknown for '
+        '20 of 20 images: markers are predicted by the mean' in said
+    )

@@ -14,6 +14,7 @@
 
 """A correction that depends on the angle of the C-arm: live by joint states, and from a bag."""
 
+from array import array
 from dataclasses import replace
 
 import numpy as np
@@ -24,8 +25,9 @@ from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from ros_graph import BAGS, NAMES, value_of
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
-from sensor_msgs.msg import JointState
+from sensor_msgs.msg import Image, JointState
 
+import tests.radiographs.test_markers as markers
 from fluoro_calib_ros.bags.definitions import (
     ADDED,
     FLUOROSCOPE_CALIBRATION,
@@ -38,9 +40,14 @@ from fluoro_calib_ros.calibration.result import digest_of_sources
 from fluoro_calib_ros.exposures.angles import AngleOptions
 from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
 from fluoro_calib_ros.files.phantom import read_phantom
+from fluoro_calib_ros.images.angle_maps import AngleMaps
+from fluoro_calib_ros.jobs.live_markers import PairSettings
 from fluoro_calib_ros.jobs.sources import BagSelection, read_calibrated_source
 from fluoro_calib_ros.nodes.messages.fields import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
+from fluoro_calib_ros.nodes.runtime.qos import images_qos
+from fluoro_calib_ros.radiographs.markers import FirstMarkers
+from fluoro_calib_ros.simulation.bead_images import bead_image
 
 START_NS = 10**18
 STEP_NS = 50_000_000  # between frames, and between states
@@ -205,6 +212,177 @@ def test_diagnostics_say_which_angle_is_used_and_why_it_is_not_known(graph, turn
     status = status_after(400, lambda s: 'angle_max_age' in s.message)
     output.publish(JointState(name=['frontal'], position=[90.0], header=publish[0].header))
     assert corrected
+
+
+def image_message(image, name, stamp_ns):
+    encoding = 'mono8' if image.dtype == np.uint8 else 'mono16'
+    message = Image(height=image.shape[0], width=image.shape[1], encoding=encoding)
+    message.step = image.shape[1] * image.itemsize
+    message.data = array('B', image.tobytes())
+    message.header.stamp = stamp_from_nanoseconds(stamp_ns)
+    message.header.frame_id = f'{name}_optical'
+    return message
+
+
+def test_images_are_corrected_at_the_angle_of_their_stamp(graph, turning, exposures):
+    """As by the maps of the angle; where it is unknown, by the mean, and the node says so."""
+    folder, calibrations = turning
+    client = graph.client
+    found = {n: [] for n in NAMES}
+    shown = {n: client.create_publisher(Image, f'{n}/image_raw', images_qos()) for n in NAMES}
+    for name in NAMES:
+        client.create_subscription(Image, f'{name}/image_corrected', found[name].append, 30)
+    node = graph.start(
+        'image_node', {'calibration_directory': folder, 'angle_joint': f"'{JOINTS}'"}
+    )
+    output = joint_output(client, len(NAMES))  # each fluoroscope has a thread that reads them
+    for name in NAMES:
+        client.wait_until(shown[name].get_subscription_count, what='the reader of images')
+        client.wait_until(
+            lambda name=name: client.count_publishers(f'{name}/image_corrected'), what='images'
+        )
+        client.wait_for_diagnostics('image_node', lambda s: value_of(s, 'calibration'), name)
+    publish_states(client, output, 'image_node', range(STATES))
+    pictures = {n: bead_image(exposures[n][0].uv, exposures[n][0].image_size) for n in NAMES}
+
+    def corrected(name, stamp_ns):
+        """Return the pixels that the node publishes for an image of a time."""
+        message = image_message(pictures[name], name, stamp_ns)
+        shown[name].publish(message)
+
+        def answer():
+            return next((m for m in found[name] if m.header == message.header), None)
+
+        out = client.wait_until(answer, what='the corrected image')
+        return np.frombuffer(out.data, np.uint8).reshape(out.height, out.width)
+
+    for name in NAMES:
+        maps = AngleMaps(calibrations[name])
+        mean = maps.mean.correct(pictures[name])
+        for number in (8, 20):
+            pixels = corrected(name, START_NS + number * STEP_NS + BEHIND_NS)
+            at_angle = maps.at(SIGNS[name] * angle_of_state(number)).correct(pictures[name])
+            assert np.array_equal(pixels, at_angle)
+            assert not np.array_equal(pixels, mean)
+        # An arm that stands still needs no further map.
+        assert np.array_equal(corrected(name, START_NS + 20 * STEP_NS + BEHIND_NS + 1), at_angle)
+        status = client.wait_for_diagnostics(
+            'image_node', lambda s: value_of(s, 'maps made for angles') == '2', name
+        )
+        assert value_of(status, 'angle [deg]') == f'{SIGNS[name] * 40:.3f}'
+        before = corrected(name, START_NS - 1)
+        assert np.array_equal(before, mean)
+        status = client.wait_for_diagnostics(
+            'image_node', lambda s: value_of(s, 'frames without angle') == '1', name
+        )
+        assert value_of(status, 'angle [deg]') == ''
+    assert node.log.count('angle of the C-arm is unknown: joint frontal: it has no state at') == 1
+
+    def status_while_shown(number, condition):
+        """Show images of a time until the status of the node fulfils a condition."""
+
+        def fulfilled():
+            corrected('a', START_NS + number * STEP_NS + next(later))
+            status = client.statuses.get('image_node: a')
+            return status if status is not None and condition(status) else None
+
+        later = iter(range(10**6))
+        return client.wait_until(fulfilled, what=f'the status of images {number}')
+
+    status = status_while_shown(60, lambda s: 'angle_max_age' in s.message)
+    assert 'the mean correction over all angles is used' in status.message
+    status = status_while_shown(39, lambda s: 'far from all calibrated' in s.message)
+    assert 'the correction of the images is extrapolated' in status.message
+    status_while_shown(20, lambda s: s.message == 'correcting')
+
+
+def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
+    """With the doubts of the same exposures offline, which the mean would not have decided."""
+    markers.save_turning(tmp_path / 'result')
+    markers.write_turned_first(tmp_path / 'first.csv')
+    first = {
+        name: FirstMarkers(each.target_id, np.round(each.uv, 6))
+        for name, each in markers.turned_first().items()
+    }
+    clusters = markers.followed_clusters()
+
+    def offline(known):
+        follower = PairSettings(
+            first, markers.turning(), markers.turning_orientation(), clusters, markers.OPTIONS
+        )()
+        return [
+            follower.extract(images, n, (), markers.angles_of_exposure(n) if known else None)
+            for n, images in enumerate(markers.turned_images(), 1)
+        ]
+
+    def doubtful(found):
+        return [sum(each.doubtful for each in of.values()) for of in found]
+
+    at_angle = offline(True)
+    pairs = enumerate(zip(doubtful(at_angle), doubtful(offline(False))))
+    last = next(number for number, (one, other) in pairs if one != other)
+    client = graph.client
+    found = {n: client.listen(f'{n}/target_observations') for n in NAMES}
+    shown = {n: client.create_publisher(Image, f'{n}/image_raw', images_qos()) for n in NAMES}
+    texts = [f'{c.name}: ' + ' '.join(map(str, c.target_id)) for c in clusters]
+    parameters = {
+        'mode': 'markers',
+        'markers': tmp_path / 'first.csv',
+        'calibration_directory': tmp_path / 'result',
+        'clusters': str(texts),
+        'shutter': markers.OPTIONS.shutter,
+        'angle_joint': f"'{JOINTS}'",
+    }
+    node = graph.start('extraction_node', parameters)
+    output = joint_output(client, 1)
+    client.wait_until(
+        lambda: all(p.get_subscription_count() for p in shown.values()), what='readers'
+    )
+    for number in range(1, last + 2):
+        state = JointState(name=['frontal', 'lateral'])
+        state.header.stamp = stamp_from_nanoseconds(START_NS + number * STEP_NS)
+        state.position = [markers.angle_at(n, number) for n in NAMES]
+        output.publish(state)
+    client.wait_for_diagnostics(
+        'extraction_node', lambda s: value_of(s, 'joint states received') == str(last + 1)
+    )
+
+    def show(number, stamp_ns):
+        for name, image in markers.turned_images()[number - 1].items():
+            message = image_message(image, name, stamp_ns)
+            shown[name].publish(message)
+
+    for number in range(1, last + 2):
+        show(number, START_NS + number * STEP_NS + BEHIND_NS)
+        client.wait_until(
+            lambda number=number: all(len(each) == number for each in found.values()),
+            what=f'the markers of exposure {number}',
+        )
+        for name in NAMES:
+            expected = at_angle[number - 1][name]
+            assert list(found[name][-1].target_id) == expected.target_id.tolist()
+            assert np.array_equal(np.stack([found[name][-1].u, found[name][-1].v], 1), expected.uv)
+    for name in NAMES:
+        status = client.wait_for_diagnostics(
+            'extraction_node', lambda s: value_of(s, 'images extracted') == str(last + 1), name
+        )
+        assert value_of(status, 'doubtful') == str(at_angle[last][name].doubtful)
+        angle = np.degrees(markers.angle_at(name, last + 1))
+        assert value_of(status, 'angle [deg]') == f'{angle:.3f}'
+        assert value_of(status, 'frames without angle') == '0'
+    assert node.running and 'Traceback' not in node.log
+
+    def unknown():
+        """Show an exposure that is too late for the last state, one after the other."""
+        count = len(found['b'])
+        show(last + 2, START_NS + next(late) * 10**9)
+        client.wait_until(lambda: len(found['b']) > count, what='its markers')
+        status = client.statuses.get('extraction_node: a')
+        return status if status is not None and 'predicted by the mean' in status.message else None
+
+    late = iter(range(100, 10**6))
+    status = client.wait_until(unknown, what='the status')
+    assert 'joint frontal: its last state is' in status.message
 
 
 def test_captured_exposures_get_their_angles(graph, exposures, tmp_path):

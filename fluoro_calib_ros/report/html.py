@@ -187,7 +187,9 @@ def _fluoroscope(given: ReportInput, name: str, residuals: Residuals) -> dict[st
     covered = covered_cells(residuals.uv, calibration.image_size)
     exposures = given.names.exposure_names()
     missing = missing_sides(residuals.uv, calibration.image_size)
-    sd = calibration.correction(residuals.uv).sd if len(residuals.uv) else np.array([np.nan])
+    sd = np.array([np.nan])
+    if len(residuals.uv):
+        sd = calibration.correction(residuals.uv, residuals.angle).sd
     return {
         'label': given.names.fluoroscope_names().get(name, name),
         'entry': given.result['fluoroscopes'][name],

@@ -41,6 +41,8 @@ class Residuals:
         Observed and corrected minus computed [px].
     inlier : (n,) ndarray of bool
         False for image points that fail their test.
+    angle : (n,) ndarray or None
+        Of the C-arm [rad], NaN where it is unknown; None: it is nowhere known.
     """
 
     exposure: np.ndarray
@@ -49,6 +51,7 @@ class Residuals:
     before: np.ndarray
     after: np.ndarray
     inlier: np.ndarray
+    angle: np.ndarray | None = None
 
     def of_exposures(self) -> list[tuple[int, int, float, float]]:
         """Return number, inliers, and RMS before and after [px] of every exposure."""
@@ -118,8 +121,15 @@ def residuals_of(
         none = np.zeros(0, dtype=int)
         return Residuals(none, none, empty, empty, empty, none.astype(bool))
     numbers, ids, observed, expected = map(np.concatenate, (exposure, target_id, uv, computed))
-    corrected = calibration.correct(observed, exact=True, angle=np.concatenate(angle)).uv
+    angles = np.concatenate(angle)
+    corrected = calibration.correct(observed, exact=True, angle=angles).uv
     inlier = np.array([pair not in outliers for pair in zip(numbers.tolist(), ids.tolist())])
     return Residuals(
-        numbers, ids, observed, observed - expected, corrected - expected, inlier.astype(bool)
+        numbers,
+        ids,
+        observed,
+        observed - expected,
+        corrected - expected,
+        inlier.astype(bool),
+        angles,
     )

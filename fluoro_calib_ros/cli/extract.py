@@ -144,7 +144,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         add_option(group, options[option])
     angles = parser.add_argument_group('angle of a C-arm')
     add_angle_options(angles)
-    add_angle(angles, 'of images that are in no bag', 'unknown')
+    add_angle(angles, 'of all images, where no joint gives it', 'unknown')
     add_file_options(parser)
 
 

@@ -74,7 +74,7 @@ class ImageAngles:
     joints : AngleOptions
         Joints whose states in a bag give the angle of its images.
     angle : float or None
-        That of all other images [rad].
+        That of images without a joint [rad].
     """
 
     joints: AngleOptions = field(default_factory=AngleOptions)

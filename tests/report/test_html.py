@@ -18,10 +18,11 @@ import html.parser
 import json
 import re
 import shutil
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import calibrated, exposures, rig, run
+from rigs import calibrated, exposures, rig, run, turning
 
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.request import CalibrationRequest
@@ -119,6 +120,25 @@ def test_report_shows_the_residuals_of_the_adjustment(folder):
     assert len(residuals.uv) == entry['observations']
     rms = np.sqrt(np.mean(residuals.after[residuals.inlier] ** 2, axis=0))
     np.testing.assert_allclose(rms, entry['rmse_px']['after'], rtol=0.1)
+
+
+def test_standard_deviation_of_a_correction_is_that_at_the_angles_of_the_exposures(
+    folder,
+):
+    """Not the one of an unknown angle, which holds what the angle changes."""
+    given = read_report_input(folder)
+    turned = [replace(f, angle=0.1 * i) for i, f in enumerate(given.frames['a'])]
+    given = replace(
+        given,
+        calibrations={'a': turning(given.calibrations['a'])},
+        frames={'a': turned},
+    )
+    residuals = html_report._residuals(given, 'a')
+    calibration = given.calibrations['a']
+    unknown = np.median(calibration.correction(residuals.uv).sd)
+    at_angles = np.median(calibration.correction(residuals.uv, residuals.angle).sd)
+    assert at_angles < 0.5 * unknown
+    assert html_report._fluoroscope(given, 'a', residuals)['correction_sd'] == at_angles
 
 
 @pytest.mark.parametrize(

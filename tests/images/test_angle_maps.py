@@ -19,6 +19,7 @@ import functools
 import numpy as np
 import pytest
 import rigs
+import turning_rig
 
 from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.errors import DataError
@@ -123,3 +124,28 @@ def test_image_far_from_all_calibrated_angles_is_outside():
 def test_unknown_interpolation_is_refused():
     with pytest.raises(DataError, match='the interpolation is one of'):
         AngleMaps(calibration(), 'none')
+
+
+def test_images_follow_a_field_that_was_estimated_from_exposures():
+    """At angles that were not calibrated, against the true change of the distortion."""
+    estimated = turning_rig.turning().calibrations['a']
+    found = AngleMaps(estimated)
+    calibrated, others = turning_rig.recording()
+
+    def true_change(uv, angle):
+        mean = [turning_rig.turned(uv, f.angle, SIZE) for f in calibrated]
+        return turning_rig.turned(uv, angle, SIZE) - np.mean(mean, axis=0)
+
+    for angle in [frame.angle for frame in others[:3]]:
+        corrector = found.at(angle)
+        v, u = np.nonzero((corrector.status == OK) & found.mean.mask)
+        by_mean = found.mean.source[:, v, u].T.astype(float)
+        change = true_change(by_mean, angle)
+        error = corrector.source[:, v, u].T - by_mean - change
+        # Shift, scale and shear are as well the interior orientation.
+        affine = np.column_stack([np.ones(len(u)), by_mean])
+
+        def rms(values, affine=affine):
+            return np.std(values - affine @ np.linalg.lstsq(affine, values, rcond=None)[0])
+
+        assert rms(error) < 0.3 * rms(change) and rms(error) < 0.05

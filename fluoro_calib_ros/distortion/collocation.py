@@ -433,7 +433,9 @@ class CollocationTerms(AdjustedTerms):
         added = False
         for f, functions in enumerate(self.functions):
             points = self._fitted_points(f, adjustment)
-            found = shown_ripples(self.sizes[f], points.uv, points.residuals, functions.complete)
+            found = shown_ripples(
+                self.sizes[f], points.uv, points.residuals, points.exposure, functions.complete
+            )
             if found is not None:
                 signal = self.priors[f].signal
                 signal = replace(signal, ripples=found.joined(signal.ripples))

@@ -25,6 +25,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import t as student
 
 from .series import MARGIN, Functions
 
@@ -33,6 +34,9 @@ SEARCHED_BANDS = 50
 # Standard deviations by which the mean power of a band with ripples exceeds that of noise.
 SIGNIFICANT = 5.0
 INDEPENDENT = 1 / MARGIN**2  # part of the sines, over their rectangle, that the image can tell
+# Chance that ripples which differ between exposures agree in a band.
+FALSE_ALARM = 1e-5
+MIN_PAIRS = 3  # of exposures, whose scatter is the standard error of a mean product
 BESIDE = 1  # bands next to one with ripples that are used, too: the image ends, and waves do not
 LEAST_EXCESS = 0.1  # power that a band starts with, over that of noise
 
@@ -89,7 +93,11 @@ def ripples_of(functions: Functions, coefficients: np.ndarray) -> Ripples | None
 
 
 def shown_ripples(
-    image_size: tuple[int, int], uv: np.ndarray, residuals: np.ndarray, complete: int
+    image_size: tuple[int, int],
+    uv: np.ndarray,
+    residuals: np.ndarray,
+    exposure: np.ndarray,
+    complete: int,
 ) -> Ripples | None:
     """Return the ripples that residuals show beyond the sines of a series, or None.
 
@@ -99,6 +107,8 @@ def shown_ripples(
         Width and height of the image [px].
     uv, residuals : (n, 2) ndarray
         Image points and their residuals [px].
+    exposure : (n,) ndarray
+        Exposures of the image points.
     complete : int
         Bands up to which the series has all sines.
     """
@@ -111,6 +121,8 @@ def shown_ripples(
     bands = np.arange(len(number))
     # The power of a sine has a standard deviation of one: it is a mean of two squares.
     shown = (excess > SIGNIFICANT / np.sqrt(INDEPENDENT * number)) & (bands > complete)
+    if shown.any():
+        shown[shown] = _are_common(functions, uv, residuals, exposure, bands[shown])
     if not shown.any():
         return None
     used = np.convolve(shown, np.ones(2 * BESIDE + 1), 'same') > 0
@@ -119,3 +131,34 @@ def shown_ripples(
     return Ripples(
         functions.frequency_of_mode, tuple(float(v) for v in np.where(used, variances, 0.0))
     )
+
+
+def _are_common(
+    functions: Functions,
+    uv: np.ndarray,
+    residuals: np.ndarray,
+    exposure: np.ndarray,
+    bands: np.ndarray,
+) -> np.ndarray:
+    """Whether the ripples of residuals (n, 2) in bands (b,) are common to the exposures (n,).
+
+    The products of pairs of exposures are compared with zero by Student's t: those of different
+    pairs are uncorrelated where the ripples of an exposure have their own signs.
+    """
+    sums = np.stack(
+        [
+            functions.sums_of_sines(uv[exposure == e], residuals[exposure == e])[0]
+            for e in np.unique(exposure)
+        ]
+    )
+    first, second = np.triu_indices(len(sums), 1)
+    if len(first) < MIN_PAIRS:
+        return np.zeros(len(bands), dtype=bool)
+    limit = student.isf(FALSE_ALARM, len(first) - 1)
+    out = []
+    for band in bands:
+        own = sums[:, functions.band == band].reshape(len(sums), -1)
+        product = (own @ own.T)[first, second]
+        error = np.std(product, ddof=1) / np.sqrt(len(product))
+        out.append(np.mean(product) > limit * error)
+    return np.array(out)

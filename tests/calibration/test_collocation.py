@@ -440,12 +440,25 @@ def test_residuals_show_the_band_of_ripples(wavelength, count):
     """
     uv = pixels(count, 4, (1024, 1024))
     noise = np.random.default_rng(6).normal(0, 0.25, uv.shape)
-    assert shown_ripples((1024, 1024), uv, noise, 10) is None
-    found = shown_ripples((1024, 1024), uv, noise + plane_wave(uv, wavelength), 10)
+    exposure = np.arange(count) % 12
+    wave = noise + plane_wave(uv, wavelength)
+    assert shown_ripples((1024, 1024), uv, noise, exposure, 10) is None
+    found = shown_ripples((1024, 1024), uv, wave, exposure, 10)
     band = 2 * 1.3 * 1024 / wavelength
     assert min(found.bands) < band < max(found.bands)
     assert len(found.bands) <= 9
-    assert shown_ripples((1024, 1024), uv, noise + plane_wave(uv, wavelength), 48) is None
+    assert shown_ripples((1024, 1024), uv, wave, exposure, 48) is None
+
+
+@pytest.mark.parametrize('exposures', [3, 15])
+def test_ripples_that_differ_between_exposures_are_not_those_of_the_distortion(exposures):
+    """Corners of a board that are all displaced alike: a wave that moves with the board."""
+    rng = np.random.default_rng(7)
+    exposure = np.repeat(np.arange(exposures), 200)
+    uv = pixels(len(exposure), 4, (1024, 1024))
+    shift = rng.uniform(0, 70, (exposures, 2))[exposure]
+    residuals = plane_wave(uv + shift, 70.0) + rng.normal(0, 0.1, uv.shape)
+    assert shown_ripples((1024, 1024), uv, residuals, exposure, 10) is None
 
 
 def test_dent_whose_image_points_look_like_false_matches_is_followed():

@@ -226,7 +226,7 @@ def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series
     """Standard deviations (33, 33) [px] on the grid of a series where rejected points agree.
 
     They are the largest RMS residual of those nearby, and zero where there are none, or where
-    chance explains that they agree.
+    chance explains that they agree. Inliers beside them count as image points without that error.
     """
     out = np.zeros(series.sd.size)
     noise = float(np.sqrt(np.mean(inliers.residuals**2)))
@@ -248,12 +248,14 @@ def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series
         return out.reshape(series.sd.shape)
     number = np.bincount(np.concatenate([i[agree], j[agree]]), minlength=len(possible))
     found = np.flatnonzero(number >= AGREE_WITH)
+    beside = cKDTree(inliers.uv).query_ball_point(uv, reach, return_length=True)
+    share = (number + 1) / (number + 1 + beside)
     pixels = sd_grid_pixels(series.functions.image_size)
     # Every one of them reaches the nodes about it.
     cell = np.linalg.norm(np.asarray(series.functions.image_size) / (SD_GRID - 1))
     for row in found:
         near = np.linalg.norm(pixels - uv[row], axis=1) < max(reach, cell)
-        out[near] = np.maximum(out[near], size[possible[row]] / np.sqrt(2))
+        out[near] = np.maximum(out[near], size[possible[row]] * np.sqrt(share[row] / 2))
     return out.reshape(series.sd.shape)
 
 

@@ -171,8 +171,14 @@ def test_rejected_points_that_agree_are_an_error_of_the_correction():
     assert not nothing.any()
     dent = np.flatnonzero(np.linalg.norm(uv - [600, 150], axis=1) < 40)
     residuals = np.array([1.5, -1.0]) + rng.normal(0, NOISE, (len(dent), 2))
-    found = sd_of_rejected(inliers, FittedPoints(uv[dent], residuals, exposure[dent]), series)
+    rejected = FittedPoints(uv[dent], residuals, exposure[dent])
+    rest = np.setdiff1d(np.arange(len(uv)), dent)
+    outside = FittedPoints(uv[rest], inliers.residuals[rest], exposure[rest])
+    found = sd_of_rejected(outside, rejected, series)
     row = round(150 / SIZE[1] * (SD_GRID - 1))
     column = round(600 / SIZE[0] * (SD_GRID - 1))
     assert 1.0 < found[row, column] < 2.0
     assert (found > 0).mean() < 0.05
+    # With as many inliers beside them, they are half of the variance there.
+    half = sd_of_rejected(inliers, rejected, series)
+    assert half[row, column] == pytest.approx(found[row, column] / np.sqrt(2), rel=0.1)

@@ -40,6 +40,7 @@ from .scoring import (
     false_matches,
     inside_hull,
     rms,
+    solved,
     unseen_residuals,
 )
 from .sets import CAMERA, DataSet
@@ -215,40 +216,47 @@ def _measure(
     }
     held = {name: parts[0] for name, parts in by_frame.items()}
     residuals = {name: parts[1] for name, parts in by_frame.items()}
-    wrong = false_matches(residuals)
+    good = solved(residuals)
+    wrong = false_matches({name: residuals[name] for name in good})
     uv = np.concatenate([frame.uv for frame in tested])
     inside = inside_hull(training, uv)
     fold.false = int(wrong.sum())
     fold.inside = int((inside & ~wrong).sum())
     fold.outside = int((~inside & ~wrong).sum())
     for name, r in residuals.items():
+        if name not in good:
+            for table in (fold.rms, fold.rms_inside, fold.rms_outside, fold.rms_held):
+                table[name] = float('nan')
+            continue
         fold.rms[name] = rms(r[~wrong])
         fold.rms_inside[name] = rms(r[inside & ~wrong])
         fold.rms_outside[name] = rms(r[~inside & ~wrong])
         fold.rms_held[name] = rms(held[name][inside & ~wrong])
-    _test_claims(data, tested, outcome, inside & ~wrong, fold)
+    _test_claims(data, tested, outcome, np.stack([inside, inside & ~wrong], axis=1), fold)
 
 
 def _test_claims(
     data: DataSet,
     tested: Sequence[Frame],
     outcome: fc.CalibrationOutcome,
-    good: np.ndarray,
+    inside: np.ndarray,
     fold: Fold,
 ) -> None:
     """Fill in what an adjustment of the tested exposures with the calibration held says.
 
-    good: image points, in the order of the frames, that count.
+    inside (N, 2): image points, in the order of the frames, in the hull of the calibrated area,
+    and those of them that some camera explains.
     """
     adjusted = fc.adjust({CAMERA: tested}, data.phantom, outcome.calibrations)
     table = adjusted.residuals
     assert table is not None
     keys = [(f.number, i) for f in tested for i in f.target_id.tolist()]
-    counts = dict(zip(keys, good.tolist()))
-    kept = np.array(
+    counts = dict(zip(keys, inside.tolist()))
+    kept, explained = np.array(
         [counts[key] for key in zip(table.exposure.tolist(), table.target_id.tolist())]
-    )
-    fold.rejected = float(np.mean(table.outlier[kept]))
+    ).T
+    fold.rejected = float(np.mean(table.outlier[explained]))
+    # What no camera explains and the adjustment keeps is in the claim, too.
     kept &= ~table.outlier
     claimed = outcome.calibrations[CAMERA].correct(table.uv[kept], exact=True).sigma
     square = np.sum(table.residual[kept] ** 2 / claimed[:, None] ** 2)

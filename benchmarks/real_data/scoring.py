@@ -48,6 +48,8 @@ MIN_SD_PX = 1e-3
 # camera.
 GROSS = 8.0
 GROSS_PX = 1.0
+# A calibration has failed if its typical residual is so many times that of the best camera.
+FAILED = 30.0
 
 
 # Residuals (n, 2) [px] of an exposure for a pose (6,) and targets (n, 3).
@@ -198,6 +200,13 @@ def inside_hull(training: Sequence[Frame], uv: np.ndarray) -> np.ndarray:
     """Whether pixels (n, 2) are in the convex hull of the image points of exposures."""
     hull = ConvexHull(np.concatenate([frame.uv for frame in training]))
     return (uv @ hull.equations[:, :2].T + hull.equations[:, 2] <= 1e-9).all(axis=1)
+
+
+def solved(residuals: Mapping[str, np.ndarray]) -> list[str]:
+    """Names of the cameras whose calibration has not failed, from residuals (n, 2) by camera."""
+    size = {name: float(np.median(np.linalg.norm(r, axis=1))) for name, r in residuals.items()}
+    best = min(value for value in size.values() if np.isfinite(value))
+    return [name for name, value in size.items() if value <= FAILED * best]
 
 
 def false_matches(residuals: Mapping[str, np.ndarray]) -> np.ndarray:

@@ -292,7 +292,7 @@ class _LevenbergMarquardt:
 
     `current` is the best iterate so far, `steps` the number of steps, refused ones included.
     `finished` ends the iteration, `converged` tells whether at a minimum. `used`: the normal
-    equations of the last accepted step; None with relative orientations.
+    equations of the last accepted step, or at the minimum; None with relative orientations.
     """
 
     def __init__(self, problem: _Problem, start: Parameters, tolerance: float) -> None:
@@ -316,6 +316,7 @@ class _LevenbergMarquardt:
             return
         self._last = None
         if self._system is None:
+            self.used = None  # frees its memory before that of the next is taken
             self._system = self._problem.linearise(self.current.parameters)
         try:
             solver = self._problem.factorize(self._system, self._damping.mu)
@@ -326,14 +327,20 @@ class _LevenbergMarquardt:
         trial = self._problem.after(self.current, step)
         if self._is_worse(trial):
             self.converged = self._is_negligible(step.predicted)
+            if self.converged:
+                self._use(solver)
             self.finished = self.converged or self._damping.refuse()
             return
         self._damping.accept((self.current.cost - trial.cost) / max(step.predicted, 1e-300))
-        if not self._problem.network.relative:
-            self.used = solver
-            self._last = solver if self._problem.is_large else None
+        self._use(solver)
+        self._last = self.used if self._problem.is_large else None
         self._rate = step.predicted / self._predicted
         self._accept(trial, step.predicted)
+
+    def _use(self, solver: _Solver) -> None:
+        """Keep the normal equations at the current parameters."""
+        if not self._problem.network.relative:
+            self.used = solver
 
     def _repeat(self, solver: _Solver) -> bool:
         """Take a step with the factors of the last one; False where they do not serve.

@@ -106,7 +106,7 @@ class _SeriesPrior:
     ----------
     trend : (2t, 2t) ndarray
         Of the trend, u first.
-    signal : (s,) ndarray
+    signal : (s, s) ndarray
         Of the sines, the same for u and v.
     gauge : (2, g, t + s) ndarray
         Products with the coefficients of u and of v whose sums have the precision of one.
@@ -122,13 +122,13 @@ def _prior_of(terms: CollocationTerms, f: int) -> _SeriesPrior:
     functions = terms.functions[f]
     m = len(functions)
     t = functions.trend
-    diagonal_and_trend = prior_precision(functions, terms.priors[f])
+    precision = prior_precision(functions, terms.priors[f])
     at = np.concatenate([np.arange(t), m + np.arange(t)])
     uv = terms.network.uv[terms.network.rows(f)]
     rows = gauge_rows(terms.values[f], uv, terms.interior[f], terms.gauge_kinds[f])
     return _SeriesPrior(
-        diagonal_and_trend[np.ix_(at, at)],
-        np.diagonal(diagonal_and_trend)[t:m],
+        precision[np.ix_(at, at)],
+        precision[t:m, t:m],
         rows.reshape(-1, 2, m).transpose(1, 0, 2) / GAUGE_SD_PX,
     )
 
@@ -179,7 +179,7 @@ def _solved(prior: _SeriesPrior, gram: np.ndarray, right: np.ndarray) -> np.ndar
     of_trend = gram[t:, :t]
     of_gauge = prior.gauge[:, :, t:]
     columns = np.column_stack([of_trend, *of_gauge.transpose(0, 2, 1), right[t:]])
-    factor = cho_factor(gram[t:, t:] + np.diag(prior.signal), lower=True)
+    factor = cho_factor(gram[t:, t:] + prior.signal, lower=True)
     solved = cho_solve(factor, columns)
     by_trend = solved[:, :t]
     by_gauge = [solved[:, t : t + g], solved[:, t + g : t + 2 * g]]

@@ -43,7 +43,15 @@ from .exposure_terms import (
     without_exposure_terms,
 )
 from .exposure_variance import estimates_beside_free_points, variance_between_exposures
-from .misfit import LARGEST_SD, FittedPoints, LeftOut, areas_of_rejected, has_common_error
+from .local_signal import correlation_beyond
+from .misfit import (
+    LARGEST_SD,
+    FittedPoints,
+    LeftOut,
+    LeftOutInPlaces,
+    areas_of_rejected,
+    has_common_error,
+)
 from .priors import (
     Prior,
     gauge_precision,
@@ -51,6 +59,8 @@ from .priors import (
     most_likely_prior,
     prior_precision,
     starting_prior,
+    with_more_places,
+    with_shown_places,
 )
 from .ripples import ripples_of, shown_ripples
 from .series import Functions, Series, sd_over_image, without_absent_bands
@@ -67,6 +77,8 @@ RINGS = 2  # radial polynomials of degree 5 and 7: what a lens or a curved scree
 START_MODES = 16  # half waves along the image, until the signal is known
 MIN_MODES = 10
 TAKEN_BACK_MODES = 24  # to start with where rejected image points agree; more may follow
+LOCAL_MODES = 24  # that tell the bumps of a place where the signal varies more
+MAX_PLACE_SEARCHES = 4  # for more such places, beside those that there are
 MAX_MODES = 30  # the time grows with the sixth power
 # Prior variance times information of a sine below which the image points say nothing about it.
 NEGLIGIBLE = 0.2
@@ -153,6 +165,8 @@ class CollocationTerms(AdjustedTerms):
         self._mode_changes = 0
         self._settled = 0
         self._searches = [0] * len(self.sizes)
+        self._places_searched = modes == 0
+        self._place_searches = [0] * len(self.sizes)
         self._start = self.zeros()
         if earlier is not None:
             self._continue(earlier, before)
@@ -170,6 +184,7 @@ class CollocationTerms(AdjustedTerms):
         self._variation_tested = not earlier.is_varying
         self._ripples_searched = True  # those of the earlier series are kept
         self.final_tolerance = CONTINUED_TOLERANCE
+        self._places_searched = all(prior is not None for prior in earlier.priors)
         self._mode_changes = 1  # those of the earlier series are not the first
         start = []
         for f, (series, prior) in enumerate(zip(earlier.series, earlier.priors)):
@@ -182,6 +197,7 @@ class CollocationTerms(AdjustedTerms):
                 prior = self._prior_of(f, matrix, before.noise.scale)
             else:
                 self._searches[f] = MAX_SEARCHES  # done where this prior was estimated
+                self._place_searches[f] = MAX_PLACE_SEARCHES
             self.priors.append(prior)
             start.append(matrix.ravel())
         self._start = tuple(start)
@@ -284,7 +300,14 @@ class CollocationTerms(AdjustedTerms):
             return None
         signal = self.priors[f].signal
         highest = functions.highest
-        return LeftOut(signal.sd_beyond(highest), partial(signal.correlation_beyond, highest))
+        local = self.priors[f].local
+        places = None
+        if local is not None:
+            places = LeftOutInPlaces(
+                partial(local.variance_beyond, functions), partial(correlation_beyond, functions)
+            )
+        correlation = partial(signal.correlation_beyond, highest)
+        return LeftOut(signal.sd_beyond(highest), correlation, places)
 
     def variance_between_exposures(
         self, f: int, network: Network, adjustment: Adjustment, precise: Precision
@@ -346,6 +369,11 @@ class CollocationTerms(AdjustedTerms):
             found_short = self._add_sines(adjustment, coefficients)
             if found_short is not None:
                 return False, found_short
+        if settled and not self._places_searched:
+            self._places_searched = True
+            modes = self._add_places(adjustment, coefficients)
+            if modes != present_modes:
+                return False, self._with_modes(modes, coefficients)
         self._settled = self._settled + 1 if settled else 0
         return settled, coefficients
 
@@ -381,6 +409,28 @@ class CollocationTerms(AdjustedTerms):
                 values = adjustment.residuals[own] + corrections[f]
                 out[f] = self._followed(f, values, used, adjustment.noise.scale)
         return tuple(out)
+
+    def _add_places(
+        self, adjustment: Adjustment, coefficients: tuple[np.ndarray, ...]
+    ) -> list[int]:
+        """Add places where the signal varies more; return the modes that they need."""
+        modes = []
+        corrections = self._corrections(coefficients)
+        for f, functions in enumerate(self.functions):
+            fine = replace(functions, modes=max(LOCAL_MODES, functions.modes))
+            rows = self.network.rows(f)
+            used = adjustment.inliers[rows]
+            rows = rows[used]
+            noise = adjustment.noise.scale * self.network.sigma[rows]
+            root = (np.sqrt(adjustment.noise.weight(adjustment.q[rows])) / noise)[:, None]
+            observed = adjustment.residuals[rows] + corrections[f][used]
+            values = fine(self.network.uv[rows])
+            found = with_shown_places(fine, values * root, observed * root, self.priors[f])
+            if found.local is not None:
+                self.priors[f] = found
+                self._settled = 0
+            modes.append(functions.complete if found.local is None else fine.complete)
+        return modes
 
     def _corrections(self, coefficients: tuple[np.ndarray, ...]) -> list[np.ndarray]:
         """Corrections (n, 2) [px] of the image points of each fluoroscope by the series."""
@@ -487,12 +537,16 @@ class CollocationTerms(AdjustedTerms):
             return most_likely_prior(functions, information, right, gauge, prior, search)
 
         prior = renewed(last, False)
-        change = prior.signal.change(last.signal, functions.frequency) if functions.modes else 0.0
+        change = prior.change(last, functions) if functions.modes else 0.0
         cheap = 0 < functions.modes <= SEARCHED_MODES
         if cheap and change < SETTLED_PRIOR and self._searches[f] < MAX_SEARCHES:
             self._searches[f] += 1
             prior = renewed(last, True)
-            change = prior.signal.change(last.signal, functions.frequency)
+            change = prior.change(last, functions)
+        if prior.local is not None and self._place_searches[f] < MAX_PLACE_SEARCHES:
+            self._place_searches[f] += 1
+            prior = with_more_places(functions, information, right, self.gauges[f], prior)
+            change = prior.change(last, functions)
         self.priors[f] = prior
         self.gauges[f] = self._gauge(f)
         if not functions.modes:
@@ -530,6 +584,8 @@ class CollocationTerms(AdjustedTerms):
         variance = self.priors[f].signal.density(numbers * functions.frequency_of_mode)
         enough = numbers[variance * level < NEGLIGIBLE]
         wanted = int(enough[0]) if len(enough) else MAX_MODES
+        if self.priors[f].local is not None:
+            wanted = max(wanted, LOCAL_MODES)
         kept = FEWER_MODES * complete <= wanted <= complete
         return complete if kept and self._mode_changes else wanted
 

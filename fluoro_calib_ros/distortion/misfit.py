@@ -28,7 +28,7 @@ from each other, but these agree.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -44,6 +44,7 @@ POINTS = 60  # image points about a node of the grid
 SIGNIFICANT = 4.0
 SIGNIFICANT_LOCAL = 4.5
 MAX_GROWTH = 4.0  # of a mean product that is extrapolated to no distance
+PLACE = 0.1  # of the largest variance of a place, up to which image points are in it
 MIN_CORRELATION = 0.05  # with which products show what a series leaves out
 FAR = 30.0  # standard deviations below zero
 # Rejected image points agree within so many standard deviations of an inlier, over so many times
@@ -98,10 +99,23 @@ class RejectedArea:
 class LeftOut:
     """What a series leaves out by design, as its covariance function expects it.
 
-    sd_px: standard deviation [px]; correlation: callable, of distances (n,) [px].
+    sd_px: standard deviation [px]; correlation: callable, of distances (n,) [px]; places: the same
+    for what is left out in places, None: nowhere.
     """
 
     sd_px: float
+    correlation: Callable[[np.ndarray], np.ndarray]
+    places: LeftOutInPlaces | None = None
+
+
+@dataclass(frozen=True)
+class LeftOutInPlaces:
+    """What a series leaves out where the signal varies more.
+
+    variance: callable, variances [px^2] at pixels (n, 2); correlation: as in `LeftOut`.
+    """
+
+    variance: Callable[[np.ndarray], np.ndarray]
     correlation: Callable[[np.ndarray], np.ndarray]
 
 
@@ -207,8 +221,12 @@ def sd_with_misfit(
     variance = series.sd**2
     if len(products.uv) < 2 * POINTS:
         return variance**0.5 if left_out is None else np.hypot(series.sd, left_out.sd_px)
-    beyond = 0.0 if left_out is None else _variance_left_out(products, series, left_out)
     pixels = sd_grid_pixels(series.functions.image_size)
+    beyond = np.zeros(len(pixels))
+    if left_out is not None:
+        beyond += _variance_left_out(products, series, left_out)
+        if left_out.places is not None:
+            beyond += _variance_in_places(products, series, left_out.places, pixels)
     _, near = cKDTree(products.uv).query(pixels, k=POINTS)
     mean = products.value[near].mean(axis=1)
     # Each product occurs twice among the points about a node.
@@ -298,6 +316,29 @@ def areas_of_rejected(
         RejectedArea(size, chance * float(np.sqrt(np.log(len(found) / alarm))), rows)  # Bonferroni
         for size, chance, alarm, rows in found
     ]
+
+
+def _variance_in_places(
+    products: _Products, series: Series, places: LeftOutInPlaces, pixels: np.ndarray
+) -> np.ndarray:
+    """Variances (n,) [px^2] at pixels (n, 2) of what a series leaves out in places.
+
+    The share of what is expected there is that which the products of these places show.
+    """
+    expected = places.variance(products.uv)
+    inside = expected > PLACE * np.max(expected, initial=0.0)
+    if not inside.any():
+        return places.variance(pixels)
+    within = replace(
+        products,
+        **{
+            name: getattr(products, name)[inside]
+            for name in ('uv', 'value', 'shown', 'exposure', 'distance')
+        },
+    )
+    mean = float(np.mean(expected[inside]))
+    found = _variance_left_out(within, series, LeftOut(mean**0.5, places.correlation))
+    return found / mean * places.variance(pixels)
 
 
 def _variance_left_out(products: _Products, series: Series, left_out: LeftOut) -> float:

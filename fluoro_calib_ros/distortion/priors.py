@@ -26,9 +26,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from .gauge import GaugeKind, gauge_rows
+from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_more_windows
 from .series import Functions
 from .signal import Signal, SignalEquations, most_likely_signal, starting_signal
 from .terms import trend_transformation
@@ -46,6 +47,11 @@ ABSENT_VARIANCE = 1e-8
 # Square of such a term over its variance from which it exists. It costs errors beyond the
 # calibrated area, where it grows fast; at 1, chance alone would make one of three exist.
 RING_EXISTS = 9.0
+# Gain of the logarithm of the likelihood by a window, with the signal of fewer sines, from which
+# the signal is estimated with more; renewals of it then.
+SUSPECTED_GAIN = 2.0
+SIGNAL_ROUNDS = 3
+RIDGE = 1e-9  # relative increase of a diagonal
 SWEEPS = 3  # over the terms of the trend
 
 
@@ -53,11 +59,20 @@ SWEEPS = 3  # over the terms of the trend
 class Prior:
     """Prior of a distortion.
 
-    signal: covariance function of the signal; trend (t,): variances of the trend terms [px^2].
+    signal: covariance function of the signal; trend (t,): variances of the trend terms [px^2];
+    local: where the signal varies more, None: nowhere.
     """
 
     signal: Signal
     trend: np.ndarray
+    local: LocalSignal | None = None
+
+    def change(self, other: Prior, functions: Functions) -> float:
+        """Mean change of the logarithms of the variances of the signal from another prior."""
+        change = self.signal.change(other.signal, functions.frequency)
+        if self.local is None:
+            return change if other.local is None else np.inf
+        return max(change, self.local.change(other.local))
 
 
 def starting_prior(functions: Functions, sd: float) -> Prior:
@@ -80,13 +95,24 @@ def prior_precision(functions: Functions, prior: Prior) -> np.ndarray:
     t = functions.trend
     out = np.zeros((2 * m, 2 * m))
     if functions.modes:
-        signal = 1 / prior.signal.variance(functions.frequency)
+        signal = signal_precision(functions, prior)
         for axis in (0, 1):
-            at = axis * m + np.arange(t, m)
-            out[at, at] = signal
+            own = slice(axis * m + t, (axis + 1) * m)
+            out[own, own] = signal
     at = _trend_columns(functions)
     out[np.ix_(at, at)] = _trend_precision(functions, prior)
     return out
+
+
+def signal_precision(functions: Functions, prior: Prior) -> np.ndarray:
+    """Precision matrix (s, s) of the coefficients of the sines of u, or of v."""
+    variance = prior.signal.variance(functions.frequency)
+    if prior.local is None:
+        return np.diag(1 / variance)
+    base = bumps(functions, prior.local.nodes)
+    covariance = (base * prior.local.of_bumps) @ base.T
+    covariance[np.diag_indices(len(variance))] += variance
+    return cho_solve(cho_factor(covariance, lower=True), np.eye(len(variance)))
 
 
 def _trend_columns(functions: Functions) -> np.ndarray:
@@ -170,9 +196,118 @@ def _most_likely_signal(
     base[np.ix_(at, at)] += _trend_precision(functions, prior)
     columns = np.setdiff1d(np.arange(len(right)), at)
     side = max(functions.image_size)
+    local = prior.local
+    if local is not None:
+        base, right = _with_bumps(functions, base, right, local)
     equations = SignalEquations(functions.frequency, base, right, columns)
     found = most_likely_signal(prior.signal, equations, side, search)
-    return replace(prior, signal=found)
+    if local is not None:
+        local = _renewed(local, equations, found.variance(functions.frequency))
+    return replace(prior, signal=found, local=local)
+
+
+def _with_bumps(
+    functions: Functions, matrix: np.ndarray, right: np.ndarray, local: LocalSignal
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations with the heights of the bumps as further unknowns, those of u first.
+
+    matrix (2m, 2m), right (2m,): of the coefficients. The coefficients of the sines are then what
+    the bumps leave.
+    """
+    m = len(functions)
+    base = bumps(functions, local.nodes)
+    sines = [slice(axis * m + functions.trend, (axis + 1) * m) for axis in (0, 1)]
+    mixed = np.concatenate([matrix[:, own] @ base for own in sines], axis=1)
+    corner = np.concatenate([base.T @ mixed[own] for own in sines])
+    size = corner.shape[0]
+    corner[np.diag_indices(size)] += 1 / np.tile(local.of_bumps, 2)
+    out = np.asfortranarray(np.block([[matrix, mixed], [mixed.T, corner]]))
+    return out, np.concatenate([right, *(base.T @ right[own] for own in sines)])
+
+
+def _renewed(
+    local: LocalSignal, equations: SignalEquations, variance: np.ndarray
+) -> LocalSignal | None:
+    """Return the windows with more likely variances; variance (s,): of the sines."""
+    matrix = equations.information.copy(order='F')
+    columns = equations.columns
+    matrix[columns, columns] += 1 / np.tile(variance, 2)
+    size = 2 * len(local.nodes)
+    units = np.eye(len(matrix))[:, -size:]
+    factor = cho_factor(matrix, lower=True)
+    solved = cho_solve(factor, np.column_stack([equations.right, units]))[-size:]
+    mean, heights = solved[:, 0], np.diagonal(solved[:, 1:])
+    return local.renewed(mean.reshape(2, -1), heights.reshape(2, -1))
+
+
+def with_shown_places(
+    functions: Functions, values: np.ndarray, observed: np.ndarray, prior: Prior
+) -> Prior:
+    """Return the prior with windows where the signal varies more, as image points show them.
+
+    Orientations are taken to be known, and the trend to have no prior, so that u and v have the
+    same matrices. The signal is estimated anew only where a window may be found.
+
+    Parameters
+    ----------
+    functions : Functions
+    values : (n, m) ndarray
+        Functions at the image points, divided by the standard deviation of their noise.
+    observed : (n, 2) ndarray
+        Corrections that they show, divided likewise.
+    prior : Prior
+
+    Returns
+    -------
+    Prior
+    """
+    t = functions.trend
+    matrix = values.T @ values
+    right = values.T @ observed
+    matrix[np.arange(t), np.arange(t)] *= (
+        1 + RIDGE
+    )  # terms that the image points do not tell apart
+
+    def estimates() -> SineEstimates:
+        precision = signal_precision(functions, prior)
+        whole = matrix.copy()
+        whole[t:, t:] += precision
+        factor = cho_factor(whole, lower=True)
+        covariance = cho_solve(factor, np.eye(len(whole))[:, t:])[t:]
+        return SineEstimates.of(precision, cho_solve(factor, right)[t:], covariance[None])
+
+    found = estimates()
+    if largest_gain(functions, found) < SUSPECTED_GAIN:
+        return prior
+    columns = np.concatenate([axis * len(matrix) + np.arange(t, len(matrix)) for axis in (0, 1)])
+    both = np.asfortranarray(block_diag(matrix, matrix))
+    equations = SignalEquations(functions.frequency, both, right.T.ravel(), columns)
+    side = max(functions.image_size)
+    for _ in range(SIGNAL_ROUNDS):
+        prior = replace(prior, signal=most_likely_signal(prior.signal, equations, side))
+    return replace(prior, local=with_more_windows(functions, estimates(), prior.local))
+
+
+def with_more_places(
+    functions: Functions,
+    information: np.ndarray,
+    right: np.ndarray,
+    gauge: np.ndarray,
+    prior: Prior,
+) -> Prior:
+    """Return the prior with more windows where the signal varies more, if there are any.
+
+    The arguments are those of `most_likely_prior`.
+    """
+    m = len(functions)
+    t = functions.trend
+    precision = information + gauge + prior_precision(functions, prior)
+    covariance = cho_solve(cho_factor(precision, lower=True), np.eye(2 * m))
+    mean = (covariance @ right).reshape(2, m).T[t:]
+    sines = [slice(axis * m + t, (axis + 1) * m) for axis in (0, 1)]
+    covariances = np.stack([covariance[own, own] for own in sines])
+    estimates = SineEstimates.of(signal_precision(functions, prior), mean, covariances)
+    return replace(prior, local=with_more_windows(functions, estimates, prior.local))
 
 
 def _most_likely_trend(
@@ -214,9 +349,9 @@ def _trend_alone(
     if not len(rest):
         return information, right
     signal = information[np.ix_(rest, rest)].copy()
-    signal[np.diag_indices(len(rest))] += 1 / np.tile(
-        prior.signal.variance(functions.frequency), 2
-    )
+    own = signal_precision(functions, prior)
+    signal[: len(own), : len(own)] += own
+    signal[len(own) :, len(own) :] += own
     mixed = information[np.ix_(rest, at)]
     solved = cho_solve(cho_factor(signal, lower=True), np.column_stack([mixed, right[rest]]))
     reduced = information[np.ix_(at, at)] - mixed.T @ solved[:, :-1]

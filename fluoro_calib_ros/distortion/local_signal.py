@@ -1,0 +1,257 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Places where the signal of a distortion varies more than elsewhere.
+
+A dent of the input screen or the seam of two fibre plates is no stationary field: one covariance
+function for the whole image follows it too little there, and follows noise elsewhere. Places are
+square windows with Gaussian bumps, whose heights have a variance of their own. The bumps are
+written as sums of the sines of the series, so that a place changes only the prior of their
+coefficients.
+
+Windows are added where they raise the marginal likelihood clearly, and then those beside them
+where they raise it at all: an edge goes on. For one more component of a covariance the gain is
+known exactly without a new solution (Tipping and Faul, "Fast marginal likelihood maximisation for
+sparse Bayesian models", 2003; here for the bumps of a window together). Variances are renewed as
+in MacKay, "Bayesian interpolation", Neural Computation 4, 1992.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import j0
+
+from .series import Functions
+
+WIDTH = 24 / 1024  # of a bump (one standard deviation), relative to the longer side of the image
+NODES = 32  # bumps along that side
+WINDOWS = 8  # windows along that side; they overlap by half
+# Gain of the logarithm of the likelihood from which a window is added: anywhere, which chance does
+# in one of twenty images, and beside those that there are.
+MIN_GAIN = 6.0
+MIN_GAIN_BESIDE = 1.5
+VARIANCES = np.geomspace(1e-3, 30.0, 40)  # of the heights [px^2] that are tried
+MIN_VARIANCE = 2e-4  # [px^2] below which a window is left out again
+# Frequencies of a quadrature, from the lowest to so many times it.
+QUADRATURE = 60
+SHORTEST = 6.0
+MIN_DETERMINED = 1e-2  # least number of heights that a sum counts as determined
+
+
+@dataclass(frozen=True)
+class LocalSignal:
+    """Bumps of the windows where the signal varies more.
+
+    Attributes
+    ----------
+    nodes : (n, 2) ndarray
+        Middles of the bumps [px].
+    window : (n,) ndarray of int
+        Window of each bump.
+    variances : (w,) ndarray
+        Variances of the heights of the bumps of each window [px^2], the same for u and v.
+    """
+
+    nodes: np.ndarray
+    window: np.ndarray
+    variances: np.ndarray
+
+    @property
+    def of_bumps(self) -> np.ndarray:
+        """Variances (n,) of the heights of the bumps [px^2]."""
+        return self.variances[self.window]
+
+    def variance_beyond(self, functions: Functions, uv: np.ndarray) -> np.ndarray:
+        """Variances (n,) [px^2] at pixels uv (n, 2) of what the sines of a series leave out."""
+        width = WIDTH * max(functions.image_size)
+        squares = np.sum((uv[:, None] - self.nodes[None]) ** 2, axis=2)
+        whole = np.exp(-squares / width**2) @ self.of_bumps
+        return whole * np.exp(-((functions.highest * width) ** 2))
+
+    def change(self, other: LocalSignal | None) -> float:
+        """Mean change of the logarithms of the variances; infinite where windows differ."""
+        if other is None or len(other.variances) != len(self.variances):
+            return np.inf
+        return float(np.mean(np.abs(np.log(self.variances / other.variances))))
+
+    def renewed(self, mean: np.ndarray, variance: np.ndarray) -> LocalSignal | None:
+        """Return the windows with more likely variances, without those that have vanished.
+
+        mean, variance (2, n): of the heights [px], [px^2]. None: no window is left.
+        """
+        count = len(self.variances)
+        squares = np.bincount(self.window, np.sum(mean**2, axis=0), count)
+        determined = np.sum(1 - variance / self.of_bumps, axis=0)
+        determined = np.bincount(self.window, determined, count)
+        variances = squares / np.maximum(determined, MIN_DETERMINED)
+        kept = variances > MIN_VARIANCE
+        if not kept.any():
+            return None
+        own = kept[self.window]
+        number = np.cumsum(kept) - 1
+        return LocalSignal(self.nodes[own], number[self.window[own]], variances[kept])
+
+
+@dataclass(frozen=True)
+class SineEstimates:
+    """What the image points say about the coefficients of the sines of u and of v.
+
+    Both times (s, 2) and (2, s, s), with K the prior covariance matrix of the coefficients of one
+    coordinate.
+
+    Attributes
+    ----------
+    pull : (s, 2) ndarray
+        Inverse of K times their estimates.
+    evidence : (k, s, s) ndarray
+        Inverse of K less that of K times their covariance times that of K: for u and v, or one
+        for both.
+    """
+
+    pull: np.ndarray
+    evidence: np.ndarray
+
+    @classmethod
+    def of(cls, precision: np.ndarray, mean: np.ndarray, covariances: np.ndarray) -> SineEstimates:
+        """Return them from the inverse of K (s, s), estimates (s, 2) and covariances (k, s, s)."""
+        evidence = [precision - precision @ one @ precision for one in covariances]
+        return cls(precision @ mean, np.stack(evidence))
+
+
+def bumps(functions: Functions, nodes: np.ndarray) -> np.ndarray:
+    """Coefficients (s, n) of the sines for bumps of height one about nodes (n, 2) [px].
+
+    A sine is an eigenfunction of the convolution with a Gaussian.
+    """
+    width = WIDTH * max(functions.image_size)
+    damped = 2 * np.pi * width**2 * np.exp(-((functions.frequency * width) ** 2) / 2)
+    return functions(nodes)[:, functions.trend :].T * damped[:, None]
+
+
+def correlation_beyond(functions: Functions, distance: np.ndarray) -> np.ndarray:
+    """Correlation (n,), at distances (n,) [px], of what the sines leave out of the bumps."""
+    f = functions.highest * np.geomspace(1, SHORTEST, QUADRATURE)
+    # f df on a geometric grid
+    weight = np.exp(-((f * WIDTH * max(functions.image_size)) ** 2)) * f**2
+    return j0(np.outer(distance, f)) @ weight / np.sum(weight)
+
+
+def with_more_windows(
+    functions: Functions, estimates: SineEstimates, local: LocalSignal | None
+) -> LocalSignal | None:
+    """Return the windows with those that raise the marginal likelihood.
+
+    Parameters
+    ----------
+    functions : Functions
+    estimates : SineEstimates
+        With the present windows.
+    local : LocalSignal or None
+        Present windows.
+
+    Returns
+    -------
+    LocalSignal or None
+        The present windows where there are no more.
+    """
+    nodes = _all_nodes(functions.image_size)
+    windows = _windows(functions.image_size, nodes)
+    found = _gains(functions, estimates)
+    taken = np.zeros(len(nodes), dtype=bool)
+    if local is not None:
+        taken = (np.abs(nodes[:, None] - local.nodes[None]).max(axis=2) < 1).any(axis=1)
+    out = local
+    reach = 1.01 * max(functions.image_size) / NODES
+    for place in np.argsort([-gain for gain, _ in found]):
+        gain, variance = found[place]
+        rows = windows[place]
+        if gain < MIN_GAIN_BESIDE:
+            break
+        if taken[rows].any():
+            continue
+        if gain < MIN_GAIN and not _is_beside(nodes[rows], nodes[taken], reach):
+            continue
+        taken[rows] = True
+        out = _joined(out, nodes[rows], variance)
+    return out
+
+
+def largest_gain(functions: Functions, estimates: SineEstimates) -> float:
+    """Largest gain of the logarithm of the likelihood by one more window."""
+    return max(gain for gain, _ in _gains(functions, estimates))
+
+
+def _gains(functions: Functions, estimates: SineEstimates) -> list[tuple[float, float]]:
+    """Gain of the logarithm of the likelihood by each window, and its most likely variance."""
+    nodes = _all_nodes(functions.image_size)
+    base = bumps(functions, nodes)
+    pulls = base.T @ estimates.pull
+    products = [base.T @ (one @ base) for one in estimates.evidence]
+    return [
+        _largest_gain(pulls[rows], [product[np.ix_(rows, rows)] for product in products])
+        for rows in _windows(functions.image_size, nodes)
+    ]
+
+
+def _all_nodes(image_size: tuple[int, int]) -> np.ndarray:
+    """Middles (n, 2) [px] of the bumps that an image may have."""
+    spacing = max(image_size) / NODES
+    u, v = ((np.arange(max(1, round(size / spacing))) + 0.5) * spacing for size in image_size)
+    return np.stack(np.meshgrid(u, v, indexing='ij'), axis=-1).reshape(-1, 2)
+
+
+def _windows(image_size: tuple[int, int], nodes: np.ndarray) -> list[np.ndarray]:
+    """Rows of the nodes (n, 2) [px] of each window."""
+    size = max(image_size) / WINDOWS
+    count = [max(1, int(np.ceil(2 * side / size)) - 1) for side in image_size]
+    corners = np.array(list(np.ndindex(*count))) * size / 2
+    inside = ((nodes >= corners[:, None]) & (nodes < corners[:, None] + size)).all(axis=2)
+    return [np.flatnonzero(one) for one in np.asarray(inside) if np.any(one)]
+
+
+def _largest_gain(pulls: np.ndarray, products: list[np.ndarray]) -> tuple[float, float]:
+    """Largest gain of the logarithm of the likelihood by one more window, and its variance.
+
+    pulls (b, 2) and products (b, b), for u and v or one for both: q and s of Tipping and Faul 2003
+    for b bumps.
+    """
+    gain = np.zeros(len(VARIANCES))
+    for axis in (0, 1):
+        values, vectors = np.linalg.eigh(products[min(axis, len(products) - 1)])
+        values = VARIANCES[:, None] * np.maximum(values, 0)
+        squares = VARIANCES[:, None] * (vectors.T @ pulls[:, axis]) ** 2
+        gain += np.sum(squares / (1 + values) - np.log1p(values), axis=1) / 2
+    best = int(np.argmax(gain))
+    return float(gain[best]), float(VARIANCES[best])
+
+
+def _is_beside(nodes: np.ndarray, others: np.ndarray, reach: float) -> bool:
+    """Whether some of the nodes (b, 2) are within reach [px] of others (n, 2)."""
+    distance = np.abs(nodes[:, None] - others[None]).max(axis=2)
+    return bool(np.min(distance, initial=np.inf) < reach)
+
+
+def _joined(local: LocalSignal | None, nodes: np.ndarray, variance: float) -> LocalSignal:
+    """Return the windows with one more, of nodes (b, 2)."""
+    if local is None:
+        return LocalSignal(nodes, np.zeros(len(nodes), dtype=int), np.array([variance]))
+    window = np.full(len(nodes), len(local.variances))
+    return replace(
+        local,
+        nodes=np.concatenate([local.nodes, nodes]),
+        window=np.concatenate([local.window, window]),
+        variances=np.append(local.variances, variance),
+    )

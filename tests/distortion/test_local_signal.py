@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 import rigs
 from scipy.linalg import block_diag
+from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.distortion.local_signal import (
@@ -43,6 +44,13 @@ from fluoro_calib_ros.distortion.signal import Signal
 SIZE = (1024, 1024)
 NOISE = 0.25
 SMOOTH = Prior(Signal(0.5, 300.0, 1e-3, 200.0), np.zeros(0))
+
+
+@pytest.fixture(autouse=True, scope='module')
+def one_thread():
+    """As the calibration runs."""
+    with threadpool_limits(1):
+        yield
 
 
 def place(middle, variance):
@@ -131,7 +139,7 @@ def test_place_is_found_and_its_variance_estimated():
 
 @pytest.mark.parametrize('reach', [80.0, 300.0])
 def test_field_that_is_the_same_everywhere_has_no_place(reach):
-    functions = Functions(SIZE, -1, 24)
+    functions = Functions(SIZE, -1, 18)
     prior = Prior(Signal(0.5, reach, 1e-3, 200.0), np.zeros(0))
     rng = np.random.default_rng(5)
     variance = prior.signal.variance(functions.frequency)
@@ -144,7 +152,7 @@ def test_field_that_is_the_same_everywhere_has_no_place(reach):
 
 
 def test_window_that_nothing_shows_vanishes():
-    functions = Functions(SIZE, -1, 24)
+    functions = Functions(SIZE, -1, 18)
     uv, values = drawn(functions)
     information, right = equations(functions, uv, values)
     prior = replace(SMOOTH, local=place((416.0, 608.0), 0.05))

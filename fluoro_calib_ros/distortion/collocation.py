@@ -62,7 +62,7 @@ from .priors import (
     with_more_places,
     with_shown_places,
 )
-from .ripples import ripples_of, shown_ripples
+from .ripples import Ripples, ripples_of, shown_ripples
 from .series import Functions, Series, sd_over_image, without_absent_bands
 from .series_model import SeriesModel
 
@@ -78,6 +78,8 @@ START_MODES = 16  # half waves along the image, until the signal is known
 MIN_MODES = 10
 TAKEN_BACK_MODES = 24  # to start with where rejected image points agree; more may follow
 LOCAL_MODES = 24  # that tell the bumps of a place where the signal varies more
+# Bands up to which a smooth field has its sines where others of few bands follow ripples.
+GAP_FROM = 12
 MAX_PLACE_SEARCHES = 4  # for more such places, beside those that there are
 MAX_MODES = 30  # the time grows with the sixth power
 # Prior variance times information of a sine below which the image points say nothing about it.
@@ -354,8 +356,9 @@ class CollocationTerms(AdjustedTerms):
         if settled and not self._ripples_searched:
             # Ripples may pass for a change between exposures.
             self._ripples_searched = True
-            if self._add_ripples(adjustment):
-                return False, self._with_modes(present_modes, coefficients)
+            ripple_modes = self._add_ripples(adjustment, coefficients)
+            if ripple_modes is not None:
+                return False, self._with_modes(ripple_modes, coefficients)
         if settled and not self._variation_tested:
             self._variation_tested = True
             if self._add_exposure_terms(adjustment):
@@ -478,20 +481,41 @@ class CollocationTerms(AdjustedTerms):
         precision = information + self.gauges[f] + prior_precision(self.functions[f], prior)
         return np.linalg.solve(precision, right)
 
-    def _add_ripples(self, adjustment: Adjustment) -> bool:
-        """Add ripples that residuals show in few bands of frequencies; True if any."""
+    def _add_ripples(
+        self, adjustment: Adjustment, coefficients: tuple[np.ndarray, ...]
+    ) -> list[int] | None:
+        """Add ripples in few bands of frequencies.
+
+        Residuals show them, or what the sines of these bands have already followed, with all
+        others that are as short. Returns the modes beside the ripples, None where there are none.
+        """
+        modes = []
         added = False
         for f, functions in enumerate(self.functions):
             points = self._fitted_points(f, adjustment)
-            found = shown_ripples(
-                self.sizes[f], points.uv, points.residuals, points.exposure, functions.complete
-            )
+            signal = self.priors[f].signal
+            modes.append(functions.complete)
+            found = self._shown_ripples(f, points, points.residuals, functions.complete)
+            if found is None and functions.complete > GAP_FROM and signal.ripples is None:
+                short = np.concatenate([np.zeros(functions.trend), functions.band > GAP_FROM])
+                own = coefficients[f][: 2 * len(functions)].reshape(2, -1) * short
+                followed = points.residuals + functions(points.uv) @ own.T
+                found = self._shown_ripples(f, points, followed, GAP_FROM)
+                found = None if found is None else found.alone()
+                if found is not None:
+                    signal = signal.without_short_field(max(self.sizes[f]))
+                    modes[f] = GAP_FROM
             if found is not None:
-                signal = self.priors[f].signal
                 signal = replace(signal, ripples=found.joined(signal.ripples))
                 self.priors[f] = replace(self.priors[f], signal=signal)
                 added = True
-        return added
+        return modes if added else None
+
+    def _shown_ripples(
+        self, f: int, points: FittedPoints, values: np.ndarray, complete: int
+    ) -> Ripples | None:
+        """Ripples of fluoroscope f that values (n, 2) [px] show beyond the complete bands."""
+        return shown_ripples(self.sizes[f], points.uv, values, points.exposure, complete)
 
     def _fitted_points(self, f: int, adjustment: Adjustment) -> FittedPoints:
         """Inliers of fluoroscope f."""

@@ -38,6 +38,7 @@ INDEPENDENT = 1 / MARGIN**2  # part of the sines, over their rectangle, that the
 FALSE_ALARM = 1e-5
 MIN_PAIRS = 3  # of exposures, whose scatter is the standard error of a mean product
 BESIDE = 1  # bands next to one with ripples that are used, too: the image ends, and waves do not
+BESIDE_PEAK = 0.2  # part of the power of the strongest band, up to which others belong to it
 LEAST_EXCESS = 0.1  # power that a band starts with, over that of noise
 
 
@@ -70,6 +71,18 @@ class Ripples:
         """Return ripples in the same bands with these variances (n,), of all bands."""
         own = np.where(np.asarray(self.variances) > 0, variances, 0.0)
         return replace(self, variances=tuple(float(value) for value in own))
+
+    def alone(self) -> Ripples | None:
+        """Return the ripples in the bands about the strongest; None: longer waves are as strong.
+
+        A field without ripples grows weaker from band to band.
+        """
+        variances = np.asarray(self.variances)
+        largest = float(variances.max())
+        if variances[self.bands[0]] > BESIDE_PEAK * largest:
+            return None
+        used = np.convolve(variances > BESIDE_PEAK * largest, np.ones(2 * BESIDE + 1), 'same') > 0
+        return replace(self, variances=tuple(float(v) for v in np.where(used, variances, 0.0)))
 
     def joined(self, other: Ripples | None) -> Ripples:
         """Return ripples with the bands of another, too; the variances of both add."""

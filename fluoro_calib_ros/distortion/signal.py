@@ -133,6 +133,10 @@ class Signal:
         """Return a signal with a short field to start with; side: of the image [px]."""
         return replace(self, fine_sd=SHOWN_PX, fine_reach=SHOWN_REACH * side)
 
+    def without_short_field(self, side: float) -> Signal:
+        """Return a signal whose short field starts anew, very small; side: of the image [px]."""
+        return replace(self, fine_sd=MIN_SD_PX, fine_reach=START_FINE_REACH * side)
+
     def change(self, other: Signal, frequency: np.ndarray) -> float:
         """Mean change of the logarithms of the variances at frequency (s,) from another signal."""
         ratio = self.variance(frequency) / other.variance(frequency)

@@ -461,6 +461,22 @@ def test_ripples_that_differ_between_exposures_are_not_those_of_the_distortion(e
     assert shown_ripples((1024, 1024), uv, residuals, exposure, 10) is None
 
 
+def test_ripples_that_short_sines_have_followed_stand_out_of_their_bands():
+    """A wave of 150 px and a field that grows weaker with its frequency, both with noise."""
+    uv = pixels(2000, 4, (1024, 1024))
+    exposure = np.arange(2000) % 15
+    noise = np.random.default_rng(6).normal(0, 0.25, uv.shape)
+    wave = shown_ripples((1024, 1024), uv, plane_wave(uv, 150.0) + noise, exposure, 12).alone()
+    assert min(wave.bands) <= 17 <= 18 <= max(wave.bands)
+    assert len(wave.bands) <= 7
+    functions = Functions((1024, 1024), -1, 30)
+    variance = Signal(1.0, 100.0).density(functions.frequency) * (functions.band > 12)
+    coefficients = np.random.default_rng(2).normal(0, np.sqrt(variance), (2, len(functions)))
+    field = functions(uv) @ coefficients.T
+    assert np.std(field) > 0.2
+    assert shown_ripples((1024, 1024), uv, field + noise, exposure, 12).alone() is None
+
+
 def test_dent_whose_image_points_look_like_false_matches_is_followed():
     """A dent of 6 px, 35 px wide: its image points agree with those of other exposures."""
     middle = (400.0, 600.0)

@@ -188,4 +188,9 @@ def _rate(field: AngleField) -> tuple[float, float]:
     uv = np.column_stack([u.ravel(), v.ravel()])
     changes = np.array([field.change(uv, float(angle))[0] for angle in TURN])
     rates = np.diff(changes, axis=0, append=changes[:1]) / (TURN[1] - TURN[0])
-    return tuple(float(np.hypot(*of.T).max()) for of in (rates, changes))  # type: ignore
+    return _longest(rates), _longest(changes)
+
+
+def _longest(vectors: np.ndarray) -> float:
+    """Length of the longest of vectors (..., 2)."""
+    return float(np.hypot(vectors[..., 0], vectors[..., 1]).max())

@@ -22,22 +22,50 @@ from pathlib import Path
 import pytest
 from ros_graph import ROOT
 
-FILES = sorted(Path(__file__).parent.glob('launch/*.py'))
+FOLDER = Path(__file__).parent / 'launch'
+FILES = sorted(FOLDER.glob('*.py'))
+LAUNCH_RIG = """\
+import sys
+from launch import LaunchService
+from shipped import rig
+service = LaunchService()
+service.include_launch_description(rig(rig=sys.argv[1]))
+sys.exit(service.run())
+"""
+
+
+@pytest.fixture
+def run(ros, tmp_path, monkeypatch):
+    """Return a function that runs Python with the modules of tests/ros/launch/."""
+    for module in ('launch_ros', 'launch_testing'):
+        pytest.importorskip(module, reason=f'{module} is not installed: it has no wheel')
+    paths = f'{FOLDER}{os.pathsep}{ROOT}'
+    monkeypatch.setenv('PYTHONPATH', paths, prepend=os.pathsep)
+    monkeypatch.setenv('LAUNCH_TEST_FOLDER', str(tmp_path))
+    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'ros_home'))
+
+    def run(*arguments):
+        done = subprocess.run(
+            [sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True
+        )
+        return done.returncode, done.stdout + done.stderr
+
+    return run
 
 
 @pytest.mark.parametrize(
     'path', [p for p in FILES if p.name != 'shipped.py'], ids=lambda path: path.stem
 )
-def test_launch(ros, path, tmp_path, monkeypatch):
-    for module in ('launch_ros', 'launch_testing'):
-        pytest.importorskip(module, reason=f'{module} is not installed: it has no wheel')
-    monkeypatch.setenv('PYTHONPATH', f'{path.parent}{os.pathsep}{ROOT}', prepend=os.pathsep)
-    monkeypatch.setenv('LAUNCH_TEST_FOLDER', str(tmp_path))
-    monkeypatch.setenv('ROS_HOME', str(tmp_path / 'ros_home'))
-    done = subprocess.run(
-        [sys.executable, '-m', 'launch_testing.launch_test', str(path)],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-    )
-    assert not done.returncode, (done.stdout + done.stderr)[-6000:]
+def test_launch(run, path):
+    status, output = run('-m', 'launch_testing.launch_test', str(path))
+    assert not status, output[-6000:]
+
+
+def test_wrong_rig_file_ends_launch_in_a_sentence(run, tmp_path):
+    rig = tmp_path / 'rig.toml'
+    rig.write_text('angle_joint = 3')
+    status, output = run('-c', LAUNCH_RIG, str(rig))
+    assert status == 1, output
+    assert f'{rig}, key angle_joint: a joint, such as "carm"' in output
+    assert 'Traceback' not in output
+    assert 'process started' not in output

@@ -1,0 +1,128 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Parameters of the started nodes: by rig.toml, and by arguments, which win.
+
+The nodes stay unconfigured, for a lifecycle manager, and are asked for what they were given.
+"""
+
+import shutil
+import time
+import unittest
+from pathlib import Path
+
+import launch_testing
+import rclpy
+from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
+from shipped import BAGS, DEADLINE, FOLDER, rig
+
+WITH_NAMES = ('extraction_node', 'calibration_node', 'correction_node', 'image_node')
+WITH_ANGLE = (*WITH_NAMES, 'recorder_node')
+WITH_PHANTOM = ('extraction_node', 'calibration_node')
+RIG = """\
+fluoroscopes = ["front", "side"]
+phantom = "cube.csv"
+angle_joint = {front = "x", side = "y"}
+"""
+PHANTOM = FOLDER / 'other.csv'
+CASES = {  # arguments, and what the nodes say: fluoroscopes, phantom, angle_joint
+    'rig': (
+        {'rig': FOLDER / 'rig.toml'},
+        ['front', 'side'],
+        FOLDER / 'cube.csv',
+        'front:x,side:y',
+    ),
+    'rig and arguments': (
+        {'rig': FOLDER / 'rig.toml', 'phantom': PHANTOM, 'angle_joint': 'front:u,side:v'},
+        ['front', 'side'],
+        PHANTOM,
+        'front:u,side:v',
+    ),
+    'no rig and no joint': ({'phantom': PHANTOM}, ['a', 'b'], PHANTOM, ''),
+}
+
+
+@launch_testing.parametrize('case', list(CASES))
+def generate_test_description(case):
+    """Start all nodes that know an angle, and the reconstruction node, which does not."""
+    (FOLDER / 'rig.toml').write_text(RIG)
+    for name in ('cube.csv', PHANTOM.name):
+        shutil.copy(BAGS / 'phantom.csv', FOLDER / name)
+    given, fluoroscopes, phantom, angle_joint = CASES[case]
+    description = rig(
+        from_images='true',
+        images='true',
+        record=FOLDER / case,
+        calibration_directory=FOLDER / 'calibrations',
+        autostart='false',
+        **given,
+    )
+    expected = {'fluoroscopes': fluoroscopes, 'phantom': str(phantom), 'angle_joint': angle_joint}
+    return description, {'expected': expected}
+
+
+class TestNodes(unittest.TestCase):
+    """While the nodes run."""
+
+    @classmethod
+    def setUpClass(cls):
+        """Make a node that asks the others."""
+        rclpy.init(args=[])
+        cls.node = rclpy.create_node('asker')
+
+    @classmethod
+    def tearDownClass(cls):
+        """Destroy it."""
+        cls.node.destroy_node()
+        rclpy.shutdown()
+
+    def value(self, node, name):
+        """Return the value of a parameter; asked again, for a first answer may be lost."""
+        client = AsyncParameterClient(self.node, node)
+        end = time.monotonic() + DEADLINE
+        while time.monotonic() < end:
+            if client.wait_for_services(1.0):
+                answer = client.get_parameters([name])
+                rclpy.spin_until_future_complete(self.node, answer, timeout_sec=1.0)
+                if answer.done():
+                    return parameter_value_to_python(answer.result().values[0])
+        return self.fail(f'{node} did not answer')
+
+    def test_parameters_reach_every_node_that_needs_them(self, expected):
+        """The joint, also the recorder node."""
+        for name, nodes in (
+            ('fluoroscopes', (*WITH_NAMES, 'reconstruction_node')),
+            ('phantom', WITH_PHANTOM),
+            ('angle_joint', WITH_ANGLE),
+        ):
+            for node in nodes:
+                with self.subTest(node=node, parameter=name):
+                    self.assertEqual(self.value(node, name), expected[name])
+
+
+@launch_testing.post_shutdown_test()
+class TestEnd(unittest.TestCase):
+    """After launch has interrupted the nodes."""
+
+    def test_all_nodes_end_cleanly(self, proc_info):
+        """Exit status 0."""
+        launch_testing.asserts.assertExitCodes(proc_info)
+
+    def test_reconstruction_node_is_given_no_joint(self, proc_info):
+        """Its last parameter file is what launch wrote from the arguments."""
+        (command,) = (one.cmd for one in proc_info if 'reconstruction_node' in one.process_name)
+        given = Path(command[-1]).read_text()
+        self.assertIn('calibration_directory', given)
+        self.assertNotIn('angle_joint', given)

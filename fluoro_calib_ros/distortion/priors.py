@@ -51,7 +51,7 @@ RING_EXISTS = 9.0
 # the signal is estimated with more; renewals of it then.
 SUSPECTED_GAIN = 2.0
 SIGNAL_ROUNDS = 3
-RIDGE = 1e-9  # relative increase of a diagonal
+RIDGE = 1e-9  # increase of a diagonal relative to its largest value
 SWEEPS = 3  # over the terms of the trend
 
 
@@ -264,20 +264,18 @@ def with_shown_places(
     t = functions.trend
     matrix = values.T @ values
     right = values.T @ observed
-    matrix[np.arange(t), np.arange(t)] *= (
-        1 + RIDGE
-    )  # terms that the image points do not tell apart
+    # Terms that the image points do not tell apart.
+    matrix[np.arange(t), np.arange(t)] += RIDGE * np.max(np.diagonal(matrix))
 
-    def estimates() -> SineEstimates:
-        precision = signal_precision(functions, prior)
+    def estimates(given: Prior) -> SineEstimates:
+        precision = signal_precision(functions, given)
         whole = matrix.copy()
         whole[t:, t:] += precision
         factor = cho_factor(whole, lower=True)
         covariance = cho_solve(factor, np.eye(len(whole))[:, t:])[t:]
         return SineEstimates.of(precision, cho_solve(factor, right)[t:], covariance[None])
 
-    found = estimates()
-    if largest_gain(functions, found) < SUSPECTED_GAIN:
+    if largest_gain(functions, estimates(prior)) < SUSPECTED_GAIN:
         return prior
     columns = np.concatenate([axis * len(matrix) + np.arange(t, len(matrix)) for axis in (0, 1)])
     both = np.asfortranarray(block_diag(matrix, matrix))
@@ -285,7 +283,7 @@ def with_shown_places(
     side = max(functions.image_size)
     for _ in range(SIGNAL_ROUNDS):
         prior = replace(prior, signal=most_likely_signal(prior.signal, equations, side))
-    return replace(prior, local=with_more_windows(functions, estimates(), prior.local))
+    return replace(prior, local=with_more_windows(functions, estimates(prior), prior.local))
 
 
 def with_more_places(

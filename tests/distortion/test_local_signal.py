@@ -35,6 +35,7 @@ from fluoro_calib_ros.distortion.priors import (
     most_likely_prior,
     prior_precision,
     signal_precision,
+    starting_prior,
     with_more_places,
     with_shown_places,
 )
@@ -149,6 +150,15 @@ def test_field_that_is_the_same_everywhere_has_no_place(reach):
         values = functions(uv) @ coefficients + rng.normal(0, NOISE, uv.shape)
         found = with_shown_places(functions, functions(uv) / NOISE, values / NOISE, prior)
         assert found.local is None
+
+
+def test_image_points_that_do_not_determine_the_trend_show_no_place():
+    """All on a line through the middle of the image: most polynomials are zero there."""
+    functions = Functions(SIZE, 3, 18)
+    uv = np.column_stack([np.full(100, 511.5), np.linspace(0, 1023, 100)])
+    prior = starting_prior(functions, 1.0)
+    found = with_shown_places(functions, functions(uv) / NOISE, np.zeros_like(uv), prior)
+    assert found.local is None
 
 
 def test_window_that_nothing_shows_vanishes():

@@ -18,7 +18,9 @@ The misclosures of the beads, from images alone, are fitted by one rigid motion 
 by two: one of a layer of beads, one of the rest. The layer with the largest decrease of the
 weighted square sum is displaced if the decrease is significant (F-test of a general linear
 hypothesis with known variance: Foerstner and Wrobel, "Photogrammetric Computer Vision", Springer
-2016, 3.1), explains most of what is wrong, and brings the beads of the layer into place.
+2016, 3.1), explains most of what is wrong, and brings the beads of the layer into place. Where the
+square sum is no larger than expected, nothing is wrong: neighbouring beads have errors of the
+correction in common, which the test takes to be independent.
 """
 
 from __future__ import annotations
@@ -122,6 +124,7 @@ def displaced_layer(beads: Beads) -> DisplacedLayer | None:
     critical = float(chdtri(MOTION, FALSE_ALARM / len(tried)))
     if (
         best.gain < critical
+        or fit.excess <= 0
         or best.gain < EXPLAINED * fit.excess
         or fit.improvement(best) < IMPROVED
     ):

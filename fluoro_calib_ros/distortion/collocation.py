@@ -374,9 +374,10 @@ class CollocationTerms(AdjustedTerms):
                 return False, found_short
         if settled and not self._places_searched:
             self._places_searched = True
-            modes = self._add_places(adjustment, coefficients)
-            if modes != present_modes:
-                return False, self._with_modes(modes, coefficients)
+            place_modes = self._add_places(adjustment, coefficients)
+            if place_modes is not None:
+                self._settled = 0
+                return False, self._with_modes(place_modes, coefficients)
         self._settled = self._settled + 1 if settled else 0
         return settled, coefficients
 
@@ -415,9 +416,13 @@ class CollocationTerms(AdjustedTerms):
 
     def _add_places(
         self, adjustment: Adjustment, coefficients: tuple[np.ndarray, ...]
-    ) -> list[int]:
-        """Add places where the signal varies more; return the modes that they need."""
+    ) -> list[int] | None:
+        """Add places where the signal varies more.
+
+        Returns the modes that they need, None where there are none.
+        """
         modes = []
+        added = False
         corrections = self._corrections(coefficients)
         for f, functions in enumerate(self.functions):
             fine = replace(functions, modes=max(LOCAL_MODES, functions.modes))
@@ -431,9 +436,9 @@ class CollocationTerms(AdjustedTerms):
             found = with_shown_places(fine, values * root, observed * root, self.priors[f])
             if found.local is not None:
                 self.priors[f] = found
-                self._settled = 0
+                added = True
             modes.append(functions.complete if found.local is None else fine.complete)
-        return modes
+        return modes if added else None
 
     def _corrections(self, coefficients: tuple[np.ndarray, ...]) -> list[np.ndarray]:
         """Corrections (n, 2) [px] of the image points of each fluoroscope by the series."""

@@ -54,6 +54,7 @@ from .misfit import (
 )
 from .priors import (
     Prior,
+    covariance_of_series,
     gauge_precision,
     has_rings,
     most_likely_prior,
@@ -291,9 +292,18 @@ class CollocationTerms(AdjustedTerms):
     def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
         """See `AdjustedTerms`; beside a field of the angle, that which belongs to it."""
         fit = self._angle_fits[f]
-        if fit is None:
-            return super().fitted_series(f, adjustment, precise)
-        return self.series(f, fit.coefficients, fit.covariance)
+        if fit is not None:
+            return self.series(f, fit.coefficients, fit.covariance)
+        covariance = precise.additional[f]
+        if covariance is None:
+            raise ValueError(f'no terms were estimated for fluoroscope number {f}')
+        functions = self.functions[f]
+        own = slice(2 * len(functions))
+        coefficients = coefficients_of(adjustment)[f][own]
+        covariance = covariance_of_series(
+            functions, self.priors[f], coefficients, covariance[own, own]
+        )
+        return self.series(f, coefficients, covariance)
 
     def left_out(self, f: int) -> LeftOut | None:
         """The signal beyond the sines of fluoroscope f."""

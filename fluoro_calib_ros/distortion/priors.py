@@ -33,6 +33,7 @@ from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_
 from .series import Functions
 from .signal import Signal, SignalEquations, most_likely_signal, starting_signal
 from .terms import trend_transformation
+from .uncertain_terms import covariance_with_uncertain_terms
 
 # Standard deviation to which the gauge is held; a much smaller one would damp the steps of the
 # adjustment.
@@ -126,6 +127,31 @@ def _trend_precision(functions: Functions, prior: Prior) -> np.ndarray:
     """Precision matrix of the coefficients of the trend; zero for what the gauge holds."""
     to_terms, count = trend_transformation(functions.degree, functions.rings)
     return to_terms[:count].T @ (to_terms[:count] / prior.trend[:, None])
+
+
+def covariance_of_series(
+    functions: Functions, prior: Prior, coefficients: np.ndarray, covariance: np.ndarray
+) -> np.ndarray:
+    """Return the covariance (2m, 2m) of a series with that of which trend terms exist.
+
+    Whether a ring exists is the result of a test, and taken as known.
+
+    Parameters
+    ----------
+    functions : Functions
+    prior : Prior
+    coefficients, covariance : (2m,) and (2m, 2m) ndarray
+        Posterior with this prior.
+
+    Returns
+    -------
+    (2m, 2m) ndarray
+    """
+    to_terms, count = trend_transformation(functions.degree, functions.rings)
+    rows = np.arange(count - 4 * functions.rings)
+    whole = np.zeros((len(rows), 2 * len(functions)))
+    whole[:, _trend_columns(functions)] = to_terms[rows]
+    return covariance_with_uncertain_terms(whole, prior.trend[rows], coefficients, covariance)
 
 
 def gauge_precision(

@@ -96,8 +96,11 @@ def out_of_sample(scene, corrected, seed):
             here = camera.at(scene.case, angle)
             observed = here.distortion.observed(camera.ideal(scene.true_mm, pose))
             on = ((observed > 0) & (observed < scene.case.side - 1)).all(axis=1)
-            ray, c, inside = corrected(f, observed, angle)
-            on &= inside
+            # Noise is of the pixels that are observed: a correction may stretch the image.
+            noisy = observed + rng.normal(0, sd, observed.shape)
+            both, c, inside = corrected(f, np.concatenate([observed, noisy]), angle)
+            ray, noisy_ray = np.split(both, 2)
+            on &= inside[: len(observed)]
             used &= on
             if on.sum() < MIN_POINTS:  # the angle of the C-arm is beyond those that are calibrated
                 break
@@ -105,7 +108,7 @@ def out_of_sample(scene, corrected, seed):
             x = (scene.true_mm - exterior[1]) @ exterior[0].T
             if f == 0:
                 squares.append(((ray - x[:, :2] / x[:, 2:])[on] * c) ** 2)
-            rays.append(ray + rng.normal(0, sd, ray.shape) / c)
+            rays.append(noisy_ray)
             exteriors.append(exterior)
         if len(rays) < len(scene.cameras):
             continue

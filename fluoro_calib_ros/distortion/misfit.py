@@ -53,6 +53,10 @@ FAR = 30.0  # standard deviations below zero
 AGREE_SD = 5.0
 AGREE_REACH = 3.0
 AGREE_WITH = 2
+# Where only one exposure has image points: part of the larger residual that the difference of two
+# residuals that agree does not exceed.
+ALONE_AGREE = 0.6
+ALONE_REACH = 3.0  # of such neighbours, relative to that of others
 AGREE_SIGNIFICANT = 1.5  # standard errors by which more pairs agree than are opposite
 LARGEST_SD = 40.0
 # Areas in which they are looked at together: cells that overlap by half, so many side by side,
@@ -245,6 +249,8 @@ def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series
 
     They are the largest RMS residual of those nearby, and zero where there are none, or where
     chance explains that they agree. Inliers beside them count as image points without that error.
+    Points of one exposure count where no other exposure has inliers: at a rim that a single one
+    shows, nothing contradicts them.
     """
     out = np.zeros(series.sd.size)
     noise = float(np.sqrt(np.mean(inliers.residuals**2)))
@@ -254,13 +260,11 @@ def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series
     possible = np.flatnonzero(size < LARGEST_SD * noise)
     if len(possible) <= AGREE_WITH:
         return out.reshape(series.sd.shape)
-    uv = rejected.uv[possible]
-    i, j = cKDTree(uv).query_pairs(reach, output_type='ndarray').T
-    r = rejected.residuals[possible]
-    apart = rejected.exposure[possible[i]] != rejected.exposure[possible[j]]
-    agree = apart & (np.linalg.norm(r[i] - r[j], axis=1) < AGREE_SD * noise)
-    # Chance makes as many pairs opposite as it makes agree.
-    opposite = apart & (np.linalg.norm(r[i] + r[j], axis=1) < AGREE_SD * noise)
+    there = FittedPoints(
+        rejected.uv[possible], rejected.residuals[possible], rejected.exposure[possible]
+    )
+    uv = there.uv
+    i, j, agree, opposite = _pairs_of_rejected(inliers, there, reach, AGREE_SD * noise)
     pairs = np.count_nonzero(agree), np.count_nonzero(opposite)
     if pairs[0] - pairs[1] <= AGREE_SIGNIFICANT * np.sqrt(sum(pairs)):
         return out.reshape(series.sd.shape)
@@ -275,6 +279,32 @@ def sd_of_rejected(inliers: FittedPoints, rejected: FittedPoints, series: Series
         near = np.linalg.norm(pixels - uv[row], axis=1) < max(reach, cell)
         out[near] = np.maximum(out[near], size[possible[row]] * np.sqrt(share[row] / 2))
     return out.reshape(series.sd.shape)
+
+
+def _pairs_of_rejected(
+    inliers: FittedPoints, rejected: FittedPoints, reach: float, limit: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs (k,), (k,) of neighbouring rejected points; which (k,) agree, and which are opposite.
+
+    reach [px]: of neighbours of different exposures; limit [px]: difference of residuals that
+    agree. Chance makes as many pairs opposite as it makes agree.
+    """
+    i, j = cKDTree(rejected.uv).query_pairs(ALONE_REACH * reach, output_type='ndarray').T
+    r = rejected.residuals
+    near = cKDTree(inliers.uv).query_ball_point(rejected.uv, reach)
+    alone = np.array(
+        [np.all(inliers.exposure[rows] == own) for rows, own in zip(near, rejected.exposure)],
+        dtype=bool,
+    )
+    same = rejected.exposure[i] == rejected.exposure[j]
+    distance = np.linalg.norm(rejected.uv[i] - rejected.uv[j], axis=1)
+    counts = np.where(same, alone[i] & alone[j], distance <= reach)
+    size = np.linalg.norm(r, axis=1)
+    # Beyond the last inliers, the error of a correction grows fast.
+    limits = np.where(same, np.maximum(limit, ALONE_AGREE * np.maximum(size[i], size[j])), limit)
+    agree = counts & (np.linalg.norm(r[i] - r[j], axis=1) < limits)
+    opposite = counts & (np.linalg.norm(r[i] + r[j], axis=1) < limits)
+    return i, j, agree, opposite
 
 
 def areas_of_rejected(

@@ -182,3 +182,22 @@ def test_rejected_points_that_agree_are_an_error_of_the_correction():
     # With as many inliers beside them, they are half of the variance there.
     half = sd_of_rejected(inliers, rejected, series)
     assert half[row, column] == pytest.approx(found[row, column] / np.sqrt(2), rel=0.1)
+
+
+def test_rejected_points_at_a_rim_that_one_exposure_shows_are_an_error_of_the_correction():
+    """Nothing contradicts them there; where other exposures have inliers, they do."""
+    uv, exposure, rng = image_points(5, 200)
+    series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
+    residuals = rng.normal(0, NOISE, uv.shape)
+    at_rim = uv[:, 0] > 0.92 * SIZE[0]
+    shown = (exposure == 2) & at_rim
+    growing = (uv[:, 0] - 0.92 * SIZE[0])[shown, None] * [0.05, 0.02] + [1.0, 0.5]
+    rejected = FittedPoints(uv[shown], growing, exposure[shown])
+
+    def found(others):
+        used = np.flatnonzero(others)
+        inliers = FittedPoints(uv[used], residuals[used], exposure[used])
+        return sd_of_rejected(inliers, rejected, series)[:, -2:]
+
+    assert np.count_nonzero(found(~at_rim) > 1.0) > 10
+    assert not found(~shown).any()

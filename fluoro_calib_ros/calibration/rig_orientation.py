@@ -48,9 +48,9 @@ from ..photogrammetry.network import Network
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import covariance_blocks
 from ..photogrammetry.relative_orientation import (
-    discrepancies,
     discrepancies_with_jacobian,
     mean_pose,
+    relative_poses,
 )
 from ..photogrammetry.relative_pose import RelativeConstraint, RelativePose
 from ..photogrammetry.rig_orientation import (
@@ -67,6 +67,7 @@ from .held_calibration import (
     too_few_rays_for_noise,
 )
 from .initial_network import MIN_TARGETS_OF_EXPOSURE, Frames, Measured, StartValues
+from .pair_scatter import PairScatter, agreeing, displacements
 from .result import FluoroscopeCalibration
 from .robust_adjustment import adjusted_with_precision
 
@@ -226,10 +227,10 @@ def orientation_of_exposures(
 ) -> RigOrientation:
     """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
 
-    The relative orientation is the weighted mean of those of the exposures. Where these scatter
-    more than their standard deviations, its covariance is enlarged accordingly. The frame is the
-    estimated one of the sensor, and its covariance is given a datum where the phantom was
-    (`with_datum_of_points`).
+    The relative orientation is the weighted mean of those of the exposures, a few of which are
+    left out where they contradict the others. Where these scatter more than their standard
+    deviations, its covariance is enlarged accordingly. The frame is the estimated one of the
+    sensor, and its covariance is given a datum where the phantom was (`with_datum_of_points`).
 
     Parameters
     ----------
@@ -254,6 +255,23 @@ def orientation_of_exposures(
     DataError
         As `orientation_of_capture`, and if no exposures can be paired.
     """
+    return orientation_and_scatter(
+        frames, phantom, calibrations, loss, raise_if_cancelled, starts
+    )[0]
+
+
+def orientation_and_scatter(
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Calibrations,
+    loss: str = 'student_t',
+    raise_if_cancelled: Callable[[], None] | None = None,
+    starts: StartValues | None = None,
+) -> tuple[RigOrientation, tuple[PairScatter, ...]]:
+    """Return `orientation_of_exposures`, and how the exposures scatter about it.
+
+    There is one PairScatter for every fluoroscope but the first. Raises DataError.
+    """
     _validate(frames, phantom, calibrations)
     paired = _paired(frames)
     with threadpool_limits(1):
@@ -261,16 +279,22 @@ def orientation_of_exposures(
             paired, phantom, calibrations, raise_if_cancelled, starts=starts
         )
         held = _adjusted(measured, calibrations, loss, False, raise_if_cancelled)
-        exteriors, exposures = _relative_to_first(held)
+        exteriors, scatter = _relative_to_first(held)
     first = held.measured.fluoroscopes[0]
     frame_id = calibrations[first].frame_id or f'{first}_optical'
+    exposures = min(int(of_one.used.sum()) for of_one in scatter)
     origin = _Origin(frame_id, 'joint calibration', _last_stamp(paired), exposures)
     found = _orientation(held, exteriors, calibrations, origin)
-    return with_datum_of_points(found, _seen_by_first(held))
+    try:
+        return with_datum_of_points(found, _seen_by_first(held)), scatter
+    except np.linalg.LinAlgError:
+        raise DataError(
+            'the fluoroscopes see the phantom from one place, so that their rays do not intersect'
+        ) from None
 
 
-def _relative_to_first(held: _HeldAdjustment) -> tuple[_Exteriors, int]:
-    """Exteriors relative to the first fluoroscope, and the smallest number of paired exposures.
+def _relative_to_first(held: _HeldAdjustment) -> tuple[_Exteriors, tuple[PairScatter, ...]]:
+    """Exteriors relative to the first fluoroscope, and the scatter of the paired exposures.
 
     Raises DataError where no exposures can be paired.
     """
@@ -280,19 +304,20 @@ def _relative_to_first(held: _HeldAdjustment) -> tuple[_Exteriors, int]:
     position = np.zeros((count, 3))
     operator = np.zeros((6 * count, 6 * len(held.measured.frames)))
     growth = np.ones(6 * count)
-    used = []
+    scatter = []
     for b in range(1, count):
         pairs = paired_exposures(held.measured, b)
         if not len(pairs):
             raise DataError(_unpaired(names, b))
         rows = slice(6 * b, 6 * b + 6)
-        pose, operator[rows], growth[rows] = _mean_of_pairs(held, pairs)
+        pose, operator[rows], of_pairs = _mean_of_pairs(held, pairs)
+        growth[rows] = of_pairs.growth
         rotation[b] = pose.rotation
         position[b] = pose.translation_mm
-        used.append(len(pairs))
+        scatter.append(of_pairs)
     known = growth[:, None] * (operator @ held.covariance_of_all() @ operator.T) * growth
     by_interior = operator @ held.by_interior.reshape(operator.shape[1], -1)
-    return _Exteriors(rotation, position, known, by_interior), min(used)
+    return _Exteriors(rotation, position, known, by_interior), tuple(scatter)
 
 
 def _seen_by_first(held: _HeldAdjustment) -> np.ndarray:
@@ -484,36 +509,55 @@ def _covariance_of_interiors(calibrations: Iterable[FluoroscopeCalibration]) -> 
 
 def _mean_of_pairs(
     held: _HeldAdjustment, pairs: np.ndarray
-) -> tuple[RelativePose, np.ndarray, float]:
+) -> tuple[RelativePose, np.ndarray, PairScatter]:
     """Weighted mean of the relative orientations of pairs (k, 2) of exposures.
 
-    Returns it, its derivatives (6, 6m) by the exposures, and the factor, at least 1, by which the
-    pairs scatter more than their standard deviations.
+    Returns it, its derivatives (6, 6m) by the exposures, and how the pairs scatter about it.
     """
     parameters = held.after.parameters
-    (a, b) = pairs.T
     constraint = RelativeConstraint((0, 1), pairs, 1.0, 1.0)
-    _, d_a, d_b, _ = discrepancies_with_jacobian(
-        constraint, mean_pose(parameters, pairs), parameters
+    start = mean_pose(parameters, pairs)
+    _, d_a, d_b, _ = discrepancies_with_jacobian(constraint, start, parameters)
+    weights = np.linalg.inv(_covariance_of_pairs(held, pairs, d_a, d_b))
+    used, off_sd = agreeing(parameters, constraint, weights)
+    pose = mean_pose(parameters, pairs[used], weights[used])
+    operator = np.zeros((6, len(held.measured.frames), 6))
+    share = np.linalg.solve(
+        weights[used].sum(axis=0), weights[used].transpose(1, 0, 2).reshape(6, -1)
+    ).reshape(6, -1, 6)
+    for rows, derivative in zip(pairs[used].T, (d_a[used], d_b[used])):
+        operator[:, rows] += np.einsum('ika,kab->ikb', share, derivative)
+    square = 6 * np.sum(off_sd[used] ** 2) / max(6 * (int(used.sum()) - 1), 1)
+    frames = held.measured.frames
+    turn, shift = relative_poses(parameters, pairs)
+    scatter = PairScatter(
+        (frames[pairs[0, 0]].fluoroscope, frames[pairs[0, 1]].fluoroscope),
+        np.array([frames[row].number for row in pairs[:, 0]]),
+        displacements(held.measured.network, parameters, pairs, pose),
+        off_sd,
+        used,
+        float(np.sqrt(max(1.0, square))),
+        turn,
+        shift,
     )
+    return pose, operator.reshape(6, -1), scatter
+
+
+def _covariance_of_pairs(
+    held: _HeldAdjustment, pairs: np.ndarray, d_a: np.ndarray, d_b: np.ndarray
+) -> np.ndarray:
+    """Covariances (k, 6, 6) of the relative orientations of pairs (k, 2) of exposures.
+
+    d_a, d_b (k, 6, 6) are their derivatives by the exposures.
+    """
+    a, b = pairs.T
     mixed = d_a @ held.covariance(a, b) @ d_b.transpose(0, 2, 1)
-    own = (
+    return (
         d_a @ held.covariance(a, a) @ d_a.transpose(0, 2, 1)
         + d_b @ held.covariance(b, b) @ d_b.transpose(0, 2, 1)
         + mixed
         + mixed.transpose(0, 2, 1)
     )
-    weights = np.linalg.inv(own)
-    pose = mean_pose(parameters, pairs, weights)
-    operator = np.zeros((6, len(held.measured.frames), 6))
-    share = np.linalg.solve(
-        weights.sum(axis=0), weights.transpose(1, 0, 2).reshape(6, -1)
-    ).reshape(6, len(pairs), 6)
-    for rows, derivative in ((a, d_a), (b, d_b)):
-        operator[:, rows] += np.einsum('ika,kab->ikb', share, derivative)
-    off = discrepancies(constraint, pose, parameters)
-    square = np.einsum('ki,kij,kj', off, weights, off) / max(6 * (len(pairs) - 1), 1)
-    return pose, operator.reshape(6, -1), np.sqrt(max(1.0, square))
 
 
 def _orientation(

@@ -282,6 +282,8 @@ def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
 
     if outcome.orientation is None and len(outcome.request.frames) > 1:
         print_note(f'no orientation of the rig: {outcome.orientation_note}')
+    elif outcome.orientation_note and outcome.orientation is not None:
+        print_note(f'orientation of the rig: {outcome.orientation_note}')
     for sentence in outcome.result.left_out:
         print_note(f'not used: {sentence}')
     for sentence in outcome.doubts:

@@ -15,12 +15,14 @@
 """Single image points that cannot be used: off the image, or of a target that is unknown.
 
 A few of them are left out and reported. Many are a fault of the whole input, such as a wrong image
-size or another phantom, and are left to `validate_frame`, which refuses the frame.
+size or another phantom, and are left to `validate_frame`, which refuses the frame. Many targets at
+the same image point are a placeholder of some program for targets that are not seen, such as
+(0, 0), and always left out.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +30,9 @@ import numpy as np
 from .frame import Frame, points_on_image
 from .phantom import Phantom
 
+MIN_TOGETHER = 4  # targets at the same image point that are placeholders
+MIN_SHARE_TOGETHER = 0.02  # the same, of the targets of the frame; the larger of both holds
+MAX_LISTED = 10  # targets in a sentence
 MAX_SHARE = 0.05  # of the image points of a frame that are left out; one always is
 
 
@@ -47,10 +52,14 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
     if uv.shape != (len(ids), 2) or (frame.sigma is not None and len(frame.sigma) != len(ids)):
         return frame, ''
     finite = np.isfinite(uv).all(axis=1)
-    off = finite & ~points_on_image(uv, frame.image_size)
+    together = finite & _together(uv)
+    off = finite & ~together & ~points_on_image(uv, frame.image_size)
     unknown = np.zeros(len(ids), dtype=bool) if phantom is None else phantom.index(ids) < 0
-    stray = off | unknown
-    if not few(int(stray.sum()), len(ids)):
+    single = (off | unknown) & ~together
+    if not few(int(single.sum()), int(np.sum(~together))):
+        single = np.zeros(len(ids), dtype=bool)
+    stray = single | together
+    if not stray.any() or stray.all():
         return frame, ''
     kept = ~stray
     cleaned = replace(
@@ -61,7 +70,14 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
     )
     causes = [
         f'target {_listed(ids[chosen])} {cause}'
-        for chosen, cause in ((off, 'off the image'), (unknown & ~off, 'not on the phantom'))
+        for chosen, cause in (
+            (off & single, 'off the image'),
+            (unknown & single & ~off, 'not on the phantom'),
+            (
+                together,
+                'at the image point of others, a placeholder for targets that are not seen',
+            ),
+        )
         if chosen.any()
     ]
     return cleaned, (
@@ -83,5 +99,14 @@ def frames_without_strays(
     return out, sentences
 
 
-def _listed(ids: Iterable[int]) -> str:
-    return ', '.join(str(i) for i in ids)
+def _together(uv: np.ndarray) -> np.ndarray:
+    """Which (n,) of image points (n, 2) are at the place of so many others that none is there."""
+    if len(uv) < MIN_TOGETHER:
+        return np.zeros(len(uv), dtype=bool)
+    _, place, count = np.unique(uv, axis=0, return_inverse=True, return_counts=True)
+    return count[place.reshape(-1)] >= max(MIN_TOGETHER, MIN_SHARE_TOGETHER * len(uv))
+
+
+def _listed(ids: Sequence[int]) -> str:
+    listed = ', '.join(str(i) for i in ids[:MAX_LISTED])
+    return listed if len(ids) <= MAX_LISTED else f'{listed} and {len(ids) - MAX_LISTED} more'

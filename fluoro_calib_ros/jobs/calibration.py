@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 
 import numpy as np
 
@@ -30,10 +31,10 @@ from ..calibration.initial_network import MIN_EXPOSURES
 from ..calibration.known_rig import orientation_of_known
 from ..calibration.request import CalibrationRequest
 from ..calibration.result import FluoroscopeCalibration
-from ..calibration.rig_orientation import orientation_of_exposures
+from ..calibration.rig_orientation import orientation_and_scatter
 from ..calibration.rounds import Round
 from ..errors import DataError
-from ..exposures.frame import Frame, validate_frame
+from ..exposures.frame import Frame
 from ..exposures.strays import frames_without_strays
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..validation.check import Validation
@@ -41,11 +42,17 @@ from ..validation.inputs import (
     copied_exposures,
     find_wrong_input,
     find_wrong_orientation,
+    find_wrong_phantom,
+    shared_exposures,
+    valid_frames,
     validate_magnitudes,
+    validate_names,
 )
 from ..validation.plausibility import implausible
-from ..validation.rigidity import contradiction, interchanged
+from ..validation.rigidity import contradiction, doubtful, interchanged
 from ..validation.verdict import validate_or_report
+
+MAX_SHARED = 1 / 3  # of the exposures of a fluoroscope that another one has as well
 
 Progress = Callable[[str, Round], None]
 Cancellation = Callable[[], None]
@@ -81,8 +88,9 @@ class CalibrationOutcome:
     rig : Rig
         The fluoroscopes that were not calibrated.
     orientation : RigOrientation or None
-        None where the exposures give none; orientation_note says why.
+        None where the exposures give none.
     orientation_note : str
+        Why there is none, or what is doubtful about it; '' for nothing.
     validation : Validation or None
         None where no validation was requested.
     doubts : tuple of str
@@ -151,10 +159,13 @@ def run_calibration(
     ValueError
         For options that contradict each other.
     """
+    validate_names((*request.frames, *(rig.frames if rig else ())))
     validate_magnitudes(request.frames, request.phantom)
     request, left_out = _without_strays(request)
     request, copies = _without_copies(request)
     left_out += copies
+    request, shared = _without_shared(request)
+    left_out += shared
     doubts = _wrong_input(request)
     if doubts and not force:
         raise DataError('. '.join(doubts))
@@ -175,8 +186,8 @@ def run_calibration(
 
 
 def _wrong_input(request: CalibrationRequest) -> list[str]:
-    """Return a sentence for every fluoroscope whose exposures cannot be right."""
-    frames = _valid(request)
+    """Return a sentence for everything in phantom and exposures that cannot be right."""
+    frames = valid_frames(request.frames)  # the calibration reports the others
     known = request.known_orientations
     absent = [name for name in known if name not in request.frames]
     if absent:
@@ -185,7 +196,9 @@ def _wrong_input(request: CalibrationRequest) -> list[str]:
             f'there are only those of {", ".join(request.frames)}'
         )
     unknown = {name: exposures for name, exposures in frames.items() if name not in known}
+    # Points in motion may rest, and may come from far away.
     return [
+        *([] if known else find_wrong_phantom(request.phantom)),
         *find_wrong_input(unknown, request.phantom).values(),
         *find_wrong_orientation(frames, request.phantom, known).values(),
     ]
@@ -234,18 +247,33 @@ def _without_copies(request: CalibrationRequest) -> tuple[CalibrationRequest, li
     return (replace(request, frames=frames) if sentences else request), sentences
 
 
-def _valid(request: CalibrationRequest) -> dict[str, list[Frame]]:
-    """Return the frames that are valid on their own; the calibration reports the others."""
-    out: dict[str, list[Frame]] = {}
-    for name, exposures in request.frames.items():
-        out[name] = []
-        for frame in exposures:
-            try:
-                validate_frame(frame)
-            except DataError:
-                continue
-            out[name].append(frame)
-    return out
+def _without_shared(request: CalibrationRequest) -> tuple[CalibrationRequest, list[str]]:
+    """Return the request without exposures that two fluoroscopes have in common.
+
+    Which of both they are of is not known. Returns a sentence for each, too. Raises DataError
+    where they are many.
+    """
+    frames = {name: list(exposures) for name, exposures in request.frames.items()}
+    sentences = []
+    for one, other in combinations(frames, 2):
+        pairs = shared_exposures(request.frames[one], request.frames[other])
+        if not pairs:
+            continue
+        fewest = min(len(request.frames[one]), len(request.frames[other]))
+        if len(pairs) > MAX_SHARED * fewest:
+            raise DataError(
+                f'fluoroscopes {one} and {other}: {len(pairs)} exposures have the same image '
+                'points, as if one recording had been given for both'
+            )
+        for k, name in enumerate((one, other)):
+            numbers = {pair[k].number for pair in pairs}
+            frames[name] = [frame for frame in frames[name] if frame.number not in numbers]
+        sentences += [
+            f'fluoroscopes {one} and {other}, exposure {a.number}'
+            f'{f" and {b.number}" * (a.number != b.number)}: both have the same image points'
+            for a, b in pairs
+        ]
+    return (replace(request, frames=frames) if sentences else request), sentences
 
 
 def _interchanged(result: CalibrationResult) -> list[str]:
@@ -259,7 +287,7 @@ def _interchanged(result: CalibrationResult) -> list[str]:
 def _orientation(
     request: CalibrationRequest, result: CalibrationResult, rig: Rig
 ) -> tuple[RigOrientation | None, str]:
-    """Return the orientation of the rig, or None and the reason."""
+    """Return the orientation of the rig and what is doubtful about it, or None and the reason."""
     frames = {**rig.frames, **request.frames}
     calibrations = {**rig.calibrations, **result.calibrations}
     names = [name for name in rig.fluoroscopes or calibrations if name in calibrations]
@@ -277,7 +305,7 @@ def _orientation(
         if sentence:
             return None, sentence
     try:
-        orientation = orientation_of_exposures(
+        orientation, scatter = orientation_and_scatter(
             {name: frames[name] for name in names},
             request.phantom,
             {name: calibrations[name] for name in names},
@@ -285,4 +313,9 @@ def _orientation(
         )
     except DataError as error:
         return None, str(error)
-    return orientation, ''
+    side = max(max(calibration.image_size) for calibration in calibrations.values())
+    found = [doubtful(pairs, side) for pairs in scatter]
+    refused = '; '.join(refusal for refusal, _ in found if refusal)
+    if refused:
+        return None, refused
+    return orientation, '; '.join(note for _, note in found if note)

@@ -686,6 +686,8 @@ class CalibrationNode(StreamNode):
         orientation, fault = self._save_outcome(outcome)
         if outcome.orientation is None:
             self.get_logger().warning(f'no new orientation of the rig: {outcome.orientation_note}')
+        elif outcome.orientation_note:
+            self.get_logger().warning(f'orientation of the rig: {outcome.orientation_note}')
         if orientation is None:
             self._orientation.clear()
         self._publish(calibrations, orientation)

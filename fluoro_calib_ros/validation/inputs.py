@@ -25,13 +25,13 @@ puts all targets behind the source (Hartley and Zisserman, "Multiple View Geomet
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..errors import DataError
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.known_orientation import KnownOrientation
@@ -39,6 +39,7 @@ from ..photogrammetry.plane_resection import flatness, plane_of, robust_homograp
 from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
 
 MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
+MIN_TESTED = 20  # targets of a single exposure that is tested
 FIT = 0.004  # median residual over the longer side of the image of ids that are certainly right
 MISFIT = 0.03  # median residual over the longer side of the image from which nothing fits
 BETTER = 0.35  # median residual of other ids over that of the given ones from which they are right
@@ -46,6 +47,9 @@ GOOD_MISFIT = 0.01  # median residual over the longer side of the image of ids t
 DISTANCES_MM = (200.0, 10_000.0)  # of the source from the phantom
 UNITS_MM = {'cm': 10.0, 'inches': 25.4, 'm': 1000.0}
 MAX_COORDINATE_MM = 1e6
+EXTENT_SHARE = 0.9  # of the targets, within the extent of the phantom
+MAX_EXTENT = 6.0  # distance of a target from the middle over that extent
+MAX_LISTED = 5  # targets in a sentence
 SD_MM = (1e-6, 1e3)  # of surveyed coordinates
 SIGMA_PX = (1e-4, 1e3)  # of image points
 MIN_REACH = 0.6  # of the image points over the image, to the right and down
@@ -107,6 +111,54 @@ def validate_magnitudes(frames: Mapping[str, Sequence[Frame]], phantom: Phantom)
         raise DataError('phantom: all targets have the same coordinates')
     for frame in (frame for exposures in frames.values() for frame in exposures):
         _validate_sigma(frame)
+
+
+def validate_names(names: Iterable[str]) -> None:
+    """Raise DataError for names of fluoroscopes that differ only in capital letters.
+
+    They are one fluoroscope written in two ways, and one file where capitals do not count.
+    """
+    seen: dict[str, str] = {}
+    for name in names:
+        other = seen.setdefault(name.lower(), name)
+        if other != name:
+            raise DataError(
+                f'fluoroscopes {other} and {name} differ in capital letters only: '
+                'this is one fluoroscope, or name them otherwise'
+            )
+
+
+def find_wrong_phantom(phantom: Phantom) -> list[str]:
+    """Return a sentence for every kind of targets whose coordinates cannot be right."""
+    xyz = phantom.xyz_mm
+    if np.linalg.matrix_rank(xyz - xyz.mean(axis=0)) < 2:
+        return []  # all on a line: the calibration says so
+    out = []
+    places, place, count = np.unique(xyz, axis=0, return_inverse=True, return_counts=True)
+    if count.max() > 1:
+        most = int(np.argmax(count))
+        ids = phantom.target_id[place.reshape(-1) == most]
+        x, y, z = places[most]
+        out.append(
+            f'phantom: targets {_first(ids)} are all at ({x:g}, {y:g}, {z:g}) mm: a repeated row, '
+            'or a placeholder for targets that are not surveyed'
+        )
+    distance = np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)
+    extent = float(np.quantile(distance, EXTENT_SHARE))
+    far = distance > MAX_EXTENT * extent
+    if extent > 0 and far.any():
+        out.append(
+            f'phantom: target {_first(phantom.target_id[far])} is {distance[far].max():.0f} mm '
+            f'from the middle of the others, most of which are within {extent:.0f} mm: a wrong '
+            'coordinate, another unit, or a placeholder for targets that are not surveyed'
+        )
+    return out
+
+
+def _first(ids: np.ndarray) -> str:
+    """Return some ids as text."""
+    listed = ', '.join(map(str, ids[:MAX_LISTED]))
+    return listed if len(ids) <= MAX_LISTED else f'{listed} and {len(ids) - MAX_LISTED} more'
 
 
 def _validate_sigma(frame: Frame) -> None:
@@ -175,6 +227,35 @@ def find_wrong_input(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) ->
         if sentence:
             out[name] = f'fluoroscope {name}: {sentence}'
     return out
+
+
+def valid_frames(frames: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]]:
+    """Return the frames that are valid on their own, by fluoroscope."""
+    out: dict[str, list[Frame]] = {}
+    for name, exposures in frames.items():
+        out[name] = []
+        for frame in exposures:
+            try:
+                validate_frame(frame)
+            except DataError:
+                continue
+            out[name].append(frame)
+    return out
+
+
+def require_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> None:
+    """Raise DataError where exposures of a calibrated fluoroscope cannot be of the phantom.
+
+    Exposures with fewer than MIN_TESTED targets are not tested, nor those that are not valid.
+    """
+    found = []
+    for name, exposures in valid_frames(frames).items():
+        tested = [frame for frame in exposures if len(frame.target_id) >= MIN_TESTED]
+        sentence = _wrong_exposures(tested, phantom)
+        if sentence:
+            found.append(f'fluoroscope {name}: {sentence}')
+    if found:
+        raise DataError('. '.join(found))
 
 
 def find_wrong_orientation(
@@ -340,6 +421,22 @@ def copied_exposures(exposures: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
         else:
             kept.append(row)
     return out
+
+
+def shared_exposures(one: Sequence[Frame], other: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
+    """Return the exposures of two fluoroscopes that have the same image points, in pairs.
+
+    No two fluoroscopes have that: one recording was given for both.
+    """
+    both = [replace(f, number=2 * f.number) for f in one]
+    both += [replace(f, number=2 * f.number + 1) for f in other]
+    found = []
+    for copy, original in copied_exposures(both):
+        if copy.number % 2 != original.number % 2:
+            pair = sorted((copy, original), key=lambda f: f.number % 2)
+            first, second = (replace(f, number=f.number // 2) for f in pair)
+            found.append((first, second))
+    return found
 
 
 def _are_copied(uv: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -37,6 +37,7 @@ MAX_MISFIT = 0.0025  # RMSE after the correction over the longer side of the ima
 MAX_MISFIT_SD = 4.0  # the same over the a-priori standard deviation of the image points
 MIN_INLIERS = 0.5  # share of the image points
 MAX_SD_DISTANCE = 0.05  # standard deviation of the principal distance over it
+MAX_DISTANCE_CHANGE = 0.2  # of one that is held, by the scale of the correction
 MAX_SD_POINT = 0.15  # of the principal point over the longer side of the image
 MAX_OFF_CENTRE = 1.0  # distance of the principal point from the middle over the longer side
 
@@ -94,6 +95,8 @@ def _wrong_interior(figures: FluoroscopeResult, calibration: FluoroscopeCalibrat
     xp, yp, c = figures.interior
     sd = figures.interior_sd
     side = max(figures.image_size)
+    if not np.any(sd) and (found := _wrong_given_distance(calibration)):
+        return found
     if sd[2] > MAX_SD_DISTANCE * c or max(sd[:2]) > MAX_SD_POINT * side:
         return (
             f'the interior orientation is not determined: principal distance {c:.0f} px with a '
@@ -109,6 +112,18 @@ def _wrong_interior(figures: FluoroscopeResult, calibration: FluoroscopeCalibrat
             'image: wrong target ids, a wrong image size, or another phantom'
         )
     return ''
+
+
+def _wrong_given_distance(calibration: FluoroscopeCalibration) -> str:
+    """A principal distance that is held, but far from the one that the correction makes of it."""
+    given = float(calibration.interior[2])
+    found = float(_interior_about_middle(calibration)[2])
+    if abs(found / given - 1) <= MAX_DISTANCE_CHANGE:
+        return ''
+    return (
+        f'the principal distance is held at {given:.0f} px, but the exposures show about '
+        f'{found:.0f} px: it has to be given in pixels'
+    )
 
 
 def _off_centre(interior: np.ndarray, image_size: tuple[int, int]) -> float:

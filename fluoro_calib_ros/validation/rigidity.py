@@ -26,7 +26,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..calibration.calibrate import ExposureResult, FluoroscopeResult
-from ..photogrammetry.rotations import matrix_from_quaternion, rotation_angle
+from ..calibration.pair_scatter import PairScatter
+from ..photogrammetry.rotations import matrix_from_quaternion, rotation_angle, vector_from_matrix
 
 MIN_PAIRS = 3
 # Distance, in radians and relative shift, from which a pair is not one of the rig.
@@ -35,6 +36,14 @@ INTERCHANGED = 0.4
 MAX_SHIFT_MM = 10.0
 MAX_SHIFT = 0.01  # the same over the distance of the sources; the larger of both holds
 MAX_TURN_RAD = np.deg2rad(1.0)
+# Scatter of the pairs over their standard deviations above which they are doubtful; of honest rigs
+# it is 1.0 to 1.4, and 3 where the model does not follow the distortion at all.
+DOUBTFUL_GROWTH = 2.0
+MAX_GROWTH = 8.0  # above which there is no orientation, where the displacement is large as well
+MIN_DOUBT_PX = 0.3  # less displaces no point by more than its noise does
+MAX_OFF = 0.0025  # median displacement of image points over the longer side of the image
+MIN_PAIRS_MOVED = 6
+MOVED_SHARE = 0.2  # of the scatter that is left when the rig was moved once
 
 
 def interchanged(names: tuple[str, str], one: FluoroscopeResult, other: FluoroscopeResult) -> str:
@@ -115,3 +124,71 @@ def contradiction(names: tuple[str, str], one: FluoroscopeResult, other: Fluoros
         'them; frames with the same number are not of the same exposure, or a fluoroscope was '
         'moved'
     )
+
+
+def doubtful(scatter: PairScatter, side_px: int) -> tuple[str, str]:
+    """Return why exposures give no orientation of a rig, or what is doubtful about the one given.
+
+    side_px is the longer side of the image. At least one of both sentences is ''.
+    """
+    a, b = scatter.fluoroscopes
+    off = float(np.median(scatter.off_px[scatter.used]))
+    left_out = ''
+    if not scatter.used.all():
+        numbers = ', '.join(str(number) for number in scatter.exposures[~scatter.used])
+        left_out = (
+            f'not from exposure {numbers}, in which fluoroscopes {a} and {b} stand otherwise to '
+            f'each other by {_size(scatter.off_px[~scatter.used])}: the frames are not of one '
+            'exposure, or the phantom moved between them'
+        )
+    if scatter.growth <= DOUBTFUL_GROWTH or off < MIN_DOUBT_PX:
+        return '', left_out
+    sentence = (
+        f'the exposures contradict each other: the relative orientation of fluoroscopes {a} and '
+        f'{b} differs between them by {off:.1f} px, {scatter.growth:.0f} times its standard '
+        f'deviation; {_cause(scatter)}'
+    )
+    refused = off > MAX_OFF * side_px and scatter.growth > MAX_GROWTH
+    return (sentence, '') if refused else ('', sentence)
+
+
+def _size(off_px: np.ndarray) -> str:
+    """Return the displacements of image points as text."""
+    low, high = float(np.min(off_px)), float(np.max(off_px))
+    if not np.isfinite(high):
+        return f'{low:.1f} px and more' if np.isfinite(low) else 'more than the image shows'
+    return f'{low:.1f} px' if high - low < 0.05 else f'{low:.1f} to {high:.1f} px'
+
+
+def _cause(scatter: PairScatter) -> str:
+    """Return why the pairs scatter: one move of the rig, where that explains nearly all."""
+    count = len(scatter.exposures)
+    order = np.argsort(scatter.exposures)
+    turn = scatter.turn[order]
+    # Rotations about the first pair [rad], and shifts over the distance of the sources.
+    base = float(np.median(np.linalg.norm(scatter.shift_mm, axis=1)))
+    place = np.hstack(
+        [vector_from_matrix(turn @ turn[0].T), scatter.shift_mm[order] / max(base, 1e-9)]
+    )
+    total = _squares(place)
+    splits = range(2, count - 1)
+    left = [_squares(place[:k]) + _squares(place[k:]) for k in splits]
+    if count < MIN_PAIRS_MOVED or min(left) > MOVED_SHARE * total:
+        return (
+            'frames with the same number are not of the same exposure, the phantom moved between '
+            'them, the fluoroscopes do not stand still, or the corrections do not hold in all of '
+            'them'
+        )
+    split = splits[int(np.argmin(left))]
+    numbers = scatter.exposures[order]
+    step = place[split:].mean(axis=0) - place[:split].mean(axis=0)
+    return (
+        f'a fluoroscope was moved between exposures {numbers[split - 1]} and {numbers[split]}, by '
+        f'about {np.linalg.norm(step[3:]) * base:.1f} mm and '
+        f'{np.rad2deg(np.linalg.norm(step[:3])):.2f} degrees: orient the rig from a capture'
+    )
+
+
+def _squares(values: np.ndarray) -> float:
+    """Sum of the squared deviations of rows (k, 6) from their mean."""
+    return float(np.sum((values - values.mean(axis=0)) ** 2))

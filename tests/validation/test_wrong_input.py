@@ -177,6 +177,89 @@ WRONG = {
 }
 
 
+def placed(count, place):
+    """The phantom with some targets where a program puts those that are not surveyed."""
+    xyz = PHANTOM.xyz_mm.copy()
+    xyz[:count] = place
+    return Phantom(PHANTOM.target_id, xyz, PHANTOM.sd_mm)
+
+
+WRONG_PHANTOM = {
+    'two targets in one place': (
+        lambda: placed(2, [1, 2, 3]),
+        'targets 1, 2 are all at (1, 2, 3)',
+    ),
+    '40 targets at the origin': (
+        lambda: placed(40, 0),
+        'targets 1, 2, 3, 4, 5 and 35 more are all at (0, 0, 0) mm',
+    ),
+    'a target at 9999': (
+        lambda: placed(1, 9999),
+        'phantom: target 1 is 17315 mm from the middle of the others',
+    ),
+    'a target in another unit': (
+        lambda: placed(1, 100 * PHANTOM.xyz_mm[0]),
+        'a wrong coordinate, another unit, or a placeholder',
+    ),
+}
+
+
+@pytest.mark.parametrize('kind', WRONG_PHANTOM)
+def test_targets_that_no_survey_has_are_refused(kind):
+    make_phantom, sentence = WRONG_PHANTOM[kind]
+    with pytest.raises(DataError, match=r'^phantom: ') as error:
+        run_calibration(CalibrationRequest({'a': frames()}, make_phantom(), FAST))
+    assert sentence in str(error.value)
+
+
+def test_one_recording_for_both_fluoroscopes_is_refused():
+    twice = {name: [replace(f, fluoroscope=name) for f in frames()] for name in ('a', 'b')}
+    sentence = 'a and b: 6 exposures have the same image points, as if one recording'
+    with pytest.raises(DataError, match=sentence):
+        run_calibration(CalibrationRequest(twice, PHANTOM, FAST))
+
+
+def test_an_exposure_that_two_fluoroscopes_share_is_left_out_of_both():
+    seen = {name: list(of_one[:8]) for name, of_one in exposures().items()}
+    seen['b'][3] = replace(seen['a'][3], fluoroscope='b')
+    outcome = run_calibration(CalibrationRequest(seen, PHANTOM, FAST))
+    assert outcome.result.left_out == (
+        'fluoroscopes a and b, exposure 4: both have the same image points',
+    )
+    assert all(len(f.exposures) == 7 for f in outcome.result.fluoroscopes.values())
+
+
+def test_one_fluoroscope_with_two_ways_to_write_its_name_is_refused():
+    seen = {'a': frames()[:3], 'A': [replace(f, fluoroscope='A') for f in frames()[3:]]}
+    with pytest.raises(DataError, match='fluoroscopes a and A differ in capital letters only'):
+        run_calibration(CalibrationRequest(seen, PHANTOM, FAST))
+
+
+def test_placeholders_of_targets_that_are_not_seen_are_left_out():
+    seen = frames()
+    unseen = np.setdiff1d(PHANTOM.target_id, seen[0].target_id)
+    seen[0] = replace(
+        seen[0],
+        target_id=np.append(seen[0].target_id, unseen),
+        uv=np.concatenate([seen[0].uv, np.zeros((len(unseen), 2))]),
+    )
+    outcome = run_calibration(CalibrationRequest({'a': seen}, PHANTOM, FAST))
+    (sentence,) = outcome.result.left_out
+    assert sentence.startswith(f'fluoroscope a, exposure 1: {len(unseen)} image points, target ')
+    assert sentence.endswith('a placeholder for targets that are not seen')
+    plain = run_calibration(CalibrationRequest({'a': frames()}, PHANTOM, FAST))
+    interior = outcome.result.fluoroscopes['a'].interior
+    assert np.array_equal(interior, plain.result.fluoroscopes['a'].interior)
+
+
+def test_a_principal_distance_in_mm_is_refused():
+    options = CalibrationOptions(interior='fixed')
+    request = CalibrationRequest({'a': frames()}, PHANTOM, options, principal_distance=1000.0)
+    with pytest.raises(DataError, match='held at 1000 px, but the exposures show about') as e:
+        run_calibration(request)
+    assert 'it has to be given in pixels' in str(e.value)
+
+
 @pytest.mark.parametrize('kind', WRONG)
 def test_wrong_input_is_refused_with_its_cause(kind):
     make_frames, make_phantom, sentence = WRONG[kind]

@@ -140,7 +140,8 @@ def run(arguments: argparse.Namespace) -> None:
             f'{arguments.source}: the rays miss each other by more than their standard deviations '
             f'allow; the limit of false matches was widened {outcome.widening:.1f} times, to '
             f'{arguments.reject * outcome.widening:.1f} standard deviations; check the sigma of '
-            'the image points, and whether a fluoroscope has moved since its calibration'
+            'the image points, whether they are corrected already or count from 1, and whether a '
+            'fluoroscope has moved since its calibration'
         )
     _print(arguments, outcome)
 

@@ -31,6 +31,7 @@ from ..options import option, validate_options
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.scatter import ObservedScatter
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
+from ..reconstruction.mismatch import mismatch
 from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
 
 
@@ -126,8 +127,8 @@ def reconstruct(
     Raises
     ------
     DataError
-        For calibrations that the orientation does not belong to, and for frames that cannot be
-        paired or corrected.
+        For calibrations that the orientation does not belong to, for frames that cannot be paired
+        or corrected, and where most rays do not meet.
     """
     options = options or ReconstructionOptions()
     if options.pair_by == 'stamp' and not options.has_stamps:
@@ -143,10 +144,11 @@ def reconstruct(
     orientation = orientation.subset(names)
     watch, drift = _drift_watch(orientation, calibrations, options)
     scatter = ObservedScatter()
+    intersector = Intersector(orientation, options.reject)
     found, unpaired = reconstruct_recording(
         frames,
         calibrations,
-        Intersector(orientation, options.reject),
+        intersector,
         options.pair_by,
         watch,
         options.pair_tolerance,
@@ -154,6 +156,9 @@ def reconstruct(
     )
     if not found:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
+    wrong = mismatch(found, frames, calibrations, intersector, options.pair_by)
+    if wrong:
+        raise DataError(wrong)
     disagreement = ''
     if options.has_stamps and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})

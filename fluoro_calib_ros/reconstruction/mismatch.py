@@ -1,0 +1,150 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recordings whose rays do not meet: most points are rejected, and why is found by trial.
+
+A share of false matches is borne. Where most rays miss each other, the frames, ids, fluoroscopes
+or coordinates are confused, or the orientation does not hold, and what meets does so by chance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+
+from ..calibration.result import FluoroscopeCalibration
+from ..exposures.frame import Frame
+from .intersection import FAILED, OK, OUTSIDE, REJECTED, Intersector
+from .reconstruct import ReconstructedFrame, reconstruct_recording
+
+MIN_POINTS = 20  # of two views, by which a recording is judged
+MAX_REJECTED = 0.5  # share of the points of two views
+MAX_TRIED = 10  # exposures
+UNKNOWN = (
+    'the frames, target ids or image coordinates do not belong together, or a fluoroscope was '
+    'moved since its orientation was determined'
+)
+BETTER = 0.3  # share of rejected points of a trial over that of the recording
+
+Frames = Mapping[str, Sequence[Frame]]
+Trial = tuple[str, dict[str, list[Frame]]]
+
+
+def share_rejected(found: Sequence[ReconstructedFrame]) -> tuple[float, int]:
+    """Return the share of rejected points, and the number of points of two views."""
+    status = np.concatenate([frame.points.status for frame in found] or [np.empty(0, int)])
+    counts = np.bincount(status, minlength=256)
+    bad = int(counts[REJECTED] + counts[FAILED])
+    total = bad + int(counts[OK] + counts[OUTSIDE])
+    return bad / max(total, 1), total
+
+
+def mismatch(
+    found: Sequence[ReconstructedFrame],
+    frames: Frames,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    intersector: Intersector,
+    pair_by: str,
+) -> str:
+    """Return a sentence where a reconstruction cannot be right, and its cause; else ''."""
+    share, total = share_rejected(found)
+    seen = sum(len(frame.target_id) for frame in found)
+    if not total and seen >= MIN_POINTS:
+        return (
+            'no target is seen by two fluoroscopes in one exposure: the target ids of the '
+            'fluoroscopes, or the numbers of their frames, do not belong together'
+        )
+    if total < MIN_POINTS or share <= MAX_REJECTED:
+        return ''
+    names = intersector.orientation.fluoroscopes
+    largest = sorted(found, key=lambda frame: -len(frame.target_id))[:MAX_TRIED]
+    numbers = {frame.number for frame in largest}
+    causes = [
+        sentence
+        for sentence, changed in _trials(frames, names, numbers)
+        if _share(changed, calibrations, intersector, pair_by) < BETTER * share
+    ]
+    cause = causes[0] if causes else UNKNOWN
+    return f'{100 * share:.0f} % of the rays miss each other: {cause}'
+
+
+def _share(
+    frames: Frames,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    intersector: Intersector,
+    pair_by: str,
+) -> float:
+    """Share of rejected points of a trial, 1 where there are too few."""
+    found, _ = reconstruct_recording(frames, calibrations, intersector, pair_by)
+    share, total = share_rejected(found)
+    return share if total >= MIN_POINTS else 1.0
+
+
+def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Trial]:
+    """Return sentences on what may be confused, each with the frames put right.
+
+    numbers are those of the frames to try.
+    """
+    tried = {name: [f for f in frames[name] if f.number in numbers] for name in names}
+    out = []
+    for one, other in pairwise(names):
+        if _size(tried[one]) == _size(tried[other]):
+            exchanged = {
+                **tried,
+                one: [replace(frame, fluoroscope=one) for frame in tried[other]],
+                other: [replace(frame, fluoroscope=other) for frame in tried[one]],
+            }
+            out.append((f'fluoroscopes {one} and {other} are interchanged', exchanged))
+    for name in names[1:]:
+        for step, word in ((1, 'small'), (-1, 'large')):
+            numbered = [replace(f, number=f.number + step) for f in frames[name]]
+            numbered = [f for f in numbered if f.number in numbers]
+            labelled = [replace(f, target_id=f.target_id + step) for f in tried[name]]
+            out += [
+                (f'the {what} of fluoroscope {name} are too {word} by 1', {**tried, name: changed})
+                for what, changed in (('frame numbers', numbered), ('target ids', labelled))
+            ]
+    return out + _other_axes(tried)
+
+
+def _other_axes(frames: Mapping[str, list[Frame]]) -> list[Trial]:
+    """Return trials of other directions of u and v, in all fluoroscopes or one."""
+    out = []
+    for sentence, change in (
+        ('u and v are interchanged', _transposed),
+        ('v runs upwards', _upside_down),
+    ):
+        everywhere = {name: [change(f) for f in of_one] for name, of_one in frames.items()}
+        out.append((sentence, everywhere))
+        out += [
+            (f'{sentence} in fluoroscope {name}', {**frames, name: changed})
+            for name, changed in everywhere.items()
+        ]
+    return out
+
+
+def _size(frames: Sequence[Frame]) -> tuple[int, int] | None:
+    return frames[0].image_size if frames else None
+
+
+def _transposed(frame: Frame) -> Frame:
+    return replace(frame, uv=frame.uv[:, ::-1].copy())
+
+
+def _upside_down(frame: Frame) -> Frame:
+    height = frame.image_size[1]
+    return replace(frame, uv=np.column_stack([frame.uv[:, 0], height - 1 - frame.uv[:, 1]]))

@@ -63,6 +63,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..jobs.result_folder import check_result_folder, save_result
     from ..jobs.sources import read_calibrations, read_source, read_survey, select_calibrations
     from ..report.tables import summary_table
+    from ..validation.held_fit import held_doubts
 
     check_result_folder(
         arguments.out, (arguments.source, arguments.phantom, arguments.calibration)
@@ -85,4 +86,8 @@ def run(arguments: argparse.Namespace) -> None:
     save_result(arguments.out, result, covariance=arguments.covariance)
     for sentence in result.left_out:
         print_note(f'not used: {sentence}')
-    print_result(arguments, result_document(result), summary_table(result))
+    doubts = held_doubts(result, calibrations)
+    for sentence in doubts:
+        print_note(f'doubtful: {sentence}')
+    document = {**result_document(result), 'doubts': doubts}
+    print_result(arguments, document, summary_table(result))

@@ -78,6 +78,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..files.result_document import orientation_document
     from ..files.rig_orientation import save_orientation
     from ..jobs.orientation import orient
+    from ..jobs.result_folder import belongs_to, saved_orientation
     from ..jobs.sources import read_calibrated_source, read_survey
     from ..report.orientation import orientation_text
 
@@ -99,16 +100,21 @@ def run(arguments: argparse.Namespace) -> None:
             name: [frame for frame in of_fluoroscope if frame.number in arguments.exposures]
             for name, of_fluoroscope in frames.items()
         }
+    present = saved_orientation(arguments.calibration)
+    if present is not None and not belongs_to(present, calibrations):
+        present = None
     try:
-        outcome = orient(frames, survey.phantom, calibrations, arguments.frame_id)
+        outcome = orient(frames, survey.phantom, calibrations, arguments.frame_id, present=present)
     except DataError as error:
         raise DataError(f'{arguments.source}: {error}') from None
     path = save_orientation(arguments.calibration, outcome.orientation)
+    print_notes(outcome.notes)
     document = {
         'out': path,
         **orientation_document(outcome.orientation),
         'targets': outcome.targets,
         'rms_mm': outcome.rms_mm,
+        'notes': list(outcome.notes),
     }
     lines = [orientation_text(outcome.orientation)]
     if outcome.targets:

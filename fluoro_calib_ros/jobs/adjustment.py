@@ -24,6 +24,7 @@ from ..calibration.result import FluoroscopeCalibration
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..exposures.strays import frames_without_strays
+from ..validation.inputs import require_phantom
 from .sources import select_calibrations
 
 
@@ -53,9 +54,10 @@ def adjust(
     Raises
     ------
     DataError
-        For a missing calibration, and for frames that do not suffice or do not fit.
+        For a missing calibration, and for frames that do not suffice, or cannot be of the phantom.
     """
     used = select_calibrations(calibrations, frames)
     cleaned, strays = frames_without_strays(frames, phantom)
+    require_phantom(cleaned, phantom)
     result = adjust_with_calibrations(cleaned, phantom, used, loss)
     return replace(result, left_out=(*strays, *result.left_out))

@@ -23,11 +23,23 @@ import numpy as np
 
 from ..calibration.result import FluoroscopeCalibration
 from ..calibration.rig_orientation import orientation_of_capture, standing_frames
+from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.rotations import rotation_angle
 from ..reconstruction.intersection import Intersector
-from ..reconstruction.reconstruct import reconstruct_exposure
+from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_exposure
+from ..validation.inputs import require_phantom
+
+MIN_MET = 0.5  # share of the targets of two views whose rays meet
+MIN_MET_SURELY = 0.9  # less is doubtful
+MIN_MATCHED = 10  # targets of two views by which a capture is judged
+MAX_SD = 2.0  # median distance of a target from its survey over the expectation
+MEDIAN_CHI2 = 2.366  # of three degrees of freedom
+# Changes of the relative orientation since the one before that are mentioned.
+MAX_SHIFT = 0.002  # over the distance of the sources
+MAX_TURN_RAD = np.deg2rad(0.2)
 
 
 @dataclass(frozen=True)
@@ -41,11 +53,14 @@ class OrientationOutcome:
         Number of targets of the capture that were intersected again.
     rms_mm : float
         Root mean square of their distances from the survey, NaN without targets.
+    notes : tuple of str
+        What is doubtful about it, and what has changed.
     """
 
     orientation: RigOrientation
     targets: int
     rms_mm: float
+    notes: tuple[str, ...] = ()
 
 
 def orient(
@@ -54,6 +69,7 @@ def orient(
     calibrations: Mapping[str, FluoroscopeCalibration],
     frame_id: str = 'rig',
     raise_if_cancelled: Callable[[], None] | None = None,
+    present: RigOrientation | None = None,
 ) -> OrientationOutcome:
     """Orient the rig in the frame of a phantom that stands still.
 
@@ -67,6 +83,8 @@ def orient(
         Name of the rig frame.
     raise_if_cancelled : callable, optional
         Called during the adjustment; may raise to stop it.
+    present : RigOrientation, optional
+        The orientation so far, with which the new one is compared.
 
     Returns
     -------
@@ -75,8 +93,10 @@ def orient(
     Raises
     ------
     DataError
-        For fewer than two fluoroscopes, missing calibrations, and frames that do not suffice.
+        For fewer than two fluoroscopes, missing calibrations, frames that do not suffice or cannot
+        be of the phantom, and where most rays do not meet.
     """
+    require_phantom(frames, phantom)
     orientation = orientation_of_capture(
         frames, phantom, calibrations, frame_id, raise_if_cancelled=raise_if_cancelled
     )
@@ -86,4 +106,64 @@ def orient(
     offset = found.points.xyz_mm - phantom.xyz_mm[phantom.index(found.target_id)]
     offset = offset[np.isfinite(offset).all(axis=1)]
     rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1)))) if len(offset) else float('nan')
-    return OrientationOutcome(orientation, len(offset), rms)
+    notes = [_doubt(found, phantom), _change(present, orientation)]
+    return OrientationOutcome(orientation, len(offset), rms, tuple(filter(None, notes)))
+
+
+def _doubt(found: ReconstructedFrame, phantom: Phantom) -> str:
+    """Return why an orientation is doubtful, '' where it is not.
+
+    found are the targets of the capture, intersected again. Raises DataError where most rays do
+    not meet.
+    """
+    points = found.points
+    matched = int(np.sum(points.rays > 1))
+    if matched < MIN_MATCHED:
+        return ''
+    rows = phantom.index(found.target_id)
+    offset = points.xyz_mm - phantom.xyz_mm[rows]
+    met = np.isfinite(offset).all(axis=1)
+    share = met.sum() / matched
+    causes = (
+        'the fluoroscopes are interchanged, their calibrations do not hold for these images, the '
+        'frames are not of one exposure, or the image points are corrected already'
+    )
+    if share < MIN_MET:
+        raise DataError(
+            f'the rays of only {met.sum()} of {matched} targets in two views meet: {causes}'
+        )
+    spread = phantom.sd_mm[rows[met]] ** 2
+    covariance = points.covariance[met] + spread[:, None, None] * np.eye(3)
+    scaled = np.linalg.solve(covariance, offset[met][:, :, None])[:, :, 0]
+    square = np.einsum('ni,ni->n', offset[met], scaled)
+    ratio = float(np.sqrt(np.median(square) / MEDIAN_CHI2))
+    if share >= MIN_MET_SURELY and ratio <= MAX_SD:
+        return ''
+    return (
+        f'doubtful: the rays of {met.sum()} of {matched} targets in two views meet, '
+        f'{ratio:.1f} times as far from their survey as expected: {causes}'
+    )
+
+
+def _change(present: RigOrientation | None, new: RigOrientation) -> str:
+    """Return how the fluoroscopes stand to each other otherwise than before, '' if they do not."""
+    if present is None or present.fluoroscopes != new.fluoroscopes:
+        return ''
+    first, *others = range(len(new.fluoroscopes))
+    for b in others:
+        turns = [o.rotation[b] @ o.rotation[first].T for o in (present, new)]
+        shifts = [
+            o.rotation[first] @ (o.position_mm[b] - o.position_mm[first]) for o in (present, new)
+        ]
+        base = float(np.linalg.norm(shifts[0]))
+        moved = float(np.linalg.norm(shifts[1] - shifts[0]))
+        turned = float(rotation_angle(turns[1] @ turns[0].T))
+        if moved > MAX_SHIFT * base or turned > MAX_TURN_RAD:
+            names = f'{new.fluoroscopes[first]} and {new.fluoroscopes[b]}'
+            return (
+                f'fluoroscopes {names} stand otherwise to each other than in the orientation '
+                f'before, by {moved:.1f} mm and {np.rad2deg(turned):.2f} degrees (distance of the '
+                f'sources {np.linalg.norm(shifts[1]) / base:.4f} times): one of them was moved '
+                'since, the frames are not of one exposure, or this is another phantom'
+            )
+    return ''

@@ -34,7 +34,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
-from ..jobs.orientation import orient
+from ..jobs.orientation import OrientationOutcome, orient
 from ..jobs.result_folder import belongs_to
 from ..photogrammetry import rig_orientation
 from .messages.rig_orientation import message_from_orientation
@@ -182,7 +182,8 @@ class OrientationService:
         settings = self._present_settings()
         try:
             with self._request():
-                orientation = await self._orient(request, settings)
+                outcome = await self._orient(request, settings)
+            orientation = outcome.orientation
             save_orientation(settings.directory, orientation)
         except (DataError, ValueError, OSError) as error:
             response.message = f'the orientation of the rig is unchanged: {error}'
@@ -196,12 +197,16 @@ class OrientationService:
             f'{orientation.exposures} captures of the phantom, standard deviation of the sources '
             f'{orientation.sd_mm.max():.2f} mm or less'
         )
-        self._node.get_logger().info(response.message)
+        response.message = '; '.join([response.message, *outcome.notes])
+        if outcome.notes:
+            self._node.get_logger().warning(response.message)
+        else:
+            self._node.get_logger().info(response.message)
         return response
 
     async def _orient(
         self, request: Orient.Request, settings: CaptureSettings
-    ) -> rig_orientation.RigOrientation:
+    ) -> OrientationOutcome:
         """Capture frames and orient the rig. Raises DataError and ValueError."""
         names = settings.names
         phantom = settings.phantom
@@ -219,11 +224,13 @@ class OrientationService:
         frames = await self._captured(names, request.frames or 1, timeout)
         calibrations = dict(self._calibrations())
         outcome = await self._in_thread(
-            lambda: orient(frames, phantom, calibrations, settings.rig_frame)
+            lambda: orient(
+                frames, phantom, calibrations, settings.rig_frame, present=self._present
+            )
         )
         if not belongs_to(outcome.orientation, self._calibrations()):
             raise DataError('the calibrations have changed meanwhile, capture the phantom again')
-        return outcome.orientation
+        return outcome
 
     async def _captured(
         self, names: Sequence[str], count: int, timeout: float

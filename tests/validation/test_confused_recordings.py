@@ -1,0 +1,369 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Recordings that do not belong together, or to the calibrations that are held.
+
+The rig has no distortion and its calibrations are the truth, so whatever is found is the fault of
+the input. What is right must pass without a word.
+"""
+
+import functools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rigs import calibrated, run
+
+from fluoro_calib_ros.calibration.rig_orientation import orientation_and_scatter
+from fluoro_calib_ros.distortion.none import no_correction
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.files.calibration import save_calibration
+from fluoro_calib_ros.files.observations import write_observations_csv
+from fluoro_calib_ros.files.phantom import write_phantom
+from fluoro_calib_ros.files.rig_orientation import save_orientation
+from fluoro_calib_ros.jobs.adjustment import adjust
+from fluoro_calib_ros.jobs.orientation import orient
+from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, phantom_poses
+from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.validation.held_fit import held_doubts
+from fluoro_calib_ros.validation.rigidity import doubtful
+
+SIZE = 1024
+COUNT = 8
+
+
+@functools.cache
+def rig():
+    """A rig without distortion."""
+    return virtual_rig(1, strength=0.0)
+
+
+@functools.cache
+def calibrations():
+    """Its true calibrations."""
+    one = calibrated('a', 5, model='parametric').calibrations['a']
+    return {
+        f.name: replace(
+            one,
+            fluoroscope=f.name,
+            interior=f.interior,
+            model=no_correction(),
+            train_exposure=np.zeros(0, dtype=int),
+            frame_id=f'{f.name}_optical',
+            image_sd=0.25,
+        )
+        for f in rig().fluoroscopes
+    }
+
+
+@functools.cache
+def orientation():
+    """Its true orientation, with a small covariance."""
+    f = rig().fluoroscopes
+    sd = np.tile([0.03] * 3 + [2e-5] * 3 + [0.1] * 3, len(f))
+    return RigOrientation(
+        tuple(x.name for x in f),
+        np.stack([x.interior for x in f]),
+        np.stack([x.rotation for x in f]),
+        np.stack([x.position_mm for x in f]),
+        np.diag(sd**2),
+        'rig',
+        'capture',
+        tuple(calibrations()[x.name].calibration_id for x in f),
+    )
+
+
+@functools.cache
+def poses():
+    return tuple(phantom_poses(np.random.default_rng(5), COUNT))
+
+
+def seen(of_rig, of_b=None):
+    """Frames of the phantom; of_b(k, fluoroscope, pose) returns what b and the phantom do."""
+    rng = np.random.default_rng(6)
+    out = {f.name: [] for f in of_rig.fluoroscopes}
+    for k, pose in enumerate(poses()):
+        for f in of_rig.fluoroscopes:
+            turn, shift, camera = *pose, f
+            if of_b and f.name == 'b':
+                camera, (turn, shift) = of_b(k, f, pose)
+            points = of_rig.true_mm @ turn.T + shift
+            ids, uv = detect_beads(rng, camera, points, of_rig.phantom.target_id, Detection())
+            out[f.name].append(Frame(f.name, k + 1, ids, uv, f.image_size))
+    return out
+
+
+@functools.cache
+def frames():
+    return seen(rig())
+
+
+def scatter(of_frames):
+    """Refusal and note on the orientation from exposures."""
+    _, (pairs,) = orientation_and_scatter(of_frames, rig().phantom, calibrations())
+    return doubtful(pairs, SIZE)
+
+
+def nudged(mm, rad, first, last=COUNT):
+    """B sees the phantom moved in a random way in some exposures."""
+    rng = np.random.default_rng(7)
+
+    def change(k, fluoroscope, pose):
+        turn = matrix_from_vector(rad * rng.normal(size=3)) @ pose[0]
+        shift = pose[1] + mm * rng.normal(size=3)
+        return fluoroscope, (turn, shift) if first <= k < last else pose
+
+    return change
+
+
+def rig_moved(mm, rad, first):
+    """B is moved once."""
+
+    def change(k, fluoroscope, pose):
+        if k < first:
+            return fluoroscope, pose
+        turn = matrix_from_vector(np.array([rad, -rad, 0]))
+        return replace(
+            fluoroscope,
+            rotation=turn @ fluoroscope.rotation,
+            position_mm=fluoroscope.position_mm + np.array([mm, 0, -mm]),
+        ), pose
+
+    return change
+
+
+def test_exposures_of_a_rigid_rig_agree():
+    assert scatter(frames()) == ('', '')
+
+
+def test_a_pair_between_which_the_phantom_moved_is_left_out_and_named():
+    bumped = seen(rig(), nudged(3.0, 0.01, 4, 5))
+    refused, note = scatter(bumped)
+    assert not refused
+    assert note.startswith('not from exposure 5, in which fluoroscopes a and b stand otherwise')
+    found, _ = orientation_and_scatter(bumped, rig().phantom, calibrations())
+    good, _ = orientation_and_scatter(frames(), rig().phantom, calibrations())
+    assert found.exposures == COUNT - 1
+    base = [np.linalg.norm(o.position_mm[1] - o.position_mm[0]) for o in (found, good)]
+    assert abs(base[0] - base[1]) < 0.5
+
+
+def test_frame_numbers_that_jump_in_one_fluoroscope_are_left_out():
+    shifted = dict(frames())
+    shifted['b'] = [replace(f, number=f.number + (f.number > 6)) for f in shifted['b']]
+    refused, note = scatter(shifted)
+    assert not refused
+    assert note.startswith('not from exposure 8, ')
+
+
+def test_a_rig_that_was_moved_between_exposures_gives_no_orientation():
+    refused, _ = scatter(seen(rig(), rig_moved(4.0, 0.006, 4)))
+    assert 'a fluoroscope was moved between exposures 4 and 5, by about' in refused
+
+
+def test_a_phantom_that_moves_between_the_fluoroscopes_gives_no_orientation():
+    refused, _ = scatter(seen(rig(), nudged(3.0, 0.01, 0)))
+    assert 'frames with the same number are not of the same exposure' in refused
+
+
+def test_small_movements_are_mentioned():
+    refused, note = scatter(seen(rig(), nudged(0.3, 0.001, 0)))
+    assert not refused
+    assert 'times its standard deviation' in note
+
+
+# ---- reconstruction
+
+
+def exchanged(of_frames):
+    a, b = of_frames['a'], of_frames['b']
+    return {
+        'a': [replace(f, fluoroscope='a') for f in b],
+        'b': [replace(f, fluoroscope='b') for f in a],
+    }
+
+
+def changed(change, names='ab'):
+    """The frames of some fluoroscopes changed."""
+    return {n: [change(f) if n in names else f for f in of] for n, of in frames().items()}
+
+
+def transposed(frame):
+    return replace(frame, uv=frame.uv[:, ::-1].copy())
+
+
+def upside_down(frame):
+    return replace(frame, uv=np.column_stack([frame.uv[:, 0], SIZE - 1 - frame.uv[:, 1]]))
+
+
+def halved(frame):
+    return replace(frame, uv=frame.uv / 2)
+
+
+CONFUSED = {
+    'fluoroscopes exchanged': (
+        lambda: exchanged(frames()),
+        'fluoroscopes a and b are interchanged',
+    ),
+    'b one exposure late': (
+        lambda: changed(lambda f: replace(f, number=f.number + 1), 'b'),
+        'the frame numbers of fluoroscope b are too large by 1',
+    ),
+    'ids of b too large': (
+        lambda: changed(lambda f: replace(f, target_id=f.target_id + 1), 'b'),
+        'the target ids of fluoroscope b are too large by 1',
+    ),
+    'u and v exchanged in b': (
+        lambda: changed(transposed, 'b'),
+        'u and v are interchanged in fluoroscope b',
+    ),
+    'u and v exchanged': (lambda: changed(transposed), 'u and v are interchanged'),
+    'v upwards': (lambda: changed(upside_down), 'v runs upwards'),
+    'images of half the size': (
+        lambda: changed(halved),
+        'the frames, target ids or image coordinates do not belong together',
+    ),
+    'other ids in b': (
+        lambda: changed(lambda f: replace(f, target_id=f.target_id + 1000), 'b'),
+        'no target is seen by two fluoroscopes in one exposure',
+    ),
+}
+FROM_FILE = ReconstructionOptions(has_stamps=False)
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('kind', CONFUSED)
+def test_rays_that_do_not_meet_are_refused_with_their_cause(kind):
+    make, sentence = CONFUSED[kind]
+    with pytest.raises(DataError, match=sentence):
+        reconstruct(make(), calibrations(), orientation(), FROM_FILE)
+
+
+def test_some_false_matches_do_not_refuse_a_reconstruction():
+    def confuse(frame):
+        ids = frame.target_id.copy()
+        some = np.random.default_rng(1).permutation(len(ids))[: len(ids) * 2 // 5]
+        ids[some] = np.roll(ids[some], 1)
+        return replace(frame, target_id=ids)
+
+    outcome = reconstruct(changed(confuse, 'b'), calibrations(), orientation(), FROM_FILE)
+    assert outcome.status_counts['OK'] > outcome.status_counts['REJECTED'] > 0
+
+
+# ---- orientation from a capture, and adjustment
+
+
+def capture(number=1):
+    return {name: [of_one[number - 1]] for name, of_one in frames().items()}
+
+
+def of_capture(change, names='ab'):
+    return {n: [change(f) if n in names else f for f in of] for n, of in capture().items()}
+
+
+def in_metres():
+    phantom = rig().phantom
+    return Phantom(phantom.target_id, phantom.xyz_mm / 1000, phantom.sd_mm / 1000)
+
+
+WRONG_CAPTURES = {
+    'metres': (capture, in_metres, 'not in mm, but perhaps in m'),
+    'ids too large by 1': (
+        lambda: of_capture(lambda f: replace(f, target_id=f.target_id + 1)),
+        None,
+        'the target ids are too large by 1',
+    ),
+    'mirrored': (lambda: of_capture(transposed), None, 'the image is mirrored'),
+    'other phantom': (
+        capture,
+        lambda: replace(rig().phantom, xyz_mm=virtual_rig(2).phantom.xyz_mm),
+        'the image points do not fit the phantom',
+    ),
+}
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize('job', ['orient', 'adjust'])
+@pytest.mark.parametrize('kind', WRONG_CAPTURES)
+def test_wrong_exposures_are_refused_with_held_calibrations(kind, job):
+    make, make_phantom, sentence = WRONG_CAPTURES[kind]
+    phantom = rig().phantom if make_phantom is None else make_phantom()
+    with pytest.raises(DataError, match=sentence):
+        (orient if job == 'orient' else adjust)(make(), phantom, calibrations())
+
+
+def test_orientation_from_a_good_capture_is_not_doubted():
+    found = orient(capture(), rig().phantom, calibrations())
+    assert found.notes == ()
+    again = orient(capture(), rig().phantom, calibrations(), present=found.orientation)
+    assert again.notes == ()
+
+
+def test_a_capture_whose_frames_are_of_two_poses_is_noticed_by_the_orientation_before():
+    before = orient(capture(), rig().phantom, calibrations()).orientation
+    mixed = {'a': capture(1)['a'], 'b': [replace(capture(2)['b'][0], number=1)]}
+    (note,) = orient(mixed, rig().phantom, calibrations(), present=before).notes
+    assert note.startswith('fluoroscopes a and b stand otherwise to each other than')
+
+
+def wrong_distance(factor):
+    """Calibrations with another principal distance."""
+    return {
+        name: replace(c, interior=c.interior * [1, 1, factor])
+        for name, c in calibrations().items()
+    }
+
+
+def test_a_capture_that_contradicts_the_calibrations_is_doubtful_or_refused():
+    try:
+        notes = orient(capture(), rig().phantom, wrong_distance(1.05)).notes
+    except DataError as error:
+        notes = (str(error),)
+    assert 'their calibrations do not hold for these images' in notes[0]
+
+
+def test_adjusted_exposures_that_contradict_the_calibrations_are_doubtful():
+    result = adjust(frames(), rig().phantom, calibrations())
+    assert held_doubts(result, calibrations()) == []
+    other = wrong_distance(1.05)
+    doubts = held_doubts(adjust(frames(), rig().phantom, other), other)
+    assert [d.split(':')[0] for d in doubts] == ['fluoroscope a', 'fluoroscope b']
+    assert 'times the noise with which it was determined' in doubts[0]
+
+
+def test_the_commands_say_what_is_wrong(tmp_path, capsys):
+    for calibration in calibrations().values():
+        save_calibration(tmp_path / 'result', calibration)
+    save_orientation(tmp_path / 'result', orientation())
+    write_phantom(tmp_path / 'phantom.csv', rig().phantom)
+    write_observations_csv(tmp_path / 'wrong.csv', exchanged(frames()))
+    held = ('--calibration', tmp_path / 'result')
+    phantom = ('--phantom', tmp_path / 'phantom.csv')
+    assert run('reconstruct', tmp_path / 'wrong.csv', *held, '--out', tmp_path / 'p.csv') == 1
+    assert 'fluoroscopes a and b are interchanged' in capsys.readouterr().err
+    assert not (tmp_path / 'p.csv').exists()
+    write_observations_csv(tmp_path / 'right.csv', frames())
+    source = tmp_path / 'right.csv'
+    assert run('adjust', source, *held, *phantom, '--out', tmp_path / 'adjusted') == 0
+    assert 'doubtful' not in capsys.readouterr().err
+    arguments = ('--exposures', '1')
+    assert run('orient', source, *held, *phantom, *arguments) == 0
+    said = capsys.readouterr().err
+    # The phantom of exposure 1 is another frame, but the fluoroscopes stand as before.
+    assert 'stand otherwise' not in said and 'doubtful' not in said

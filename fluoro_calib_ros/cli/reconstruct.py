@@ -136,12 +136,15 @@ def run(arguments: argparse.Namespace) -> None:
     if outcome.disagreement:
         print_note(f'{arguments.source}: {outcome.disagreement}')
     if outcome.widening > 1:
+        check = (
+            'check the sigma of the image points, whether they are corrected already or count '
+            'from 1, and whether a fluoroscope has moved since its calibration'
+        )
         print_note(
             f'{arguments.source}: the rays miss each other by more than their standard deviations '
             f'allow; the limit of false matches was widened {outcome.widening:.1f} times, to '
-            f'{arguments.reject * outcome.widening:.1f} standard deviations; check the sigma of '
-            'the image points, whether they are corrected already or count from 1, and whether a '
-            'fluoroscope has moved since its calibration'
+            f'{arguments.reject * outcome.widening:.1f} standard deviations; '
+            f'{outcome.cause or check}'
         )
     _print(arguments, outcome)
 

@@ -29,9 +29,9 @@ from ..exposures.frame import Frame
 from ..exposures.pairing import PAIR_BY, PairingOptions, disagreement_of_recording
 from ..options import option, validate_options
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..photogrammetry.scatter import ObservedScatter
+from ..photogrammetry.scatter import MAX_WIDENING, ObservedScatter
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
-from ..reconstruction.mismatch import mismatch
+from ..reconstruction.mismatch import cause_of_misses, mismatch
 from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
 
 
@@ -82,6 +82,8 @@ class ReconstructionOutcome:
     widening : float
         Factor of the limit of false matches at the end: above 1 where the rays miss each other by
         more than their standard deviations allow.
+    cause : str
+        Why, where the factor is the largest and a trial tells it.
     """
 
     frames: list[ReconstructedFrame]
@@ -90,6 +92,7 @@ class ReconstructionOutcome:
     drift: DriftVerdict | None
     disagreement: str = ''
     widening: float = 1.0
+    cause: str = ''
 
     @property
     def incomplete(self) -> int:
@@ -159,11 +162,16 @@ def reconstruct(
     wrong = mismatch(found, frames, calibrations, intersector, options.pair_by)
     if wrong:
         raise DataError(wrong)
+    cause = ''
+    if scatter.factor >= MAX_WIDENING:
+        cause = cause_of_misses(found, frames, calibrations, intersector, options.pair_by)
     disagreement = ''
     if options.has_stamps and options.pair_by == 'frame_number':
         disagreement = disagreement_of_recording({name: frames[name] for name in names})
     drift = watch.verdict() if watch else drift
-    return ReconstructionOutcome(found, unpaired, orientation, drift, disagreement, scatter.factor)
+    return ReconstructionOutcome(
+        found, unpaired, orientation, drift, disagreement, scatter.factor, cause
+    )
 
 
 def check_orientation(

@@ -16,6 +16,7 @@
 
 A share of false matches is borne. Where most rays miss each other, the frames, ids, fluoroscopes
 or coordinates are confused, or the orientation does not hold, and what meets does so by chance.
+Where they miss each other by a little, the same trials may tell why.
 """
 
 from __future__ import annotations
@@ -27,18 +28,22 @@ from itertools import pairwise
 import numpy as np
 
 from ..calibration.result import FluoroscopeCalibration
+from ..distortion.none import no_correction
 from ..exposures.frame import Frame
-from .intersection import FAILED, OK, OUTSIDE, REJECTED, Intersector
+from .intersection import FAILED, OK, OUTSIDE, REJECTED, SINGLE_VIEW, Intersector
 from .reconstruct import ReconstructedFrame, reconstruct_recording
 
 MIN_POINTS = 20  # of two views, by which a recording is judged
 MAX_REJECTED = 0.5  # share of the points of two views
+CORRECTED = 'the image points are corrected already'
 MAX_TRIED = 10  # exposures
 UNKNOWN = (
     'the frames, target ids or image coordinates do not belong together, or a fluoroscope was '
     'moved since its orientation was determined'
 )
 BETTER = 0.3  # share of rejected points of a trial over that of the recording
+
+CLOSER = 0.6  # median miss of a trial over that of the recording
 
 Frames = Mapping[str, Sequence[Frame]]
 Trial = tuple[str, dict[str, list[Frame]]]
@@ -71,27 +76,54 @@ def mismatch(
     if total < MIN_POINTS or share <= MAX_REJECTED:
         return ''
     names = intersector.orientation.fluoroscopes
-    largest = sorted(found, key=lambda frame: -len(frame.target_id))[:MAX_TRIED]
-    numbers = {frame.number for frame in largest}
-    causes = [
-        sentence
-        for sentence, changed in _trials(frames, names, numbers)
-        if _share(changed, calibrations, intersector, pair_by) < BETTER * share
-    ]
-    cause = causes[0] if causes else UNKNOWN
-    return f'{100 * share:.0f} % of the rays miss each other: {cause}'
+    for sentence, changed in _trials(frames, names, _largest(found)):
+        tried, _ = reconstruct_recording(changed, calibrations, intersector, pair_by)
+        rejected, count = share_rejected(tried)
+        if count >= MIN_POINTS and rejected < BETTER * share:
+            return f'{100 * share:.0f} % of the rays miss each other: {sentence}'
+    return f'{100 * share:.0f} % of the rays miss each other: {UNKNOWN}'
 
 
-def _share(
+def cause_of_misses(
+    found: Sequence[ReconstructedFrame],
     frames: Frames,
     calibrations: Mapping[str, FluoroscopeCalibration],
     intersector: Intersector,
     pair_by: str,
-) -> float:
-    """Share of rejected points of a trial, 1 where there are too few."""
-    found, _ = reconstruct_recording(frames, calibrations, intersector, pair_by)
-    share, total = share_rejected(found)
-    return share if total >= MIN_POINTS else 1.0
+) -> str:
+    """Return why rays miss each other by more than they should, '' where no trial tells it.
+
+    The trials are those of `mismatch`, and image points that are corrected already.
+    """
+    names = intersector.orientation.fluoroscopes
+    numbers = _largest(found)
+    limit = CLOSER * _miss([frame for frame in found if frame.number in numbers])
+    uncorrected = {name: replace(calibrations[name], model=no_correction()) for name in names}
+    uncorrected = {name: replace(c, angle_field=None) for name, c in uncorrected.items()}
+    tried = {name: [f for f in frames[name] if f.number in numbers] for name in names}
+    trials = [(CORRECTED, tried), *_trials(frames, names, numbers)]
+    misses = []
+    for sentence, changed in trials:
+        used = uncorrected if sentence == CORRECTED else calibrations
+        again, _ = reconstruct_recording(changed, used, intersector, pair_by)
+        misses.append(_miss(again))
+    best = int(np.argmin(misses))
+    return trials[best][0] if misses[best] < limit else ''
+
+
+def _largest(found: Sequence[ReconstructedFrame]) -> set[int]:
+    """Numbers of the frames with the most targets, on which causes are tried."""
+    largest = sorted(found, key=lambda frame: -len(frame.target_id))[:MAX_TRIED]
+    return {frame.number for frame in largest}
+
+
+def _miss(found: Sequence[ReconstructedFrame]) -> float:
+    """Median miss of the rays over its standard deviation, infinite where there are few."""
+    points = [frame.points for frame in found]
+    size = np.concatenate([p.standardised[p.status != SINGLE_VIEW] for p in points] or [[]])
+    if len(size) < MIN_POINTS:
+        return np.inf
+    return float(np.median(np.where(np.isfinite(size), size, np.inf)))
 
 
 def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Trial]:

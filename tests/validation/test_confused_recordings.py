@@ -266,6 +266,37 @@ def test_some_false_matches_do_not_refuse_a_reconstruction():
     assert outcome.status_counts['OK'] > outcome.status_counts['REJECTED'] > 0
 
 
+def distorted():
+    """Calibrations with a distortion, and frames that have it."""
+    held = {}
+    seen_so = {}
+    for name in 'ab':
+        calibration = calibrated(name).calibrations[name]
+        held[name] = replace(
+            calibrations()[name],
+            model=calibration.model,
+            train_exposure=calibration.train_exposure,
+        )
+        seen_so[name] = [
+            replace(f, uv=f.uv + calibration.correction(f.uv).duv) for f in frames()[name]
+        ]
+        seen_so[name] = [
+            replace(f, target_id=f.target_id[inside], uv=f.uv[inside])
+            for f in seen_so[name]
+            for inside in [((f.uv > 0) & (f.uv < SIZE - 1)).all(axis=1)]
+        ]
+    return held, seen_so
+
+
+def test_points_that_are_corrected_already_are_recognised():
+    held, observed = distorted()
+    right = reconstruct(observed, held, orientation(), FROM_FILE)
+    assert right.cause == '' and right.widening < 2
+    corrected = changed(lambda f: f)
+    wrong = reconstruct(corrected, held, orientation(), FROM_FILE)
+    assert wrong.cause == 'the image points are corrected already'
+
+
 # ---- orientation from a capture, and adjustment
 
 

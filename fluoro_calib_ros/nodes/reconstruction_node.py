@@ -54,6 +54,7 @@ from ..reconstruction.intersection import (
     IntersectedPoints,
     Intersector,
 )
+from ..reconstruction.mismatch import RecentMisses
 from ..reconstruction.reconstruct import intersect_exposure, watch_exposure
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected
@@ -73,7 +74,7 @@ from .messages.rig_orientation import (
     orientation_from_message,
 )
 from .messages.transforms import transforms_of_orientation
-from .runtime.diagnostics import OK, WARN, LatencyWindow, Status
+from .runtime.diagnostics import ERROR, OK, WARN, LatencyWindow, Status
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run
 from .runtime.parameters import (
@@ -201,6 +202,7 @@ class ReconstructionNode(StreamNode):
         self._stalls = {name: StallDetector() for name in self._names}
         self._refusals = RefusalLog('frame', self.limited_logger)
         self._points: Counter[str] = Counter()
+        self._misses = RecentMisses()
         self._exposures = 0
         self._reconstructed = 0
         self._without_orientation = 0
@@ -332,6 +334,7 @@ class ReconstructionNode(StreamNode):
             self._refusals.last_fault = str(error)
             self.get_logger().error(f'orientation refused, the current one stays in use: {error}')
             return
+        self._misses = RecentMisses()
         ids = orientation.calibration_ids
         newest = list(self._rigs.items())[-(MAX_ORIENTATIONS - 1) :]
         self._rigs = {**{i: old for i, old in newest if i != ids}, ids: rig}
@@ -417,6 +420,7 @@ class ReconstructionNode(StreamNode):
     def _count_points(self, points: IntersectedPoints) -> None:
         """Count the points by status."""
         self._points['points'] += len(points.status)
+        self._misses.add(points)
         if points.status.any():
             for name, status in COUNTED_STATUSES.items():
                 self._points[name] += int(np.count_nonzero(points.status == status))
@@ -501,6 +505,10 @@ class ReconstructionNode(StreamNode):
         missing = [n for n in self._names if not self.has_publisher(f'{n}/corrected_observations')]
         if missing:
             return WARN, f'no publisher of corrected observations of {", ".join(missing)}'
+        disagreement = self._pairer.stamps.disagreement()
+        misses = self._misses.message()
+        if misses:
+            return ERROR, '; '.join(filter(None, (misses, disagreement)))
         if self._pairer.silent:
             return (
                 WARN,
@@ -516,7 +524,6 @@ class ReconstructionNode(StreamNode):
         refusals = self._refusals.refusal_status()
         if refusals:
             return refusals
-        disagreement = self._pairer.stamps.disagreement()
         if disagreement:
             return WARN, disagreement
         if unpaired:

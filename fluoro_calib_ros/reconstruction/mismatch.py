@@ -21,6 +21,7 @@ Where they miss each other by a little, the same trials may tell why.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import pairwise
@@ -30,7 +31,16 @@ import numpy as np
 from ..calibration.result import FluoroscopeCalibration
 from ..distortion.none import no_correction
 from ..exposures.frame import Frame
-from .intersection import FAILED, OK, OUTSIDE, REJECTED, SINGLE_VIEW, Intersector
+from .intersection import (
+    FAILED,
+    OK,
+    OUTSIDE,
+    REJECTED,
+    SINGLE_VIEW,
+    STATUS_NAMES,
+    IntersectedPoints,
+    Intersector,
+)
 from .reconstruct import ReconstructedFrame, reconstruct_recording
 
 MIN_POINTS = 20  # of two views, by which a recording is judged
@@ -38,15 +48,43 @@ MAX_REJECTED = 0.5  # share of the points of two views
 CORRECTED = 'the image points are corrected already'
 MAX_TRIED = 10  # exposures
 UNKNOWN = (
-    'the frames, target ids or image coordinates do not belong together, or a fluoroscope was '
-    'moved since its orientation was determined'
+    'the frames, target ids or image coordinates do not belong together, the fluoroscopes are '
+    'interchanged, or one was moved since its orientation was determined'
 )
+UNMATCHED = (
+    'no target is seen by two fluoroscopes in one exposure: the target ids of the fluoroscopes, '
+    'or the numbers of their frames, do not belong together'
+)
+RECENT = 100  # exposures of a stream
 BETTER = 0.3  # share of rejected points of a trial over that of the recording
 
 CLOSER = 0.6  # median miss of a trial over that of the recording
 
 Frames = Mapping[str, Sequence[Frame]]
 Trial = tuple[str, dict[str, list[Frame]]]
+
+
+class RecentMisses:
+    """Share of the rays of recent exposures of a stream that miss each other."""
+
+    def __init__(self) -> None:
+        self._recent: deque[tuple[int, int, int]] = deque(maxlen=RECENT)
+
+    def add(self, points: IntersectedPoints) -> None:
+        """Add the points of an exposure."""
+        counts = np.bincount(points.status, minlength=len(STATUS_NAMES))
+        bad = int(counts[REJECTED] + counts[FAILED])
+        total = bad + int(counts[OK] + counts[OUTSIDE])
+        self._recent.append((bad, total, int(counts[SINGLE_VIEW])))
+
+    def message(self) -> str:
+        """Return a sentence where points of the recent exposures cannot be right, else ''."""
+        bad, total, single = (sum(column) for column in zip(*list(self._recent) or [(0, 0, 0)]))
+        if not total and single >= MIN_POINTS:
+            return UNMATCHED
+        if total < MIN_POINTS or bad <= MAX_REJECTED * total:
+            return ''
+        return f'{100 * bad / total:.0f} % of the rays miss each other: {UNKNOWN}'
 
 
 def share_rejected(found: Sequence[ReconstructedFrame]) -> tuple[float, int]:
@@ -69,10 +107,7 @@ def mismatch(
     share, total = share_rejected(found)
     seen = sum(len(frame.target_id) for frame in found)
     if not total and seen >= MIN_POINTS:
-        return (
-            'no target is seen by two fluoroscopes in one exposure: the target ids of the '
-            'fluoroscopes, or the numbers of their frames, do not belong together'
-        )
+        return UNMATCHED
     if total < MIN_POINTS or share <= MAX_REJECTED:
         return ''
     names = intersector.orientation.fluoroscopes

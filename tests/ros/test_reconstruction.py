@@ -366,3 +366,25 @@ def test_damaged_corrected_frames_are_counted_by_kind(rig, tracking):
     publish(client, tracking, [9], lambda frame: replace(frame, number=95_001))
     client.wait_until(lambda: rig.points[-1].frame_number == 95_001, what='the next good exposure')
     assert 'Traceback' not in rig.nodes['reconstruction_node'].log
+
+
+def test_rays_that_miss_each_other_are_an_error(rig, tracking):
+    """The image of one fluoroscope is upside down."""
+
+    def upside_down(frame):
+        number = 200_000 + frame.number
+        if frame.fluoroscope == 'a':
+            return replace(frame, number=number)
+        height = frame.image_size[1]
+        uv = np.column_stack([frame.uv[:, 0], height - 1 - frame.uv[:, 1]])
+        return replace(frame, number=number, uv=uv)
+
+    publish(rig.client, tracking, range(80), upside_down)
+    status = rig.client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: 'rays miss each other' in s.message,
+        'reconstruction',
+        'rays that miss each other',
+    )
+    assert status.level == b'\2'
+    assert 'do not belong together' in status.message

@@ -39,6 +39,9 @@ from fluoro_calib_ros.jobs.orientation import orient
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.reconstruction.intersection import Intersector
+from fluoro_calib_ros.reconstruction.mismatch import RecentMisses
+from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
 from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, phantom_poses
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.validation.held_fit import held_doubts
@@ -295,6 +298,26 @@ def test_points_that_are_corrected_already_are_recognised():
     corrected = changed(lambda f: f)
     wrong = reconstruct(corrected, held, orientation(), FROM_FILE)
     assert wrong.cause == 'the image points are corrected already'
+
+
+def test_a_stream_whose_rays_miss_each_other_is_noticed_and_forgotten():
+    def of(some):
+        found, _ = reconstruct_recording(some, calibrations(), Intersector(orientation()))
+        return found
+
+    misses = RecentMisses()
+    assert misses.message() == ''
+    for found in of(frames()):
+        misses.add(found.points)
+    assert misses.message() == ''
+    for _ in range(3):
+        for found in of(exchanged(frames())):
+            misses.add(found.points)
+    assert '% of the rays miss each other' in misses.message()
+    for _ in range(10):
+        for found in of(frames()):
+            misses.add(found.points)
+    assert misses.message() == ''
 
 
 # ---- orientation from a capture, and adjustment

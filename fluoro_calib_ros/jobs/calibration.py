@@ -198,7 +198,7 @@ def _wrong_input(request: CalibrationRequest) -> list[str]:
     unknown = {name: exposures for name, exposures in frames.items() if name not in known}
     # Points in motion may rest, and may come from far away.
     return [
-        *([] if known else find_wrong_phantom(request.phantom)),
+        *([] if known else find_wrong_phantom(frames, request.phantom)),
         *find_wrong_input(unknown, request.phantom).values(),
         *find_wrong_orientation(frames, request.phantom, known).values(),
     ]

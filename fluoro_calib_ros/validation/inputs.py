@@ -128,16 +128,21 @@ def validate_names(names: Iterable[str]) -> None:
             )
 
 
-def find_wrong_phantom(phantom: Phantom) -> list[str]:
-    """Return a sentence for every kind of targets whose coordinates cannot be right."""
-    xyz = phantom.xyz_mm
+def find_wrong_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> list[str]:
+    """Return a sentence for every kind of targets in frames whose coordinates cannot be right."""
+    every = [frame.target_id for exposures in frames.values() for frame in exposures]
+    seen = np.isin(phantom.target_id, np.concatenate(every or [np.empty(0, int)]))
+    if not seen.any():
+        return []
+    seen_id = phantom.target_id[seen]
+    xyz = phantom.xyz_mm[seen]
     if np.linalg.matrix_rank(xyz - xyz.mean(axis=0)) < 2:
         return []  # all on a line: the calibration says so
     out = []
     places, place, count = np.unique(xyz, axis=0, return_inverse=True, return_counts=True)
     if count.max() > 1:
         most = int(np.argmax(count))
-        ids = phantom.target_id[place.reshape(-1) == most]
+        ids = seen_id[place.reshape(-1) == most]
         x, y, z = places[most]
         out.append(
             f'phantom: targets {_first(ids)} are all at ({x:g}, {y:g}, {z:g}) mm: a repeated row, '
@@ -148,7 +153,7 @@ def find_wrong_phantom(phantom: Phantom) -> list[str]:
     far = distance > MAX_EXTENT * extent
     if extent > 0 and far.any():
         out.append(
-            f'phantom: target {_first(phantom.target_id[far])} is {distance[far].max():.0f} mm '
+            f'phantom: target {_first(seen_id[far])} is {distance[far].max():.0f} mm '
             f'from the middle of the others, most of which are within {extent:.0f} mm: a wrong '
             'coordinate, another unit, or a placeholder for targets that are not surveyed'
         )

@@ -178,24 +178,28 @@ WRONG = {
 
 
 def placed(count, place):
-    """The phantom with some targets where a program puts those that are not surveyed."""
+    """The phantom with some targets where a program puts those that are not surveyed.
+
+    They are the first ones that are seen.
+    """
     xyz = PHANTOM.xyz_mm.copy()
-    xyz[:count] = place
+    seen = np.unique(np.concatenate([f.target_id for f in frames()]))[:count]
+    xyz[PHANTOM.index(seen)] = place
     return Phantom(PHANTOM.target_id, xyz, PHANTOM.sd_mm)
 
 
 WRONG_PHANTOM = {
     'two targets in one place': (
         lambda: placed(2, [1, 2, 3]),
-        'targets 1, 2 are all at (1, 2, 3)',
+        ' are all at (1, 2, 3)',
     ),
     '40 targets at the origin': (
         lambda: placed(40, 0),
-        'targets 1, 2, 3, 4, 5 and 35 more are all at (0, 0, 0) mm',
+        'and 35 more are all at (0, 0, 0) mm',
     ),
     'a target at 9999': (
         lambda: placed(1, 9999),
-        'phantom: target 1 is 17315 mm from the middle of the others',
+        ' mm from the middle of the others, most of which are within ',
     ),
     'a target in another unit': (
         lambda: placed(1, 100 * PHANTOM.xyz_mm[0]),
@@ -210,6 +214,15 @@ def test_targets_that_no_survey_has_are_refused(kind):
     with pytest.raises(DataError, match=r'^phantom: ') as error:
         run_calibration(CalibrationRequest({'a': frames()}, make_phantom(), FAST))
     assert sentence in str(error.value)
+
+
+def test_targets_that_are_not_seen_need_no_survey():
+    wrong = placed(5, 9999)
+    surveyed = PHANTOM.target_id[(wrong.xyz_mm == PHANTOM.xyz_mm).all(axis=1)]
+    kept = [np.isin(f.target_id, surveyed) for f in frames()]
+    seen = [replace(f, target_id=f.target_id[k], uv=f.uv[k]) for f, k in zip(frames(), kept)]
+    outcome = run_calibration(CalibrationRequest({'a': seen}, wrong, FAST))
+    assert outcome.doubts == ()
 
 
 def test_one_recording_for_both_fluoroscopes_is_refused():

@@ -47,6 +47,7 @@ from ..validation.inputs import (
     valid_frames,
     validate_magnitudes,
     validate_names,
+    why_left_out,
 )
 from ..validation.plausibility import implausible
 from ..validation.rigidity import contradiction, doubtful, interchanged
@@ -170,7 +171,7 @@ def run_calibration(
     if doubts and not force:
         raise DataError('. '.join(doubts))
     result = _calibrated(request, progress, raise_if_cancelled)
-    result = replace(result, left_out=(*left_out, *result.left_out))
+    result = replace(result, left_out=(*left_out, *_with_causes(request, result)))
     doubts += implausible(request, result)
     doubts += _interchanged(result)
     if doubts and not force:
@@ -217,6 +218,27 @@ def _calibrated(
             f'the exposures do not determine the calibration: {str(error).lower()}; add exposures '
             'with the phantom turned and moved, and check target ids and sigma'
         ) from None
+
+
+def _with_causes(request: CalibrationRequest, result: CalibrationResult) -> tuple[str, ...]:
+    """Return what was left out, with the causes of exposures that do not fit, where found."""
+    causes: dict[str, str] = {}
+    for name, figures in result.fluoroscopes.items():
+        used = {exposure.exposure for exposure in figures.exposures}
+        frames = valid_frames({name: request.frames[name]})[name]
+        if name not in request.known_orientations:
+            causes |= {
+                f'fluoroscope {name}, exposure {frame.number}: ': why_left_out(
+                    frame, request.phantom
+                )
+                for frame in frames
+                if frame.number not in used
+            }
+    out = []
+    for sentence in result.left_out:
+        found = [cause for start, cause in causes.items() if cause and sentence.startswith(start)]
+        out.append('; '.join([sentence, *found]))
+    return tuple(out)
 
 
 def _without_strays(request: CalibrationRequest) -> tuple[CalibrationRequest, list[str]]:

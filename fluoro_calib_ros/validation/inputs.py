@@ -66,6 +66,9 @@ _MIRRORED = (
     'the image is mirrored: v must run down and u to the right, and neither they nor the axes of '
     'the phantom may be interchanged'
 )
+_OTHER_PHANTOM = (
+    'the image points do not fit the phantom: this is another phantom, or the target ids are wrong'
+)
 # Sentence and ids of the ways in which ids are confused.
 CONFUSIONS: tuple[tuple[str, Relabel], ...] = (
     ('the target ids are too large by 1', lambda ids, phantom: ids - 1),
@@ -126,6 +129,12 @@ def validate_names(names: Iterable[str]) -> None:
                 f'fluoroscopes {other} and {name} differ in capital letters only: '
                 'this is one fluoroscope, or name them otherwise'
             )
+
+
+def why_left_out(frame: Frame, phantom: Phantom) -> str:
+    """Return why an exposure that does not fit was left out, '' where the cause is not found."""
+    cause = _cause(frame, phantom)
+    return '' if cause == _OTHER_PHANTOM else cause
 
 
 def find_wrong_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> list[str]:
@@ -387,10 +396,7 @@ def _cause(frame: Frame, phantom: Phantom) -> str:
         ):
             return f'{sentence}: with the right ones the image points fit the phantom'
     if given.misfit_px > MISFIT * side:
-        return (
-            'the image points do not fit the phantom: this is another phantom, or the target ids '
-            'are wrong'
-        )
+        return _OTHER_PHANTOM
     if given.depth < 0:
         return _MIRRORED
     return _unit_cause(phantom, given)

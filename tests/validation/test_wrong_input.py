@@ -423,6 +423,23 @@ def test_few_wrong_exposures_are_left_out_and_named():
     assert 'exposure 200: the image points are those of exposure 1' in outcome.result.left_out[0]
 
 
+@pytest.mark.parametrize(
+    ('change', 'cause'),
+    [
+        (lambda f: replace(f, uv=f.uv[:, ::-1].copy()), 'the image is mirrored'),
+        (lambda f: replace(f, target_id=f.target_id + 1), 'the target ids are too large by 1'),
+    ],
+)
+def test_the_cause_of_exposures_that_are_left_out_is_named(change, cause):
+    seen = frames(8)
+    last = seen[4].target_id < PHANTOM.target_id[-1]  # which has a next one
+    seen[4] = change(replace(seen[4], target_id=seen[4].target_id[last], uv=seen[4].uv[last]))
+    outcome = run_calibration(CalibrationRequest({'a': seen}, PHANTOM, FAST))
+    (sentence,) = outcome.result.left_out
+    assert sentence.startswith('fluoroscope a, exposure 5: ')
+    assert cause in sentence
+
+
 def test_exposures_of_which_less_than_half_fits_are_left_out_and_named():
     """Beads labelled as ones nearby: the exposure starts well, but most of it does not fit."""
     strong = virtual_rig(1, 2.0)

@@ -176,8 +176,8 @@ def _cause(scatter: PairScatter) -> str:
     if count < MIN_PAIRS_MOVED or min(left) > MOVED_SHARE * total:
         return (
             'frames with the same number are not of the same exposure, the phantom moved between '
-            'them, the fluoroscopes do not stand still, or the corrections do not hold in all of '
-            'them'
+            'them, the fluoroscopes or their images do not stand still, or the corrections do not '
+            'hold in all of them'
         )
     split = splits[int(np.argmin(left))]
     numbers = scatter.exposures[order]

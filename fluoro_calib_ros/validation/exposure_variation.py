@@ -29,6 +29,8 @@ NAME = 'variation'
 # A change below it leaves corrections and verdict as they are: with 15 exposures it adds less than
 # 2 % to the errors (docs/pathologies.md).
 HARMLESS_PX = 0.1
+# Range [rad] of angles in degrees that is not larger than a full turn in radians.
+LARGEST_RADIANS = np.deg2rad(2 * np.pi)
 
 
 def check_variation(evidence: Evidence, names: Sequence[str]) -> list[Check]:
@@ -56,13 +58,23 @@ def _check(evidence: Evidence, name: str) -> Check:
             f'fluoroscope {name}: the distortion differs between exposures by '
             f'{found.size_px:.2f} px (chi2/dof {found.chi2_per_dof:.2f}, constant up to '
             f'{VARYING:.2f})',
-            'a C-arm at another angle, a lens that was focused or zoomed, a source or detector '
+            f'{_angles(evidence, name)}, a lens that was focused or zoomed, a source or detector '
             'that is not rigid, or a phantom that moved, was bent or is surveyed wrongly; '
             f'{more_exposures(count)} at the angle and setting that are used, or calibrate each'
             + _how_to_give_angles(evidence, name),
         ),
         evidence.trends[name].is_significant,
     )
+
+
+def _angles(evidence: Evidence, name: str) -> str:
+    """What may be wrong with the angles of the C-arm."""
+    angles = angles_of(evidence.frames[name])
+    if not np.isfinite(angles).all() or np.ptp(angles) == 0:
+        return 'a C-arm at another angle'
+    if np.ptp(angles) < LARGEST_RADIANS:
+        return 'angles of the C-arm that are in radians, not in degrees'
+    return 'angles of the C-arm that are not those of these exposures'
 
 
 def _how_to_give_angles(evidence: Evidence, name: str) -> str:

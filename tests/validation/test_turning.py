@@ -14,11 +14,15 @@
 
 """Verdict on calibrations of a C-arm that turns."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from rigs import rig
 from turning_rig import recording, turning
 
 from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.validation.verdict import validate
 
 
@@ -40,3 +44,20 @@ def test_calibration_with_unknown_angles_fails_and_is_told_to_give_them():
     assert found.verdict == 'fail'
     assert [c.name for c in found.checks if c.name == 'variation' and c.passed is False]
     assert any('angle_deg' in finding for finding in found.findings)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ('change', 'cause'),
+    [
+        (np.deg2rad, 'angles of the C-arm that are in radians'),
+        (lambda angles: np.roll(angles, 1), 'angles of the C-arm that are not those of these'),
+    ],
+)
+def test_wrong_angles_fail_with_their_cause(change, cause):
+    frames = recording(True)[0]
+    angles = change(np.array([frame.angle for frame in frames]))
+    wrong = [replace(frame, angle=float(angle)) for frame, angle in zip(frames, angles)]
+    outcome = run_calibration(CalibrationRequest({'a': wrong}, rig().phantom), validate=True)
+    assert outcome.validation.verdict == 'fail'
+    assert any(cause in finding for finding in outcome.validation.findings)

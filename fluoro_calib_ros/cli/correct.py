@@ -75,7 +75,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default='linear',
         help='interpolation between the pixels of an image (default: linear)',
     )
-    add_angle(parser, 'of images, and of points without angle_deg')
+    angle = parser.add_mutually_exclusive_group()
+    add_angle(angle, 'of images, and of points without angle_deg')
+    angle.add_argument(
+        '--angles',
+        type=Path,
+        metavar='FILE',
+        help='CSV file with columns image, angle_deg: angles of the C-arm in the images of a '
+        'stack or video, the first of which is 1; an image without one gets the mean correction',
+    )
     folders = parser.add_argument_group('folders of images and videos')
     folders.add_argument(
         '--recursive', action='store_true', help='correct the folders in SOURCE, too'
@@ -159,9 +167,14 @@ def _correct_images(
             f'{", ".join(calibrations)}: choose one with --fluoroscope'
         )
     (calibration,) = calibrations.values()
-    if calibration.angle_field is not None and arguments.angle_deg is None:
-        print_note(f'{source}: corrected with the mean over the angles, --angle-deg is not given')
-    calibration = calibration.at_angle(angle_of(arguments))
+    angles = _angles_of_images(arguments, calibration)
+    if angles is None:
+        if calibration.angle_field is not None and arguments.angle_deg is None:
+            print_note(
+                f'{source}: corrected with the mean over the angles, neither --angle-deg nor '
+                '--angles is given'
+            )
+        calibration = calibration.at_angle(angle_of(arguments))
     request = ImageCorrectionRequest(
         source,
         arguments.out,
@@ -171,6 +184,7 @@ def _correct_images(
         arguments.scheduler,
         arguments.recursive,
         arguments.keep_going,
+        angles,
     )
     with ProgressBar(source.name) as progress:
         done = run_image_correction(request, progress)
@@ -180,6 +194,13 @@ def _correct_images(
         )
     if done.failed:
         print_note(f'not corrected: {_some(done.failed, "; ")}')
+    if angles is not None:
+        unknown = sum(number not in angles for number in range(1, done.images + 1))
+        if unknown:
+            print_note(
+                f'{source}: {unknown} of {done.images} images have no angle in '
+                f'{arguments.angles}, they are corrected with the mean over the angles'
+            )
     corrector = ImageCorrector(calibration, arguments.interpolation)
     size = 'x'.join(map(str, calibration.image_size))
     empty = int((~corrector.mask).sum())
@@ -203,6 +224,21 @@ def _correct_images(
         f'{done.images} {noun} of {size} px corrected with {calibration.calibration_id}, written '
         f'to {arguments.out}; {empty} pixels of each are empty, the original does not show them',
     )
+
+
+def _angles_of_images(
+    arguments: argparse.Namespace, calibration: FluoroscopeCalibration
+) -> dict[int, float] | None:
+    """Angles [rad] of the images by number, None where --angles is not given. Raises DataError."""
+    from ..files.image_angles import read_image_angles
+
+    if arguments.angles is None:
+        return None
+    if calibration.angle_field is None:
+        name = calibration.calibration_id
+        print_note(f'{arguments.angles}: not used, {name} does not depend on an angle')
+        return None
+    return read_image_angles(arguments.angles)
 
 
 def _some(names: Sequence[str], separator: str) -> str:

@@ -21,7 +21,7 @@ and nothing is written. Videos are written without loss (FFV1), except for MP4.
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -56,10 +56,14 @@ class CorrectedImages:
     failed: tuple[str, ...] = ()
 
 
+# Gives the corrector of an image from its number, the first being 1.
+Correctors = Callable[[int], ImageCorrector]
+
+
 def correct_images(
     source: str | os.PathLike[str],
     out: str | os.PathLike[str],
-    corrector: ImageCorrector,
+    corrector: ImageCorrector | Correctors,
     progress: Progress | None = None,
 ) -> CorrectedImages:
     """Correct an image file, a stack or a video.
@@ -67,7 +71,8 @@ def correct_images(
     Parameters
     ----------
     source, out : path
-    corrector : ImageCorrector
+    corrector : ImageCorrector or callable
+        Of all images, or that gives the one of each image from its number, the first being 1.
     progress : callable, optional
         Called after every image with the number of images that are done, and their total.
 
@@ -88,7 +93,8 @@ def correct_images(
     if out.is_dir():
         raise DataError(f'{out}: this is a folder, but {source} is a file')
     images = open_images(source)
-    written = write_images(out, _corrected(images, corrector), progress or _no_progress)
+    correctors = (lambda number: corrector) if isinstance(corrector, ImageCorrector) else corrector
+    written = write_images(out, _corrected(images, correctors), progress or _no_progress)
     return CorrectedImages(images.kind, written)
 
 
@@ -104,17 +110,18 @@ def _no_progress(done: int, total: int) -> None:
     """Ignore the progress."""
 
 
-def _corrected(source: ImageSource, corrector: ImageCorrector) -> ImageSource:
+def _corrected(source: ImageSource, correctors: Correctors) -> ImageSource:
     """A source of the corrected images of another."""
-    return replace(source, images=_corrected_images(source, corrector))
+    return replace(source, images=_corrected_images(source, correctors))
 
 
 def _corrected_images(
-    source: ImageSource, corrector: ImageCorrector
+    source: ImageSource, correctors: Correctors
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Corrected images, all in the same array."""
     out = None
-    for where, image in source.images:
+    for number, (where, image) in enumerate(source.images, 1):
+        corrector = correctors(number)
         try:
             corrector.check(image)
         except DataError as error:

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from ..files.image_files import CorrectedImages, correct_images
 from ..files.image_folder import ImageFolder, folder_like, list_images
 from ..files.image_formats import VIDEO_SUFFIXES, suffix_of
 from ..files.image_writing import Progress
+from ..images.angle_maps import AngleMaps
 from ..images.corrector import ImageCorrector
 from .scheduling import open_workers
 
@@ -53,6 +54,9 @@ class ImageCorrectionRequest:
         Whether the folders in a folder belong to it.
     keep_going : bool
         Whether the other files of a folder are corrected where some cannot be.
+    angles : mapping of int to float or None
+        Angle of the C-arm [rad] in an image of a file, by the number of the image, from 1; others
+        get the mean correction, as all do where it is None.
     """
 
     source: Path
@@ -63,6 +67,7 @@ class ImageCorrectionRequest:
     scheduler: str | None = None
     recursive: bool = False
     keep_going: bool = False
+    angles: Mapping[int, float] | None = None
 
 
 @dataclass(frozen=True)
@@ -101,11 +106,15 @@ def run_image_correction(
     DataError
         If a source cannot be read, is damaged, or is no grey image of the size of the
         calibration; if `out` cannot be written, or its format cannot hold the images; for
-        workers that are lost. `out` is left as it was.
+        workers that are lost, and angles of a folder. `out` is left as it was.
     """
     if not request.source.is_dir():
+        if request.angles is not None:
+            return _correct_by_angle(request, request.angles, progress)
         corrector = ImageCorrector(request.calibration, request.interpolation)
         return correct_images(request.source, request.out, corrector, progress)
+    if request.angles is not None:
+        raise DataError(f'{request.source}: angles are those of the images of one file')
     folder = list_images(request.source, request.recursive)
     with folder_like(request.out, folder) as temporary:
         done = list(_corrected_files(request, folder, temporary, progress))
@@ -114,6 +123,18 @@ def run_image_correction(
         if not images:
             raise DataError(f'none of {len(done)} files can be corrected, {failed[0]}')
     return CorrectedImages('folder', images, len(done) - len(failed), folder.passed_over, failed)
+
+
+def _correct_by_angle(
+    request: ImageCorrectionRequest, angles: Mapping[int, float], progress: Progress | None
+) -> CorrectedImages:
+    """Correct the images of a file, each at its angle."""
+    maps = AngleMaps(request.calibration, request.interpolation)
+
+    def corrector(number: int) -> ImageCorrector:
+        return maps.at(angles.get(number))
+
+    return correct_images(request.source, request.out, corrector, progress)
 
 
 def _corrected_files(

@@ -34,6 +34,7 @@ from fluoro_calib_ros.files.image_folder import list_images
 from fluoro_calib_ros.files.image_formats import IMAGE_SUFFIXES, SUPPORTS_16_BIT_VIDEOS
 from fluoro_calib_ros.files.image_reading import ImageSource
 from fluoro_calib_ros.files.image_writing import write_video
+from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.images.codec import decode, encode
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.simulation.bead_images import bead_image
@@ -573,3 +574,65 @@ def test_odd_sizes_of_videos(tmp_path):
     with pytest.raises(DataError, match='128 x 95 px, both must be even'):
         odd = ImageSource('video', 1, iter([('x', image_of()[:95])]), 25.0)
         write_video(tmp_path / 'x.avi', odd, lambda *_: None)
+
+
+@pytest.fixture(scope='module')
+def turning(tmp_path_factory):
+    """Folder with a calibration of a C-arm that turns."""
+    folder = tmp_path_factory.mktemp('turning')
+    save_calibration(folder, rigs.turning(a_calibration('a')))
+    return folder
+
+
+def test_images_of_a_video_are_corrected_each_at_its_angle(turning, tmp_path, capsys):
+    images = stack_of(4)
+    cv2.imwritemulti(str(tmp_path / 'trial.tif'), images)
+    angles = tmp_path / 'angles.csv'
+    angles.write_text('image,angle_deg\n2,-30\n1,40\n4,\n')  # the third one has no row
+    out = tmp_path / 'out.tif'
+    assert correct(tmp_path / 'trial.tif', turning, out, '--angles', angles) == 0
+    assert '2 of 4 images have no angle in' in capsys.readouterr().err
+    calibration = rigs.turning(a_calibration('a'))
+    maps = AngleMaps(calibration)
+    wanted = [maps.at(a).correct(i) for a, i in zip(np.radians([40, -30]), images)]
+    mean = ImageCorrector(calibration)
+    wanted += [mean.correct(image) for image in images[2:]]
+    _, found = cv2.imreadmulti(str(out), flags=cv2.IMREAD_UNCHANGED)
+    assert np.array_equal(found, wanted)
+    assert not np.array_equal(wanted[0], mean.correct(images[0]))
+
+
+@pytest.mark.parametrize(
+    'text, cause',
+    [
+        ('image,angle_deg\n0,3\n', "row 2: image is '0', the first image is 1"),
+        ('image,angle_deg\n1,3\n1,4\n', 'row 3: image 1 is in row 2, too'),
+        ('image,angle_deg\n1,9999\n', "row 2: angle_deg is '9999', not an angle"),
+        ('image,angle_deg\n1,x\n', "row 2: angle_deg is 'x', not a number"),
+        ('image\n1\n', 'angle_deg'),
+    ],
+)
+def test_wrong_angles_of_images_are_named_with_file_and_row(
+    turning, tmp_path, capsys, text, cause
+):
+    cv2.imwrite(str(tmp_path / 'one.png'), image_of())
+    (tmp_path / 'angles.csv').write_text(text)
+    out = tmp_path / 'out.png'
+    assert correct(tmp_path / 'one.png', turning, out, '--angles', tmp_path / 'angles.csv') == 1
+    error = capsys.readouterr().err
+    assert 'angles.csv' in error and cause in error
+    assert not out.exists()
+
+
+def test_angles_of_images_need_one_file_and_a_calibration_that_depends_on_them(
+    turning, one, tmp_path, capsys
+):
+    folder = tmp_path / 'folder'
+    folder.mkdir()
+    cv2.imwrite(str(folder / 'one.png'), image_of())
+    angles = tmp_path / 'angles.csv'
+    angles.write_text('image,angle_deg\n1,30\n')
+    assert correct(folder, turning, tmp_path / 'out', '--angles', angles) == 1
+    assert 'angles are those of the images of one file' in capsys.readouterr().err
+    assert correct(folder / 'one.png', one, tmp_path / 'out.png', '--angles', angles) == 0
+    assert 'does not depend on an angle' in capsys.readouterr().err

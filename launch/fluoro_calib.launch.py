@@ -73,6 +73,9 @@ PARAMETERS = (
         'joint on joint_states whose position is the angle of the C-arm, or one for each '
         'fluoroscope, e.g. a:frontal,b:lateral',
     ),
+    Argument(
+        'angle_max_age', '', 'longest time from the last state of the joint to an exposure [s]'
+    ),
     Argument('autostart', '', 'false: a lifecycle manager configures and activates the nodes'),
 )
 SWITCHES = (
@@ -93,8 +96,8 @@ OTHERS = (
     Argument(
         'rig',
         '',
-        'rig.toml, whose fluoroscopes, phantom and angle_joint hold where these arguments are '
-        'empty',
+        'rig.toml, whose fluoroscopes, phantom, angle_joint and angle_max_age hold where these '
+        'arguments are empty',
     ),
     Argument('namespace', '', 'namespace of the rig'),
     Argument('params_file', '', 'parameters of the nodes (default: config/fluoro_calib.yaml)'),
@@ -109,18 +112,19 @@ OTHERS = (
 )
 # Parameters of the nodes that launch arguments set.
 RIG = ('fluoroscopes', 'calibration_directory', 'autostart')
+ANGLE = ('angle_joint', 'angle_max_age')
 OF_NODE = {
     'extraction_node': (
         'phantom',
         'fluoroscopes',
         'autostart',
         'principal_distance',
-        'angle_joint',
+        *ANGLE,
     ),
-    'calibration_node': ('phantom', *RIG, 'rig_frame', 'angle_joint'),
-    'correction_node': (*RIG, 'angle_joint'),
+    'calibration_node': ('phantom', *RIG, 'rig_frame', *ANGLE),
+    'correction_node': (*RIG, *ANGLE),
     'reconstruction_node': (*RIG, 'rig_frame'),
-    'image_node': (*RIG, 'angle_joint'),
+    'image_node': (*RIG, *ANGLE),
 }
 
 
@@ -148,6 +152,7 @@ def with_rig(values):
         else '',
         'phantom': str(rig.phantom.absolute()) if rig.phantom else '',
         'angle_joint': rig.angle_joint or '',
+        'angle_max_age': '' if rig.angle_max_age is None else str(rig.angle_max_age),
     }
     return {**values, **{name: text for name, text in found.items() if not values[name]}}
 
@@ -174,7 +179,7 @@ def nodes_of_rig(context):
         ):
             if name in given:
                 given[name] = parameters[name]  # also where it reads like a number
-        for name in ('rate', 'principal_distance'):
+        for name in ('rate', 'principal_distance', 'angle_max_age'):
             if name in given:
                 given[name] = float(given[name])
         return Node(

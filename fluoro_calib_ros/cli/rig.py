@@ -23,13 +23,14 @@ from pathlib import Path
 from ..files.rig_file import NAME, RigFile, read_rig_file
 
 # Arguments whose default a rig.toml gives, by command; `out` is the key calibration.
-_SOURCE = ('fluoroscopes', 'image_size', 'angle_joint')
+_ANGLE = ('angle_joint', 'angle_max_age')
+_SOURCE = ('fluoroscopes', 'image_size', *_ANGLE)
 USED = {
-    'extract': ('phantom', 'angle_joint'),
+    'extract': ('phantom', *_ANGLE),
     'calibrate': (*_SOURCE, 'phantom', 'out'),
     'adjust': (*_SOURCE, 'phantom', 'calibration'),
     'correct': ('calibration',),
-    'validate': ('calibration', 'angle_joint'),
+    'validate': ('calibration', *_ANGLE),
     'report': ('calibration',),
     'orient': (*_SOURCE, 'phantom', 'calibration'),
     'reconstruct': (*_SOURCE, 'calibration'),

@@ -19,6 +19,7 @@
     phantom = "phantom.csv"
     calibration = "result"        # result folder of calibrate
     angle_joint = "carm"          # joint of the C-arm; or {a = "frontal", b = "lateral"}
+    angle_max_age = 0.5           # longest time from its last state to an exposure [s]
 
 All keys are optional; paths are relative to the folder of the file.
 """
@@ -39,7 +40,14 @@ else:
     import tomli as tomllib
 
 NAME = 'rig.toml'
-KEYS = ('fluoroscopes', 'image_size', 'phantom', 'calibration', 'angle_joint')
+KEYS = (
+    'fluoroscopes',
+    'image_size',
+    'phantom',
+    'calibration',
+    'angle_joint',
+    'angle_max_age',
+)
 
 
 @dataclass(frozen=True)
@@ -56,6 +64,8 @@ class RigFile:
         File with the phantom, and result folder.
     angle_joint : str or None
         Joint of the C-arm, or one for each fluoroscope, as the option of this name.
+    angle_max_age : float or None
+        Longest time from the last state of the joint to an exposure [s].
     """
 
     path: Path
@@ -64,6 +74,7 @@ class RigFile:
     phantom: Path | None = None
     calibration: Path | None = None
     angle_joint: str | None = None
+    angle_max_age: float | None = None
 
 
 def read_rig_file(path: Path) -> RigFile:
@@ -83,6 +94,7 @@ def read_rig_file(path: Path) -> RigFile:
         _path(path, 'phantom', document.get('phantom')),
         _path(path, 'calibration', document.get('calibration')),
         _joint(path, document.get('angle_joint'), names),
+        _max_age(path, document.get('angle_max_age')),
     )
 
 
@@ -129,6 +141,20 @@ def _joint(path: Path, value: Any, names: list[str] | None) -> str | None:
         if names is not None and name not in names:
             raise DataError(f'{where}: there is no fluoroscope {name!r}, only {", ".join(names)}')
     return value.strip()
+
+
+def _max_age(path: Path, value: Any) -> float | None:
+    """Return the option angle_max_age [s]."""
+    from ..exposures.angles import AngleOptions  # every command reads this module
+
+    if value is None:
+        return None
+    try:
+        if isinstance(value, bool) or not isinstance(value, int | float):
+            raise ValueError
+        return AngleOptions(angle_max_age=float(value)).angle_max_age
+    except (ValueError, OverflowError):
+        raise DataError(f'{path}, key angle_max_age: a time [s], such as 0.5') from None
 
 
 def _path(path: Path, key: str, value: Any) -> Path | None:

@@ -40,6 +40,7 @@ def rig(tmp_path):
 JOINTS = """
 fluoroscopes = ["a", "b"]
 angle_joint = {a = "frontal", b = "lateral"}
+angle_max_age = 2
 """
 
 
@@ -85,6 +86,9 @@ def test_joints_of_the_rig_give_the_angle_in_every_command_that_reads_a_bag(rig,
     options = angle_options(parsed(words, content))
     assert options.joints(['a', 'b']) == {'a': 'frontal', 'b': 'lateral'}
     assert options.joints(['a']) == {'a': 'frontal'}  # a recording of one of them
+    assert options.angle_max_age == 2.0
+    assert angle_options(parsed([*words, '--angle-max-age', '3'], content)).angle_max_age == 3.0
+    assert angle_options(parsed(words)).angle_max_age == 0.5
     flag = angle_options(parsed([*words, '--angle-joint', 'carm'], content))
     assert flag.joints(['a', 'b']) == dict.fromkeys('ab', 'carm') and not flag.of_rig
     assert not angle_options(parsed([*words, '--angle-joint', ''], content)).joints(['a'])
@@ -117,6 +121,10 @@ def test_what_the_rig_file_does_not_say_is_required_as_before(rig, capsys):
         ('angle_joint = 3', 'key angle_joint: a joint, such as "carm", or one for each'),
         ('angle_joint = ""', 'key angle_joint: a joint, such as'),
         ('angle_joint = "a,b"', 'key angle_joint: a joint, such as'),
+        ('angle_max_age = -1', 'key angle_max_age: a time [s], such as 0.5'),
+        ('angle_max_age = "1"', 'key angle_max_age: a time [s]'),
+        ('angle_max_age = true', 'key angle_max_age: a time [s]'),
+        ('angle_max_age = nan', 'key angle_max_age: a time [s]'),
         ('angle_joint = {}', 'key angle_joint: a joint, such as'),
         ('angle_joint = {a = 1}', 'key angle_joint: a joint, such as'),
         ('angle_joint = {a = "x:y"}', 'key angle_joint: a joint, such as'),

@@ -35,22 +35,25 @@ RIG = """\
 fluoroscopes = ["front", "side"]
 phantom = "cube.csv"
 angle_joint = {front = "x", side = "y"}
+angle_max_age = 2
 """
 PHANTOM = FOLDER / 'other.csv'
-CASES = {  # arguments, and what the nodes say: fluoroscopes, phantom, angle_joint
+CASES = {  # arguments, and what the nodes say: fluoroscopes, phantom, joint, longest age
     'rig': (
         {'rig': FOLDER / 'rig.toml'},
         ['front', 'side'],
         FOLDER / 'cube.csv',
         'front:x,side:y',
+        2.0,
     ),
     'rig and arguments': (
         {'rig': FOLDER / 'rig.toml', 'phantom': PHANTOM, 'angle_joint': 'front:u,side:v'},
         ['front', 'side'],
         PHANTOM,
         'front:u,side:v',
+        2.0,
     ),
-    'no rig and no joint': ({'phantom': PHANTOM}, ['a', 'b'], PHANTOM, ''),
+    'no rig and no joint': ({'phantom': PHANTOM}, ['a', 'b'], PHANTOM, '', 0.5),
 }
 
 
@@ -60,7 +63,7 @@ def generate_test_description(case):
     (FOLDER / 'rig.toml').write_text(RIG)
     for name in ('cube.csv', PHANTOM.name):
         shutil.copy(BAGS / 'phantom.csv', FOLDER / name)
-    given, fluoroscopes, phantom, angle_joint = CASES[case]
+    given, fluoroscopes, phantom, angle_joint, angle_max_age = CASES[case]
     description = rig(
         from_images='true',
         images='true',
@@ -69,7 +72,12 @@ def generate_test_description(case):
         autostart='false',
         **given,
     )
-    expected = {'fluoroscopes': fluoroscopes, 'phantom': str(phantom), 'angle_joint': angle_joint}
+    expected = {
+        'fluoroscopes': fluoroscopes,
+        'phantom': str(phantom),
+        'angle_joint': angle_joint,
+        'angle_max_age': angle_max_age,
+    }
     return description, {'expected': expected}
 
 
@@ -106,6 +114,7 @@ class TestNodes(unittest.TestCase):
             ('fluoroscopes', (*WITH_NAMES, 'reconstruction_node')),
             ('phantom', WITH_PHANTOM),
             ('angle_joint', WITH_ANGLE),
+            ('angle_max_age', WITH_NAMES),
         ):
             for node in nodes:
                 with self.subTest(node=node, parameter=name):

@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
+from ..calibration.result import FluoroscopeCalibration
 from ..distortion.angle_field import AngleField
 from .text import TERMINAL_WIDTH, number_text
 
@@ -72,7 +73,6 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
     converged = result.converged if run is None else run.converged
     inlier_percent = 100 * figures.inliers / max(figures.observations, 1)
     model = calibration.model
-    correction_sd = model.evaluate(model.train_uv).sd if len(model.train_uv) else [np.nan]
     return {
         'Fluoroscope': name if len(name) < COLUMN_WIDTH else name[: COLUMN_WIDTH - 4] + '...',
         **_rmse_rows(figures),
@@ -85,10 +85,23 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
         'exposures': str(len(figures.exposures)),
         'interior orientation': 'estimated' if calibration.interior_estimated else 'held',
         **_interior_rows(figures),
-        'median sd of the correction [px]': number_text(float(np.median(correction_sd))),
+        'median sd of the correction [px]': number_text(_median_sd(calibration)),
         **_angle_rows(calibration.angle_field),
         'calibration [s]': number_text(calibration.seconds, 1),
     }
+
+
+def _median_sd(calibration: FluoroscopeCalibration) -> float:
+    """Median standard deviation of a correction [px], at all angles of the exposures."""
+    uv = calibration.model.train_uv
+    if not len(uv):
+        return float('nan')
+    sd = calibration.model.evaluate(uv).sd
+    field = calibration.angle_field
+    if field is None:
+        return float(np.median(sd))
+    squares = [sd**2 + field.change(uv, angle)[1] for angle in field.angles.tolist()]
+    return float(np.sqrt(np.maximum(np.median(squares), 0)))
 
 
 def _angle_rows(field: AngleField | None) -> dict[str, str]:

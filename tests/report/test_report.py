@@ -21,6 +21,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 import pytest
+import rigs
 from PIL import Image
 
 from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
@@ -191,6 +192,17 @@ def test_summary_holds_the_numbers(job):
     )
     assert 'median 0.123 ms, 99 % below 0.5 ms, largest 2.25 ms (480 frames)' in text
     assert 'Latency' not in summary_table(job)
+
+
+def test_sd_of_the_correction_in_the_summary_is_that_at_the_angles_of_the_exposures(job):
+    turning = rigs.turning(job.calibrations['a'])
+    text = summary_table(dataclasses.replace(job, calibrations={**job.calibrations, 'a': turning}))
+    line = {row[:36].strip(): row[36:].split() for row in text.splitlines()}
+    uv = turning.model.train_uv
+    sd = [turning.correction(uv, angle).sd for angle in turning.angle_field.angles]
+    found = float(line['median sd of the correction [px]'][0])
+    assert found == pytest.approx(np.median(sd), abs=5e-4)
+    assert found > np.median(turning.model.evaluate(uv).sd)
 
 
 def test_summary_fits_a_terminal(job):

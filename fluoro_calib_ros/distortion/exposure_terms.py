@@ -20,6 +20,15 @@ exposure absorbs, describe it (Gronenschild, Medical Physics 26, 1999). Their co
 random effects with mean zero (Robinson, "That BLUP is a good thing", Statistical Science 6, 1991);
 the variance of each term over the exposures has the largest marginal likelihood (MacKay, Neural
 Computation 4, 1992) and vanishes where nothing changes.
+
+A change of the principal distance is hardly different from one of the distance of the source: its
+variance over the exposures can be estimated many times too small, and its stated standard
+deviation with it. Terms of the interior orientation change about as much as the others do. This is
+the prior of their variances: inverse chi squared with a few degrees of freedom, about the mean
+variance of the others (Smyth, "Linear models and empirical Bayes methods", Statistical
+Applications in Genetics and Molecular Biology 3, 2004). Their variances are the means of the
+posterior (Gelman et al., "Bayesian Data Analysis", 2013, 2.6): what is not known of them enlarges
+the stated standard deviations.
 """
 
 from __future__ import annotations
@@ -34,12 +43,16 @@ from .series import Functions
 from .terms import trend_transformation
 
 TREND_DEGREE = 3
+TERMS = 14  # of the cubic trend without the gauge
 # Square sum of the terms over its expectation for independent residuals from which distortion is
 # taken to vary. Object points and the common distortion absorb a part of the residuals: constant
 # distortions have 0.4 to 0.8 (docs/pathologies.md).
 VARYING = 0.85
 MIN_VARIANCE = 1e-8  # px^2
 INTERIOR = 3  # principal point and principal distance
+# Exposures as many as which the other terms tell of the variances of a change of the interior
+# orientation. Variances of the terms of a smooth field scatter like this.
+LIKE_OTHERS = 4
 ORIENTATION = 6  # unknowns of an exposure
 MIN_POINTS = 30  # of an exposure whose terms are tested
 
@@ -177,7 +190,13 @@ class ExposureTerms:
         mean = mean.reshape(self.exposures, -1)
         posterior = posterior.reshape(self.exposures, -1)
         determined = np.clip(1 - posterior / self.variance, 1e-6, 1).sum(axis=0)
-        self.variance = np.maximum(np.sum(mean**2, axis=0) / determined, MIN_VARIANCE)
+        squares = np.sum(mean**2, axis=0)
+        others = np.sum(squares[:TERMS]) / np.sum(determined[:TERMS])
+        of_interior = np.arange(len(squares)) >= TERMS
+        squares = squares + LIKE_OTHERS * others * of_interior
+        # The mean of inverse chi squared has two degrees of freedom less.
+        exposures = determined + (LIKE_OTHERS - 2) * of_interior
+        self.variance = np.maximum(squares / exposures, MIN_VARIANCE)
 
 
 def without_exposure_terms(

@@ -98,6 +98,26 @@ def test_variances_of_the_terms_are_found_and_vanish_where_nothing_differs():
     np.testing.assert_allclose(np.linalg.solve(reduced, rest), everything[:14], rtol=1e-8)
 
 
+def test_what_is_not_known_of_a_change_of_the_interior_is_as_large_as_other_terms():
+    rng = np.random.default_rng(5)
+    uv, exposure, _ = image_points(5)
+    functions = exposure_functions(uv, SIZE, INTERIOR, with_interior=True)
+    terms = ExposureTerms(functions, exposure, 0.5)
+    true = np.full(17, 0.2)
+    true[16] = 0.05
+    mean = rng.normal(0, 1, (EXPOSURES, 17)) * true
+    mean[:, 14] = 0  # not determined: the posterior is the prior
+    for _ in range(40):
+        posterior = np.full((EXPOSURES, 17), 0.01**2)
+        posterior[:, 14] = terms.variance[14]
+        terms.renew(mean.ravel(), posterior.ravel())
+    sd = np.sqrt(terms.variance)
+    assert 0.2 < sd[14] < 0.4
+    np.testing.assert_allclose(sd[:14], np.sqrt(np.mean(mean[:, :14] ** 2, axis=0)), rtol=0.01)
+    np.testing.assert_allclose(sd[15], 0.2, rtol=0.4)
+    assert sd[16] < 0.12
+
+
 def test_what_a_series_cannot_follow_is_part_of_its_standard_deviation():
     """A dent in one place, and nothing where residuals are noise."""
     uv, exposure, rng = image_points(3, 200)

@@ -41,6 +41,24 @@ MIN_SHARE = 0.05  # of what differs between exposures that the angle explains, e
 
 
 @dataclass(frozen=True)
+class Effects:
+    """Coefficients of the harmonics of all terms of exposures, harmonic by harmonic.
+
+    Attributes
+    ----------
+    mean : (q,) ndarray
+        [px]
+    covariance : (q, q) ndarray
+    mixed : (c, q) ndarray
+        Covariance of the coefficients of the series with these.
+    """
+
+    mean: np.ndarray
+    covariance: np.ndarray
+    mixed: np.ndarray
+
+
+@dataclass(frozen=True)
 class AngleFit:
     """A series and the terms of exposures, once these are a function of the angle.
 
@@ -52,12 +70,15 @@ class AngleFit:
     covariance : (c, c) ndarray
     remaining : float
         Share of the variance between exposures that the angle does not explain.
+    effects : Effects
+        Of which the field is made.
     """
 
     field: AngleField
     coefficients: np.ndarray
     covariance: np.ndarray
     remaining: float
+    effects: Effects
 
 
 @dataclass(frozen=True)
@@ -120,12 +141,13 @@ def _fit(estimated: SeriesWithExposures, angles: np.ndarray) -> AngleFit | None:
     of_series = estimated.covariance[:c, :c] - by_terms @ lost @ by_terms.T
     count = effects.count
     mixed = by_terms @ effects.design @ covariance[:, :count]
-    field = _field(estimated, angles, mean[:count], covariance[:count, :count], mixed)
+    of_field = Effects(mean[:count], covariance[:count, :count], mixed)
     return AngleFit(
-        field,
+        field_of(estimated, angles, of_field),
         estimated.coefficients[:c] + by_terms @ moved,
         of_series,
         1 - effects.explained(h),
+        of_field,
     )
 
 
@@ -192,32 +214,23 @@ def _inverse_root(matrix: np.ndarray) -> np.ndarray:
     return root
 
 
-def _field(
-    estimated: SeriesWithExposures,
-    angles: np.ndarray,
-    mean: np.ndarray,
-    covariance: np.ndarray,
-    mixed: np.ndarray,
-) -> AngleField:
-    """Field of harmonics with coefficients mean (q,) and their covariance (q, q).
-
-    mixed (c, q): covariance with the coefficients of the series.
-    """
+def field_of(estimated: SeriesWithExposures, angles: np.ndarray, effects: Effects) -> AngleField:
+    """Field of the effects of angles (e,) [rad] on estimated terms."""
     size = estimated.functions.image_size
     cubic = Functions(size, TREND_DEGREE)
     values = cubic(estimated.uv)
     of_terms = estimated.terms.functions.values
     # Terms are cubic polynomials: this solution is exact.
     to_cubic = [np.linalg.lstsq(values, of_terms[:, axis], rcond=None)[0] for axis in (0, 1)]
-    effects = mean.reshape(HARMONICS, -1)
-    coefficients = np.stack([effects @ matrix.T for matrix in to_cubic], axis=1)
+    by_harmonic = effects.mean.reshape(HARMONICS, -1)
+    coefficients = np.stack([by_harmonic @ matrix.T for matrix in to_cubic], axis=1)
     pixels = sd_grid_pixels(size)
     series = estimated.functions(pixels)
     terms = [cubic(pixels) @ matrix for matrix in to_cubic]
     m = series.shape[1]
-    count = effects.shape[1]
-    cross = mixed.reshape(2, m, HARMONICS, count)
-    pairs = covariance.reshape(HARMONICS, count, HARMONICS, count)
+    count = by_harmonic.shape[1]
+    cross = effects.mixed.reshape(2, m, HARMONICS, count)
+    pairs = effects.covariance.reshape(HARMONICS, count, HARMONICS, count)
     with_series = [
         np.mean(
             [np.sum((series @ cross[axis, :, j]) * terms[axis], axis=1) for axis in (0, 1)], axis=0

@@ -1,0 +1,241 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Errors of a correction at angles of a C-arm, against what it claims there.
+
+Twice for each case of the group `turning` whose angles are given:
+
+- held: rays of all angles have one interior orientation. The truth is in the gauge of the mean
+  correction over the exposures, and a turn of the sensor at each angle. This is what a correction
+  states.
+- free: each angle has an interior orientation of its own, so the error has no part that one can
+  express. The claim is without its part of a change of the interior orientation.
+"""
+
+import argparse
+import json
+import multiprocessing
+import sys
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.distortion import collocation
+from fluoro_calib_ros.distortion.angle_field import HARMONICS
+from fluoro_calib_ros.distortion.angle_fit import field_of
+from fluoro_calib_ros.distortion.exposure_terms import TERMS
+from fluoro_calib_ros.distortion.gauge import GaugeKind, gauge_coefficients
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+
+from .cases import CASES
+from .measure import ANGLES, COVER, GRID
+from .scene import NAMES, draw
+
+FIRST = 101
+TURN_SCALE = 1e-3  # rad
+HELD_CASES = [case for case in CASES if case.group == 'turning' and case.angle_known]
+
+
+@dataclass(frozen=True)
+class Errors:
+    """Errors (n, 2) of a correction and their stated standard deviations (n,) [px]."""
+
+    error: np.ndarray
+    sd: np.ndarray
+
+    def figures(self, name):
+        """NSE, cover95 and RMS of the errors."""
+        normalised = np.abs(self.error) / self.sd[:, None]
+        return {
+            f'{name}_nse': float(np.mean(normalised**2)),
+            f'{name}_cover': float(np.mean(normalised <= COVER)),
+            f'{name}_px': float(np.sqrt(np.mean(self.error**2))),
+            f'{name}_sd_px': float(np.sqrt(np.mean(self.sd**2))),
+        }
+
+
+class Truth:
+    """True corrections of a camera at pixels (n, 2), in a gauge over the first of them."""
+
+    def __init__(self, camera, pixels, count, interior):
+        self.pixels = pixels
+        self.count = count
+        self.interior = interior
+        self.back = np.linalg.inv(_matrix(camera.interior))
+
+    def seen_by(self, x, true):
+        """True corrections (n, 2) with the interior orientation and turn x (6,) of the sensor."""
+        ideal = np.column_stack([self.pixels - true, np.ones(len(self.pixels))])
+        turned = ideal @ (_matrix(x[:3]) @ matrix_from_vector(x[3:]) @ self.back).T
+        return self.pixels - turned[:, :2] / turned[:, 2:]
+
+    def gauge(self, true, found, held=None):
+        """Orientation (6,) with which corrections and found ones have the same part in the gauge.
+
+        held (3,): interior orientation; None: it is free.
+        """
+        kind = GaugeKind.FULL if held is None else GaugeKind.TURNS
+        uv = self.pixels[: self.count]
+
+        def whole(x):
+            return x if held is None else np.concatenate([held, x])
+
+        def misclosure(x):
+            left = (self.seen_by(whole(x), true) - found)[: self.count]
+            return gauge_coefficients(uv, left, self.interior, kind)
+
+        turn = np.zeros(3)
+        start = turn if held is not None else np.concatenate([self.interior, turn])
+        scale = np.append(np.ones(len(start) - 3), np.full(3, TURN_SCALE))
+        return whole(least_squares(misclosure, start, x_scale=scale, xtol=1e-14).x)
+
+
+def _matrix(k):
+    return np.array([[k[2], 0, k[0]], [0, k[2], k[1]], [0, 0, 1.0]])
+
+
+@contextmanager
+def recorded_fits():
+    """List of (estimated, angles, fit) of the fits to angles within the context."""
+    original = collocation.fit_angles
+    fits = []
+
+    def fit_angles(estimated, angles):
+        fit = original(estimated, angles)
+        fits.append((estimated, angles, fit))
+        return fit
+
+    collocation.fit_angles = fit_angles
+    try:
+        yield fits
+    finally:
+        collocation.fit_angles = original
+
+
+def without_interior(estimated, angles, fit):
+    """Field of angles that states no variance of a change of the interior orientation."""
+    count = len(fit.effects.mean) // HARMONICS
+    kept = np.tile(np.arange(count) < TERMS, HARMONICS).astype(float)
+    effects = replace(
+        fit.effects,
+        covariance=fit.effects.covariance * np.outer(kept, kept),
+        mixed=fit.effects.mixed * kept,
+    )
+    return field_of(estimated, angles, effects)
+
+
+def measured(case, seed):
+    """Figures of one case with one seed."""
+    scene = draw(case, seed)
+    name = NAMES[0]
+    with recorded_fits() as fits:
+        result = calibrate(
+            {name: scene.frames()[name]}, scene.phantom, CalibrationOptions(**case.options)
+        )
+    out = {'case': case.name, 'seed': seed}
+    calibration = result.calibrations[name]
+    if calibration.angle_field is None:
+        return {**out, 'said': 'no field of the angle'}
+    free_field = without_interior(*fits[-1])
+    run = result.runs[name]
+    uv = run.measured.network.uv[run.trained]
+    errors = errors_at_angles(scene, calibration, uv, free_field)
+    for kind, found in errors.items():
+        out |= found.figures(kind)
+    return out
+
+
+def errors_at_angles(scene, calibration, uv, free_field):
+    """Errors 'held' and 'free' within the calibrated area; uv: image points of the fit."""
+    axis = np.linspace(0, scene.case.side - 1, GRID)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    grid = grid[~calibration.model.outside(grid)]
+    pixels = np.concatenate([uv, grid])
+    camera = scene.cameras[0]
+    truth = Truth(camera, pixels, len(uv), calibration.interior)
+
+    def true_at(angle):
+        return camera.at(scene.case, angle).distortion.correction(pixels)
+
+    mean = np.mean([true_at(angle) for angle in scene.angles], axis=0)
+    interior = truth.gauge(mean, calibration.correction(pixels, None).duv)[:3]
+    parts = {'held': [], 'free': []}
+    field = calibration.angle_field
+    for angle in [a for a in scene.test_angles if field.covers(a)][:ANGLES]:
+        true = true_at(angle)
+        found = calibration.correction(pixels, angle)
+        less = field.change(grid, angle)[1] - free_field.change(grid, angle)[1]
+        sd = found.sd[len(uv) :]
+        for kind, held, own in (
+            ('held', interior, sd),
+            ('free', None, np.sqrt(np.maximum(sd**2 - less, 0))),
+        ):
+            orientation = truth.gauge(true, found.duv, held)
+            error = (found.duv - truth.seen_by(orientation, true))[len(uv) :]
+            parts[kind].append((error, own))
+    return {
+        kind: Errors(*(np.concatenate(column) for column in zip(*pairs)))
+        for kind, pairs in parts.items()
+    }
+
+
+def table(results):
+    """Rows of a Markdown table: means and medians over the seeds, by case."""
+    lines = ['| case | seeds | held: mean NSE | median | free: mean NSE | median |']
+    lines.append('|---|---:|---:|---:|---:|---:|')
+    names = [case.name for case in HELD_CASES]
+    for name in [*names, 'all']:
+        own = [r for r in results if 'said' not in r and (name == 'all' or r['case'] == name)]
+        if not own:
+            continue
+        cells = []
+        for kind in ('held', 'free'):
+            nse = [r[f'{kind}_nse'] for r in own]
+            cells += [f'{np.mean(nse):.2f}', f'{np.median(nse):.2f}']
+        lines.append(f'| {name} | {len(own)} | {" | ".join(cells)} |')
+    return '\n'.join(lines)
+
+
+def main(arguments=None):
+    """Entry point."""
+    parser = argparse.ArgumentParser(prog='python -m benchmarks.pathologies.angle_claims')
+    parser.add_argument('--seeds', type=int, default=10, help='seeds of each case (default: 10)')
+    parser.add_argument('--first', type=int, default=FIRST, help=f'first seed (default: {FIRST})')
+    parser.add_argument('--processes', type=int, default=2)
+    parser.add_argument('--results', type=Path, help='JSON lines to write')
+    options = parser.parse_args(arguments)
+    seeds = range(options.first, options.first + options.seeds)
+    jobs = [(index, seed) for seed in seeds for index in range(len(HELD_CASES))]
+    results = []
+    with multiprocessing.get_context('spawn').Pool(options.processes) as pool:
+        for result in pool.imap_unordered(_one, jobs):
+            results.append(result)
+            print(json.dumps(result), file=sys.stderr, flush=True)
+    if options.results:
+        options.results.write_text(''.join(json.dumps(r) + '\n' for r in results))
+    print(table(results))
+
+
+def _one(job):
+    index, seed = job
+    return measured(HELD_CASES[index], seed)
+
+
+if __name__ == '__main__':
+    main()

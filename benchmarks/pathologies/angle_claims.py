@@ -32,7 +32,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from fluoro_calib_ros.calibration.calibrate import calibrate
 from fluoro_calib_ros.calibration.options import CalibrationOptions
@@ -40,15 +39,13 @@ from fluoro_calib_ros.distortion import collocation
 from fluoro_calib_ros.distortion.angle_field import HARMONICS
 from fluoro_calib_ros.distortion.angle_fit import field_of
 from fluoro_calib_ros.distortion.exposure_terms import TERMS
-from fluoro_calib_ros.distortion.gauge import GaugeKind, gauge_coefficients
-from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 
+from .angle_errors import errors_at_angles
 from .cases import CASES
-from .measure import ANGLES, COVER, GRID
+from .measure import COVER, calibrated_grid, test_angles
 from .scene import NAMES, draw
 
 FIRST = 101
-TURN_SCALE = 1e-3  # rad
 HELD_CASES = [case for case in CASES if case.group == 'turning' and case.angle_known]
 
 
@@ -68,46 +65,6 @@ class Errors:
             f'{name}_px': float(np.sqrt(np.mean(self.error**2))),
             f'{name}_sd_px': float(np.sqrt(np.mean(self.sd**2))),
         }
-
-
-class Truth:
-    """True corrections of a camera at pixels (n, 2), in a gauge over the first of them."""
-
-    def __init__(self, camera, pixels, count, interior):
-        self.pixels = pixels
-        self.count = count
-        self.interior = interior
-        self.back = np.linalg.inv(_matrix(camera.interior))
-
-    def seen_by(self, x, true):
-        """True corrections (n, 2) with the interior orientation and turn x (6,) of the sensor."""
-        ideal = np.column_stack([self.pixels - true, np.ones(len(self.pixels))])
-        turned = ideal @ (_matrix(x[:3]) @ matrix_from_vector(x[3:]) @ self.back).T
-        return self.pixels - turned[:, :2] / turned[:, 2:]
-
-    def gauge(self, true, found, held=None):
-        """Orientation (6,) with which corrections and found ones have the same part in the gauge.
-
-        held (3,): interior orientation; None: it is free.
-        """
-        kind = GaugeKind.FULL if held is None else GaugeKind.TURNS
-        uv = self.pixels[: self.count]
-
-        def whole(x):
-            return x if held is None else np.concatenate([held, x])
-
-        def misclosure(x):
-            left = (self.seen_by(whole(x), true) - found)[: self.count]
-            return gauge_coefficients(uv, left, self.interior, kind)
-
-        turn = np.zeros(3)
-        start = turn if held is not None else np.concatenate([self.interior, turn])
-        scale = np.append(np.ones(len(start) - 3), np.full(3, TURN_SCALE))
-        return whole(least_squares(misclosure, start, x_scale=scale, xtol=1e-14).x)
-
-
-def _matrix(k):
-    return np.array([[k[2], 0, k[0]], [0, k[2], k[1]], [0, 0, 1.0]])
 
 
 @contextmanager
@@ -155,44 +112,12 @@ def measured(case, seed):
     free_field = without_interior(*fits[-1])
     run = result.runs[name]
     uv = run.measured.network.uv[run.trained]
-    errors = errors_at_angles(scene, calibration, uv, free_field)
+    grid = calibrated_grid(scene, calibration)
+    angles = test_angles(scene, calibration)
+    errors = errors_at_angles(scene, calibration, uv, grid, angles, free_field)
     for kind, found in errors.items():
-        out |= found.figures(kind)
+        out |= Errors(*found).figures(kind)
     return out
-
-
-def errors_at_angles(scene, calibration, uv, free_field):
-    """Errors 'held' and 'free' within the calibrated area; uv: image points of the fit."""
-    axis = np.linspace(0, scene.case.side - 1, GRID)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    grid = grid[~calibration.model.outside(grid)]
-    pixels = np.concatenate([uv, grid])
-    camera = scene.cameras[0]
-    truth = Truth(camera, pixels, len(uv), calibration.interior)
-
-    def true_at(angle):
-        return camera.at(scene.case, angle).distortion.correction(pixels)
-
-    mean = np.mean([true_at(angle) for angle in scene.angles], axis=0)
-    interior = truth.gauge(mean, calibration.correction(pixels, None).duv)[:3]
-    parts = {'held': [], 'free': []}
-    field = calibration.angle_field
-    for angle in [a for a in scene.test_angles if field.covers(a)][:ANGLES]:
-        true = true_at(angle)
-        found = calibration.correction(pixels, angle)
-        less = field.change(grid, angle)[1] - free_field.change(grid, angle)[1]
-        sd = found.sd[len(uv) :]
-        for kind, held, own in (
-            ('held', interior, sd),
-            ('free', None, np.sqrt(np.maximum(sd**2 - less, 0))),
-        ):
-            orientation = truth.gauge(true, found.duv, held)
-            error = (found.duv - truth.seen_by(orientation, true))[len(uv) :]
-            parts[kind].append((error, own))
-    return {
-        kind: Errors(*(np.concatenate(column) for column in zip(*pairs)))
-        for kind, pairs in parts.items()
-    }
 
 
 def table(results):

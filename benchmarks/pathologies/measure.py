@@ -21,6 +21,7 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.precision import truth_in_gauge
 
+from .angle_errors import errors_at_angles
 from .scene import NAMES
 
 RESECTION_STEPS = 6
@@ -157,10 +158,14 @@ def claims(scene, result):
     uv = network.uv[run.trained]
     calibration = result.calibrations[name]
     model = calibration.model
-    found = [
-        _errors_at(scene, calibration, uv, angle) for angle in _test_angles(scene, calibration)
-    ]
-    error, sd = (np.concatenate(parts) for parts in zip(*found))
+    angles = test_angles(scene, calibration)
+    if scene.case.arm and scene.case.angle_known and calibration.angle_field is not None:
+        # What it states at an angle is for one interior orientation at all angles.
+        grid = calibrated_grid(scene, calibration)
+        error, sd = errors_at_angles(scene, calibration, uv, grid, angles)['held']
+    else:
+        found = [_errors_at(scene, calibration, uv, angle) for angle in angles]
+        error, sd = (np.concatenate(parts) for parts in zip(*found))
     out = _statistics('correction', error, np.broadcast_to(sd[:, None], error.shape))
     out['correction_px'] = float(np.sqrt(np.mean(error**2)))
     out['correction_sd_px'] = float(np.sqrt(np.mean(sd**2)))
@@ -176,15 +181,20 @@ def claims(scene, result):
     return out
 
 
+def calibrated_grid(scene, calibration):
+    """Pixels (g, 2) of a grid within the calibrated area."""
+    axis = np.linspace(0, scene.case.side - 1, GRID)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    return grid[~calibration.model.outside(grid)]
+
+
 def _errors_at(scene, calibration, uv, angle):
     """Errors (n, 2) and stated sd (n,) of a correction within the calibrated area, at an angle.
 
     uv: image points to which it was fitted. Angle None: unknown, the truth is the mean over the
     exposures.
     """
-    axis = np.linspace(0, scene.case.side - 1, GRID)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    grid = grid[~calibration.model.outside(grid)]
+    grid = calibrated_grid(scene, calibration)
     camera = scene.cameras[0]
     both = np.concatenate([uv, grid])
     angles = scene.angles if angle is None and scene.case.arm else [angle]
@@ -197,7 +207,7 @@ def _errors_at(scene, calibration, uv, angle):
     return found.duv[on_grid] - in_gauge(grid), found.sd[on_grid]
 
 
-def _test_angles(scene, calibration):
+def test_angles(scene, calibration):
     """Angles at which a correction is compared with the truth; None: it is unknown."""
     field = calibration.angle_field
     if not (scene.case.arm and scene.case.angle_known):

@@ -41,7 +41,8 @@ with a standard deviation of 0.1 mm. Model: {model}.
 - **stereo**: the same for points intersected from both fluoroscopes, with noise, in mm.
 - **NSE**: mean of (error / claimed standard deviation)^2 of the correction (grid within the
   calibrated area, in the gauge of the calibration), the object points and the sources of
-  fluoroscope a; 1 is honest. A calibration has few independent errors, so that its NSE scatters:
+  fluoroscope a; 1 is honest. At the angles of a C-arm, the interior orientation
+  is held: see c_arm_angle.md. A calibration has few independent errors, so that its NSE scatters:
   that of the sources by about 0.7, that of the correction as chi squared over its degrees of
   freedom, which follow from the claimed covariance (Box 1954).
 - **cover**: share [%] of errors within the claimed 95 % interval, in the same order.

@@ -24,9 +24,11 @@ from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.distortion.angle_field import PACKED_SHAPES, AngleField
+from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
 from fluoro_calib_ros.photogrammetry.network import Network
+from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 from fluoro_calib_ros.simulation.exposures import phantom_poses, simulate_exposures
@@ -50,6 +52,38 @@ def calibrated(name='a', count=15, **options):
     """CalibrationResult of one fluoroscope of the rig from the first `count` of 15 exposures."""
     return calibrate(
         {name: exposures()[name][:count]}, rig().phantom, CalibrationOptions(**options)
+    )
+
+
+def true_calibrations(fluoroscopes, image_sd=0.25):
+    """True calibrations by name of the fluoroscopes of a rig without distortion."""
+    one = calibrated('a', 5, model='parametric').calibrations['a']
+    return {
+        f.name: replace(
+            one,
+            fluoroscope=f.name,
+            interior=f.interior,
+            model=no_correction(),
+            train_exposure=np.zeros(0, dtype=int),
+            frame_id=f'{f.name}_optical',
+            image_sd=image_sd,
+        )
+        for f in fluoroscopes
+    }
+
+
+def true_orientation(fluoroscopes, calibrations):
+    """True orientation of fluoroscopes with these calibrations by name, a small covariance."""
+    sd = np.tile([0.03] * 3 + [2e-5] * 3 + [0.1] * 3, len(fluoroscopes))
+    return RigOrientation(
+        tuple(f.name for f in fluoroscopes),
+        np.stack([f.interior for f in fluoroscopes]),
+        np.stack([f.rotation for f in fluoroscopes]),
+        np.stack([f.position_mm for f in fluoroscopes]),
+        np.diag(sd**2),
+        'rig',
+        'capture',
+        tuple(calibrations[f.name].calibration_id for f in fluoroscopes),
     )
 
 

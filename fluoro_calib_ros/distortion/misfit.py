@@ -289,21 +289,25 @@ def _pairs_of_rejected(
     reach [px]: of neighbours of different exposures; limit [px]: difference of residuals that
     agree. Chance makes as many pairs opposite as it makes agree.
     """
-    i, j = cKDTree(rejected.uv).query_pairs(ALONE_REACH * reach, output_type='ndarray').T
-    r = rejected.residuals
     near = cKDTree(inliers.uv).query_ball_point(rejected.uv, reach)
-    alone = np.array(
-        [np.all(inliers.exposure[rows] == own) for rows, own in zip(near, rejected.exposure)],
-        dtype=bool,
+    exposure = rejected.exposure
+    alone = np.flatnonzero(
+        [np.all(inliers.exposure[rows] == own) for rows, own in zip(near, exposure)]
     )
-    same = rejected.exposure[i] == rejected.exposure[j]
-    distance = np.linalg.norm(rejected.uv[i] - rejected.uv[j], axis=1)
-    counts = np.where(same, alone[i] & alone[j], distance <= reach)
-    size = np.linalg.norm(r, axis=1)
+    apart = cKDTree(rejected.uv).query_pairs(reach, output_type='ndarray')
+    apart = apart[exposure[apart[:, 0]] != exposure[apart[:, 1]]]
+    same = alone[
+        cKDTree(rejected.uv[alone]).query_pairs(ALONE_REACH * reach, output_type='ndarray')
+    ]
+    same = same[exposure[same[:, 0]] == exposure[same[:, 1]]]
+    i, j = np.concatenate([apart, same]).T
+    r = rejected.residuals
+    limits = np.full(len(i), limit)
     # Beyond the last inliers, the error of a correction grows fast.
-    limits = np.where(same, np.maximum(limit, ALONE_AGREE * np.maximum(size[i], size[j])), limit)
-    agree = counts & (np.linalg.norm(r[i] - r[j], axis=1) < limits)
-    opposite = counts & (np.linalg.norm(r[i] + r[j], axis=1) < limits)
+    larger = np.linalg.norm(r[same], axis=2).max(axis=1, initial=0.0)
+    limits[len(apart) :] = np.maximum(limit, ALONE_AGREE * larger)
+    agree = np.linalg.norm(r[i] - r[j], axis=1) < limits
+    opposite = np.linalg.norm(r[i] + r[j], axis=1) < limits
     return i, j, agree, opposite
 
 

@@ -56,9 +56,10 @@ UNMATCHED = (
     'or the numbers of their frames, do not belong together'
 )
 RECENT = 100  # exposures of a stream
-BETTER = 0.3  # share of rejected points of a trial over that of the recording
-
-CLOSER = 0.6  # median miss of a trial over that of the recording
+# Share of rejected points of a trial, and median miss of one, over those of the recording, from
+# which the trial tells the cause.
+BETTER = 0.3
+CLOSER = 0.6
 
 Frames = Mapping[str, Sequence[Frame]]
 Trial = tuple[str, dict[str, list[Frame]]]
@@ -72,10 +73,7 @@ class RecentMisses:
 
     def add(self, points: IntersectedPoints) -> None:
         """Add the points of an exposure."""
-        counts = np.bincount(points.status, minlength=len(STATUS_NAMES))
-        bad = int(counts[REJECTED] + counts[FAILED])
-        total = bad + int(counts[OK] + counts[OUTSIDE])
-        self._recent.append((bad, total, int(counts[SINGLE_VIEW])))
+        self._recent.append(_counts(points.status))
 
     def message(self) -> str:
         """Return a sentence where points of the recent exposures cannot be right, else ''."""
@@ -90,10 +88,15 @@ class RecentMisses:
 def share_rejected(found: Sequence[ReconstructedFrame]) -> tuple[float, int]:
     """Return the share of rejected points, and the number of points of two views."""
     status = np.concatenate([frame.points.status for frame in found] or [np.empty(0, int)])
-    counts = np.bincount(status, minlength=256)
-    bad = int(counts[REJECTED] + counts[FAILED])
-    total = bad + int(counts[OK] + counts[OUTSIDE])
+    bad, total, _ = _counts(status)
     return bad / max(total, 1), total
+
+
+def _counts(status: np.ndarray) -> tuple[int, int, int]:
+    """Number of rejected points, of points of two views, and of points of a single one."""
+    counts = np.bincount(status, minlength=len(STATUS_NAMES))
+    bad = int(counts[REJECTED] + counts[FAILED])
+    return bad, bad + int(counts[OK] + counts[OUTSIDE]), int(counts[SINGLE_VIEW])
 
 
 def mismatch(
@@ -133,8 +136,10 @@ def cause_of_misses(
     names = intersector.orientation.fluoroscopes
     numbers = _largest(found)
     limit = CLOSER * _miss([frame for frame in found if frame.number in numbers])
-    uncorrected = {name: replace(calibrations[name], model=no_correction()) for name in names}
-    uncorrected = {name: replace(c, angle_field=None) for name, c in uncorrected.items()}
+    uncorrected = {
+        name: replace(calibrations[name], model=no_correction(), angle_field=None)
+        for name in names
+    }
     tried = {name: [f for f in frames[name] if f.number in numbers] for name in names}
     trials = [(CORRECTED, tried), *_trials(frames, names, numbers)]
     misses = []

@@ -21,9 +21,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import calibrated, run
+from rigs import run, true_calibrations, true_orientation
 
-from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.drift.clusters import parse_clusters
 from fluoro_calib_ros.drift.options import DriftOptions
 from fluoro_calib_ros.drift.recording_watch import RecordingDriftWatch
@@ -33,7 +32,6 @@ from fluoro_calib_ros.files.calibration import save_calibration
 from fluoro_calib_ros.files.observations import write_observations_csv
 from fluoro_calib_ros.files.rig_orientation import save_orientation
 from fluoro_calib_ros.jobs.dataset import write_bag
-from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.reconstruction.correspondence import CorrectedView, match_views
 from fluoro_calib_ros.reconstruction.intersection import OK, SINGLE_VIEW, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import (
@@ -57,32 +55,9 @@ def rig(names='abc'):
 @functools.cache
 def known(names='abc'):
     """Calibrations and orientation of the rig, true, with a small covariance."""
-    one = calibrated('a', 5, model='parametric').calibrations['a']
-    f = rig(names).fluoroscopes
-    calibrations = {
-        x.name: replace(
-            one,
-            fluoroscope=x.name,
-            interior=x.interior,
-            model=no_correction(),
-            train_exposure=np.zeros(0, dtype=int),
-            frame_id=f'{x.name}_optical',
-            image_sd=NOISE_PX,
-        )
-        for x in f
-    }
-    sd = np.tile([0.03] * 3 + [2e-5] * 3 + [0.1] * 3, len(names))
-    orientation = RigOrientation(
-        tuple(names),
-        np.stack([x.interior for x in f]),
-        np.stack([x.rotation for x in f]),
-        np.stack([x.position_mm for x in f]),
-        np.diag(sd**2),
-        'rig',
-        'capture',
-        tuple(c.calibration_id for c in calibrations.values()),
-    )
-    return calibrations, orientation
+    fluoroscopes = rig(names).fluoroscopes
+    calibrations = true_calibrations(fluoroscopes, NOISE_PX)
+    return calibrations, true_orientation(fluoroscopes, calibrations)
 
 
 @functools.cache

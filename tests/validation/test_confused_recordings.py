@@ -23,10 +23,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import calibrated, run
+from rigs import calibrated, run, true_calibrations, true_orientation
 
 from fluoro_calib_ros.calibration.rig_orientation import orientation_and_scatter
-from fluoro_calib_ros.distortion.none import no_correction
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
@@ -37,7 +36,6 @@ from fluoro_calib_ros.files.rig_orientation import save_orientation
 from fluoro_calib_ros.jobs.adjustment import adjust
 from fluoro_calib_ros.jobs.orientation import orient
 from fluoro_calib_ros.jobs.reconstruction import ReconstructionOptions, reconstruct
-from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.mismatch import RecentMisses
@@ -60,36 +58,13 @@ def rig():
 @functools.cache
 def calibrations():
     """Its true calibrations."""
-    one = calibrated('a', 5, model='parametric').calibrations['a']
-    return {
-        f.name: replace(
-            one,
-            fluoroscope=f.name,
-            interior=f.interior,
-            model=no_correction(),
-            train_exposure=np.zeros(0, dtype=int),
-            frame_id=f'{f.name}_optical',
-            image_sd=0.25,
-        )
-        for f in rig().fluoroscopes
-    }
+    return true_calibrations(rig().fluoroscopes)
 
 
 @functools.cache
 def orientation():
     """Its true orientation, with a small covariance."""
-    f = rig().fluoroscopes
-    sd = np.tile([0.03] * 3 + [2e-5] * 3 + [0.1] * 3, len(f))
-    return RigOrientation(
-        tuple(x.name for x in f),
-        np.stack([x.interior for x in f]),
-        np.stack([x.rotation for x in f]),
-        np.stack([x.position_mm for x in f]),
-        np.diag(sd**2),
-        'rig',
-        'capture',
-        tuple(calibrations()[x.name].calibration_id for x in f),
-    )
+    return true_orientation(rig().fluoroscopes, calibrations())
 
 
 @functools.cache

@@ -58,9 +58,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Adjust and write the result folder. Raises DataError."""
     from ..files.names import read_names
-    from ..files.result_document import result_document
+    from ..files.result_check import disagreements
     from ..jobs.adjustment import adjust
-    from ..jobs.result_folder import check_result_folder, save_result
+    from ..jobs.result_folder import check_result_folder, save_result, written_document
     from ..jobs.sources import read_calibrations, read_source, read_survey, select_calibrations
     from ..report.tables import summary_table
     from ..validation.held_fit import held_doubts
@@ -69,6 +69,7 @@ def run(arguments: argparse.Namespace) -> None:
         arguments.out, (arguments.source, arguments.phantom, arguments.calibration)
     )
     calibrations = read_calibrations(arguments.calibration)
+    print_notes(disagreements(arguments.calibration, calibrations))
     known = read_names(arguments.calibration)
     survey = read_survey(arguments.phantom, file_settings(arguments, names=known))
     recording = read_source(
@@ -83,11 +84,10 @@ def run(arguments: argparse.Namespace) -> None:
     frames = recording.frames
     calibrations = select_calibrations(calibrations, frames, arguments.calibration)
     result = adjust(frames, survey.phantom, calibrations, arguments.loss)
-    save_result(arguments.out, result, covariance=arguments.covariance)
+    doubts = held_doubts(result, calibrations)
+    save_result(arguments.out, result, doubts, covariance=arguments.covariance)
     for sentence in result.left_out:
         print_note(f'not used: {sentence}')
-    doubts = held_doubts(result, calibrations)
     for sentence in doubts:
         print_note(f'doubtful: {sentence}')
-    document = {**result_document(result), 'doubts': doubts}
-    print_result(arguments, document, summary_table(result))
+    print_result(arguments, written_document(result, doubts), summary_table(result))

@@ -275,20 +275,18 @@ def _options(arguments: argparse.Namespace) -> CalibrationOptions:
 
 def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
     """Print notes, the summary, and the verdict with the report."""
-    from ..files.result_document import result_document
     from ..files.validation import validation_document
+    from ..jobs.result_folder import written_document
     from ..report.tables import summary_table
     from ..report.verdict import verdict_line
 
-    if outcome.orientation is None and len(outcome.request.frames) > 1:
-        print_note(f'no orientation of the rig: {outcome.orientation_note}')
-    elif outcome.orientation_note and outcome.orientation is not None:
-        print_note(f'orientation of the rig: {outcome.orientation_note}')
+    if outcome.rig_note:
+        print_note(outcome.rig_note)
     for sentence in outcome.result.left_out:
         print_note(f'not used: {sentence}')
     for sentence in outcome.doubts:
         print_note(f'this cannot be right: {sentence}')
-    document = {**result_document(outcome.result), 'doubts': list(outcome.doubts)}
+    document = written_document(outcome.result, outcome.doubts, outcome.rig_note)
     lines = [summary_table(outcome.result).rstrip()]
     if outcome.validation is not None:
         report = _report(arguments.out)

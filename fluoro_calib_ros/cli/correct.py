@@ -108,12 +108,14 @@ def run(arguments: argparse.Namespace) -> None:
         listed,
         suffix_of,
     )
+    from ..files.result_check import disagreements
     from ..jobs.sources import read_calibrations
 
     if arguments.source.is_file() or not arguments.out.is_dir():  # images can fill a folder
         check_output_file(arguments.out, (arguments.source, arguments.calibration))
     names = None if arguments.fluoroscope is None else [arguments.fluoroscope]
     calibrations = read_calibrations(arguments.calibration, names)
+    print_notes(disagreements(arguments.calibration, calibrations))
     if is_image_source(arguments.source):
         _correct_images(arguments, calibrations)
     elif suffix_of(arguments.source) in POINTS_SUFFIXES or not arguments.source.exists():

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from ..errors import DataError
@@ -74,12 +75,18 @@ def run(arguments: argparse.Namespace) -> None:
     """
     from ..files.calibration_request import read_request
     from ..files.names import read_names
+    from ..files.result_check import edited, exchanged, read_result
     from ..files.validation import validation_document, write_validation
+    from ..jobs.result_folder import saved_orientation, saved_rig_note
     from ..jobs.sources import BagSelection, read_calibrations, read_source, read_survey
     from ..report.verdict import verdict_text
     from ..validation.verdict import validate
 
     calibrations = read_calibrations(arguments.directory, arguments.fluoroscopes)
+    document = read_result(arguments.directory)
+    mixed = exchanged(arguments.directory, document, calibrations)
+    if mixed:
+        raise DataError(mixed)
     frames = phantom = None
     known = read_names(arguments.directory)
     if arguments.source is not None:
@@ -99,10 +106,15 @@ def run(arguments: argparse.Namespace) -> None:
         print_notes(survey.notes)
         phantom = survey.phantom
     request = read_request(arguments.directory, calibrations, frames, phantom)
-    validation = validate(request, calibrations, print_step)
+    notes = (edited(arguments.directory, document), saved_rig_note(arguments.directory))
+    validation = replace(
+        validate(request, calibrations, print_step), notes=tuple(filter(None, notes))
+    )
     write_validation(arguments.directory, validation)
     passed = validation.verdict == 'pass'
     following = ('reconstruct', 'MEASURED', '--calibration', arguments.directory)
+    if saved_orientation(arguments.directory) is None:
+        following = ('correct', 'POINTS', '--calibration', arguments.directory)
     print_result(
         arguments,
         validation_document(validation),

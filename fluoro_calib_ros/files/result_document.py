@@ -30,7 +30,8 @@ from ..drift.recording_watch import DriftVerdict
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
 
-FORMAT_VERSION = 2  # 1 had neither version, date, units nor adjustments
+# 1 had neither version, date, units nor adjustments; 2 no ids, no note on the rig and no digest.
+FORMAT_VERSION = 3
 UNITS = {'lengths': 'mm', 'image': 'px', 'angles': 'rad', 'seconds': 's'}
 
 
@@ -44,7 +45,11 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
         'created': job.created,
         'units': UNITS,
         'fluoroscopes': {
-            name: _fluoroscope(figures) | _angle(job.calibrations[name])
+            name: {
+                'calibration_id': job.calibrations[name].calibration_id,
+                **_fluoroscope(figures),
+                **_angle(job.calibrations[name]),
+            }
             for name, figures in job.fluoroscopes.items()
         },
         'targets': [

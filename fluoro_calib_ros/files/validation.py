@@ -36,6 +36,7 @@ def validation_document(validation: Validation) -> dict[str, Any]:
         'checks': [dataclasses.asdict(check) for check in validation.checks],
         'calibration_id': dict(validation.calibration_id),
         'achieved_sd_px': dict(validation.achieved_sd_px),
+        'notes': list(validation.notes),
         'seconds': validation.seconds,
     }
 

@@ -107,6 +107,14 @@ class CalibrationOutcome:
     doubts: tuple[str, ...] = ()
 
     @property
+    def rig_note(self) -> str:
+        """Why the rig has no orientation, or what is doubtful about it, as a sentence."""
+        if not self.orientation_note or len(self.calibrations) < 2:
+            return ''
+        none = 'no ' if self.orientation is None else ''
+        return f'{none}orientation of the rig: {self.orientation_note}'
+
+    @property
     def calibrations(self) -> dict[str, FluoroscopeCalibration]:
         """Calibrations of all fluoroscopes of the rig, the new ones among them."""
         return {**self.rig.calibrations, **self.result.calibrations}
@@ -183,7 +191,12 @@ def run_calibration(
         validation = validate_or_report(
             request, result.calibrations, report_step, raise_if_cancelled
         )
-    return CalibrationOutcome(request, result, rig, orientation, note, validation, tuple(doubts))
+    outcome = CalibrationOutcome(
+        request, result, rig, orientation, note, validation, tuple(doubts)
+    )
+    if validation is None or not outcome.rig_note:
+        return outcome
+    return replace(outcome, validation=replace(validation, notes=(outcome.rig_note,)))
 
 
 def _wrong_input(request: CalibrationRequest) -> list[str]:

@@ -31,9 +31,10 @@ from ..files.calibration import load_calibrations
 from ..files.calibration_request import OPTIONS, read_request
 from ..files.json_file import read_json
 from ..files.names import read_names
+from ..files.result_check import edited, exchanged
 from ..files.validation import NAME as VALIDATION
 from ..report.html import ReportInput, report_html
-from .result_folder import REPORT, RESULT, belongs_to, saved_orientation
+from .result_folder import REPORT, RESULT, belongs_to, saved_orientation, saved_rig_note
 
 
 def write_report(directory: str | os.PathLike[str]) -> str:
@@ -75,6 +76,9 @@ def read_report_input(directory: str | os.PathLike[str]) -> ReportInput:
     present = {name: c for name, c in calibrations.items() if name in result['fluoroscopes']}
     if not present:
         raise DataError(f'{directory / RESULT}: there are no figures of {", ".join(calibrations)}')
+    mixed = exchanged(directory, result, present)
+    if mixed:
+        raise DataError(mixed)
     request = read_request(directory, present)
     orientation = saved_orientation(directory)
     if orientation is not None and not belongs_to(orientation, calibrations):
@@ -91,6 +95,8 @@ def read_report_input(directory: str | os.PathLike[str]) -> ReportInput:
         orientation,
         read_names(directory),
         when.strftime('%Y-%m-%d %H:%M UTC'),
+        saved_rig_note(directory),
+        edited(directory, result),
     )
 
 

@@ -19,6 +19,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from ..calibration.calibrate import CalibrationResult
 from ..calibration.result import FluoroscopeCalibration
@@ -36,6 +37,8 @@ from ..files.covariance import SUFFIX as COVARIANCE
 from ..files.covariance import write_covariance
 from ..files.folder import FolderKind, check_output_folder, replaced_folder
 from ..files.json_file import write_json
+from ..files.result_check import NAME as RESULT
+from ..files.result_check import read_result, with_digest
 from ..files.result_document import result_document
 from ..files.result_tables import NAMES as TABLES
 from ..files.result_tables import write_tables
@@ -45,7 +48,6 @@ from ..files.validation import write_validation
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 
-RESULT = 'result.json'
 REPORT = 'report.html'
 # All that belongs to one calibration; calibrations of other fluoroscopes stay in the folder.
 _OWN = (
@@ -112,7 +114,7 @@ def save_outcome(
         present or saved_orientation(directory), outcome.orientation, outcome.calibrations
     )
     with replaced_folder(directory, RESULT_FOLDER) as folder:
-        _write_result(folder, outcome.result, outcome.doubts)
+        _write_result(folder, outcome.result, outcome.doubts, outcome.rig_note)
         write_request(folder, outcome.request)
         if orientation is not None:
             save_orientation(folder, orientation)
@@ -179,11 +181,21 @@ def check_result_folder(
     check_output_folder(directory, RESULT_FOLDER, inputs)
 
 
-def _write_result(folder: Path, result: CalibrationResult, doubts: Sequence[str]) -> None:
+def _write_result(
+    folder: Path, result: CalibrationResult, doubts: Sequence[str], rig_note: str = ''
+) -> None:
     for calibration in result.calibrations.values():
         save_calibration(folder, calibration)
-    write_json(folder / RESULT, {**result_document(result), 'doubts': list(doubts)})
+    write_json(folder / RESULT, written_document(result, doubts, rig_note))
     write_tables(folder, result)
+
+
+def written_document(
+    result: CalibrationResult, doubts: Sequence[str] = (), rig_note: str = ''
+) -> dict[str, Any]:
+    """Return the whole content of result.json."""
+    document = {**result_document(result), 'doubts': list(doubts), 'rig_note': rig_note}
+    return with_digest(document)
 
 
 def _saved_ids(
@@ -203,6 +215,18 @@ def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | Non
         return load_orientation(orientation_path(directory))
     except DataError:
         return None
+
+
+def saved_rig_note(directory: str | os.PathLike[str]) -> str:
+    """Return what result.json says about the orientation of the rig from its exposures.
+
+    '' for nothing, and where the folder has a captured orientation, which the exposures do not
+    concern. Raises DataError for a file that cannot be read.
+    """
+    note = read_result(directory).get('rig_note', '')
+    orientation = saved_orientation(directory)
+    captured = orientation is not None and orientation.source == 'capture'
+    return note if isinstance(note, str) and not captured else ''
 
 
 def belongs_to(

@@ -40,6 +40,7 @@ from ..files.calibration import load_calibrations
 from ..files.image_points import PointsFile, points_of_frames, read_points
 from ..files.known_orientation import holds_known_orientations, read_known_orientations
 from ..files.names import read_names
+from ..files.result_check import disagreements
 from ..photogrammetry.known_orientation import KnownOrientation
 
 MAGIC = b'\x89MCAP'  # of a bag
@@ -367,7 +368,8 @@ def read_calibrated_source(
     )
     select_calibrations(calibrations, recording.frames, directory)
     unknown = _unknown_angles(path, recording.frames, calibrations, selection)
-    return replace(recording, notes=(*recording.notes, *unknown)), calibrations
+    mixed = disagreements(directory, calibrations)
+    return replace(recording, notes=(*recording.notes, *unknown, *mixed)), calibrations
 
 
 def _unknown_angles(

@@ -51,7 +51,7 @@ from ..calibration import result as calibration_result
 from ..calibration.options import CalibrationOptions
 from ..calibration.request import CalibrationRequest
 from ..calibration.rounds import Round
-from ..errors import DataError
+from ..errors import DataError, printable
 from ..exposures.angles import AngleOptions
 from ..exposures.collector import StillOptions
 from ..exposures.frame import Frame
@@ -61,6 +61,7 @@ from ..exposures.phantom import Phantom
 from ..files.calibration import SUFFIX, load_calibrations
 from ..files.calibration_request import PHANTOM as PHANTOM_FILE
 from ..files.phantom import read_phantom
+from ..files.result_check import disagreements
 from ..images.coverage_picture import coverage_picture
 from ..jobs.calibration import CalibrationOutcome, Rig
 from ..jobs.result_folder import (
@@ -583,6 +584,8 @@ class CalibrationNode(StreamNode):
         Raises DataError and OSError.
         """
         loaded = {n: c for n, c in load_calibrations(directory).items() if n in self._names}
+        for sentence in disagreements(directory, loaded):
+            self.get_logger().warning(printable(sentence))
         return loaded, self._orientation.load(directory, loaded) if loaded else None
 
     def _check_phantom_of_directory(self) -> None:
@@ -686,8 +689,8 @@ class CalibrationNode(StreamNode):
         orientation, fault = self._save_outcome(outcome)
         if outcome.orientation is None:
             self.get_logger().warning(f'no new orientation of the rig: {outcome.orientation_note}')
-        elif outcome.orientation_note:
-            self.get_logger().warning(f'orientation of the rig: {outcome.orientation_note}')
+        elif outcome.rig_note:
+            self.get_logger().warning(outcome.rig_note)
         if orientation is None:
             self._orientation.clear()
         self._publish(calibrations, orientation)

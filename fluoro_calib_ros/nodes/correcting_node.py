@@ -22,9 +22,10 @@ from typing import Any, ClassVar
 
 from ..calibration.result import FluoroscopeCalibration
 from ..distortion.angle_field import AngleField
-from ..errors import DataError
+from ..errors import DataError, printable
 from ..exposures.angles import AngleOptions
 from ..files.calibration import load_calibrations
+from ..files.result_check import disagreements
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
 from .runtime.diagnostics import ERROR, OK, WARN, LatencyWindow, Status
@@ -190,6 +191,8 @@ class CorrectingNode(StreamNode):
             for name in self.names:
                 self._on_refused_calibration(name, one_line(error))
             return
+        for sentence in disagreements(directory, loaded):
+            self.get_logger().warning(printable(sentence))
         for name in self.names:
             self._calibrations.begin_with(name, loaded[name])
 

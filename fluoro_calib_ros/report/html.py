@@ -78,6 +78,10 @@ class ReportInput:
     names : Names
     written : str
         Date of result.json, as text.
+    rig_note : str
+        Why the rig has no orientation, or what is doubtful about it; '' for nothing.
+    edited : str
+        What is wrong with result.json itself; '' for nothing.
     """
 
     title: str
@@ -90,6 +94,8 @@ class ReportInput:
     orientation: RigOrientation | None = None
     names: Names = field(default_factory=Names)
     written: str = ''
+    rig_note: str = ''
+    edited: str = ''
 
 
 def report_html(given: ReportInput) -> str:
@@ -128,6 +134,8 @@ def _verdict(given: ReportInput) -> dict[str, Any]:
     verdict = None if given.validation is None else given.validation.get('verdict')
     findings = list(given.validation.get('findings', [])) if given.validation else []
     findings += [f'This cannot be right: {doubt}' for doubt in given.result.get('doubts', [])]
+    findings = [given.edited, *findings, _sentence(given.rig_note)]
+    findings = [sentence for sentence in findings if sentence]
     if verdict is None:
         findings.insert(
             0, 'Run fluoro-calib validate on this folder, then write the report again.'
@@ -141,6 +149,10 @@ def _verdict(given: ReportInput) -> dict[str, Any]:
         'findings': findings,
         'checks': given.validation.get('checks', []) if given.validation else [],
     }
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:]
 
 
 def _residuals(given: ReportInput, name: str) -> Residuals:

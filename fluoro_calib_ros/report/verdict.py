@@ -55,7 +55,7 @@ def verdict_text(validation: Validation) -> str:
     lines += ['', f'Verdict: {validation.verdict} ({validation.seconds:.1f} s)']
     for name, sd in validation.achieved_sd_px.items():
         lines.append(f'Achieved, fluoroscope {_shortened(name)}: corrections to {sd:.3f} px (sd)')
-    for sentence in validation.findings:
+    for sentence in (*validation.findings, *validation.notes):
         lines += textwrap.wrap(f'- {sentence}', TERMINAL_WIDTH, subsequent_indent='  ')
     return '\n'.join(lines) + '\n'
 

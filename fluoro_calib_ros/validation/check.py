@@ -71,6 +71,9 @@ class Validation:
     achieved_sd_px : mapping of str to float
         Standard deviation of a coordinate of the correction that the checks confirm [px], by
         fluoroscope; whatever the verdict is, it says what the calibration is good for.
+    notes : tuple of str
+        What a user has to know beside the verdict, such as what is doubtful about the orientation
+        of the rig, on which the verdict does not depend.
     """
 
     verdict: str
@@ -78,6 +81,7 @@ class Validation:
     calibration_id: Mapping[str, str]
     seconds: float
     achieved_sd_px: Mapping[str, float] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     @property
     def findings(self) -> tuple[str, ...]:

@@ -57,7 +57,7 @@ def test_tables_contain_what_the_result_says(calibrated, tmp_path):
     job, frames, _ = calibrated
     save_result(tmp_path / 'made', job)
     document = json.loads((tmp_path / 'made' / 'result.json').read_text())
-    assert document['format_version'] == 2 and document['created'].endswith('+00:00')
+    assert document['format_version'] == 3 and document['created'].endswith('+00:00')
     assert document['units']['image'] == 'px'
     of_adjustment = document['adjustments'][0]
     assert (

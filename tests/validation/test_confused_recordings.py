@@ -19,6 +19,7 @@ the input. What is right must pass without a word.
 """
 
 import functools
+import json
 from dataclasses import replace
 
 import numpy as np
@@ -40,6 +41,7 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.intersection import Intersector
 from fluoro_calib_ros.reconstruction.mismatch import RecentMisses
 from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
+from fluoro_calib_ros.report import html as html_report
 from fluoro_calib_ros.simulation.exposures import Detection, detect_beads, phantom_poses
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.validation.held_fit import held_doubts
@@ -374,6 +376,41 @@ def test_adjusted_exposures_that_contradict_the_calibrations_are_doubtful():
     doubts = held_doubts(adjust(frames(), rig().phantom, other), other)
     assert [d.split(':')[0] for d in doubts] == ['fluoroscope a', 'fluoroscope b']
     assert 'times the noise with which it was determined' in doubts[0]
+
+
+@pytest.mark.parametrize(
+    ('change', 'sentence'),
+    [
+        (nudged(3.0, 0.01, 4, 5), 'orientation of the rig: not from exposure 5, in which'),
+        (rig_moved(4.0, 0.006, 4), 'a fluoroscope was moved between exposures 4 and 5'),
+        (None, ''),
+    ],
+)
+def test_what_is_doubtful_about_the_rig_stays_with_the_result(
+    change, sentence, tmp_path, capsys, monkeypatch
+):
+    monkeypatch.setattr(html_report, '_base64', lambda figure: '')
+    write_phantom(tmp_path / 'phantom.csv', rig().phantom)
+    source = tmp_path / 'observations.csv'
+    write_observations_csv(source, seen(rig(), change))
+    arguments = ('--image-size', '1024x1024', '--phantom', tmp_path / 'phantom.csv', '--model')
+    out = tmp_path / 'result'
+    assert run('calibrate', source, *arguments, 'none', '--out', out) == 0
+    said = capsys.readouterr().err
+    assert sentence in said if sentence else 'orientation of the rig' not in said
+    note = json.loads((out / 'result.json').read_text())['rig_note']
+    assert sentence in note and bool(note) == bool(sentence)
+    assert run('validate', out) == 0
+    assert note in ' '.join(capsys.readouterr().out.replace('\n  ', ' ').split())
+    assert json.loads((out / 'validation.json').read_text())['notes'] == [note] * bool(note)
+    for _ in range(2):
+        assert ('rientation of the rig:' in (out / 'report.html').read_text()) == bool(note)
+        assert run('report', out) == 0
+    # A capture orients the rig whatever the exposures say.
+    arguments = ('--calibration', out, '--phantom', tmp_path / 'phantom.csv', '--exposures', '1')
+    assert run('orient', source, *arguments) == 0
+    assert run('validate', out) == 0
+    assert 'orientation of the rig:' not in capsys.readouterr().out.partition('Verdict')[2]
 
 
 def test_the_commands_say_what_is_wrong(tmp_path, capsys):

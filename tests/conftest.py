@@ -24,6 +24,11 @@ except ImportError:  # without the plugin, one process runs all tests
     LoadFileScheduling = None
 
 
+# Before numpy is imported: workers share the cores, and threads of linear algebra would only wait
+# for each other.
+for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
+    os.environ.setdefault(_name, '1')
+
 ROS = ('tests/ros 1', 'tests/ros 2')
 # Files whose tests share the calibrations of tests/rigs.py, so that one worker makes them once.
 SHARING = (

@@ -214,6 +214,7 @@ def test_convert_corrects_at_the_angles_of_a_bag(tmp_path, capsys):
     assert 'which is unknown for 5 of 5 frames' in capsys.readouterr().err
 
 
+@pytest.mark.long
 def test_lookup_table_by_the_mean_over_the_angles_is_said(tmp_path, capsys):
     turning = rigs.turning(rigs.calibrated('a').calibrations['a'])
     save_calibration(tmp_path / 'result', turning)

@@ -477,6 +477,7 @@ def test_ripples_that_short_sines_have_followed_stand_out_of_their_bands():
     assert shown_ripples((1024, 1024), uv, field + noise, exposure, 12).alone() is None
 
 
+@pytest.mark.long
 def test_dent_whose_image_points_look_like_false_matches_is_followed():
     """A dent of 6 px, 35 px wide: its image points agree with those of other exposures."""
     middle = (400.0, 600.0)

@@ -137,6 +137,7 @@ def rmse_of_test(calibration, frames):
     return float(np.linalg.norm(job.fluoroscopes['a'].rmse_after))
 
 
+@pytest.mark.long
 def test_calibration_with_angles_fits_exposures_at_other_angles():
     test = recording()[1]
     with_angle = rmse_of_test(turning().calibrations['a'], test)

@@ -190,6 +190,7 @@ def without_dent():
     return calibrate({'a': rigs.exposures()['a']}, rigs.rig().phantom).runs['a']
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('middle', [(400.0, 600.0), (800.0, 700.0)])
 def test_dent_is_corrected_and_the_rest_stays_precise(middle, without_dent):
     """A dent of 4 px, 40 px wide. What is claimed elsewhere is as without it, within a fifth."""

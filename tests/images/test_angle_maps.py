@@ -126,6 +126,7 @@ def test_unknown_interpolation_is_refused():
         AngleMaps(calibration(), 'none')
 
 
+@pytest.mark.long
 def test_images_follow_a_field_that_was_estimated_from_exposures():
     """At angles that were not calibrated, against the true change of the distortion."""
     estimated = turning_rig.turning().calibrations['a']

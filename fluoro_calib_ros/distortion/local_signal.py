@@ -16,20 +16,22 @@
 
 A dent of the input screen or the seam of two fibre plates is no stationary field: one covariance
 function for the whole image follows it too little there, and follows noise elsewhere. Places are
-square windows with Gaussian bumps, whose heights have a variance of their own. The bumps are
-written as sums of the sines of the series, so that a place changes only the prior of their
-coefficients.
+square windows, or bands along straight lines, with Gaussian bumps whose heights have a variance of
+their own. The bumps are written as sums of the sines of the series, so that a place changes only
+the prior of their coefficients.
 
 Windows are added where they raise the marginal likelihood clearly, and then those beside them
-where they raise it at all: an edge goes on. For one more component of a covariance the gain is
-known exactly without a new solution (Tipping and Faul, "Fast marginal likelihood maximisation for
-sparse Bayesian models", 2003; here for the bumps of a window together). Variances are renewed as
-in MacKay, "Bayesian interpolation", Neural Computation 4, 1992.
+where they raise it at all: an edge goes on. A low edge, which no window shows alone, is shown by
+the band along it. For one more component of a covariance the gain is known exactly without a new
+solution (Tipping and Faul, "Fast marginal likelihood maximisation for sparse Bayesian models",
+2003; here for the bumps of a place together). Variances are renewed as in MacKay, "Bayesian
+interpolation", Neural Computation 4, 1992.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.special import j0
@@ -39,8 +41,14 @@ from .series import Functions
 WIDTH = 24 / 1024  # of a bump (one standard deviation), relative to the longer side of the image
 NODES = 32  # bumps along that side
 WINDOWS = 8  # windows along that side; they overlap by half
-# Gain of the logarithm of the likelihood from which a window is added: anywhere, which chance does
-# in one of twenty images, and beside those that there are.
+# Bands: directions of their lines, half their width and the distance of the next [bumps], least
+# number of bumps, and those that are looked at more closely.
+DIRECTIONS = 32
+BAND = 1.5
+MIN_BAND = 32
+LIKELY_BANDS = 8
+# Gain of the logarithm of the likelihood from which a place is added: anywhere, which chance does
+# in one of twenty images, and for windows beside those that there are.
 MIN_GAIN = 6.0
 MIN_GAIN_BESIDE = 1.5
 VARIANCES = np.geomspace(1e-3, 30.0, 40)  # of the heights [px^2] that are tried
@@ -48,21 +56,22 @@ MIN_VARIANCE = 2e-4  # [px^2] below which a window is left out again
 # Frequencies of a quadrature, from the lowest to so many times it.
 QUADRATURE = 60
 SHORTEST = 6.0
+MIN_LEVEL = 1e-30  # of the evidence of a bump that no image point shows
 MIN_DETERMINED = 1e-2  # least number of heights that a sum counts as determined
 
 
 @dataclass(frozen=True)
 class LocalSignal:
-    """Bumps of the windows where the signal varies more.
+    """Bumps of the windows and bands where the signal varies more.
 
     Attributes
     ----------
     nodes : (n, 2) ndarray
         Middles of the bumps [px].
     window : (n,) ndarray of int
-        Window of each bump.
+        Window or band of each bump.
     variances : (w,) ndarray
-        Variances of the heights of the bumps of each window [px^2], the same for u and v.
+        Variances of the heights of the bumps of each of them [px^2], the same for u and v.
     """
 
     nodes: np.ndarray
@@ -149,61 +158,110 @@ def correlation_beyond(functions: Functions, distance: np.ndarray) -> np.ndarray
     return j0(np.outer(distance, f)) @ weight / np.sum(weight)
 
 
-def with_more_windows(
+def with_likely_places(
     functions: Functions, estimates: SineEstimates, local: LocalSignal | None
 ) -> LocalSignal | None:
-    """Return the windows with those that raise the marginal likelihood.
+    """Return the windows and bands with those that raise the marginal likelihood.
 
     Parameters
     ----------
     functions : Functions
     estimates : SineEstimates
-        With the present windows.
+        With the present places.
     local : LocalSignal or None
-        Present windows.
+        Present places.
 
     Returns
     -------
     LocalSignal or None
-        The present windows where there are no more.
+        The present places where there are no more.
     """
-    nodes = _all_nodes(functions.image_size)
-    windows = _windows(functions.image_size, nodes)
-    found = _gains(functions, estimates)
-    taken = np.zeros(len(nodes), dtype=bool)
+    shown = _ShownBumps.of(functions, estimates)
+    taken = np.zeros(len(shown.nodes), dtype=bool)
     if local is not None:
-        taken = (np.abs(nodes[:, None] - local.nodes[None]).max(axis=2) < 1).any(axis=1)
+        taken = (np.abs(shown.nodes[:, None] - local.nodes[None]).max(axis=2) < 1).any(axis=1)
+    windows = shown.windows()
+    band = shown.most_likely_band(taken)
+    if band is not None and band.gain > max(MIN_GAIN, *(place.gain for place in windows)):
+        # What windows gain is known again when this band is in the prior.
+        return _joined(local, shown.nodes[band.rows], band.variance)
     out = local
     reach = 1.01 * max(functions.image_size) / NODES
-    for place in np.argsort([-gain for gain, _ in found]):
-        gain, variance = found[place]
-        rows = windows[place]
-        if gain < MIN_GAIN_BESIDE:
+    for place in sorted(windows, key=lambda window: -window.gain):
+        if place.gain < MIN_GAIN_BESIDE:
             break
-        if taken[rows].any():
+        nodes = shown.nodes[place.rows]
+        if taken[place.rows].any():
             continue
-        if gain < MIN_GAIN and not _is_beside(nodes[rows], nodes[taken], reach):
+        if place.gain < MIN_GAIN and not _is_beside(nodes, shown.nodes[taken], reach):
             continue
-        taken[rows] = True
-        out = _joined(out, nodes[rows], variance)
+        taken[place.rows] = True
+        out = _joined(out, nodes, place.variance)
     return out
 
 
 def largest_gain(functions: Functions, estimates: SineEstimates) -> float:
-    """Largest gain of the logarithm of the likelihood by one more window."""
-    return max(gain for gain, _ in _gains(functions, estimates))
+    """Largest gain of the logarithm of the likelihood by one more window or band."""
+    shown = _ShownBumps.of(functions, estimates)
+    places = shown.windows()
+    band = shown.most_likely_band(np.zeros(len(shown.nodes), dtype=bool))
+    return max(place.gain for place in (*places, *([] if band is None else [band])))
 
 
-def _gains(functions: Functions, estimates: SineEstimates) -> list[tuple[float, float]]:
-    """Gain of the logarithm of the likelihood by each window, and its most likely variance."""
-    nodes = _all_nodes(functions.image_size)
-    base = bumps(functions, nodes)
-    pulls = base.T @ estimates.pull
-    products = [base.T @ (one @ base) for one in estimates.evidence]
-    return [
-        _largest_gain(pulls[rows], [product[np.ix_(rows, rows)] for product in products])
-        for rows in _windows(functions.image_size, nodes)
-    ]
+@dataclass(frozen=True)
+class _Place:
+    """Bumps that have a variance in common.
+
+    rows (b,); gain: of the logarithm of the likelihood; variance: the most likely one [px^2].
+    """
+
+    rows: np.ndarray
+    gain: float
+    variance: float
+
+
+@dataclass(frozen=True)
+class _ShownBumps:
+    """What the image points say about all bumps that an image may have.
+
+    nodes (n, 2) [px]; pulls (n, 2) and products (k, n, n), for u and v or one for both: q and s of
+    Tipping and Faul 2003.
+    """
+
+    image_size: tuple[int, int]
+    nodes: np.ndarray
+    pulls: np.ndarray
+    products: np.ndarray
+
+    @classmethod
+    def of(cls, functions: Functions, estimates: SineEstimates) -> _ShownBumps:
+        """Return it for what the image points say about the sines."""
+        nodes = _all_nodes(functions.image_size)
+        base = bumps(functions, nodes)
+        products = np.stack([base.T @ (one @ base) for one in estimates.evidence])
+        return cls(functions.image_size, nodes, base.T @ estimates.pull, products)
+
+    def windows(self) -> list[_Place]:
+        """Return all windows."""
+        return [self._place(rows) for rows in _windows(self.image_size, self.nodes)]
+
+    def most_likely_band(self, taken: np.ndarray) -> _Place | None:
+        """Return the band that gains most, without the bumps that are taken (n,).
+
+        Those whose bumps, each alone, are the least likely to be zero are looked at.
+        """
+        level = np.diagonal(self.products, axis1=1, axis2=2).T
+        excess = np.sum(self.pulls**2 / np.maximum(level, MIN_LEVEL) - 1, axis=1)
+        bands = [rows[~taken[rows]] for rows in _bands(self.image_size)]
+        bands = [rows for rows in bands if len(rows) >= MIN_BAND]
+        score = [np.sum(excess[rows]) / np.sqrt(len(rows)) for rows in bands]
+        likely = [self._place(bands[i]) for i in np.argsort(score)[-LIKELY_BANDS:]]
+        return max(likely, key=lambda band: band.gain, default=None)
+
+    def _place(self, rows: np.ndarray) -> _Place:
+        """Return the place of some bumps (b,)."""
+        products = [product[np.ix_(rows, rows)] for product in self.products]
+        return _Place(rows, *_largest_gain(self.pulls[rows], products))
 
 
 def _all_nodes(image_size: tuple[int, int]) -> np.ndarray:
@@ -222,8 +280,21 @@ def _windows(image_size: tuple[int, int], nodes: np.ndarray) -> list[np.ndarray]
     return [np.flatnonzero(one) for one in np.asarray(inside) if np.any(one)]
 
 
+@lru_cache(maxsize=4)
+def _bands(image_size: tuple[int, int]) -> tuple[np.ndarray, ...]:
+    """Rows of all nodes within a distance of each of many lines across the image."""
+    nodes = _all_nodes(image_size)
+    half = BAND * max(image_size) / NODES
+    out = []
+    for angle in np.arange(DIRECTIONS) * np.pi / DIRECTIONS:
+        across = nodes @ [np.cos(angle), np.sin(angle)]
+        lines = np.arange(across.min(), across.max() + half, half)
+        out += [np.flatnonzero(np.abs(across - line) <= half) for line in lines]
+    return tuple(out)
+
+
 def _largest_gain(pulls: np.ndarray, products: list[np.ndarray]) -> tuple[float, float]:
-    """Largest gain of the logarithm of the likelihood by one more window, and its variance.
+    """Largest gain of the logarithm of the likelihood by one more place, and its variance.
 
     pulls (b, 2) and products (b, b), for u and v or one for both: q and s of Tipping and Faul 2003
     for b bumps.
@@ -245,7 +316,7 @@ def _is_beside(nodes: np.ndarray, others: np.ndarray, reach: float) -> bool:
 
 
 def _joined(local: LocalSignal | None, nodes: np.ndarray, variance: float) -> LocalSignal:
-    """Return the windows with one more, of nodes (b, 2)."""
+    """Return the places with one more, of nodes (b, 2)."""
     if local is None:
         return LocalSignal(nodes, np.zeros(len(nodes), dtype=int), np.array([variance]))
     window = np.full(len(nodes), len(local.variances))

@@ -29,7 +29,7 @@ import numpy as np
 from scipy.linalg import block_diag, cho_factor, cho_solve
 
 from .gauge import GaugeKind, gauge_rows
-from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_more_windows
+from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_likely_places
 from .series import Functions
 from .signal import Signal, SignalEquations, most_likely_signal, starting_signal
 from .terms import trend_transformation
@@ -48,7 +48,7 @@ ABSENT_VARIANCE = 1e-8
 # Square of such a term over its variance from which it exists. It costs errors beyond the
 # calibrated area, where it grows fast; at 1, chance alone would make one of three exist.
 RING_EXISTS = 9.0
-# Gain of the logarithm of the likelihood by a window, with the signal of fewer sines, from which
+# Gain of the logarithm of the likelihood by a place, with the signal of fewer sines, from which
 # the signal is estimated with more; renewals of it then.
 SUSPECTED_GAIN = 2.0
 SIGNAL_ROUNDS = 3
@@ -254,7 +254,7 @@ def _with_bumps(
 def _renewed(
     local: LocalSignal, equations: SignalEquations, variance: np.ndarray
 ) -> LocalSignal | None:
-    """Return the windows with more likely variances; variance (s,): of the sines."""
+    """Return the places with more likely variances; variance (s,): of the sines."""
     matrix = equations.information.copy(order='F')
     columns = equations.columns
     matrix[columns, columns] += 1 / np.tile(variance, 2)
@@ -269,10 +269,10 @@ def _renewed(
 def with_shown_places(
     functions: Functions, values: np.ndarray, observed: np.ndarray, prior: Prior
 ) -> Prior:
-    """Return the prior with windows where the signal varies more, as image points show them.
+    """Return the prior with places where the signal varies more, as image points show them.
 
     Orientations are taken to be known, and the trend to have no prior, so that u and v have the
-    same matrices. The signal is estimated anew only where a window may be found.
+    same matrices. The signal is estimated anew only where a place may be found.
 
     Parameters
     ----------
@@ -309,7 +309,7 @@ def with_shown_places(
     side = max(functions.image_size)
     for _ in range(SIGNAL_ROUNDS):
         prior = replace(prior, signal=most_likely_signal(prior.signal, equations, side))
-    return replace(prior, local=with_more_windows(functions, estimates(prior), prior.local))
+    return replace(prior, local=with_likely_places(functions, estimates(prior), prior.local))
 
 
 def with_more_places(
@@ -319,7 +319,7 @@ def with_more_places(
     gauge: np.ndarray,
     prior: Prior,
 ) -> Prior:
-    """Return the prior with more windows where the signal varies more, if there are any.
+    """Return the prior with more places where the signal varies more, if there are any.
 
     The arguments are those of `most_likely_prior`.
     """
@@ -331,7 +331,7 @@ def with_more_places(
     sines = [slice(axis * m + t, (axis + 1) * m) for axis in (0, 1)]
     covariances = np.stack([covariance[own, own] for own in sines])
     estimates = SineEstimates.of(signal_precision(functions, prior), mean, covariances)
-    return replace(prior, local=with_more_windows(functions, estimates, prior.local))
+    return replace(prior, local=with_likely_places(functions, estimates, prior.local))
 
 
 def _most_likely_trend(

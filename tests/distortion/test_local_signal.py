@@ -28,7 +28,7 @@ from fluoro_calib_ros.distortion.local_signal import (
     SineEstimates,
     bumps,
     largest_gain,
-    with_more_windows,
+    with_likely_places,
 )
 from fluoro_calib_ros.distortion.priors import (
     Prior,
@@ -109,7 +109,7 @@ def test_gain_of_a_window_is_that_of_the_marginal_likelihood():
     estimates = SineEstimates.of(
         signal_precision(functions, SMOOTH), mean, covariance[None, :m, :m]
     )
-    found = with_more_windows(functions, estimates, None)
+    found = with_likely_places(functions, estimates, None)
     first = found.window == 0
     alone = LocalSignal(found.nodes[first], found.window[first], found.variances[:1])
     gain = cost(SMOOTH) - cost(replace(SMOOTH, local=alone))
@@ -136,6 +136,26 @@ def test_place_is_found_and_its_variance_estimated():
         more = with_more_places(functions, information, right, gauge, prior)
         assert len(more.local.variances) <= 2
     assert np.mean(variances) == pytest.approx(0.36, rel=0.5)
+
+
+@pytest.mark.parametrize('seed', range(3))
+@pytest.mark.parametrize('bend', [0.0, 0.1])
+def test_low_edge_is_found_by_the_band_along_it(seed, bend):
+    """A jump of 1 px across a line, straight or bent, with noise of 0.25 px."""
+    functions = Functions(SIZE, -1, 24)
+    uv, values = drawn(functions, seed=seed)
+    angle = 0.4 + seed
+
+    def across(at):
+        x = (at - 512) / 512
+        along = x @ [-np.sin(angle), np.cos(angle)]
+        return (x @ [np.cos(angle), np.sin(angle)] - 0.1 + bend * along**2) * 512
+
+    values += 0.5 * np.tanh(across(uv) / 5)[:, None] * [0.6, -0.8]
+    found = with_shown_places(functions, functions(uv) / NOISE, values / NOISE, SMOOTH).local
+    first = found.nodes[found.window == 0]
+    assert len(first) > 60
+    assert np.median(np.abs(across(first))) < 48
 
 
 @pytest.mark.parametrize('reach', [80.0, 300.0])

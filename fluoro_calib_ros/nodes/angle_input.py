@@ -86,6 +86,8 @@ class AngleInput:
                 decode_joint_state,
                 MAX_BYTES,
             )
+            # An exposure that waits among others must not get the angle of the first of them.
+            reader.take_first(TOPIC)
 
     def guarded(self, faults: FaultHandlers) -> FaultHandlers:
         """Return the handlers of a reader, but for faults of the states of joints."""

@@ -32,7 +32,7 @@ import traceback
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy._rclpy_pybind11 import InvalidHandle, RCLError
 from rclpy.callback_groups import CallbackGroup
@@ -56,6 +56,7 @@ WAIT_NS = 50_000_000  # after which the thread checks whether it has to end
 # Messages of a topic that are handled before the next topic has its turn: views wait for each
 # other.
 MAX_BATCH = 8
+MAX_FIRST = 100  # messages of a topic that comes first that are handled at once
 # What decoding a damaged message raises, in our decoders and in those of the middleware.
 DECODING_ERRORS = (ValueError, RCLError, RuntimeError, MemoryError)
 
@@ -71,6 +72,16 @@ class _ReaderGroup(CallbackGroup):
 
     def ending_execution(self, entity: Any) -> None:
         pass
+
+
+class _Route(NamedTuple):
+    """A subscription, what makes a message from its bytes, and what is called with it."""
+
+    topic: str
+    kind: type
+    handle: Any
+    decode: Callable
+    callback: Callable
 
 
 @dataclass(frozen=True)
@@ -106,6 +117,7 @@ class StreamReader:
         # (topic, Subscription, decode, callback)
         self._routes: list[tuple[str, Subscription, Callable, Callable]] = []
         self._max_bytes: dict[str, int] = {}  # by topic
+        self._first: set[str] = set()  # topics
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -147,6 +159,10 @@ class StreamReader:
         self._max_bytes[topic] = max_bytes or read_limits().max_image_bytes
         decode = decode or (lambda data: deserialize_message(data, kind))
         self._routes.append((topic, subscription, decode, callback))
+
+    def take_first(self, topic: str) -> None:
+        """Handle what is pending of a subscribed topic before each message of the others."""
+        self._first.add(topic)
 
     def topics(self) -> dict[str, bool]:
         """Return the subscribed topics by relative name, and whether each has a publisher."""
@@ -235,12 +251,12 @@ class StreamReader:
 
     def _serve(self) -> None:
         served = -1
-        routes: dict[int, tuple[str, type, Any, Callable, Callable]] = {}
+        routes: dict[int, _Route] = {}
         wait_set: Any = None
         while not self._stopping.is_set() and self._node.context.ok():
             if len(self._routes) != served:  # a topic was added meanwhile
                 routes = {
-                    s.handle.pointer: (topic, s.msg_type, s.handle, decode, callback)
+                    s.handle.pointer: _Route(topic, s.msg_type, s.handle, decode, callback)
                     for topic, s, decode, callback in list(self._routes)
                 }
                 served = len(routes)
@@ -251,11 +267,12 @@ class StreamReader:
                 self._stopping.wait(WAIT_NS * 1e-9)
                 continue
             wait_set.clear_entities()
-            for _, _, handle, *_ in routes.values():
-                wait_set.add_subscription(handle)
+            for route in routes.values():
+                wait_set.add_subscription(route.handle)
             wait_set.wait(WAIT_NS)
+            first = [route for route in routes.values() if route.topic in self._first]
             for pointer in wait_set.get_ready_entities('subscription'):
-                self._drain(*routes[pointer])
+                self._drain(routes[pointer], first, MAX_BATCH)
 
     def _drop(self, topic: str, size: int) -> None:
         """Count a message that is too large."""
@@ -264,29 +281,34 @@ class StreamReader:
         else:
             self._faults.too_large(topic, size)
 
-    def _drain(
-        self, topic: str, kind: type, handle: Any, decode: Callable, callback: Callable
-    ) -> None:
-        """Handle the pending messages of a subscription, at most MAX_BATCH of them."""
-        for _ in range(MAX_BATCH):
+    def _drain(self, route: _Route, first: list[_Route], most: int) -> None:
+        """Handle the pending messages of a subscription, at most so many of them.
+
+        first: routes whose pending messages are handled before each of these.
+        """
+        for _ in range(most):
             if self._stopping.is_set():
                 return
             # As bytes: taking the message itself would not tell a damaged one from none.
-            received = handle.take_message(kind, True)
+            received = route.handle.take_message(route.kind, True)
             if received is None:
                 return
-            data, info = received
-            if len(data) > self._max_bytes[topic]:
-                self._drop(topic, len(data))
-                continue
-            try:
-                message = decode(data)
-            except DECODING_ERRORS:
-                self._faults.undecodable(topic)
-                continue
-            try:
-                callback(message, info)
-            except Exception as error:  # this message is lost, the next ones are not
-                if self._stopping.is_set() or not self._node.context.ok():
-                    return  # the outputs are being destroyed
-                self._faults.callback_error(topic, error)
+            for other in first:
+                if other is not route:
+                    self._drain(other, [], MAX_FIRST)
+            self._handle(route, *received)
+
+    def _handle(self, route: _Route, data: bytes, info: dict) -> None:
+        if len(data) > self._max_bytes[route.topic]:
+            self._drop(route.topic, len(data))
+            return
+        try:
+            message = route.decode(data)
+        except DECODING_ERRORS:
+            self._faults.undecodable(route.topic)
+            return
+        try:
+            route.callback(message, info)
+        except Exception as error:  # this message is lost, the next ones are not
+            if not self._stopping.is_set() and self._node.context.ok():
+                self._faults.callback_error(route.topic, error)

@@ -182,6 +182,10 @@ class AngleField:
         duv[rows], variance[rows] = self._change_at(uv[rows], np.nan)
         return duv, variance
 
+    def duv(self, uv: np.ndarray, angle: float) -> np.ndarray:
+        """Return what a known angle [rad] adds to a correction (n, 2) at pixels uv (n, 2) [px]."""
+        return self._values(uv, self._known(angle).coefficients)[:, 0]
+
     def added_to(self, series: Series, angle: float) -> Series:
         """Return a series at an angle [rad], with its standard deviations there."""
         weights = harmonics(angle) - self._mean

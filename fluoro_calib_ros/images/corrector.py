@@ -23,7 +23,9 @@ image then takes a single remap of OpenCV.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -46,6 +48,22 @@ NOWHERE = -10_000.0  # source of a pixel without one: far off any image
 SHARPNESS = -0.75  # of OpenCV's cubic convolution
 
 
+@dataclass(frozen=True)
+class Sources:
+    """Where the pixels of a corrected image were seen.
+
+    source (2, h, w), as of an `ImageCorrector`; find_status: returns its status (h, w).
+    """
+
+    source: np.ndarray
+    find_status: Callable[[], np.ndarray]
+
+    @cached_property
+    def status(self) -> np.ndarray:
+        """Status (h, w)."""
+        return self.find_status()
+
+
 class ImageCorrector:
     """Corrects the images of one fluoroscope by a map that is built once.
 
@@ -58,9 +76,9 @@ class ImageCorrector:
     interpolation : {'linear', 'cubic'}
     border : int
         Grey value where nothing was observed.
-    sources : (ndarray, ndarray), optional
-        Attributes source and status, where they are known; by default they are those of the
-        calibration, of a correction that depends on an angle the mean (see `angle_maps`).
+    sources : Sources, optional
+        Where they are known; by default they are those of the calibration, of a correction that
+        depends on an angle the mean (see `angle_maps`).
 
     Attributes
     ----------
@@ -87,7 +105,7 @@ class ImageCorrector:
         calibration: FluoroscopeCalibration,
         interpolation: str = 'linear',
         border: int = 0,
-        sources: tuple[np.ndarray, np.ndarray] | None = None,
+        sources: Sources | None = None,
     ) -> None:
         if interpolation not in INTERPOLATIONS:
             raise DataError(
@@ -103,16 +121,41 @@ class ImageCorrector:
         self.shape = self.image_size[::-1]
         self.interpolation = interpolation
         self.border = border
-        self.source, self.status = sources or _sources(calibration.grid, self.image_size)
-        self.mask = self.status != CorrectionStatus.INVALID
-        self._empty = np.flatnonzero(~self.mask)
+        if sources is None:
+            sources = _sources(calibration.grid, self.image_size)
+        self._sources = sources
+        self._map_1 = np.empty((*self.shape, 2), dtype=np.int16)
+        self._map_2 = np.empty(self.shape, dtype=np.uint16)
         high = np.array(self.image_size, dtype=np.float32)[:, None, None] - 1
-        # A source in the outer half of a pixel at the rim takes the value of that pixel.
-        u, v = np.where(self.mask, np.clip(self.source, 0, high), np.float32(NOWHERE))
-        if interpolation == 'cubic':
-            u = _cubic_coordinates(u)
-            v = _cubic_coordinates(v)
-        self._map_1, self._map_2 = cv2.convertMaps(u, v, cv2.CV_16SC2)
+        for start in range(0, self.shape[0], ROWS):
+            rows = slice(start, start + ROWS)
+            # A source in the outer half of a pixel at the rim takes the value of that pixel.
+            u, v = np.clip(self.source[:, rows], 0, high)
+            cv2.patchNaNs(u, NOWHERE)
+            cv2.patchNaNs(v, NOWHERE)
+            if interpolation == 'cubic':
+                u = _cubic_coordinates(u)
+                v = _cubic_coordinates(v)
+            cv2.convertMaps(u, v, cv2.CV_16SC2, self._map_1[rows], self._map_2[rows])
+
+    @property
+    def source(self) -> np.ndarray:
+        """See above."""
+        return self._sources.source
+
+    @property
+    def status(self) -> np.ndarray:
+        """See above."""
+        return self._sources.status
+
+    @cached_property
+    def mask(self) -> np.ndarray:
+        """See above."""
+        return ~np.isnan(self.source[0])
+
+    @cached_property
+    def _empty(self) -> np.ndarray:
+        return np.flatnonzero(~self.mask)
 
     def correct(self, image: np.ndarray, out: np.ndarray | None = None) -> np.ndarray:
         """Correct an image (h, w) of uint8 or uint16; its rows need not be contiguous.
@@ -179,8 +222,8 @@ class ImageCorrector:
         out.ravel()[self._empty] = self.border
 
 
-def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Sources (2, h, w) of float32 and their status (h, w) of uint8, see ImageCorrector."""
+def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> Sources:
+    """Sources of all pixels, by iteration."""
     width, height = image_size
     source = np.empty((2, height, width), dtype=np.float32)
     status = np.empty((height, width), dtype=np.uint8)
@@ -193,7 +236,7 @@ def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> tuple[np.ndar
         status[rows] = row_status.reshape(-1, width)
     status[is_folded(source)] = CorrectionStatus.INVALID
     source[:, status == CorrectionStatus.INVALID] = np.nan
-    return source, status
+    return Sources(source, lambda: status)
 
 
 def _invert_correction(
@@ -207,22 +250,25 @@ def _invert_correction(
     return observed, status
 
 
-def iterated(grid: CorrectionGrid, undistorted: np.ndarray) -> np.ndarray:
+def iterated(
+    grid: CorrectionGrid,
+    undistorted: np.ndarray,
+    look_up: Callable[[CorrectionGrid, np.ndarray], np.ndarray] | None = None,
+) -> np.ndarray:
     """Observed pixels (2, n) of undistorted ones (2, n) [px], also where they do not converge.
 
     The iteration is observed = undistorted + (du, dv)(observed). Each step leaves the fraction of
     the error by which the correction changes per pixel, some hundredths. Off the image, the
     correction continues as it is at the rim, so that a step too far comes back. Where it changes
-    so much that full steps do not converge, half steps may.
+    so much that full steps do not converge, half steps may. look_up gives corrections (2, n) at
+    pixels (2, n), by default these.
     """
-    low = -0.5
-    high = np.array(grid.image_size)[:, None] - 0.5
+    look_up = look_up or as_at_rim
     observed = undistorted.copy()
     active = np.arange(undistorted.shape[1])
     for number in range(FULL_STEPS + HALF_STEPS):
         at = observed[:, active]
-        correction = grid.look_up(*np.clip(at, low, high))[0][:2]
-        step = undistorted[:, active] + correction - at
+        step = undistorted[:, active] + look_up(grid, at) - at
         observed[:, active] = at + (step if number < FULL_STEPS else step / 2)
         active = active[np.abs(step).max(axis=0) > STEP_PX]
         if not len(active):
@@ -230,12 +276,35 @@ def iterated(grid: CorrectionGrid, undistorted: np.ndarray) -> np.ndarray:
     return observed
 
 
+def as_at_rim(grid: CorrectionGrid, at: np.ndarray) -> np.ndarray:
+    """Corrections (2, n) at pixels (2, n); off the image that of the nearest pixel."""
+    return grid.look_up(*np.clip(at, -0.5, _end(grid)))[0][:2]
+
+
+def continued(grid: CorrectionGrid, at: np.ndarray) -> np.ndarray:
+    """Corrections (2, n) at pixels (2, n), beyond the rim as steep as before it."""
+    out = as_at_rim(grid, at)
+    off = np.flatnonzero(((at < -0.5) | (at > _end(grid))).any(axis=0))
+    mirrored = 2 * np.clip(at[:, off], -0.5, _end(grid)) - at[:, off]
+    out[:, off] = 2 * out[:, off] - as_at_rim(grid, mirrored)
+    return out
+
+
+def _end(grid: CorrectionGrid) -> np.ndarray:
+    """Largest columns and rows (2, 1) on the image."""
+    return np.array(grid.image_size)[:, None] - 0.5 - 1e-6
+
+
 def is_folded(source: np.ndarray) -> np.ndarray:
     """Whether (h, w) the neighbours of a pixel are seen mirrored by the sources (2, h, w)."""
-    right = np.diff(source, axis=2)[:, :-1]
-    down = np.diff(source, axis=1)[:, :, :-1]
+    right, down = steps(source)
     folded = right[0] * down[1] - right[1] * down[0] <= 0
     return np.pad(folded, ((0, 1), (0, 1))) | np.pad(folded, ((1, 0), (1, 0)))
+
+
+def steps(source: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """From the source of a pixel to those on its right and below it (2, h - 1, w - 1) [px]."""
+    return np.diff(source, axis=2)[:, :-1], np.diff(source, axis=1)[:, :, :-1]
 
 
 def _cubic_coordinates(wanted: np.ndarray) -> np.ndarray:

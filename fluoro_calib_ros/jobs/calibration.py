@@ -49,6 +49,7 @@ from ..validation.inputs import (
     validate_names,
     why_left_out,
 )
+from ..validation.mixed_units import mixed_units
 from ..validation.plausibility import implausible
 from ..validation.rigidity import contradiction, doubtful, interchanged
 from ..validation.verdict import validate_or_report
@@ -211,9 +212,13 @@ def _wrong_input(request: CalibrationRequest) -> list[str]:
         )
     unknown = {name: exposures for name, exposures in frames.items() if name not in known}
     # Points in motion may rest, and may come from far away.
-    return [
+    found = [
         *([] if known else find_wrong_phantom(frames, request.phantom)),
         *find_wrong_input(unknown, request.phantom).values(),
+    ]
+    mixed = '' if known else mixed_units(unknown, request.phantom, bool(found))
+    return [
+        *([mixed] if mixed else found),
         *find_wrong_orientation(frames, request.phantom, known).values(),
     ]
 

@@ -17,7 +17,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -44,6 +44,8 @@ class Check:
         What was found and, unless the check passed, what to do.
     place : (float, float) or None
         Pixel (u, v) that the finding is about.
+    advice : str
+        The end of the sentence that says what to do; '' where there is none.
     """
 
     name: str
@@ -54,6 +56,14 @@ class Check:
     passed: bool | None
     sentence: str
     place: tuple[float, float] | None = None
+    advice: str = ''
+
+    def advised(self, advice: str) -> Check:
+        """Return the check with another advice, if it has any."""
+        if not self.advice:
+            return self
+        found = self.sentence.removesuffix(self.advice)
+        return replace(self, sentence=f'{found}{advice}', advice=advice)
 
 
 @dataclass(frozen=True)
@@ -153,6 +163,7 @@ def judge(name: str, fluoroscope: str, finding: Finding, has_trend: bool = False
         passed,
         finding.sentence if passed else f'{finding.sentence}: {advice}',
         place,
+        '' if passed else advice,
     )
 
 

@@ -211,6 +211,14 @@ class Evidence:
         # where the distortion is large.
         return calibrate_part(part, self.starts, sd, self.raise_if_cancelled)
 
+    def calibrate_free(self, names: Sequence[str]) -> Mapping[str, FluoroscopeCalibration]:
+        """Calibrate all frames of some fluoroscopes without a given interior orientation.
+
+        Raises DataError.
+        """
+        request = replace(self.request, options=replace(self.request.options, interior_sd=None))
+        return replace(self, request=request).calibrate(self.part(names, lambda i: True))
+
     def _has_lost_points(
         self,
         found: Mapping[str, FluoroscopeCalibration],

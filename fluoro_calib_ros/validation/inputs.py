@@ -37,6 +37,7 @@ from ..photogrammetry.collinearity import project
 from ..photogrammetry.known_orientation import KnownOrientation
 from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
 from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
+from .mixed_units import DISTANCES_MM, mixed_units
 
 MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
 MIN_TESTED = 20  # targets of a single exposure that is tested
@@ -44,7 +45,6 @@ FIT = 0.004  # median residual over the longer side of the image of ids that are
 MISFIT = 0.03  # median residual over the longer side of the image from which nothing fits
 BETTER = 0.35  # median residual of other ids over that of the given ones from which they are right
 GOOD_MISFIT = 0.01  # median residual over the longer side of the image of ids that are right
-DISTANCES_MM = (200.0, 10_000.0)  # of the source from the phantom
 UNITS_MM = {'cm': 10.0, 'inches': 25.4, 'm': 1000.0}
 MAX_COORDINATE_MM = 1e6
 EXTENT_SHARE = 0.9  # of the targets, within the extent of the phantom
@@ -269,7 +269,8 @@ def require_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> 
         if sentence:
             found.append(f'fluoroscope {name}: {sentence}')
     if found:
-        raise DataError('. '.join(found))
+        mixed = mixed_units(valid_frames(frames), phantom, is_suspicious=True)
+        raise DataError(mixed or '. '.join(found))
 
 
 def find_wrong_orientation(

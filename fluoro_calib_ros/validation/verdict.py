@@ -36,6 +36,7 @@ from .beads import BEADS
 from .check import Check, Validation, not_made, verdict_of
 from .evidence import Evidence
 from .exposure_variation import VARIATION
+from .given_interior import with_given_interior
 from .halves import HALVES
 from .held_out import HELD_OUT
 from .precision import PRECISION
@@ -96,6 +97,7 @@ def validate(
         for subject in SUBJECTS:
             if not subject.of_rig:
                 checks += subject.run(evidence, names)
+    checks = with_given_interior(evidence, checks)
     checks = _by_fluoroscope(checks, [name for names in request.groups for name in names])
     return Validation(
         verdict_of(checks),

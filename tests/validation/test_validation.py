@@ -17,13 +17,18 @@
 import functools
 import json
 import pathlib
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from rigs import calibrated, exposures, rig, run
 
-from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
+from fluoro_calib_ros.calibration.calibrate import (
+    adjust_with_calibrations,
+    calibrate,
+    calibrate_request,
+)
 from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.errors import DataError
@@ -96,6 +101,37 @@ def verdict(fault='', **options):
     )
     request = CalibrationRequest(frames, rig().phantom, CalibrationOptions(**options))
     return validate(request, job.calibrations)
+
+
+@functools.cache
+def weighted(error, sd):
+    """Validation with a given principal distance that is off by a share of it."""
+    options = CalibrationOptions(model='parametric', interior_sd=(sd, sd, sd))
+    shown = calibrated('a', model='parametric').calibrations['a'].interior
+    distance = (1 + error) * shown[2]
+    request = CalibrationRequest(
+        {'a': exposures()['a']}, rig().phantom, options, principal_distance=distance
+    )
+    return validate(request, calibrate_request(request).calibrations), shown
+
+
+def test_a_given_principal_distance_that_the_exposures_contradict_is_the_first_finding():
+    validation, shown = weighted(0.05, 1.0)
+    assert validation.verdict == 'fail'
+    first, *others = validation.findings
+    assert first.startswith('fluoroscope a: the given interior orientation, c = ')
+    value, sd = re.search(r'which show c = ([\d.]+) \(sd ([\d.]+)\)', first).groups()
+    assert abs(float(value) - shown[2]) < 10 and 0 < float(sd) < 10
+    assert 'a larger --interior-sd, or none' in first
+    assert others
+    assert all('check this again when the given interior' in sentence for sentence in others)
+
+
+def test_a_weak_given_interior_orientation_is_not_accused():
+    """The exposures overrule it."""
+    for error in (0.0, 0.05):
+        validation, _ = weighted(error, 200.0)
+        assert 'given_interior' not in [check.name for check in validation.checks]
 
 
 def failed(validation):

@@ -18,6 +18,7 @@ The table is the contract: kind of wrong input, and the sentence that a user rea
 but difficult must pass.
 """
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -37,6 +38,7 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector, rotati
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.validation.inputs import copied_exposures, find_wrong_input, wrong_unit
+from fluoro_calib_ros.validation.mixed_units import mixed_units
 from fluoro_calib_ros.validation.plausibility import implausible
 from fluoro_calib_ros.validation.verdict import validate_or_report
 
@@ -216,6 +218,36 @@ def test_targets_that_no_survey_has_are_refused(kind):
     assert sentence in str(error.value)
 
 
+def partly(share, factor, seed=4):
+    """The phantom with a share of its targets in another unit; also which."""
+    ids = PHANTOM.target_id
+    which = np.random.default_rng(seed).permutation(len(ids)) < share * len(ids)
+    xyz = np.where(which[:, None], factor * PHANTOM.xyz_mm, PHANTOM.xyz_mm)
+    return Phantom(ids, xyz, PHANTOM.sd_mm), which
+
+
+@pytest.mark.parametrize(
+    ('share', 'factor', 'meant'),
+    [
+        (0.03, 0.1, '10 (cm in place of mm)'),
+        (0.5, 0.1, '10 (cm in place of mm)'),
+        (0.5, 1 / 25.4, '25.4 (inches in place of mm)'),
+        (0.6, 0.001, '1000 (m in place of mm)'),
+        (0.9, 0.1, '10 (cm in place of mm)'),
+        (0.2, 10.0, '0.1'),
+    ],
+)
+def test_targets_in_another_unit_than_the_others_are_named(share, factor, meant):
+    phantom, which = partly(share, factor)
+    with pytest.raises(DataError, match=r'^phantom: \d+ targets, ') as error:
+        run_calibration(CalibrationRequest({'a': frames()}, phantom, FAST))
+    count, *listed = re.findall(r'\d+', str(error.value))[:4]
+    seen = np.isin(PHANTOM.target_id, np.concatenate([f.target_id for f in frames()]))
+    assert abs(int(count) - (which & seen).sum()) <= 0.05 * which.sum() + 2
+    assert set(map(int, listed)) <= set(PHANTOM.target_id[which].tolist())
+    assert str(error.value).endswith(f'when their coordinates are multiplied by {meant}')
+
+
 def test_targets_that_are_not_seen_need_no_survey():
     wrong = placed(5, 9999)
     surveyed = PHANTOM.target_id[(wrong.xyz_mm == PHANTOM.xyz_mm).all(axis=1)]
@@ -378,6 +410,7 @@ RIGHT = {
 @pytest.mark.parametrize('kind', RIGHT)
 def test_difficult_input_is_accepted(kind):
     assert find_wrong_input({'a': RIGHT[kind]()}, PHANTOM) == {}
+    assert mixed_units({'a': RIGHT[kind]()}, PHANTOM, is_suspicious=True) == ''
     assert copied_exposures(RIGHT[kind]()) == []
 
 

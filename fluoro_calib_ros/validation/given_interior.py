@@ -1,0 +1,112 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Whether a given interior orientation is why a calibration fails.
+
+An interior orientation that is given with a small standard deviation holds the adjustment where
+the exposures contradict it: their misfit looks like a trend of the residuals, or like a distortion
+that differs between exposures. Where checks fail, the fluoroscope is calibrated again without what
+was given. If the residuals are then clearly smaller, and the interior orientation is clearly
+another one, that is the cause, and a check of its own says so.
+
+The interior orientation of an image with distortion depends on what is called distortion, so that
+a given one which the exposures move away from, with good residuals, is no fault.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..calibration.initial_network import nominal_interior
+from ..calibration.result import FluoroscopeCalibration
+from ..errors import DataError
+from .check import Check, Finding, judge
+from .evidence import Evidence
+
+NAME = 'given_interior'
+MAX_SD = 4.0  # by which what the exposures show may deviate from what was given
+# RMSE with what was given over that without, from which it is the cause; without a correction
+# model, the distortion is a better one.
+MIN_GAIN = 1.05
+MIN_GAIN_UNCORRECTED = 2.0
+LABELS = ('xp', 'yp', 'c')
+
+
+def with_given_interior(evidence: Evidence, checks: Sequence[Check]) -> list[Check]:
+    """Return the checks, with one more for every given interior orientation that made some fail.
+
+    The advice of the others is then to repair that first.
+    """
+    request = evidence.request
+    distance = request.principal_distance
+    if request.options.interior_sd is None or distance is None:
+        return list(checks)
+    found: list[Check] = []
+    for names in request.groups:
+        names = tuple(name for name in names if name not in request.known_orientations)
+        if names and any(c.passed is False and c.fluoroscope in (*names, '') for c in checks):
+            found += _contradictions(evidence, names, distance)
+    if not found:
+        return list(checks)
+    wrong = {check.fluoroscope for check in found}
+    advice = 'check this again when the given interior orientation fits the exposures'
+    others = [
+        check.advised(advice) if check.fluoroscope in (*wrong, '') else check for check in checks
+    ]
+    return [*found, *others]
+
+
+def _contradictions(evidence: Evidence, names: Sequence[str], distance: float) -> list[Check]:
+    """Return a failed check for every fluoroscope whose exposures contradict what was given."""
+    evidence.report_step(f'{"+".join(names)}: interior orientation without what was given')
+    try:
+        free = evidence.calibrate_free(names)
+    except DataError:
+        return []
+    checks = [_check(evidence, name, free[name], distance) for name in names]
+    return [check for check in checks if check is not None]
+
+
+def _check(
+    evidence: Evidence, name: str, free: FluoroscopeCalibration, distance: float
+) -> Check | None:
+    held = evidence.calibrations[name]
+    gain = _rmse(held) / _rmse(free)
+    given = nominal_interior(held.image_size, distance)
+    given_sd = np.asarray(evidence.request.options.interior_sd)
+    sd = np.sqrt(np.diag(free.interior_covariance))
+    off = np.abs(free.interior - given) / np.hypot(given_sd, sd)
+    least = MIN_GAIN if held.model.corrects else MIN_GAIN_UNCORRECTED
+    if not gain > least or not off.max() > MAX_SD:
+        return None
+    wrong = [i for i in np.argsort(-off) if off[i] > MAX_SD]
+    stated = ', '.join(f'{LABELS[i]} = {given[i]:.1f} (sd {given_sd[i]:g})' for i in wrong)
+    shown = ', '.join(f'{LABELS[i]} = {free.interior[i]:.1f} (sd {sd[i]:.1f})' for i in wrong)
+    finding = Finding(
+        float(off.max()),
+        MAX_SD,
+        'sd',
+        f'fluoroscope {name}: the given interior orientation, {stated} px, contradicts the '
+        f'exposures, which show {shown} px: the residuals are {_rmse(held):.2f} px with what was '
+        f'given and {_rmse(free):.2f} px without',
+        'give the right value, a larger --interior-sd, or none',
+    )
+    return judge(NAME, name, finding)
+
+
+def _rmse(calibration: FluoroscopeCalibration) -> float:
+    """RMSE of the inlier residuals of a coordinate after the correction [px]."""
+    return float(np.sqrt(np.mean(np.square(calibration.rmse_after))))

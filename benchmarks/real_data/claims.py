@@ -55,10 +55,11 @@ def expected_square(
     network = tested.measured.network
     uv = network.uv[rows]
     common = _common_errors(run, uv, by_interior)
-    between = run.between_exposures.get(run.measured.fluoroscopes[0], 0.0)
+    between = float(np.mean(run.between_exposures.get(run.measured.fluoroscopes[0], 0.0)))
     variation, share = _variation(run, tested, rows)
     variance = np.sum(common[:, 3:] ** 2, axis=1).reshape(-1, 2).mean(axis=1)
-    white = np.maximum(claimed[rows] ** 2 - variance - between, 0.0)
+    noise = np.maximum(claimed[rows] ** 2 - variance, 0.0)
+    white = noise * max(1 - between / float(np.mean(noise)), 0.0)
     scale = np.sqrt(between / share) if share else 0.0
     return float(
         np.sum(to_residuals**2 @ np.repeat(white, 2))

@@ -32,8 +32,14 @@ from ..errors import DataError
 PACKAGE = 'fluoro_calib_msgs'
 TARGET_OBSERVATIONS = f'{PACKAGE}/msg/TargetObservations'
 FLUOROSCOPE_CALIBRATION = f'{PACKAGE}/msg/FluoroscopeCalibration'
-# Fields that were added at the end of a message: those of an earlier definition do not have them.
-ADDED = {FLUOROSCOPE_CALIBRATION: ('angles', 'angle_coefficients', 'angle_variances')}
+# Fields that were added at the end of a message, one change after the other: those of an earlier
+# definition do not have them, or only the first of them.
+ADDED = {
+    FLUOROSCOPE_CALIBRATION: (
+        ('angles', 'angle_coefficients', 'angle_variances'),
+        ('noise_profile',),
+    )
+}
 PADDING = 4  # bytes at the end of a message that Fast DDS reserves for an empty float64[]
 MAX_PADDING = 10 * PADDING  # of a message with ten of them
 SEPARATOR = '=' * 80  # between the definitions of a schema
@@ -111,13 +117,18 @@ def from_cdr(data: bytes, msg_type: str) -> Any:
     kind = message_class(msg_type)
     try:
         return _read_cdr(typestore(), data, msg_type)
-    except DataError:
-        if msg_type not in ADDED:
-            raise
-        earlier = _read_cdr(_earlier_typestore(), data, msg_type)
-    added = {name: np.zeros(0) for name in ADDED[msg_type]}
-    known = [f.name for f in dataclasses.fields(earlier) if f.init]
-    return kind(**{name: getattr(earlier, name) for name in known}, **added)
+    except DataError as error:
+        last = error
+    for changes in reversed(range(len(ADDED.get(msg_type, ())))):
+        try:
+            earlier = _read_cdr(_earlier_typestore(changes), data, msg_type)
+        except DataError as error:
+            last = error
+            continue
+        added = {name: np.zeros(0) for name in _added(msg_type, changes)}
+        known = [f.name for f in dataclasses.fields(earlier) if f.init]
+        return kind(**{name: getattr(earlier, name) for name in known}, **added)
+    raise last
 
 
 def present_cdr(data: bytes, msg_type: str) -> bytes:
@@ -128,18 +139,26 @@ def present_cdr(data: bytes, msg_type: str) -> bytes:
     return to_cdr(from_cdr(data, msg_type), msg_type)
 
 
-def earlier_text(msg_type: str) -> str:
-    """Return the definition of a type without the fields that were added since."""
+def earlier_text(msg_type: str, changes: int = 0) -> str:
+    """Return the definition of a type after so many of the changes that added fields."""
     lines = _package_texts()[msg_type].splitlines(keepends=True)
-    return ''.join(line for line in lines if (line.split() + ['', ''])[1] not in ADDED[msg_type])
+    added = _added(msg_type, changes)
+    return ''.join(line for line in lines if (line.split() + ['', ''])[1] not in added)
+
+
+def _added(msg_type: str, changes: int) -> list[str]:
+    """Return the fields of a type that were added after so many changes."""
+    return [name for names in ADDED[msg_type][changes:] for name in names]
 
 
 @cache
-def _earlier_typestore() -> Typestore:
-    """Return the typestore with the earlier definitions of the types in ADDED."""
+def _earlier_typestore(changes: int) -> Typestore:
+    """Return the typestore with the types in ADDED after so many changes."""
     store = get_typestore(Stores.ROS2_JAZZY)
     for name, text in _package_texts().items():
-        store.register(get_types_from_msg(earlier_text(name) if name in ADDED else text, name))
+        earlier = name in ADDED and changes < len(ADDED[name])
+        text = earlier_text(name, changes) if earlier else text
+        store.register(get_types_from_msg(text, name))
     return store
 
 

@@ -31,6 +31,7 @@ from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.held_precision import precision_with_held_interiors
 from ..photogrammetry.known_orientation import KnownOrientation
+from ..photogrammetry.noise_profile import NoiseProfile, fitted_profile
 from ..photogrammetry.precision import Precision, geometric_redundancy
 from ..photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
 from .adjustment_report import (
@@ -57,6 +58,7 @@ from .rounds import Round, SelfCalibration, rmse_of_inliers
 from .self_calibration import self_calibrate
 
 MAX_REPEATS = 3  # of a calibration, to leave out exposures that do not fit
+MIN_REDUNDANCY = 0.05  # of a coordinate, for the square of its residual to be divided by
 EQUAL_WEIGHTS_NU = 100.0  # degrees of freedom from which weights of inliers hardly differ
 TOLERANCE_WITHOUT_CORRECTION = 1e-4  # its residuals are only reported
 ROUNDING = 1e-6  # of the information of object points, relative to that of the survey
@@ -308,7 +310,7 @@ def calibrate_request(
 def calibrate_part(
     request: CalibrationRequest,
     starts: StartValues,
-    image_sd: Mapping[str, float],
+    whole: Mapping[str, FluoroscopeCalibration],
     raise_if_cancelled: Callable[[], None] | None = None,
 ) -> dict[str, FluoroscopeCalibration]:
     """Self-calibrate with a part of the exposures of an earlier calibration.
@@ -319,8 +321,8 @@ def calibrate_part(
         With the frames of the part.
     starts : StartValues
         Of the earlier calibration.
-    image_sd : mapping of str to float
-        Standard deviations of image coordinates [px] by fluoroscope, those of all exposures.
+    whole : mapping of str to FluoroscopeCalibration
+        The earlier calibration, of all exposures, whose noise of image coordinates is taken over.
     raise_if_cancelled : callable, optional
         Called before every step; may raise to stop.
 
@@ -342,7 +344,8 @@ def calibrate_part(
             seconds = time.perf_counter() - start
             for f, name in enumerate(run.measured.fluoroscopes):
                 digest = digest_of_sources(frames[name], request.phantom)
-                out[name] = _calibration(run, f, name, digest, seconds, image_sd[name])
+                noise = _ImageNoise(whole[name].image_sd, whole[name].noise_profile)
+                out[name] = _calibration(run, f, name, digest, seconds, noise)
     return out
 
 
@@ -379,7 +382,7 @@ def _calibrations_of_run(
             name,
             digest_of_sources(frames[name], phantom),
             seconds,
-            _image_sd(run, f, name),
+            _image_noise(run, f, name),
         )
         for f, name in enumerate(run.measured.fluoroscopes)
     }
@@ -670,8 +673,16 @@ def _figures(
     )
 
 
-def _image_sd(run: SelfCalibration, f: int, name: str) -> float:
-    """Standard deviation [px] of an image coordinate of fluoroscope number f.
+@dataclass(frozen=True)
+class _ImageNoise:
+    """Standard deviation of an image coordinate [px], and its factors over the image."""
+
+    sd: float
+    profile: NoiseProfile | None
+
+
+def _image_noise(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
+    """Noise of an image coordinate of fluoroscope number f.
 
     It is that of the inlier residuals, which are smaller than the noise by the root of their
     redundancy numbers, together with what the distortion of an exposure differs from the model.
@@ -685,8 +696,12 @@ def _image_sd(run: SelfCalibration, f: int, name: str) -> float:
         redundancy = geometric_redundancy(run.measured.network, run.after.parameters, noise_model)
     rows = _rows_of(run.measured, f)
     rows = rows[run.after.inliers[rows]]
-    noise = np.sum(run.after.residuals[rows] ** 2) / np.sum(2 * redundancy[rows])
-    return float(np.sqrt(noise + run.between_exposures.get(name, 0.0)))
+    square = np.sum(run.after.residuals[rows] ** 2, axis=1) / 2
+    between = run.between_exposures.get(name, np.zeros(len(rows)))
+    variance = np.sum(square) / np.sum(redundancy[rows]) + np.mean(between)
+    squares = square / np.maximum(redundancy[rows], MIN_REDUNDANCY) + between
+    profile = fitted_profile(run.measured.network.uv[rows], squares, run.measured.image_size[f])
+    return _ImageNoise(float(np.sqrt(variance)), profile)
 
 
 def _calibration(
@@ -695,7 +710,7 @@ def _calibration(
     name: str,
     digest: str,
     seconds: float,
-    image_sd: float,
+    noise: _ImageNoise,
 ) -> FluoroscopeCalibration:
     """Calibration of fluoroscope number f of a self-calibration."""
     rows = _rows_of(run.measured, f)
@@ -715,7 +730,7 @@ def _calibration(
         interior_estimated=bool(run.measured.network.interior_free[f]),
         model=model,
         train_exposure=train_exposure,
-        image_sd=image_sd,
+        image_sd=noise.sd,
         sigma0=run.after.noise.scale,
         nu=run.after.noise.nu,
         exposures=len(frames),
@@ -731,5 +746,6 @@ def _calibration(
         frame_id=frames[0].frame_id,
         source_digest=digest,
         angle_field=run.angle_fields.get(name),
+        noise_profile=noise.profile,
         seconds=seconds,
     )

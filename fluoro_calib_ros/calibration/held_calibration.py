@@ -81,16 +81,20 @@ def held_corrections(
     """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in sigma.
 
     Where a correction is uncertain, at the rim and beyond the calibrated area, an image point has
-    less weight.
+    less weight, and where the noise of the calibration is larger, unless it has a sigma itself.
     """
     network = measured.network
     correction = np.zeros_like(network.uv)
     sigma = network.sigma.copy()
+    has_sigma = np.array([frame.sigma is not None for frame in measured.frames])
     for f, name in enumerate(measured.fluoroscopes):
         rows = network.rows(f)
-        found = calibrations[name].correction(network.uv[rows], _angles(measured, rows))
+        calibration = calibrations[name]
+        found = calibration.correction(network.uv[rows], _angles(measured, rows))
         correction[rows] = found.duv
-        sigma[rows] = np.hypot(sigma[rows], found.sd / calibrations[name].sigma0)
+        without = rows[~has_sigma[network.exposure[rows]]]
+        sigma[without] *= calibration.noise_factors(network.uv[without])
+        sigma[rows] = np.hypot(sigma[rows], found.sd / calibration.sigma0)
     return correction, replace(network, sigma=sigma)
 
 

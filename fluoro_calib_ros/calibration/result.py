@@ -32,6 +32,7 @@ from ..distortion.status import CorrectionStatus
 from ..errors import DataError
 from ..exposures.frame import Frame, points_on_image
 from ..exposures.phantom import Phantom
+from ..photogrammetry.noise_profile import NoiseProfile, packed_profile
 
 
 @dataclass(frozen=True)
@@ -87,6 +88,8 @@ class FluoroscopeCalibration:
         SHA-256 of observations and phantom.
     angle_field : AngleField or None
         Change of the correction with the angle of the C-arm; None: there is none.
+    noise_profile : NoiseProfile or None
+        Factors of image_sd over the image; None: it is the same everywhere.
     seconds : float
         Time the calibration took; NaN where it was read from a file.
     calibration_id : str
@@ -116,6 +119,7 @@ class FluoroscopeCalibration:
     frame_id: str
     source_digest: str
     angle_field: AngleField | None = None
+    noise_profile: NoiseProfile | None = None
     seconds: float = field(default=np.nan, compare=False)
     calibration_id: str = field(init=False)
 
@@ -151,6 +155,7 @@ class FluoroscopeCalibration:
         if self.angle_field is not None:
             for array in packed_angles(self.angle_field):
                 digest.update(array.tobytes())
+        digest.update(packed_profile(self.noise_profile).tobytes())
         digest.update(f'{self.fluoroscope}/{self.model.kind}/{self.source_digest}'.encode())
         return digest
 
@@ -178,6 +183,16 @@ class FluoroscopeCalibration:
             self.converged,
         )
         digest.update('/'.join(str(int(word)) for word in words).encode())
+
+    def noise_factors(self, uv: np.ndarray) -> np.ndarray:
+        """Return the factors (n,) of image_sd at pixels uv (n, 2)."""
+        if self.noise_profile is None:
+            return np.ones(len(uv))
+        return self.noise_profile.factors(uv[:, 0], uv[:, 1], self.image_size)
+
+    def image_sd_at(self, uv: np.ndarray) -> np.ndarray:
+        """Return the standard deviations (n,) [px] of image coordinates at pixels uv (n, 2)."""
+        return self.image_sd * self.noise_factors(uv)
 
     @cached_property
     def grid(self) -> CorrectionGrid:
@@ -256,7 +271,9 @@ class FluoroscopeCalibration:
         uv = np.asarray(uv, dtype=float).reshape(-1, 2)
         sigma = None if sigma is None else np.asarray(sigma, dtype=float)
         if exact:
-            return self._correct_exactly(uv, self.image_sd if sigma is None else sigma, angle)
+            return self._correct_exactly(
+                uv, self.image_sd_at(uv) if sigma is None else sigma, angle
+            )
         u, v, total, _, status = self.correct_arrays(uv[:, 0], uv[:, 1], sigma, angle)
         return CorrectedPoints(np.stack([u, v], axis=1), total, status)
 
@@ -279,7 +296,14 @@ class FluoroscopeCalibration:
         np.subtract(u, du, out=du)
         np.subtract(v, dv, out=dv)
         total = sd * sd
-        total += self.image_sd**2 if sigma is None else sigma * sigma
+        if sigma is not None:
+            total += sigma * sigma
+        elif self.noise_profile is None:
+            total += self.image_sd**2
+        else:
+            noise = self.image_sd * self.noise_profile.factors(u, v, self.image_size)
+            noise *= noise
+            total += noise
         return du, dv, np.sqrt(total, out=total), sd, status
 
     @staticmethod

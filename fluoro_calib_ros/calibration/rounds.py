@@ -85,9 +85,9 @@ class SelfCalibration:
         False where the largest number of rounds ended it.
     stated : Precision or None
         With the errors of the models (see `model_errors`); None: these are in the precision.
-    between_exposures : mapping of str to float
-        Variance [px^2] by which the distortion differs between exposures, without what
-        orientations absorb, of the fluoroscopes where it does.
+    between_exposures : mapping of str to (i,) ndarray
+        Variances [px^2], at the inliers of a fluoroscope, by which its distortion differs between
+        exposures, without what orientations absorb.
     angle_fields : mapping of str to AngleField
         Of the fluoroscopes whose distortion changes with the angle of the C-arm.
     """
@@ -102,7 +102,7 @@ class SelfCalibration:
     history: tuple[Round, ...]
     converged: bool
     stated: Precision | None = None
-    between_exposures: Mapping[str, float] = field(default_factory=dict)
+    between_exposures: Mapping[str, np.ndarray] = field(default_factory=dict)
     angle_fields: Mapping[str, AngleField] = field(default_factory=dict)
 
     @property

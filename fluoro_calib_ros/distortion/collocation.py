@@ -323,12 +323,12 @@ class CollocationTerms(AdjustedTerms):
 
     def variance_between_exposures(
         self, f: int, network: Network, adjustment: Adjustment, precise: Precision
-    ) -> float:
+    ) -> np.ndarray:
         """See `AdjustedTerms`."""
         own = self.exposure_terms[f]
         covariance = precise.additional[f]
         if own is None or covariance is None:
-            return 0.0
+            return super().variance_between_exposures(f, network, adjustment, precise)
         last = slice(-own.count, None)
         fit = self._angle_fits[f]
         return (1.0 if fit is None else fit.remaining) * variance_between_exposures(

@@ -160,13 +160,13 @@ class AdjustedTerms(ABC):
 
     def variance_between_exposures(
         self, f: int, network: Network, adjustment: Adjustment, precise: Precision
-    ) -> float:
-        """Variance [px^2] by which the distortion of fluoroscope f differs between exposures.
+    ) -> np.ndarray:
+        """Variances [px^2] by which the distortion of fluoroscope f differs between exposures.
 
-        It is without what orientations absorb. network: that with the terms as additional
-        parameters; adjustment and precise: of this network.
+        They are those of its inliers (i,), without what orientations absorb. network: that with
+        the terms as additional parameters; adjustment and precise: of this network.
         """
-        return 0.0
+        return np.zeros(int(adjustment.inliers[network.rows(f)].sum()))
 
     def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
         """Return the series of fluoroscope f that an adjustment has estimated."""

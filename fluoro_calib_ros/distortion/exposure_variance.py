@@ -69,8 +69,8 @@ def variance_between_exposures(
     terms: ExposureTerms,
     coefficients: np.ndarray,
     covariance: np.ndarray,
-) -> float:
-    """Variance [px^2] of an image coordinate by terms of exposures, less what orientations absorb.
+) -> np.ndarray:
+    """Variances [px^2] of image coordinates by terms of exposures, less what orientations absorb.
 
     Parameters
     ----------
@@ -88,7 +88,8 @@ def variance_between_exposures(
 
     Returns
     -------
-    float
+    (i,) ndarray
+        Of the inliers among the image points of the fluoroscope.
 
     Raises
     ------
@@ -99,9 +100,9 @@ def variance_between_exposures(
     information = _information(network, adjustment, f, terms)
     expected = float(variance @ np.diagonal(information))
     if not expected > 0:
-        return 0.0
+        return np.zeros(int(adjustment.inliers[network.rows(f)].sum()))
     found = float(coefficients @ information @ coefficients + np.sum(information * covariance))
-    return found / expected * _mean_square_left(network, adjustment, f, terms)
+    return found / expected * _variances_left(network, adjustment, f, terms)
 
 
 def _information(
@@ -125,15 +126,15 @@ def _information(
     return information_of_additional(matrix, f) - np.diag(terms.precision)
 
 
-def _mean_square_left(
+def _variances_left(
     network: Network, adjustment: Adjustment, f: int, terms: ExposureTerms
-) -> float:
-    """Expected mean square [px^2] of the terms without what orientations absorb of them."""
+) -> np.ndarray:
+    """Expected squares (i,) [px^2] of the terms, without what orientations absorb, of inliers."""
     rows = network.rows(f)
     inliers = adjustment.inliers[rows]
     _, by_exterior, _, _ = project_with_jacobian(*network.per_image_point(adjustment.parameters))
     exposure = network.exposure[rows]
-    square = 0.0
+    squares = np.zeros(len(rows))
     for number in np.unique(exposure):
         at = inliers & (exposure == number)
         own = terms.functions.values[at].reshape(2 * int(at.sum()), -1)
@@ -141,5 +142,5 @@ def _mean_square_left(
         absorbed = by_exterior[rows[at]].reshape(len(own), -1)
         absorbed = absorbed / np.linalg.norm(absorbed, axis=0)
         left = own - absorbed @ np.linalg.lstsq(absorbed, own, rcond=None)[0]
-        square += float(np.sum(left**2, axis=0) @ terms.variance)
-    return square / (2 * int(inliers.sum()))
+        squares[at] = (left**2 @ terms.variance).reshape(-1, 2).mean(axis=1)
+    return squares[inliers]

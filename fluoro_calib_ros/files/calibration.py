@@ -38,6 +38,7 @@ from ..limits import (
     MAX_PX,
     read_limits,
 )
+from ..photogrammetry.noise_profile import packed_profile, unpacked_profile
 from .access import PathLike, check_safe_name, make_folder, os_error_reason
 from .arrays import ArraySpec, Layout, read_arrays, to_arrays, to_values, write_arrays
 
@@ -79,6 +80,7 @@ ARRAYS = {
     'angles': ArraySpec('float', ('A',), maximum=MAX_ANGLE, longest=MAX_ANGLES),
     'angle_coefficients': ArraySpec('float', ('H', 2, 'T'), maximum=MAX_PX),
     'angle_variances': ArraySpec('float', ('V', 'G', 'G'), maximum=MAX_PX**2),
+    'noise_profile': ArraySpec('float', ('P',), minimum=0, maximum=MAX_PX, longest=3),
 }
 COINCIDENT_PX = 1e-3
 _ANGLES = ('angles', 'angle_coefficients', 'angle_variances')
@@ -89,16 +91,18 @@ _MODEL_ENTRIES = {
     'model_k': 'k',
     **{name: name for name in ('train_uv', 'train_duv', 'noise_px', 'bias_px', *_SERIES)},
 }
-_NO_ANGLES = dict(zip(_ANGLES, packed_angles(None)))
+_NO_PROFILE = {'noise_profile': packed_profile(None)}
+_NO_ANGLES = {**dict(zip(_ANGLES, packed_angles(None))), **_NO_PROFILE}
 LAYOUT = Layout(
     'a calibration',
     ARRAYS,
-    version=3,
-    readable=(1, 2, 3),
-    # Version 1 did not have a series, version 2 no angles.
+    version=4,
+    readable=(1, 2, 3, 4),
+    # Version 1 did not have a series, version 2 no angles, version 3 no noise profile.
     defaults={
         1: {**dict(zip(_SERIES, map(np.asarray, packed(None)))), **_NO_ANGLES},
         2: _NO_ANGLES,
+        3: _NO_PROFILE,
     },
 )
 
@@ -131,10 +135,11 @@ def validated_arrays(where: object, calibration: FluoroscopeCalibration) -> dict
     """
     model = calibration.model.to_arrays()
     values = dict(zip(_ANGLES, packed_angles(calibration.angle_field)))
+    values['noise_profile'] = packed_profile(calibration.noise_profile)
     values |= {
         name: model[_MODEL_ENTRIES[name]] if name in _MODEL_ENTRIES else getattr(calibration, name)
         for name in ARRAYS
-        if name not in _ANGLES
+        if name not in values
     }
     if not len(calibration.train_exposure):
         values['train_exposure'] = np.zeros(0, dtype=np.int64)  # an empty list would be float
@@ -181,9 +186,12 @@ def read_with_id(path: PathLike) -> tuple[FluoroscopeCalibration, str]:
     try:
         model = model_from_arrays(content, values['image_size'])
         field = unpacked_angles(values['image_size'], *(values.pop(name) for name in _ANGLES))
+        profile = unpacked_profile(values.pop('noise_profile'))
     except ValueError as error:
         raise DataError(f'{path}: {error}') from None
-    calibration = FluoroscopeCalibration(model=model, angle_field=field, **values)
+    calibration = FluoroscopeCalibration(
+        model=model, angle_field=field, noise_profile=profile, **values
+    )
     if identity not in (calibration.calibration_id, calibration.earlier_id):
         raise DataError(
             f'{path}: the content does not belong to its calibration_id {identity}, '

@@ -193,7 +193,9 @@ def correct_points(
         calibration = calibrations[str(name)]
         sigma = points.sigma
         if sigma is not None:
-            sigma = np.where(np.isnan(sigma[rows]), calibration.image_sd, sigma[rows])
+            sigma = np.where(
+                np.isnan(sigma[rows]), calibration.image_sd_at(points.uv[rows]), sigma[rows]
+            )
         angles = np.full(len(rows), np.nan if points.angle is None else points.angle[rows])
         if angle is not None:
             angles[np.isnan(angles)] = angle

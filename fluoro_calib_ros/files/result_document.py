@@ -48,6 +48,7 @@ def result_document(job: CalibrationResult) -> dict[str, Any]:
             name: {
                 'calibration_id': job.calibrations[name].calibration_id,
                 **_fluoroscope(figures),
+                'noise_px': _noise(job.calibrations[name]),
                 **_angle(job.calibrations[name]),
             }
             for name, figures in job.fluoroscopes.items()
@@ -144,6 +145,16 @@ def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
             for e in figures.exposures
         ],
     }
+
+
+def _noise(calibration: FluoroscopeCalibration) -> dict[str, float]:
+    """Return the standard deviation of an image coordinate [px], also by place if it differs."""
+    profile = calibration.noise_profile
+    out = {'sd': calibration.image_sd}
+    if profile is not None:
+        factors = {'middle': profile.middle, 'rim': profile.rim}
+        out |= {name: calibration.image_sd * factor for name, factor in factors.items()}
+    return out
 
 
 def _angle(calibration: FluoroscopeCalibration) -> dict[str, Any]:

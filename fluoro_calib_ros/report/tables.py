@@ -85,6 +85,7 @@ def _column(result: CalibrationResult, name: str) -> dict[str, str]:
         'exposures': str(len(figures.exposures)),
         'interior orientation': 'estimated' if calibration.interior_estimated else 'held',
         **_interior_rows(figures),
+        'noise of an image coordinate [px]': _noise_text(calibration),
         'median sd of the correction [px]': number_text(_median_sd(calibration)),
         **_angle_rows(calibration.angle_field),
         'calibration [s]': number_text(calibration.seconds, 1),
@@ -102,6 +103,15 @@ def _median_sd(calibration: FluoroscopeCalibration) -> float:
         return float(np.median(sd))
     squares = [sd**2 + field.change(uv, angle)[1] for angle in field.angles.tolist()]
     return float(np.sqrt(np.maximum(np.median(squares), 0)))
+
+
+def _noise_text(calibration: FluoroscopeCalibration) -> str:
+    """Standard deviation of an image coordinate [px]; in the middle and at the rim."""
+    profile = calibration.noise_profile
+    if profile is None:
+        return number_text(calibration.image_sd)
+    middle, rim = (number_text(calibration.image_sd * f) for f in (profile.middle, profile.rim))
+    return f'{middle}; rim {rim}'
 
 
 def _angle_rows(field: AngleField | None) -> dict[str, str]:

@@ -284,7 +284,7 @@ def _rays(job: CalibrationResult, frames: Mapping[str, Sequence[Frame]]) -> Rays
             frame = by_number[e.exposure]
             n = len(frame.target_id)
             correction = calibration.correction(frame.uv, frame.angle)
-            sigma: np.ndarray | float = calibration.image_sd
+            sigma = calibration.image_sd_at(frame.uv)
             if frame.sigma is not None:
                 sigma = calibration.sigma0 * frame.sigma
             parts.append(

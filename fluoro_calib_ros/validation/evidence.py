@@ -126,12 +126,13 @@ class Evidence:
     def _common_trend(self, name: str) -> CommonTrend:
         calibration = self.calibrations[name]
         residuals = residuals_of(self.result, name, self.frames[name])
-        inliers = residuals.inliers(calibration.image_sd)
+        noise = calibration.image_sd_at(residuals.uv)
+        inliers = residuals.inliers(noise)
         claimed = float(
             np.sqrt(np.mean(calibration.correction(inliers.uv, inliers.angle).sd ** 2))
         )
         size = calibration.image_size
-        rejected = rejected_trend(residuals.rejected(calibration.image_sd), inliers, size)
+        rejected = rejected_trend(residuals.rejected(noise), inliers, size)
         return CommonTrend(inliers, common_trend(inliers, size), claimed, rejected)
 
     @cached_property
@@ -200,16 +201,15 @@ class Evidence:
         if options.model == AUTO and len(kinds) == 1 and kinds <= set(selectable_models()):
             options = replace(options, model=kinds.pop())  # the one that is validated
         part = replace(self.request, frames=frames, options=options, principal_distance=distance)
-        sd = {name: self.calibrations[name].image_sd for name in frames}
         if options.model == CollocationModel.kind:
             starts = replace(self.starts, earlier=self.earlier)
             with contextlib.suppress(DataError):
-                found = calibrate_part(part, starts, sd, self.raise_if_cancelled)
+                found = calibrate_part(part, starts, self.calibrations, self.raise_if_cancelled)
                 if not self._has_lost_points(found, frames):
                     return found
         # The gauge of the part is another one. Outliers can keep the exposures of a part from it
         # where the distortion is large.
-        return calibrate_part(part, self.starts, sd, self.raise_if_cancelled)
+        return calibrate_part(part, self.starts, self.calibrations, self.raise_if_cancelled)
 
     def calibrate_free(self, names: Sequence[str]) -> Mapping[str, FluoroscopeCalibration]:
         """Calibrate all frames of some fluoroscopes without a given interior orientation.

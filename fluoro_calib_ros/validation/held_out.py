@@ -95,13 +95,13 @@ def _hold_out(
     job_inside = evidence.adjust(frames, {name: evidence.calibrations[name] for name in names})
     out: dict[str, list[ExposureSums]] = {}
     for name in names:
-        sd = evidence.calibrations[name].image_sd
         outside = residuals_of(job_outside, name, frames[name])
         inside = residuals_of(job_inside, name, frames[name])
         if not np.array_equal(outside.numbers, inside.numbers):
             raise DataError(
                 f'fluoroscope {name}: an exposure does not fit a calibration without it'
             )
+        sd = evidence.calibrations[name].image_sd_at(outside.uv)
         squared_outside = outside.capped(sd)
         squared_inside = inside.capped(sd)
         predicted = 2 * calibrations[name].correction(outside.uv, outside.angle).sd ** 2

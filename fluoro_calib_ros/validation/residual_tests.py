@@ -97,19 +97,19 @@ class Residuals:
         """Angle (n,) of the C-arm [rad] of each residual."""
         return self.angles[self.exposure]
 
-    def capped(self, sd: float) -> np.ndarray:
+    def capped(self, sd: np.ndarray) -> np.ndarray:
         """Return squared lengths (n,) [px^2], capped at the border of the core of the noise.
 
-        sd is the standard deviation of the noise [px].
+        sd (n,): standard deviations of the noise [px].
         """
         squared = np.sum(self.r**2, axis=1)
         return np.minimum(np.where(np.isfinite(squared), squared, np.inf), INLIER_Q * sd**2)
 
-    def inliers(self, sd: float) -> Residuals:
-        """Return the residuals in the core of noise of standard deviation sd [px]."""
+    def inliers(self, sd: np.ndarray) -> Residuals:
+        """Return the residuals in the core of noise of standard deviations sd (n,) [px]."""
         return self._part(np.sum(self.r**2, axis=1) <= INLIER_Q * sd**2)
 
-    def rejected(self, sd: float) -> Residuals:
+    def rejected(self, sd: np.ndarray) -> Residuals:
         """Return the residuals beyond that core which a distortion may have left."""
         q = np.sum(self.r**2, axis=1) / sd**2
         return self._part((q > INLIER_Q) & (q < LARGEST_SD**2))

@@ -644,7 +644,7 @@ def test_calibration_corrects_observed_points():
     exact = calibration.correct(uv, exact=True)
     np.testing.assert_allclose(exact.uv[:3], uv[:3] - model.duv, atol=1e-9)
     np.testing.assert_allclose(
-        exact.sigma[:3], np.hypot(calibration.image_sd, model.sd), rtol=1e-9
+        exact.sigma[:3], np.hypot(calibration.image_sd_at(uv[:3]), model.sd), rtol=1e-9
     )
     np.testing.assert_allclose(
         found.uv, exact.uv, atol=0.01

@@ -74,13 +74,13 @@ def test_terms_that_differ_at_random_have_their_own_size(case):
     for _ in range(10):
         coefficients = rng.normal(0, np.sqrt(np.tile(terms.variance, terms.exposures)))
         true = mean_square_left(network, by_exterior, terms.values @ coefficients)
-        got = variance_between_exposures(network, found, 0, terms, coefficients, exact)
+        got = variance_between_exposures(network, found, 0, terms, coefficients, exact).mean()
         ratios.append(got / true)
     assert np.mean(ratios) == pytest.approx(1, abs=0.05)
     assert np.std(ratios) < 0.1
     # Coefficients that are only known to be within their prior are as large as it says.
     prior = np.diag(np.tile(terms.variance, terms.exposures))
-    got = variance_between_exposures(network, found, 0, terms, np.zeros(terms.count), prior)
+    got = variance_between_exposures(network, found, 0, terms, np.zeros(terms.count), prior).mean()
     draws = [rng.normal(0, np.sqrt(np.diagonal(prior))) for _ in range(20)]
     expected = np.mean([mean_square_left(network, by_exterior, terms.values @ c) for c in draws])
     assert got == pytest.approx(expected, rel=0.1)
@@ -97,7 +97,7 @@ def test_a_phantom_that_has_shrunk_is_no_variation(case):
     scale = np.sqrt(np.mean(like_variation**2))
     assert scale > 0.1  # the terms can follow it
     exact = np.zeros((terms.count, terms.count))
-    got = variance_between_exposures(loose, found, 0, terms, coefficients, exact)
+    got = variance_between_exposures(loose, found, 0, terms, coefficients, exact).mean()
     assert got < 0.3 * mean_square_left(network, by_exterior, like_variation)
 
 

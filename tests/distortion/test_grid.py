@@ -480,7 +480,7 @@ def test_sigma_includes_observation_and_correction():
     uv = np.array([[300.0, 400.0], [700.5, 500.25]])
     sd = looked_up(calibration.grid, uv)[1]
     np.testing.assert_allclose(
-        calibration.correct(uv).sigma, np.hypot(calibration.image_sd, sd), rtol=1e-12
+        calibration.correct(uv).sigma, np.hypot(calibration.image_sd_at(uv), sd), rtol=1e-12
     )
     np.testing.assert_allclose(
         calibration.correct(uv, [2.0, 0.01]).sigma, np.hypot([2.0, 0.01], sd), rtol=1e-12

@@ -43,6 +43,7 @@ from fluoro_calib_ros.files.json_file import read_json, write_json
 from fluoro_calib_ros.files.observations import read_observations_csv, write_observations_csv
 from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.files.rig_orientation import load_orientation, save_orientation
+from fluoro_calib_ros.photogrammetry.noise_profile import NoiseProfile
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 SIZE = (1024, 960)
@@ -429,7 +430,7 @@ def test_same_calibration_gives_the_same_bytes(tmp_path, monkeypatch):
 def test_numpy_reads_the_file_without_pickle_and_every_array_is_documented(tmp_path):
     with np.load(save_calibration(tmp_path, some_calibration()), allow_pickle=False) as file:
         assert file.files == ['format_version', *ARRAYS]
-        assert file['format_version'] == 3
+        assert file['format_version'] == 4
         docs = Path(__file__).parents[2] / 'docs'
         document = (docs / 'calibration_file.md').read_text()
         for name in file.files:
@@ -448,6 +449,32 @@ def changed(tmp_path, **arrays):
     return path
 
 
+ARRAYS_OF_VERSION = {
+    2: ('series_degree', 'series_modes', 'series_coefficients', 'series_sd'),
+    3: ('angles', 'angle_coefficients', 'angle_variances'),
+    4: ('noise_profile',),
+}
+
+
+@pytest.mark.parametrize('version', [1, 2, 3])
+def test_calibration_of_an_earlier_layout_is_read(tmp_path, version):
+    later = [name for v, names in ARRAYS_OF_VERSION.items() if v > version for name in names]
+    path = changed(tmp_path, format_version=np.array(version), **dict.fromkeys(later))
+    assert load_calibration(path).calibration_id == some_calibration().calibration_id
+
+
+def test_noise_profile_is_read_to_the_last_bit(tmp_path):
+    calibration = some_calibration(noise_profile=NoiseProfile(0.81, 1.37, 1.13))
+    found = load_calibration(save_calibration(tmp_path, calibration))
+    assert found.noise_profile == calibration.noise_profile
+    uv = np.array([[500.0, 500.0], [100.0, 900.0], [np.nan, 3.0]])
+    sigma = found.correct(uv).sigma
+    assert np.array_equal(sigma, calibration.correct(uv).sigma, equal_nan=True)
+    alone = [found.correct(uv[:2], [1e-9, 1e-9]).sigma, found.image_sd_at(uv[:2])]
+    np.testing.assert_allclose(sigma[:2], np.hypot(*alone), rtol=1e-9)
+    assert sigma[1] > sigma[0]
+
+
 class Bomb:
     def __reduce__(self):
         return os.mkdir, ('/tmp/this_must_never_be_made',)
@@ -456,7 +483,9 @@ class Bomb:
 @pytest.mark.parametrize(
     'arrays, sentence',
     [
-        ({'format_version': np.array(7)}, 'layout version 7, this program knows versions 1 to 3'),
+        ({'format_version': np.array(7)}, 'layout version 7, this program knows versions 1 to 4'),
+        ({'noise_profile': np.array([1.0, 1e3, 1.0])}, 'factors that no image has'),
+        ({'noise_profile': np.array([1.0, 2.0])}, 'its noise profile has 2 values'),
         ({'format_version': np.array('1')}, 'format_version is not a whole number'),
         ({'format_version': None}, 'it has no array format_version'),
         ({'interior': None}, 'has no array interior'),

@@ -14,6 +14,8 @@
 
 """Angles in messages: the angle field of a calibration, earlier definitions, joint states."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import rigs
@@ -38,9 +40,13 @@ from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
     message_from_calibration,
 )
 from fluoro_calib_ros.nodes.messages.joint_state import decode_joint_state
+from fluoro_calib_ros.photogrammetry.noise_profile import NoiseProfile
 
-# Of FluoroscopeCalibration before it had angles (REP-2016).
-EARLIER_HASH = 'RIHS01_0f953840578d8b58b031c13ce41212b81930fc2fb1ab721e149235d7490eaf4a'
+# Of FluoroscopeCalibration before it had angles, and before it had a noise profile (REP-2016).
+EARLIER_HASHES = (
+    'RIHS01_0f953840578d8b58b031c13ce41212b81930fc2fb1ab721e149235d7490eaf4a',
+    'RIHS01_114db66782793eb5b2d2a006354e69009304cdc156d56be9b3abae2d333fa6a6',
+)
 
 
 @pytest.fixture(scope='module')
@@ -53,22 +59,21 @@ def turning(plain):
     return rigs.turning(plain)
 
 
-def earlier_store():
+def earlier_store(changes):
     store = get_typestore(Stores.ROS2_JAZZY)
-    store.register(
-        get_types_from_msg(earlier_text(FLUOROSCOPE_CALIBRATION), FLUOROSCOPE_CALIBRATION)
-    )
+    text = earlier_text(FLUOROSCOPE_CALIBRATION, changes)
+    store.register(get_types_from_msg(text, FLUOROSCOPE_CALIBRATION))
     return store
 
 
-def earlier_bytes(calibration):
-    """Return a message as it was before there were angles."""
+def earlier_bytes(calibration, changes=0):
+    """Return a message as it was after the first changes of its definition."""
     present = from_cdr(
         serialize_message(message_from_calibration(calibration)), FLUOROSCOPE_CALIBRATION
     )
-    store = earlier_store()
+    store = earlier_store(changes)
     kind = store.types[FLUOROSCOPE_CALIBRATION]
-    added = ADDED[FLUOROSCOPE_CALIBRATION]
+    added = [name for names in ADDED[FLUOROSCOPE_CALIBRATION][changes:] for name in names]
     fields = {n: v for n, v in vars(present).items() if n not in added and n != '__msgtype__'}
     return bytes(store.serialize_cdr(kind(**fields), FLUOROSCOPE_CALIBRATION))
 
@@ -118,17 +123,20 @@ def test_changed_angles_do_not_match_the_id(turning):
         calibration_from_message(message)
 
 
-def test_earlier_definition_is_the_one_that_was_recorded():
-    assert earlier_store().hash_rihs01(FLUOROSCOPE_CALIBRATION) == EARLIER_HASH
+@pytest.mark.parametrize('changes, expected', list(enumerate(EARLIER_HASHES)))
+def test_earlier_definition_is_the_one_that_was_recorded(changes, expected):
+    assert earlier_store(changes).hash_rihs01(FLUOROSCOPE_CALIBRATION) == expected
 
 
+@pytest.mark.parametrize('changes', range(len(EARLIER_HASHES)))
 @pytest.mark.parametrize(
     'model, padding', [('collocation', 0), ('knn', 0), ('knn', 4), ('none', 0), ('none', 4)]
 )
-def test_message_of_the_earlier_definition_is_read(model, padding):
+def test_message_of_an_earlier_definition_is_read(model, padding, changes):
     calibration = rigs.calibrated('a', 5, model=model).calibrations['a']
+    calibration = replace(calibration, noise_profile=None)
     # Each empty sequence of float64 may leave four bytes at the end, of any content.
-    data = earlier_bytes(calibration) + b'\xff' * padding
+    data = earlier_bytes(calibration, changes) + b'\xff' * padding
     found = calibration_from_message(decode_fluoroscope_calibration(data))
     assert found.calibration_id == calibration.calibration_id
     offline = from_cdr(data, FLUOROSCOPE_CALIBRATION)
@@ -136,10 +144,43 @@ def test_message_of_the_earlier_definition_is_read(model, padding):
     assert from_cdr(present_cdr(data, FLUOROSCOPE_CALIBRATION), FLUOROSCOPE_CALIBRATION)
 
 
+def test_turning_calibration_of_the_definition_before_noise_profiles_is_read(turning):
+    turning = replace(turning, noise_profile=None)
+    found = calibration_from_message(decode_fluoroscope_calibration(earlier_bytes(turning, 1)))
+    assert found.calibration_id == turning.calibration_id
+
+
+def test_noise_profile_of_a_message_is_the_same_to_the_last_bit(plain):
+    plain = replace(plain, noise_profile=NoiseProfile(0.8, 1.3, 1.1))
+    data = serialize_message(message_from_calibration(plain))
+    found = calibration_from_message(decode_fluoroscope_calibration(data))
+    assert found.noise_profile == plain.noise_profile
+    assert found.calibration_id == plain.calibration_id
+
+
+@pytest.mark.parametrize(
+    'values, said',
+    [
+        ([1.0, 2.0], 'has 2 values, 3 are expected'),
+        ([1.0, 1e9, 1.0], 'factors that no image has'),
+        ([0.0, 1.0, 1.0], 'factors that no image has'),
+        ([1.0, np.nan, 1.0], 'factors that no image has'),
+        ([1.0, 1.0, -1.0], 'factors that no image has'),
+    ],
+)
+def test_damaged_noise_profile_is_refused_in_one_sentence(plain, values, said):
+    message = message_from_calibration(plain)
+    message.noise_profile = values
+    with pytest.raises(DataError, match=said) as refused:
+        calibration_from_message(message)
+    assert '\n' not in str(refused.value)
+
+
 def test_truncated_messages_are_refused(turning, plain):
     for data in (
         serialize_message(message_from_calibration(turning)),
         earlier_bytes(plain),
+        earlier_bytes(turning, 1),
     ):
         for length in (len(data) // 2, len(data) - 9, 20, 3, 0):
             with pytest.raises((ValueError, RuntimeError)):

@@ -30,6 +30,7 @@ from ...distortion.registry import model_from_arrays
 from ...distortion.series import SD_GRID
 from ...errors import DataError
 from ...files.calibration import check_model_content, validated_arrays
+from ...photogrammetry.noise_profile import NoiseProfile, packed_profile, unpacked_profile
 from ..runtime.stream_reader import DECODING_ERRORS
 from .fields import (
     float64_field,
@@ -59,7 +60,7 @@ ANGLES = ('angles', 'angle_coefficients', 'angle_variances')
 
 
 def decode_fluoroscope_calibration(data: bytes) -> FluoroscopeCalibration:
-    """Read a message from its bytes, also one of an earlier definition, which had no angles.
+    """Read a message from its bytes, also one of an earlier definition.
 
     Raises one of DECODING_ERRORS for damaged bytes.
     """
@@ -89,6 +90,7 @@ def message_from_calibration(
         setattr(message, name, getattr(calibration, name))
     for name, values in zip(ANGLES, packed_angles(calibration.angle_field), strict=True):
         setattr(message, name, float64_field(values.ravel()))
+    message.noise_profile = float64_field(packed_profile(calibration.noise_profile))
     message.calibration_id = calibration.calibration_id
     return message
 
@@ -125,6 +127,7 @@ def content_of_calibration(
         stamp_ns=nanoseconds_from_stamp(message.header.stamp),
         frame_id=message.header.frame_id,
         angle_field=_angle_field_of(message, where),
+        noise_profile=_noise_profile_of(message, where),
         **{name: getattr(message, name) for name in SAME_NAME},
     )
     validated_arrays(where, calibration)
@@ -204,5 +207,13 @@ def _angle_field_of(message: FluoroscopeCalibration, where: str) -> AngleField |
     shaped = [a if shape is None else a.reshape(shape) for a, shape in zip(arrays, PACKED_SHAPES)]
     try:
         return unpacked_angles((message.image_width, message.image_height), *shaped)
+    except ValueError as error:
+        raise DataError(f'{where}: {error}') from None
+
+
+def _noise_profile_of(message: FluoroscopeCalibration, where: str) -> NoiseProfile | None:
+    """Return the noise profile of a message, if any. Raises DataError, beginning with `where`."""
+    try:
+        return unpacked_profile(np.array(message.noise_profile, dtype=float))
     except ValueError as error:
         raise DataError(f'{where}: {error}') from None

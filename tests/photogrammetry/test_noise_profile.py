@@ -1,0 +1,93 @@
+# Copyright 2026 fluoro_calib_ros maintainers
+#
+# Licensed under the Apache License, Version 2.0 (the "License");
+# you may not use this file except in compliance with the License.
+# You may obtain a copy of the License at
+#
+#     http://www.apache.org/licenses/LICENSE-2.0
+#
+# Unless required by applicable law or agreed to in writing, software
+# distributed under the License is distributed on an "AS IS" BASIS,
+# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
+# See the License for the specific language governing permissions and
+# limitations under the License.
+
+"""Noise that differs between the middle of an image and its rim."""
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+
+from fluoro_calib_ros.photogrammetry.noise_profile import (
+    NoiseProfile,
+    fitted_profile,
+    packed_profile,
+    unpacked_profile,
+)
+
+SIZE = (1024, 768)
+
+
+def drawn(rng, rim_over_middle, count=2000, nu=np.inf):
+    """Image points, and mean squares of errors; standard deviation 0.2 px in the middle."""
+    uv = rng.uniform(0, 1, (count, 2)) * SIZE
+    square = np.sum((uv - np.array([511.5, 383.5])) ** 2, axis=1) / 512**2
+    noise = rng.normal(0, 1, (count, 2))
+    if nu < np.inf:
+        noise /= np.sqrt(rng.chisquare(nu, count) / nu)[:, None]
+    noise *= (0.2 * rim_over_middle**square)[:, None]
+    return uv, np.mean(noise**2, axis=1)
+
+
+@pytest.mark.parametrize('nu', [np.inf, 8.0])
+@pytest.mark.parametrize('ratio', [0.6, 1.5, 2.5])
+def test_rim_is_estimated_without_bias(ratio, nu):
+    rng = np.random.default_rng(1)
+    found = [fitted_profile(*drawn(rng, ratio, nu=nu), SIZE) for _ in range(20)]
+    assert np.mean([f.rim / f.middle for f in found]) == pytest.approx(ratio, rel=0.03)
+
+
+def test_squares_are_as_large_as_claimed_in_the_middle_and_at_the_rim():
+    uv, squares = drawn(np.random.default_rng(2), 2.0)
+    factors = fitted_profile(uv, squares, SIZE).factors(uv[:, 0], uv[:, 1], SIZE)
+    assert np.mean(factors**2) == pytest.approx(1.0, rel=1e-12)
+    q = squares / np.mean(squares) / factors**2
+    inner = factors < np.median(factors)
+    assert np.mean(q[inner]) == pytest.approx(1.0, abs=0.1)
+    assert np.mean(q[~inner]) == pytest.approx(1.0, abs=0.1)
+
+
+@pytest.mark.parametrize('nu', [np.inf, 8.0])
+def test_same_noise_everywhere_has_no_profile_but_by_chance(nu):
+    """One of 20 images, and then a slight one."""
+    rng = np.random.default_rng(3)
+    found = [fitted_profile(*drawn(rng, 1.0, nu=nu), SIZE) for _ in range(200)]
+    ratios = [f.rim / f.middle for f in found if f is not None]
+    assert len(ratios) <= binom.ppf(0.999, 200, 1 / 20)
+    assert np.abs(np.log(ratios)).max() < np.log(1.25)
+
+
+def test_noise_stays_as_it_is_beyond_the_image_points():
+    profile = NoiseProfile(0.8, 1.6, 0.9)
+    u = 511.5 + 512 * np.array([0.0, 0.9, 1.0, 1.4, np.inf])
+    found = profile.factors(u, np.full(5, 383.5), SIZE)
+    assert found[0] == 0.8
+    np.testing.assert_allclose(found[1:], 0.8 * 2**0.81, rtol=1e-12)
+
+
+@pytest.mark.parametrize('count', [0, 5, 99])
+def test_few_image_points_show_no_profile(count):
+    assert fitted_profile(*drawn(np.random.default_rng(4), 3.0, count), SIZE) is None
+
+
+@pytest.mark.parametrize('zeros', [slice(None), slice(100)])
+def test_errors_of_zero_show_no_profile(zeros):
+    uv, squares = drawn(np.random.default_rng(5), 1.0)
+    squares[zeros] = 0
+    assert fitted_profile(uv, squares, SIZE) is None
+
+
+def test_packed_profile_is_the_same():
+    profile = NoiseProfile(0.8, 1.6, 0.9)
+    assert unpacked_profile(packed_profile(profile)) == profile
+    assert unpacked_profile(packed_profile(None)) is None

@@ -30,7 +30,7 @@ intersected afterwards: C_ei describes that.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
@@ -39,7 +39,7 @@ from threadpoolctl import threadpool_limits
 
 from ..errors import DataError
 from ..exposures.collector import displacement
-from ..exposures.frame import Frame, validate_frame
+from ..exposures.frame import Frame, angles_of, validate_frame
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.collinearity import to_sensor
@@ -67,7 +67,7 @@ from .held_calibration import (
     too_few_rays_for_noise,
 )
 from .initial_network import MIN_TARGETS_OF_EXPOSURE, Frames, Measured, StartValues
-from .pair_scatter import PairScatter, agreeing, displacements
+from .pair_scatter import PairScatter, agreeing, displacements, functions_of_angles
 from .result import FluoroscopeCalibration
 from .robust_adjustment import adjusted_with_precision
 
@@ -279,7 +279,8 @@ def orientation_and_scatter(
             paired, phantom, calibrations, raise_if_cancelled, starts=starts
         )
         held = _adjusted(measured, calibrations, loss, False, raise_if_cancelled)
-        exteriors, scatter = _relative_to_first(held)
+        turning = {name for name, each in calibrations.items() if each.angle_field is not None}
+        exteriors, scatter = _relative_to_first(held, turning)
     first = held.measured.fluoroscopes[0]
     frame_id = calibrations[first].frame_id or f'{first}_optical'
     exposures = min(int(of_one.used.sum()) for of_one in scatter)
@@ -293,9 +294,12 @@ def orientation_and_scatter(
         ) from None
 
 
-def _relative_to_first(held: _HeldAdjustment) -> tuple[_Exteriors, tuple[PairScatter, ...]]:
+def _relative_to_first(
+    held: _HeldAdjustment, turning: Collection[str]
+) -> tuple[_Exteriors, tuple[PairScatter, ...]]:
     """Exteriors relative to the first fluoroscope, and the scatter of the paired exposures.
 
+    turning: names of those whose corrections change with the angle of a C-arm.
     Raises DataError where no exposures can be paired.
     """
     names = held.measured.fluoroscopes
@@ -310,7 +314,8 @@ def _relative_to_first(held: _HeldAdjustment) -> tuple[_Exteriors, tuple[PairSca
         if not len(pairs):
             raise DataError(_unpaired(names, b))
         rows = slice(6 * b, 6 * b + 6)
-        pose, operator[rows], of_pairs = _mean_of_pairs(held, pairs)
+        corrected = names[0] in turning or names[b] in turning
+        pose, operator[rows], of_pairs = _mean_of_pairs(held, pairs, corrected)
         growth[rows] = of_pairs.growth
         rotation[b] = pose.rotation
         position[b] = pose.translation_mm
@@ -508,18 +513,24 @@ def _covariance_of_interiors(calibrations: Iterable[FluoroscopeCalibration]) -> 
 
 
 def _mean_of_pairs(
-    held: _HeldAdjustment, pairs: np.ndarray
+    held: _HeldAdjustment, pairs: np.ndarray, corrected: bool
 ) -> tuple[RelativePose, np.ndarray, PairScatter]:
     """Weighted mean of the relative orientations of pairs (k, 2) of exposures.
 
-    Returns it, its derivatives (6, 6m) by the exposures, and how the pairs scatter about it.
+    corrected: whether a correction changes with the angle of a C-arm. Returns the mean, its
+    derivatives (6, 6m) by the exposures, and how the pairs scatter about it.
     """
     parameters = held.after.parameters
+    frames = held.measured.frames
+    pairs = pairs[np.argsort([frames[row].number for row in pairs[:, 0]], kind='stable')]
+    angles = [angles_of(frames[row] for row in rows) for rows in pairs.T]
     constraint = RelativeConstraint((0, 1), pairs, 1.0, 1.0)
     start = mean_pose(parameters, pairs)
     _, d_a, d_b, _ = discrepancies_with_jacobian(constraint, start, parameters)
     weights = np.linalg.inv(_covariance_of_pairs(held, pairs, d_a, d_b))
-    used, off_sd = agreeing(parameters, constraint, weights)
+    columns = functions_of_angles(angles)
+    found = agreeing(parameters, constraint, weights, columns)
+    used = found.used
     pose = mean_pose(parameters, pairs[used], weights[used])
     operator = np.zeros((6, len(held.measured.frames), 6))
     share = np.linalg.solve(
@@ -527,16 +538,21 @@ def _mean_of_pairs(
     ).reshape(6, -1, 6)
     for rows, derivative in zip(pairs[used].T, (d_a[used], d_b[used])):
         operator[:, rows] += np.einsum('ika,kab->ikb', share, derivative)
-    square = 6 * np.sum(off_sd[used] ** 2) / max(6 * (int(used.sum()) - 1), 1)
-    frames = held.measured.frames
+    poses = [pose.updated(step) for step in found.trend]
+    network = held.measured.network
+    by_angle = displacements(network, parameters, pairs, poses, [pose] * len(poses))
     turn, shift = relative_poses(parameters, pairs)
     scatter = PairScatter(
         (frames[pairs[0, 0]].fluoroscope, frames[pairs[0, 1]].fluoroscope),
         np.array([frames[row].number for row in pairs[:, 0]]),
-        displacements(held.measured.network, parameters, pairs, pose),
-        off_sd,
+        displacements(network, parameters, pairs, poses),
+        found.off_sd,
         used,
-        float(np.sqrt(max(1.0, square))),
+        found.growth,
+        found.unexplained,
+        float(np.sqrt(np.mean(by_angle**2))),
+        columns,
+        corrected,
         turn,
         shift,
     )

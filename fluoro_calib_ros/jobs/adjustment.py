@@ -21,9 +21,11 @@ from dataclasses import replace
 
 from ..calibration.calibrate import CalibrationResult, adjust_with_calibrations
 from ..calibration.result import FluoroscopeCalibration
+from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..exposures.strays import frames_without_strays
+from ..validation.held_fit import corrected_already, misfits, uncorrected
 from ..validation.inputs import require_phantom
 from .sources import select_calibrations
 
@@ -54,10 +56,16 @@ def adjust(
     Raises
     ------
     DataError
-        For a missing calibration, and for frames that do not suffice, or cannot be of the phantom.
+        For a missing calibration, and for frames that do not suffice, cannot be of the phantom, or
+        are corrected already.
     """
     used = select_calibrations(calibrations, frames)
     cleaned, strays = frames_without_strays(frames, phantom)
     require_phantom(cleaned, phantom)
     result = adjust_with_calibrations(cleaned, phantom, used, loss)
+    if misfits(result, used):
+        without = adjust_with_calibrations(cleaned, phantom, uncorrected(used), loss)
+        corrected = corrected_already(result, without, used)
+        if corrected:
+            raise DataError(corrected)
     return replace(result, left_out=(*strays, *result.left_out))

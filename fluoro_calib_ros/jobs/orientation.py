@@ -30,6 +30,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import rotation_angle
 from ..reconstruction.intersection import Intersector
 from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_exposure
+from ..validation.held_fit import uncorrected
 from ..validation.inputs import require_phantom
 
 MIN_MET = 0.5  # share of the targets of two views whose rays meet
@@ -93,55 +94,108 @@ def orient(
     Raises
     ------
     DataError
-        For fewer than two fluoroscopes, missing calibrations, frames that do not suffice or cannot
-        be of the phantom, and where most rays do not meet.
+        For fewer than two fluoroscopes, missing calibrations, frames that do not suffice, cannot
+        be of the phantom or are corrected already, and where most rays do not meet.
     """
     require_phantom(frames, phantom)
     orientation = orientation_of_capture(
         frames, phantom, calibrations, frame_id, raise_if_cancelled=raise_if_cancelled
     )
-    found = reconstruct_exposure(
-        standing_frames(frames, calibrations), calibrations, Intersector(orientation)
-    )
+    found = _intersected(frames, calibrations, orientation)
+    met = _met(found, phantom)
+    if not met.is_good and _fits_uncorrected(frames, phantom, calibrations, frame_id):
+        raise DataError(
+            'the image points are corrected already, their rays meet without the correction of '
+            'the calibrations only: give the observed ones'
+        )
     offset = found.points.xyz_mm - phantom.xyz_mm[phantom.index(found.target_id)]
     offset = offset[np.isfinite(offset).all(axis=1)]
     rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1)))) if len(offset) else float('nan')
-    notes = [_doubt(found, phantom), _change(present, orientation)]
+    notes = [_doubt(met), _change(present, orientation)]
     return OrientationOutcome(orientation, len(offset), rms, tuple(filter(None, notes)))
 
 
-def _doubt(found: ReconstructedFrame, phantom: Phantom) -> str:
-    """Return why an orientation is doubtful, '' where it is not.
+@dataclass(frozen=True)
+class _Met:
+    """How well the targets of a capture in two views are intersected again.
 
-    found are the targets of the capture, intersected again. Raises DataError where most rays do
-    not meet.
+    matched: their number; met: that of those whose rays meet; ratio: of their distances from the
+    survey to the expected ones, NaN for none.
     """
+
+    matched: int
+    met: int
+    ratio: float
+
+    @property
+    def is_good(self) -> bool:
+        """Whether nothing is doubtful, or too few targets are seen to tell."""
+        if self.matched < MIN_MATCHED:
+            return True
+        return self.met >= MIN_MET_SURELY * self.matched and self.ratio <= MAX_SD
+
+
+def _intersected(
+    frames: Mapping[str, Sequence[Frame]],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation,
+) -> ReconstructedFrame:
+    """Return the targets of a capture, intersected again."""
+    standing = standing_frames(frames, calibrations)
+    return reconstruct_exposure(standing, calibrations, Intersector(orientation))
+
+
+def _met(found: ReconstructedFrame, phantom: Phantom) -> _Met:
+    """Return how well targets that are intersected again fit the phantom."""
     points = found.points
     matched = int(np.sum(points.rays > 1))
-    if matched < MIN_MATCHED:
-        return ''
     rows = phantom.index(found.target_id)
     offset = points.xyz_mm - phantom.xyz_mm[rows]
     met = np.isfinite(offset).all(axis=1)
-    share = met.sum() / matched
-    causes = (
-        'the fluoroscopes are interchanged, their calibrations do not hold for these images, the '
-        'frames are not of one exposure, or the image points are corrected already'
-    )
-    if share < MIN_MET:
-        raise DataError(
-            f'the rays of only {met.sum()} of {matched} targets in two views meet: {causes}'
-        )
+    if not met.any():
+        return _Met(matched, 0, np.nan)
     spread = phantom.sd_mm[rows[met]] ** 2
     covariance = points.covariance[met] + spread[:, None, None] * np.eye(3)
     scaled = np.linalg.solve(covariance, offset[met][:, :, None])[:, :, 0]
     square = np.einsum('ni,ni->n', offset[met], scaled)
-    ratio = float(np.sqrt(np.median(square) / MEDIAN_CHI2))
-    if share >= MIN_MET_SURELY and ratio <= MAX_SD:
+    return _Met(matched, int(met.sum()), float(np.sqrt(np.median(square) / MEDIAN_CHI2)))
+
+
+def _fits_uncorrected(
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    frame_id: str,
+) -> bool:
+    """Whether a capture fits the calibrations without their corrections."""
+    if not any(calibrations[name].model.corrects for name in frames):
+        return False
+    plain = uncorrected(calibrations)
+    try:
+        orientation = orientation_of_capture(frames, phantom, plain, frame_id)
+        return _met(_intersected(frames, plain, orientation), phantom).is_good
+    except DataError:
+        return False
+
+
+def _doubt(met: _Met) -> str:
+    """Return why an orientation is doubtful, '' where it is not.
+
+    Raises DataError where most rays do not meet.
+    """
+    if met.is_good:
         return ''
+    causes = (
+        'the fluoroscopes are interchanged, their calibrations do not hold for these images, or '
+        'the frames are not of one exposure'
+    )
+    if met.met < MIN_MET * met.matched:
+        raise DataError(
+            f'the rays of only {met.met} of {met.matched} targets in two views meet: {causes}'
+        )
     return (
-        f'doubtful: the rays of {met.sum()} of {matched} targets in two views meet, '
-        f'{ratio:.1f} times as far from their survey as expected: {causes}'
+        f'doubtful: the rays of {met.met} of {met.matched} targets in two views meet, '
+        f'{met.ratio:.1f} times as far from their survey as expected: {causes}'
     )
 
 

@@ -26,7 +26,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..calibration.calibrate import ExposureResult, FluoroscopeResult
-from ..calibration.pair_scatter import PairScatter
+from ..calibration.pair_scatter import MOVED_SHARE, PairScatter, steps_of
 from ..photogrammetry.rotations import matrix_from_quaternion, rotation_angle, vector_from_matrix
 
 MIN_PAIRS = 3
@@ -43,7 +43,6 @@ MAX_GROWTH = 8.0  # above which there is no orientation, where the displacement 
 MIN_DOUBT_PX = 0.3  # less displaces no point by more than its noise does
 MAX_OFF = 0.0025  # median displacement of image points over the longer side of the image
 MIN_PAIRS_MOVED = 6
-MOVED_SHARE = 0.2  # of the scatter that is left when the rig was moved once
 
 
 def interchanged(names: tuple[str, str], one: FluoroscopeResult, other: FluoroscopeResult) -> str:
@@ -141,15 +140,26 @@ def doubtful(scatter: PairScatter, side_px: int) -> tuple[str, str]:
             f'each other by {_size(scatter.off_px[~scatter.used])}: the frames are not of one '
             'exposure, or the phantom moved between them'
         )
-    if scatter.growth <= DOUBTFUL_GROWTH or off < MIN_DOUBT_PX:
-        return '', left_out
+    if scatter.unexplained <= DOUBTFUL_GROWTH or off < MIN_DOUBT_PX:
+        bent = '' if scatter.corrected or scatter.angle_px < MIN_DOUBT_PX else _bent(scatter)
+        return '', '; '.join(filter(None, (left_out, bent)))
     sentence = (
         f'the exposures contradict each other: the relative orientation of fluoroscopes {a} and '
-        f'{b} differs between them by {off:.1f} px, {scatter.growth:.0f} times its standard '
+        f'{b} differs between them by {off:.1f} px, {scatter.unexplained:.0f} times its standard '
         f'deviation; {_cause(scatter)}'
     )
-    refused = off > MAX_OFF * side_px and scatter.growth > MAX_GROWTH
+    refused = off > MAX_OFF * side_px and scatter.unexplained > MAX_GROWTH
     return (sentence, '') if refused else ('', sentence)
+
+
+def _bent(scatter: PairScatter) -> str:
+    """Return the sentence on a relative orientation that changes with the angle of a C-arm."""
+    a, b = scatter.fluoroscopes
+    return (
+        f'the relative orientation of fluoroscopes {a} and {b} changes with the angle of the '
+        f'C-arm, by {scatter.angle_px:.1f} px: it is that of the mean angle; orient the rig from '
+        'a capture at the angle that is used'
+    )
 
 
 def _size(off_px: np.ndarray) -> str:
@@ -165,23 +175,25 @@ def _cause(scatter: PairScatter) -> str:
     count = len(scatter.exposures)
     order = np.argsort(scatter.exposures)
     turn = scatter.turn[order]
+    columns = scatter.columns[order]
     # Rotations about the first pair [rad], and shifts over the distance of the sources.
     base = float(np.median(np.linalg.norm(scatter.shift_mm, axis=1)))
     place = np.hstack(
         [vector_from_matrix(turn @ turn[0].T), scatter.shift_mm[order] / max(base, 1e-9)]
     )
-    total = _squares(place)
-    splits = range(2, count - 1)
-    left = [_squares(place[:k]) + _squares(place[k:]) for k in splits]
-    if count < MIN_PAIRS_MOVED or min(left) > MOVED_SHARE * total:
+    steps = steps_of(count)
+    fits = [_squares(place, np.hstack([columns, step])) for step in steps]
+    left = [squares for squares, _ in fits]
+    if count < MIN_PAIRS_MOVED or min(left) > MOVED_SHARE * _squares(place, columns)[0]:
         return (
             'frames with the same number are not of the same exposure, the phantom moved between '
             'them, the fluoroscopes or their images do not stand still, or the corrections do not '
             'hold in all of them'
         )
-    split = splits[int(np.argmin(left))]
+    best = int(np.argmin(left))
+    split = 2 + best
     numbers = scatter.exposures[order]
-    step = place[split:].mean(axis=0) - place[:split].mean(axis=0)
+    step = fits[best][1][-1]
     return (
         f'a fluoroscope was moved between exposures {numbers[split - 1]} and {numbers[split]}, by '
         f'about {np.linalg.norm(step[3:]) * base:.1f} mm and '
@@ -189,6 +201,7 @@ def _cause(scatter: PairScatter) -> str:
     )
 
 
-def _squares(values: np.ndarray) -> float:
-    """Sum of the squared deviations of rows (k, 6) from their mean."""
-    return float(np.sum((values - values.mean(axis=0)) ** 2))
+def _squares(values: np.ndarray, columns: np.ndarray) -> tuple[float, np.ndarray]:
+    """Fit functions (k, p) to values (k, 6); return the squares left, and coefficients (p, 6)."""
+    coefficients = np.linalg.lstsq(columns, values, rcond=None)[0]
+    return float(np.sum((values - columns @ coefficients) ** 2)), coefficients

@@ -24,7 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from rigs import calibrated, run, true_calibrations, true_orientation
+from rigs import calibrated, run, true_calibrations, true_orientation, turning
 
 from fluoro_calib_ros.calibration.rig_orientation import orientation_and_scatter
 from fluoro_calib_ros.errors import DataError
@@ -159,6 +159,54 @@ def test_a_rig_that_was_moved_between_exposures_gives_no_orientation():
 
 def test_a_phantom_that_moves_between_the_fluoroscopes_gives_no_orientation():
     refused, _ = scatter(seen(rig(), nudged(3.0, 0.01, 0)))
+    assert 'frames with the same number are not of the same exposure' in refused
+
+
+def on_an_arm(of_frames, order=range(COUNT)):
+    """The frames of a C-arm whose image b shifts with the angle, as orientations express it."""
+    angles = np.linspace(-1.4, 1.4, COUNT)[list(order)]
+
+    def at(frame):
+        angle = float(angles[frame.number - 1])
+        shift = 1.5 * np.array([np.cos(angle), np.sin(angle)]) if frame.fluoroscope == 'b' else 0
+        uv = frame.uv + shift
+        on = ((uv > 0) & (uv < SIZE - 1)).all(axis=1)
+        return replace(frame, target_id=frame.target_id[on], uv=uv[on], angle=angle)
+
+    return {name: [at(frame) for frame in of_one] for name, of_one in of_frames.items()}
+
+
+MIXED = (3, 6, 0, 5, 1, 7, 2, 4)
+
+
+def scatter_on_an_arm(of_b=None, order=MIXED, changes=True):
+    """Refusal and note; changes: whether the calibrations know of a change with the angle."""
+    held = calibrations()
+    if changes:
+        held = {name: turning(c, 90.0, 0.0) for name, c in held.items()}
+    frames_on_arm = on_an_arm(seen(rig(), of_b), order)
+    _, (pairs,) = orientation_and_scatter(frames_on_arm, rig().phantom, held)
+    return doubtful(pairs, SIZE)
+
+
+@pytest.mark.parametrize('order', [MIXED, range(COUNT)])
+def test_a_distortion_that_turns_with_a_c_arm_is_not_doubted(order):
+    assert scatter_on_an_arm(order=order) == ('', '')
+
+
+def test_an_arm_whose_calibrations_do_not_change_with_the_angle_is_mentioned():
+    refused, note = scatter_on_an_arm(changes=False)
+    assert not refused
+    assert 'b changes with the angle of the C-arm, by ' in note
+
+
+@pytest.mark.parametrize('order', [MIXED, range(COUNT)])
+def test_movements_are_found_on_a_c_arm_that_turns(order):
+    refused, note = scatter_on_an_arm(rig_moved(4.0, 0.006, 4), order)
+    assert 'a fluoroscope was moved between exposures 4 and 5, by about' in refused + note
+    refused, note = scatter_on_an_arm(nudged(3.0, 0.01, 4, 5), order)
+    assert note.startswith('not from exposure 5, in which fluoroscopes a and b stand otherwise')
+    refused, note = scatter_on_an_arm(nudged(3.0, 0.01, 0), order)
     assert 'frames with the same number are not of the same exposure' in refused
 
 
@@ -351,6 +399,21 @@ def test_a_capture_whose_frames_are_of_two_poses_is_noticed_by_the_orientation_b
     mixed = {'a': capture(1)['a'], 'b': [replace(capture(2)['b'][0], number=1)]}
     (note,) = orient(mixed, rig().phantom, calibrations(), present=before).notes
     assert note.startswith('fluoroscopes a and b stand otherwise to each other than')
+
+
+@pytest.mark.filterwarnings('error')
+def test_orient_and_adjust_refuse_points_that_are_corrected_already():
+    held, observed = distorted()
+    phantom = rig().phantom
+    of_capture = {name: of_one[:1] for name, of_one in observed.items()}
+    assert orient(of_capture, phantom, held).notes == ()
+    assert held_doubts(adjust(observed, phantom, held), held) == []
+    for job, of_frames in ((orient, capture()), (adjust, frames())):
+        with pytest.raises(DataError, match='the image points are corrected already'):
+            job(of_frames, phantom, held)
+    only_b = {'a': observed['a'], 'b': frames()['b']}
+    with pytest.raises(DataError, match=r'^fluoroscope b: the image points are corrected already'):
+        adjust(only_b, phantom, held)
 
 
 def wrong_distance(factor):

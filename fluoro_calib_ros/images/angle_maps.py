@@ -26,6 +26,8 @@ all images of an arm that stands still, and depends on the angle only, not on th
 
 from __future__ import annotations
 
+from functools import cached_property
+
 import cv2
 import numpy as np
 
@@ -35,8 +37,8 @@ from ..distortion.status import CorrectionStatus
 from .corrector import (
     LIMIT_PX,
     ROWS,
+    STRIPE,
     ImageCorrector,
-    Sources,
     continued,
     is_folded,
     iterated,
@@ -44,7 +46,6 @@ from .corrector import (
 )
 
 NODE_PX = 8  # between nodes at which the change is iterated
-STRIPE = 32  # rows that are handled at once: they fit into the cache
 STEPS = 3  # of this iteration; each leaves the fraction by which the change differs per pixel
 TURN = np.deg2rad(np.arange(360.0))  # angles at which the rate of change is measured
 SIDE = 17  # of the grid of pixels at which it is measured
@@ -106,7 +107,7 @@ class AngleMaps:
         if angle is None or self._field is None:
             return self.mean
         if self._last is None or self._last[0] != angle:
-            sources = self._base.sources(self._field, angle)
+            sources = _AtAngle(self._base, self._field, angle)
             mean = self.mean
             corrector = ImageCorrector(self._calibration, mean.interpolation, mean.border, sources)
             self._last = angle, corrector
@@ -123,7 +124,8 @@ class _Base:
     def __init__(self, calibration: FluoroscopeCalibration, margin: int) -> None:
         self._grid = calibration.grid
         self._size = calibration.image_size
-        self._margin = margin
+        self.height = self._size[1]
+        self.margin = margin
         width, height = (side + 2 * margin for side in self._size)
         source = np.empty((2, height, width), dtype=np.float32)
         bad = np.empty((height, width), dtype=np.uint8)
@@ -146,7 +148,7 @@ class _Base:
         own = slice(margin, -margin)
         self._source = np.ascontiguousarray(source[:, own, own])
         self._high = np.array(self._size, dtype=np.float32)[:, None, None] - np.float32(0.5)
-        self._stripes = [self._stripe(start) for start in range(0, self._size[1], STRIPE)]
+        self._inner = [self._far_from_rim(start) for start in range(0, self._size[1], STRIPE)]
         pixels = np.moveaxis(np.indices((height, width))[::-1], 0, 2).astype(np.float32)
         shift = np.moveaxis(source, 0, 2) - pixels + np.float32(margin)
         self._shift = np.ascontiguousarray(shift)  # else OpenCV copies it each time
@@ -154,50 +156,49 @@ class _Base:
         self._nodes = np.stack(np.meshgrid(*nodes), axis=2).astype(np.float32) + np.float32(margin)
         self._shift_of_nodes = self._shift_at(self._nodes)
 
-    def _stripe(self, start: int) -> tuple[slice, slice]:
-        """Rows from the first one, and the columns between those whose sources are near the rim.
-
-        By the mean, the sources of these are further from it than any angle shifts them.
-        """
-        width, height = self._size
-        rows = slice(start, min(start + STRIPE, height))
-        own = self._source[:, rows]
-        near = (own < self._margin - 0.5) | (own >= self._high - self._margin)
+    def _far_from_rim(self, start: int) -> slice:
+        """Columns in the stripe from a row whose sources are on the image at all angles."""
+        own = self._source[:, start : start + STRIPE]
+        near = (own < self.margin - 0.5) | (own >= self._high - self.margin)
+        width = self._size[0]
         columns = np.flatnonzero(near.reshape(-1, width).any(axis=0))
-        middle = width // 2
-        left, right = columns[columns < middle], columns[columns >= middle]
-        return rows, slice(left.max(initial=-1) + 1, right.min(initial=width))
+        left, right = columns[columns < width // 2], columns[columns >= width // 2]
+        return slice(left.max(initial=-1) + 1, right.min(initial=width))
 
-    def sources(self, field: AngleField, angle: float) -> Sources:
-        """Return the sources at an angle [rad]."""
-        change, shift = self._at_nodes(field, angle)
-        source = np.empty_like(self._source)
-        for rows, _ in self._stripes:
-            for out, mean, of_nodes in zip(source, self._source, shift):
-                cv2.add(mean[rows], self._between(of_nodes, rows), dst=out[rows])
-        folded = self._folded(source, change) if self._may_fold(shift) else None
-        is_near = np.abs(shift).max() < self._margin
-        for rows, inner in self._stripes:
-            parts = [slice(0, inner.start), slice(inner.stop, None)] if is_near else [slice(None)]
-            for columns in parts:
-                own = source[:, rows, columns]
-                own[:, ~((own >= -0.5) & (own < self._high)).all(axis=0)] = np.nan
-        if folded is not None:
-            source[:, folded] = np.nan
-        return Sources(source, lambda: self._status(source, bool(field.covers(angle))))
+    def of_stripe(self, start: int, shift: np.ndarray, is_small: bool) -> np.ndarray:
+        """Sources (2, r, w) of a stripe, shifted by values of nodes; NaN off the image.
 
-    def _between(self, of_nodes: np.ndarray, rows: slice) -> np.ndarray:
-        """Values (r, w) at the pixels of rows from those of nodes; r and the first are multiples.
+        is_small: no shift is larger than the margin.
+        """
+        mean = self._source[:, start : start + STRIPE]
+        source = np.empty_like(mean)
+        for out, of_mean, of_nodes in zip(source, mean, shift):
+            cv2.add(of_mean, self._between(of_nodes, start), dst=out)
+        inner = self._inner[start // STRIPE] if is_small else slice(0, 0)
+        for columns in (slice(0, inner.start), slice(inner.stop, None)):
+            own = source[:, :, columns]
+            own[:, ~((own >= -0.5) & (own < self._high)).all(axis=0)] = np.nan
+        return source
+
+    def _between(self, of_nodes: np.ndarray, start: int) -> np.ndarray:
+        """Values (r, w) at the pixels of a stripe from those of nodes.
 
         The first node is half a step before the image: resizing begins between two nodes.
         """
-        first, last = rows.start // NODE_PX, -(-rows.stop // NODE_PX) + 2
-        own = of_nodes[first:last]
+        width, height = self._size
+        count = min(STRIPE, height - start)
+        own = of_nodes[start // NODE_PX : -(-(start + count) // NODE_PX) + 2]
         fine = cv2.resize(own, (own.shape[1] * NODE_PX, own.shape[0] * NODE_PX))
-        count = rows.stop - rows.start
-        return fine[NODE_PX : NODE_PX + count, NODE_PX : NODE_PX + self._size[0]]
+        return fine[NODE_PX : NODE_PX + count, NODE_PX : NODE_PX + width]
 
-    def _may_fold(self, shift: np.ndarray) -> bool:
+    def status(self, source: np.ndarray) -> np.ndarray:
+        """Status (h, w) of the observed pixels at sources (2, h, w)."""
+        found = [
+            self._grid.look_up(*source[:, row].astype(float))[1] for row in range(source.shape[1])
+        ]
+        return np.stack(found)
+
+    def may_fold(self, shift: np.ndarray) -> bool:
         """Whether pixels may be seen mirrored by sources that are shifted (2, rows, columns)."""
         if self._bad is not None:
             return True
@@ -205,35 +206,26 @@ class _Base:
         turn = max(np.abs(np.diff(shift, axis=axis)).max() for axis in (1, 2)) / NODE_PX
         return bool(self._least_area <= 4 * self._longest_step * turn + 2 * turn**2)
 
-    def _folded(self, source: np.ndarray, change: np.ndarray) -> np.ndarray:
+    def folded(self, source: np.ndarray, change: np.ndarray) -> np.ndarray:
         """Whether (h, w) sources are folded, or those of a pixel that has none by the mean."""
         folded = is_folded(source)
         if self._bad is None:
             return folded
-        for rows, _ in self._stripes:
-            u, v = (self._between(part, rows) for part in cv2.split(change))
-            u = u + (np.arange(u.shape[1], dtype=np.float32) + self._margin)
-            v = v + (np.arange(rows.start, rows.stop, dtype=np.float32) + self._margin)[:, None]
-            folded[rows] |= cv2.remap(self._bad, u, v, cv2.INTER_NEAREST, borderValue=1) > 0
+        for start in range(0, self._size[1], STRIPE):
+            u, v = (self._between(part, start) for part in cv2.split(change))
+            u = u + (np.arange(u.shape[1], dtype=np.float32) + self.margin)
+            v = v + (np.arange(start, start + len(v), dtype=np.float32) + self.margin)[:, None]
+            bad = cv2.remap(self._bad, u, v, cv2.INTER_NEAREST, borderValue=1) > 0
+            folded[start : start + STRIPE] |= bad
         return folded
 
-    def _status(self, source: np.ndarray, is_covered: bool) -> np.ndarray:
-        """Status (h, w) of sources (2, h, w), those of no angle near by are OUTSIDE."""
-        status = np.empty((self._size[1], self._size[0]), dtype=np.uint8)
-        for start in range(0, len(status), ROWS):
-            rows = slice(start, start + ROWS)
-            own = source[:, rows].astype(float).reshape(2, -1)
-            status[rows] = self._grid.look_up(*own)[1].reshape(-1, status.shape[1])
-        if not is_covered:
-            status[status != CorrectionStatus.INVALID] = CorrectionStatus.OUTSIDE
-        return status
-
-    def _at_nodes(self, field: AngleField, angle: float) -> tuple[np.ndarray, np.ndarray]:
+    def at_nodes(self, field: AngleField, angle: float) -> tuple[np.ndarray, np.ndarray]:
         """Change of the correction, and by what it moves the sources (2, rows, columns) [px]."""
         shift = self._shift_of_nodes
         change = np.zeros_like(self._nodes)
         for _ in range(STEPS):
-            source = self._nodes + change + shift - self._margin
+            source = self._nodes + change + shift - self.margin
+            source = np.clip(source, -self.margin, self._size + np.float32(self.margin))
             change = field.duv(source.reshape(-1, 2), angle).reshape(change.shape)
             change = change.astype(np.float32)
             shift = self._shift_at(self._nodes + change)
@@ -244,6 +236,41 @@ class _Base:
         return cv2.remap(
             self._shift, places, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
         )
+
+
+class _AtAngle:
+    """The `corrector.Sources` at an angle [rad]; as a whole only where they are asked for."""
+
+    def __init__(self, base: _Base, field: AngleField, angle: float) -> None:
+        self._base = base
+        self._covered = bool(field.covers(angle))
+        change, self._shift = base.at_nodes(field, angle)
+        self._is_small = bool(np.abs(self._shift).max() < base.margin)
+        self._folded: np.ndarray | None = None
+        if base.may_fold(self._shift):
+            self._folded = base.folded(self.source, change)
+            del self.source  # it is without them
+
+    def of_stripe(self, start: int) -> np.ndarray:
+        """See `corrector.Sources`."""
+        source = self._base.of_stripe(start, self._shift, self._is_small)
+        if self._folded is not None:
+            source[:, self._folded[start : start + STRIPE]] = np.nan
+        return source
+
+    @cached_property
+    def source(self) -> np.ndarray:
+        """See `corrector.Sources`."""
+        starts = range(0, self._base.height, STRIPE)
+        return np.concatenate([self.of_stripe(start) for start in starts], axis=1)
+
+    @cached_property
+    def status(self) -> np.ndarray:
+        """See `corrector.Sources`."""
+        status = self._base.status(self.source)
+        if not self._covered:
+            status[status != CorrectionStatus.INVALID] = CorrectionStatus.OUTSIDE
+        return status
 
 
 def _rate(field: AngleField) -> tuple[float, float]:

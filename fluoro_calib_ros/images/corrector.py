@@ -26,6 +26,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Protocol
 
 import cv2
 import numpy as np
@@ -44,24 +45,38 @@ FULL_STEPS = 12
 HALF_STEPS = 60
 # Rows that are iterated at once: they fit into the cache, and other threads do not wait for long.
 ROWS = 16
+STRIPE = 64  # rows whose map is made at once, for the cache
 NOWHERE = -10_000.0  # source of a pixel without one: far off any image
 SHARPNESS = -0.75  # of OpenCV's cubic convolution
 
 
-@dataclass(frozen=True)
-class Sources:
-    """Where the pixels of a corrected image were seen.
+class Sources(Protocol):
+    """Where the pixels of a corrected image were seen, see `ImageCorrector`."""
 
-    source (2, h, w), as of an `ImageCorrector`; find_status: returns its status (h, w).
-    """
+    @property
+    def source(self) -> np.ndarray:
+        """Sources (2, h, w)."""
+        ...
 
-    source: np.ndarray
-    find_status: Callable[[], np.ndarray]
-
-    @cached_property
+    @property
     def status(self) -> np.ndarray:
         """Status (h, w)."""
-        return self.find_status()
+        ...
+
+    def of_stripe(self, start: int) -> np.ndarray:
+        """Return the source (2, r, w) of STRIPE rows, or those that are left, from a row on."""
+        ...
+
+
+@dataclass(frozen=True)
+class _KnownSources:
+    """See `Sources`."""
+
+    source: np.ndarray
+    status: np.ndarray
+
+    def of_stripe(self, start: int) -> np.ndarray:
+        return self.source[:, start : start + STRIPE]
 
 
 class ImageCorrector:
@@ -121,16 +136,14 @@ class ImageCorrector:
         self.shape = self.image_size[::-1]
         self.interpolation = interpolation
         self.border = border
-        if sources is None:
-            sources = _sources(calibration.grid, self.image_size)
-        self._sources = sources
+        self._sources = sources or _sources(calibration.grid, self.image_size)
         self._map_1 = np.empty((*self.shape, 2), dtype=np.int16)
         self._map_2 = np.empty(self.shape, dtype=np.uint16)
         high = np.array(self.image_size, dtype=np.float32)[:, None, None] - 1
-        for start in range(0, self.shape[0], ROWS):
-            rows = slice(start, start + ROWS)
+        for start in range(0, self.shape[0], STRIPE):
+            rows = slice(start, start + STRIPE)
             # A source in the outer half of a pixel at the rim takes the value of that pixel.
-            u, v = np.clip(self.source[:, rows], 0, high)
+            u, v = np.clip(self._sources.of_stripe(start), 0, high)
             cv2.patchNaNs(u, NOWHERE)
             cv2.patchNaNs(v, NOWHERE)
             if interpolation == 'cubic':
@@ -236,7 +249,7 @@ def _sources(grid: CorrectionGrid, image_size: tuple[int, ...]) -> Sources:
         status[rows] = row_status.reshape(-1, width)
     status[is_folded(source)] = CorrectionStatus.INVALID
     source[:, status == CorrectionStatus.INVALID] = np.nan
-    return Sources(source, lambda: status)
+    return _KnownSources(source, status)
 
 
 def _invert_correction(

@@ -15,12 +15,14 @@
 """Maps of corrected images at the angles of a C-arm."""
 
 import functools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import rigs
 import turning_rig
 
+from fluoro_calib_ros.distortion.registry import create_model
 from fluoro_calib_ros.distortion.status import CorrectionStatus
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.angle_maps import AngleMaps
@@ -150,3 +152,43 @@ def test_images_follow_a_field_that_was_estimated_from_exposures():
             return np.std(values - affine @ np.linalg.lstsq(affine, values, rcond=None)[0])
 
         assert rms(error) < 0.3 * rms(change) and rms(error) < 0.05
+
+
+@pytest.mark.parametrize(
+    'size, worst', [((1000, 703), LIMIT_PX), ((333, 1024), LIMIT_PX), ((70, 45), 0.3)]
+)
+def test_map_of_an_image_of_any_size(size, worst):
+    """Also of one that is so small that its change is steep."""
+    found = rigs.turning(rigs.pincushion('a', size), size_px=0.4)
+    maps = AngleMaps(found)
+    corrector = maps.at(0.6)
+    assert corrector.shape == size[::-1] and corrector.mask.mean() > 0.7
+    v, u = np.nonzero(corrector.mask)
+    observed = corrector.source[:, v, u].astype(float)
+    x, y, *_ = found.correct_arrays(*observed, None, maps.rounded(0.6))
+    assert np.hypot(x - u, y - v).max() < worst
+    assert np.array_equal(corrector.mask, corrector.status != INVALID)
+
+
+@pytest.mark.parametrize('size, size_px', [((5, 9), 0.4), ((40, 30), 100.0)])
+def test_change_as_large_as_the_image_leaves_it_empty(size, size_px):
+    corrector = AngleMaps(rigs.turning(rigs.pincushion('a', size), size_px=size_px)).at(0.6)
+    assert corrector.correct(np.full(size[::-1], 9, np.uint8)).shape == size[::-1]
+    assert corrector.mask.mean() < 0.5
+
+
+@pytest.mark.parametrize('steepness', [0.9, 1.8])
+def test_folds_are_left_empty_at_an_angle(steepness):
+    """Where the correction of the mean folds, and where only the change makes it fold."""
+    size = (96, 96)
+    places = np.meshgrid(*[np.linspace(0, 95, 25)] * 2)
+    uv = np.stack(places, axis=-1).reshape(-1, 2)
+    duv = np.zeros_like(uv)
+    duv[:, 0] = np.clip(steepness * (uv[:, 0] - 48), -18, 18)
+    model = create_model('local_linear', 6, uv, duv, 0.2, 0.0)
+    mean = replace(
+        rigs.pincushion('a', size), model=model, train_exposure=np.zeros(len(uv), dtype=np.int64)
+    )
+    corrector = AngleMaps(rigs.turning(mean, size_px=2.0)).at(0.6)
+    assert corrector.mask.any() and not corrector.mask.all()
+    assert np.nanmin(np.diff(corrector.source[0], axis=1)) > 0

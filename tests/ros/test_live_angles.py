@@ -21,6 +21,7 @@ import numpy as np
 import pytest
 import rigs
 from fluoro_calib_msgs.srv import Calibrate
+from rclpy.duration import Duration
 from rclpy.qos import QoSProfile
 from rclpy.serialization import serialize_message
 from ros_graph import BAGS, NAMES, value_of
@@ -46,6 +47,7 @@ from fluoro_calib_ros.jobs.sources import BagSelection, read_calibrated_source
 from fluoro_calib_ros.nodes.messages.fields import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.runtime.qos import images_qos
+from fluoro_calib_ros.nodes.runtime.stream_reader import FaultHandlers, StreamReader
 from fluoro_calib_ros.radiographs.markers import FirstMarkers
 from fluoro_calib_ros.simulation.bead_images import bead_image
 
@@ -294,6 +296,35 @@ def test_images_are_corrected_at_the_angle_of_their_stamp(graph, turning, exposu
     status = status_while_shown(39, lambda s: 'far from all calibrated' in s.message)
     assert 'the correction of the images is extrapolated' in status.message
     status_while_shown(20, lambda s: s.message == 'correcting')
+
+
+def test_states_are_taken_before_each_image_that_waits(graph):
+    """Else an image that waits among others would get the angle of the first of them."""
+    client = graph.client
+    heard = []
+    faults = FaultHandlers(heard.append, lambda *fault: heard.append(fault), heard.append)
+    reader = StreamReader(client, faults)
+    outputs = {}
+    for topic in ('slow', 'first'):
+        reader.subscribe(
+            JointState,
+            topic,
+            lambda message, _, topic=topic: heard.append((topic, message.name[0])),
+            QoSProfile(depth=10),
+        )
+        outputs[topic] = client.create_publisher(JointState, topic, QoSProfile(depth=10))
+        client.wait_until(outputs[topic].get_subscription_count, what=topic)
+    reader.take_first('first')
+    for number in range(3):
+        outputs['slow'].publish(JointState(name=[f'{number}']))
+        outputs['first'].publish(JointState(name=[f'{number}']))
+    for output in outputs.values():
+        assert output.wait_for_all_acked(Duration(seconds=30))
+    reader.start()
+    client.wait_until(lambda: len(heard) == 6, what='all messages')
+    reader.stop()
+    assert heard[:3] == [('first', str(number)) for number in range(3)]
+    assert heard[3:] == [('slow', str(number)) for number in range(3)]
 
 
 def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):

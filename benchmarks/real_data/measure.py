@@ -68,6 +68,9 @@ class Fold:
     nse : float
         Of an adjustment of the tested exposures with the calibration held: square sum of the
         residuals inside over their claimed variance, by degree of freedom, without the rejected.
+    nse_thirds : list of float
+        NSE of the third of these image points that is nearest to the middle of the image, of the
+        next, and of the third at the rim.
     nse_correlated : float
         The same over its expectation by the covariances of the calibration (see `claims`).
     rejected : float
@@ -96,6 +99,7 @@ class Fold:
     rms: dict[str, float] = field(default_factory=dict)
     rms_held: dict[str, float] = field(default_factory=dict)
     nse: float = float('nan')
+    nse_thirds: list[float] = field(default_factory=list)
     nse_correlated: float = float('nan')
     rejected: float = float('nan')
     seconds: float = float('nan')
@@ -259,8 +263,15 @@ def _test_claims(
     # What no camera explains and the adjustment keeps is in the claim, too.
     kept &= ~table.outlier
     claimed = outcome.calibrations[CAMERA].correct(table.uv[kept], exact=True).sigma
-    square = np.sum(table.residual[kept] ** 2 / claimed[:, None] ** 2)
-    fold.nse = float(square / np.sum(table.redundancy[kept]))
+    squares = np.sum(table.residual[kept] ** 2, axis=1) / claimed**2
+    redundancy = np.sum(table.redundancy[kept], axis=1)
+    fold.nse = float(np.sum(squares) / np.sum(redundancy))
+    middle = (np.asarray(data.image_size) - 1) / 2
+    order = np.argsort(np.linalg.norm(table.uv[kept] - middle, axis=1))
+    fold.nse_thirds = [
+        float(np.sum(squares[part]) / np.sum(redundancy[part]))
+        for part in np.array_split(order, 3)
+    ]
     run = outcome.result.runs[CAMERA]
     if fold.model == CollocationModel.kind:
         sigma = outcome.calibrations[CAMERA].correct(table.uv, exact=True).sigma

@@ -65,7 +65,8 @@ are not part of this project; `--download` fetches them.
   calibration claims let expect of it. It tells more where the correction is as uncertain as an
   image point, as with exom. Both are given for each half, and for the set as their geometric mean:
   a ratio of variances is symmetrical in its logarithm, and where exposures differ, one half has
-  too much where the other has too little.
+  too much where the other has too little. **thirds**: NSE of the third of the image points that is
+  nearest to the middle of the image, of the next, and of that at the rim.
   **rejected**: share of the image points that `fc.adjust` takes as gross errors, of those that
   some camera explains.
 - A dash stands for a calibration that failed: its residuals are not finite, or their median is
@@ -227,6 +228,7 @@ def _claims(results: Sequence[Result]) -> str:
             _cell(_mean(one, 'noise_px')),
             _halves(one, 'nse'),
             _cell(_geometric_mean(one, 'nse'), 2),
+            _thirds(one),
             _halves(one, 'nse_correlated'),
             _cell(_geometric_mean(one, 'nse_correlated'), 2),
             _cell(100 * _mean(one, 'rejected'), 1),
@@ -236,7 +238,7 @@ def _claims(results: Sequence[Result]) -> str:
         ]
         for one in results
     ]
-    nse = ['halves: NSE', 'NSE', 'halves: correlated', 'NSE correlated']
+    nse = ['halves: NSE', 'NSE', 'thirds: NSE', 'halves: correlated', 'NSE correlated']
     head = ['set', 'model', 'noise [px]', *nse, 'rejected [%]', 'false', 'verdict', 's']
     return _table(head, rows, 2)
 
@@ -244,6 +246,14 @@ def _claims(results: Sequence[Result]) -> str:
 def _halves(result: Result, figure: str) -> str:
     """A figure of both splits."""
     return ', '.join(_cell(fold.get(figure, float('nan')), 2) for fold in result['folds'])
+
+
+def _thirds(result: Result) -> str:
+    """NSE in the middle, about it and at the rim, geometric means of both splits."""
+    values = [fold['nse_thirds'] for fold in result['folds'] if fold.get('nse_thirds')]
+    if not values:
+        return '-'
+    return ', '.join(_cell(value, 2) for value in np.exp(np.mean(np.log(values), axis=0)))
 
 
 def _geometric_mean(result: Result, figure: str) -> float:

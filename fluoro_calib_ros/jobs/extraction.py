@@ -50,6 +50,7 @@ from .scheduling import Workers, open_workers
 from .sources import Recording, Survey
 
 FOLLOWED = 12  # images of a video after which the pose is searched for anew
+MAX_MIRRORED = 2  # images that are tried mirrored, where none gives observations
 
 Progress = Callable[[int, int], None]
 
@@ -265,7 +266,7 @@ def run_extraction(
         results = _first_pass(request, sources, workers, progress)
         _second_pass(request, sources, workers, results)
     if not any(result.frame is not None for result in results):
-        raise DataError(_all_refused(results))
+        raise DataError(_mirrored(request, sources, results) or _all_refused(results))
     results.sort(key=lambda result: result.exposure)
     angles = [result.frame.angle for result in results if result.frame is not None]
     notes = request.angles.note(request.fluoroscope, angles)
@@ -418,6 +419,30 @@ def _first_lens(request: ExtractionRequest, image: np.ndarray | DataError) -> Le
     if isinstance(image, DataError):
         return None
     return assumed_lens((image.shape[1], image.shape[0]), request.principal_distance_px)
+
+
+def _mirrored(
+    request: ExtractionRequest, sources: ImageSources, results: Sequence[ImageResult]
+) -> str:
+    """Return a sentence where the phantom is found in a mirrored image, '' where it is not.
+
+    Some images are tried, none of which gives observations as it is.
+    """
+    found = [result.exposure for result in results if may_be_found(result.reason)]
+    tried = set(found[:MAX_MIRRORED])
+    for source in sources.images():
+        if source.exposure not in tried or isinstance(source.image, DataError):
+            continue
+        flipped = replace(source, image=np.ascontiguousarray(source.image[:, ::-1]))
+        task = _task(request, (flipped,), _first_lens(request, flipped.image))
+        (result,) = _extract(request.phantom, replace(task, overlay=False))
+        if result.frame is not None:
+            many = f'none of {len(results)} images gives observations, ' * (len(results) > 1)
+            return (
+                f'{many}{source.place}: the image is mirrored, the phantom is found in it when '
+                'left and right are interchanged: flip the images before they are extracted'
+            )
+    return ''
 
 
 def _all_refused(results: Sequence[ImageResult]) -> str:

@@ -91,6 +91,30 @@ def extract(folder: Path, source: str, *more: str) -> None:
     )
 
 
+@pytest.mark.parametrize('turn', [np.fliplr, np.flipud, np.transpose])
+def test_mirrored_images_are_named(folder, turn, capsys):
+    for number in (1, 2):
+        path = str(folder / 'a' / f'image_{number:04d}.png')
+        cv2.imwrite(path, np.ascontiguousarray(turn(picture(number)[0])))
+    (folder / 'a' / 'image_0003.png').unlink()
+    with pytest.raises(SystemExit):
+        extract(folder, 'a')
+    said = capsys.readouterr().err
+    assert 'none of 2 images gives observations' in said
+    assert 'image_0001.png: the image is mirrored' in said
+    assert not (folder / 'out.csv').exists()
+
+
+def test_images_of_another_phantom_are_not_called_mirrored(folder, capsys):
+    other = np.random.default_rng(6).uniform(-60, 60, (COUNT, 3))
+    phantom = Phantom(np.arange(COUNT) + 1, other, np.full(COUNT, 0.1))
+    write_phantom(folder / 'phantom.csv', phantom)
+    with pytest.raises(SystemExit):
+        extract(folder, 'a')
+    said = capsys.readouterr().err
+    assert 'gives observations' in said and 'mirrored' not in said
+
+
 def test_a_folder_becomes_a_table_that_calibrate_reads(folder, capsys):
     (folder / 'a' / 'image_0002.png').write_bytes(b'\x89PNG\r\n\x1a\nnothing')
     cv2.imwrite(str(folder / 'a' / 'image_0007.png'), picture(1)[0][:, :300])

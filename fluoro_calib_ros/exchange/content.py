@@ -211,6 +211,9 @@ class Content:
         The names in the file.
     notes : tuple of str
         What a user has to know about the conversion.
+    corrected_by : mapping of str to str
+        By fluoroscope the id of the calibration that corrected the observations; empty: they are
+        as observed.
     """
 
     observations: Mapping[str, Sequence[Frame]] | None = None
@@ -223,6 +226,7 @@ class Content:
     grids: Mapping[str, np.ndarray] = field(default_factory=dict)
     names: Names = field(default_factory=Names)
     notes: tuple[str, ...] = ()
+    corrected_by: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def parts(self) -> list[str]:

@@ -29,7 +29,11 @@ from ..exposures.names import Names, without_trivial
 from ..files.atomic import atomic_file
 from ..files.csv_table import format_float, read_blocks, write_rows
 from ..files.observations import COLUMNS as OBSERVATIONS
-from ..files.observations import read_named_observations, write_observations_csv
+from ..files.observations import (
+    corrections_of,
+    read_named_observations,
+    write_observations_csv,
+)
 from ..files.phantom import COLUMNS as PHANTOM
 from ..files.phantom import read_named_phantom, write_phantom
 from ..files.reconstructed_points import COLUMNS as POINTS
@@ -51,13 +55,18 @@ def _has_columns(sample: Sample, columns: tuple[str, ...]) -> bool:
 
 def _read_observations(path: Path, settings: FileSettings) -> Content:
     frames, names, stray = read_named_observations(path, settings.image_size, settings.names)
-    return Content(observations=frames, names=names, notes=(stray,) if stray else ())
+    return Content(
+        observations=frames,
+        names=names,
+        notes=(stray,) if stray else (),
+        corrected_by=corrections_of(path),
+    )
 
 
 def _write_observations(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write the ids; names would not be read by programs that know this layout."""
     assert content.observations is not None
-    write_observations_csv(path, content.observations, content.names)
+    write_observations_csv(path, content.observations, content.names, content.corrected_by)
     return Written((str(path),))
 
 

@@ -30,7 +30,7 @@ from ..exposures.names import Names
 from .access import PathLike
 from .atomic import atomic_file
 from .csv_table import Block, format_float, read_blocks, write_rows
-from .observations import ANGLE
+from .observations import ANGLE, CORRECTED_BY
 
 STATUS = tuple(status.name for status in CorrectionStatus)
 ADDED_COLUMNS = ('u_corrected', 'v_corrected', 'sigma', 'status')
@@ -132,6 +132,11 @@ def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> Point
         else None,
         np.concatenate([_angle(block) for block in blocks]) if ANGLE in header else None,
     )
+    if CORRECTED_BY in header:
+        raise DataError(
+            f'{path}: the image points are corrected already, as its column {CORRECTED_BY} says: '
+            'give the observed ones'
+        )
     for name in points.added_columns:
         if name in header:
             raise DataError(

@@ -40,6 +40,7 @@ from .csv_table import Block, format_float, read_blocks, write_rows
 from .named_column import NamedColumn
 
 ANGLE = 'angle_deg'
+CORRECTED_BY = 'corrected_by'  # id of the calibration, of image points that are corrected already
 COLUMNS = ('fluoroscope', 'exposure', 'target_id', 'u', 'v')
 
 PathLike = str | os.PathLike[str]
@@ -193,11 +194,13 @@ def write_observations_csv(
     path: PathLike,
     frames: Mapping[str, Sequence[Frame]] | Iterable[Frame],
     names: Names | None = None,
+    corrected_by: Mapping[str, str] | None = None,
 ) -> None:
     """Write frames, by fluoroscope or as a sequence, to a CSV file.
 
     The file has a column sigma if any frame has sigma, and angle_deg if any has an angle. Names
-    are written instead of ids in a column whose ids all have one. Raises DataError where the file
+    are written instead of ids in a column whose ids all have one. corrected_by are the ids of the
+    calibrations that corrected the image points, a further column. Raises DataError where the file
     cannot be written.
     """
     if isinstance(frames, Mapping):
@@ -207,10 +210,26 @@ def write_observations_csv(
     with_angle = any(frame.angle is not None for frame in frames)
     labels = _labels(frames, names or Names())
     with atomic_file(path, 'w') as file:
-        write_rows(file, [COLUMNS + ('sigma',) * with_sigma + (ANGLE,) * with_angle])
+        header = COLUMNS + ('sigma',) * with_sigma + (ANGLE,) * with_angle
+        write_rows(file, [header + (CORRECTED_BY,) * bool(corrected_by)])
         for frame in frames:
             check_safe_name(frame.fluoroscope, path)
-            write_rows(file, _csv_rows(frame, with_sigma, with_angle, labels))
+            last = [corrected_by.get(frame.fluoroscope, '')] if corrected_by else []
+            rows = _csv_rows(frame, with_sigma, with_angle, labels)
+            write_rows(file, ([*row, *last] for row in rows))
+
+
+def corrections_of(path: PathLike) -> dict[str, str]:
+    """Return by fluoroscope the ids of calibrations that corrected the points of a CSV file.
+
+    {} for points as they were observed. Raises DataError.
+    """
+    found: dict[str, str] = {}
+    for block in read_blocks(path, COLUMNS):
+        if CORRECTED_BY not in block:
+            return {}
+        found |= dict(zip(block.strings('fluoroscope'), block.strings(CORRECTED_BY)))
+    return {name: identity for name, identity in found.items() if identity}
 
 
 @dataclass(frozen=True)

@@ -56,7 +56,7 @@ from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .dataset import write_bag
 from .result_folder import RESULT, belongs_to
-from .sources import is_bag, select_calibrations
+from .sources import is_bag, require_observed, select_calibrations
 
 BAG = 'bag'
 PHANTOM_BODY = 'phantom'  # name of the phantom as a rigid body
@@ -141,7 +141,13 @@ def convert(request: ConversionRequest) -> Written:
     content = _selected(content, request)
     if request.corrected:
         observations, notes = _corrected(content, calibrations, request)
-        content = replace(content, observations=observations, notes=(*content.notes, *notes))
+        require_observed(request.source, content.corrected_by)
+        content = replace(
+            content,
+            observations=observations,
+            notes=(*content.notes, *notes),
+            corrected_by={name: calibrations[name].calibration_id for name in observations},
+        )
     written = _write(request, content, is_own)
     notes = _lost_angles(request, content.observations or {})
     return Written(written.paths, (*content.notes, *written.notes, *notes))

@@ -40,6 +40,7 @@ from ..files.calibration import load_calibrations
 from ..files.image_points import PointsFile, points_of_frames, read_points
 from ..files.known_orientation import holds_known_orientations, read_known_orientations
 from ..files.names import read_names
+from ..files.observations import CORRECTED_BY
 from ..files.result_check import disagreements
 from ..photogrammetry.known_orientation import KnownOrientation
 
@@ -259,6 +260,7 @@ def read_source(
         selection.check_file(path)
         settings = replace(settings, image_size=image_size, fluoroscopes=tuple(fluoroscopes or ()))
         content = read_content(path, settings, 'observations', 'observations')
+        require_observed(path, content.corrected_by)
         found = {name: list(frames) for name, frames in (content.observations or {}).items()}
         if not found:
             raise DataError(f'{path}: the file has no image points')
@@ -319,6 +321,16 @@ def read_calibrations(
     if not found:
         raise DataError(f'{directory}: there is no calibration in this folder')
     return select_calibrations(found, found if fluoroscopes is None else fluoroscopes, directory)
+
+
+def require_observed(path: object, corrected_by: Mapping[str, str]) -> None:
+    """Raise DataError for image points that a calibration has corrected already."""
+    for name, identity in corrected_by.items():
+        raise DataError(
+            f'{path}: the image points of fluoroscope {name} are corrected already, by the '
+            f'calibration {identity}: give the observed ones, or remove the column '
+            f'{CORRECTED_BY} where this is not so'
+        )
 
 
 def read_calibrated_source(

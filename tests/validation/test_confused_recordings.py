@@ -416,6 +416,35 @@ def test_orient_and_adjust_refuse_points_that_are_corrected_already():
         adjust(only_b, phantom, held)
 
 
+def test_a_file_of_corrected_points_says_so(tmp_path, capsys):
+    held, observed = distorted()
+    for calibration in held.values():
+        save_calibration(tmp_path / 'result', calibration)
+    save_orientation(tmp_path / 'result', true_orientation(rig().fluoroscopes, held))
+    write_phantom(tmp_path / 'phantom.csv', rig().phantom)
+    write_observations_csv(tmp_path / 'seen.csv', observed)
+    with_held = ('--calibration', tmp_path / 'result')
+    corrected = tmp_path / 'corrected.csv'
+    to_file = ('--to', 'observations', '--out', corrected)
+    assert run('convert', tmp_path / 'seen.csv', *with_held, '--corrected', *to_file) == 0
+    phantom = ('--phantom', tmp_path / 'phantom.csv')
+    out = ('--out', tmp_path / 'out.csv')
+    size = ('--image-size', '1024x1024')
+    for command in (
+        ('calibrate', corrected, *size, *phantom, '--out', tmp_path / 'again'),
+        ('orient', corrected, *with_held, *phantom),
+        ('adjust', corrected, *with_held, *phantom, '--out', tmp_path / 'adjusted'),
+        ('reconstruct', corrected, *with_held, *out),
+        ('correct', corrected, *with_held, *out),
+        ('convert', corrected, *with_held, '--corrected', '--to', 'xmalab2d', *out),
+    ):
+        capsys.readouterr()
+        assert run(*command) == 1
+        assert 'are corrected already' in capsys.readouterr().err
+    # As they are, they can be converted on.
+    assert run('convert', corrected, *with_held, '--to', 'xmalab2d', *out) == 0
+
+
 def wrong_distance(factor):
     """Calibrations with another principal distance."""
     return {

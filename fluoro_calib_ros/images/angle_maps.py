@@ -17,8 +17,8 @@
 While a C-arm turns, every image needs another map, and the iteration of a map for each pixel
 takes far longer than an image may. It is not repeated: with the mean correction d and the change e
 of an angle, the source S of pixel x is S = x + d(S) + e(S), which is the source of pixel x + e(S)
-by d alone. So the map of an angle is that of the mean, looked up at places shifted by e(S); e is
-smooth, and it is iterated at every eighth pixel only.
+by d alone. So the map of an angle is that of the mean, shifted by what it has at x + e(S) and not
+at x. This is smooth: it is computed at every eighth pixel, and interpolated between.
 
 Angles are rounded to steps within which no pixel moves by more than LIMIT_PX, so that a map serves
 all images of an arm that stands still, and depends on the angle only, not on the images before.

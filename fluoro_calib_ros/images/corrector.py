@@ -45,7 +45,7 @@ FULL_STEPS = 12
 HALF_STEPS = 60
 # Rows that are iterated at once: they fit into the cache, and other threads do not wait for long.
 ROWS = 16
-STRIPE = 64  # rows whose map is made at once, for the cache
+STRIPE = 256  # rows whose map is made at once; threads wait for each other after each step
 NOWHERE = -10_000.0  # source of a pixel without one: far off any image
 SHARPNESS = -0.75  # of OpenCV's cubic convolution
 

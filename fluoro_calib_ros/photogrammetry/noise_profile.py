@@ -28,8 +28,6 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from sklearn.linear_model import GammaRegressor
-from sklearn.metrics import mean_gamma_deviance
 
 MIN_POINTS = 100
 # Gain of deviance over the dispersion from which a profile is taken. Chance exceeds it in one of
@@ -39,6 +37,10 @@ MIN_DISPERSION = 0.1
 MIN_SQUARE = 1e-6  # of the mean: the logarithm of a zero would count for ever
 MAX_FACTOR = 10.0  # of the rim over the middle, or the inverse
 REACH_QUANTILE = 0.99
+# Steps of the regression: at most so many, of so much, and the one at which it ends.
+MAX_STEPS = 100
+MAX_STEP = 1.0
+MIN_STEP = 1e-6
 
 
 @dataclass(frozen=True)
@@ -48,11 +50,11 @@ class NoiseProfile:
     Attributes
     ----------
     middle, rim : float
-        Factors in the middle of the image, and half its longer side away from it. The mean of
-        their squares over the image points is one.
+        Factors in the middle of the image, and at the rim and beyond. The mean of their squares
+        over the image points is one.
     reach : float
-        Distance from the middle, in halves of the longer side, from which the factor stays as it
-        is: no image points are known beyond.
+        Distance of the rim from the middle, in halves of the longer side: no image points are
+        known beyond.
     """
 
     middle: float
@@ -62,7 +64,7 @@ class NoiseProfile:
     def factors(self, u: np.ndarray, v: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:
         """Return the factors (n,) at pixels u, v (n,)."""
         square = np.minimum(_square_distance(u, v, image_size), self.reach**2)
-        square *= math.log(self.rim / self.middle)
+        square *= math.log(self.rim / self.middle) / self.reach**2
         return self.middle * np.exp(square)
 
     def packed(self) -> np.ndarray:
@@ -85,7 +87,7 @@ def unpacked_profile(values: np.ndarray) -> NoiseProfile | None:
     if len(values) != 3:
         raise ValueError(f'its noise profile has {len(values)} values, 3 are expected')
     middle, rim, reach = np.asarray(values, dtype=float).tolist()
-    valid = min(middle, rim) > 0 and max(middle, rim) < np.inf and 0 <= reach < np.inf
+    valid = min(middle, rim, reach) > 0 and max(middle, rim, reach) < np.inf
     if not valid or not 1 / MAX_FACTOR**2 < middle / rim < MAX_FACTOR**2:
         raise ValueError('its noise profile has factors that no image has')
     return NoiseProfile(middle, rim, reach)
@@ -114,18 +116,36 @@ def fitted_profile(
         return None
     square = _square_distance(uv[:, 0], uv[:, 1], image_size)
     y = np.maximum(squares / mean, MIN_SQUARE)
-    model = GammaRegressor(alpha=0, solver='newton-cholesky').fit(square[:, None], y)
-    expected = model.predict(square[:, None])
+    y /= np.mean(y)
+    slope, expected = _gamma_regression(square, y)
     # Two coordinates are chi squared with two degrees of freedom: a dispersion of one.
     dispersion = float(np.mean((y / expected - 1) ** 2))
-    gain = mean_gamma_deviance(y, np.ones(len(y))) - mean_gamma_deviance(y, expected)
-    if len(y) * gain < MIN_GAIN * max(dispersion, MIN_DISPERSION):
+    gain = -2 * float(np.sum(np.log(expected)))  # of deviance; the mean of y / expected is one
+    if gain < MIN_GAIN * max(dispersion, MIN_DISPERSION):
         return None
-    limit = 2 * np.log(MAX_FACTOR)
-    slope = float(np.clip(model.coef_[0], -limit, limit))
     reach = float(np.sqrt(np.quantile(square, REACH_QUANTILE)))
-    middle = float(np.mean(np.exp(slope * np.minimum(square, reach**2))) ** -0.5)
-    return NoiseProfile(middle, middle * float(np.exp(slope / 2)), reach)
+    limit = 2 * np.log(MAX_FACTOR)
+    growth = float(np.clip(slope * reach**2, -limit, limit))
+    middle = float(np.mean(np.exp(growth * np.minimum(square / reach**2, 1))) ** -0.5)
+    return NoiseProfile(middle, middle * float(np.exp(growth / 2)), reach)
+
+
+def _gamma_regression(x: np.ndarray, y: np.ndarray) -> tuple[float, np.ndarray]:
+    """Slope of the logarithm of the expectation of y (n,) over x (n,), and the expectations (n,).
+
+    Fisher scoring: with a logarithmic link, all weights are one (McCullagh and Nelder, 8.4).
+    """
+    x = x - np.mean(x)
+    square = max(float(x @ x), MIN_SQUARE)
+    slope = 0.0
+    for _ in range(MAX_STEPS):
+        expected = np.exp(slope * x)
+        expected *= np.mean(y / expected)
+        step = float(x @ (y / expected)) / square
+        slope += float(np.clip(step, -MAX_STEP, MAX_STEP))
+        if abs(step) < MIN_STEP:
+            break
+    return slope, expected
 
 
 def _square_distance(u: np.ndarray, v: np.ndarray, image_size: tuple[int, int]) -> np.ndarray:

@@ -20,6 +20,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..calibration.options import AUTO
 from .check import Check, Finding, judge, more_exposures
 from .evidence import Evidence, Subject
 
@@ -38,6 +39,12 @@ def _check(evidence: Evidence, name: str) -> Check:
     common = evidence.trends[name]
     # Residuals are smaller than the noise: orientations, object points and correction follow it.
     noise = evidence.calibrations[name].image_sd
+    advice = f'{more_exposures(len(evidence.frames[name]))}, or a phantom with more beads'
+    if common.trend.size > common.trend.limit:
+        # What a model cannot follow is in its residuals, and in its claim.
+        noise = float(np.sqrt(max(noise**2 - common.trend.size**2, 0.0)))
+        if evidence.request.options.model_name != AUTO:
+            advice = f'choose another model (--model auto), or {advice}'
     ratio = common.claimed_sd / noise if noise > 0 else np.inf
     growth = 100 * (np.sqrt(1 + ratio**2) - 1)
     return judge(
@@ -50,7 +57,7 @@ def _check(evidence: Evidence, name: str) -> Check:
             f'fluoroscope {name}: the correction has a standard deviation of '
             f'{common.claimed_sd:.2f} px, at an image noise of {noise:.2f} px: it makes the '
             f'errors of corrected points {growth:.0f} % larger',
-            f'{more_exposures(len(evidence.frames[name]))}, or a phantom with more beads',
+            advice,
         ),
     )
 

@@ -726,3 +726,15 @@ def test_imprecise_correction_does_not_pass():
     assert verdict.verdict == 'fail' and not check.passed and check.value > check.limit
     assert 'it makes the errors of corrected points' in check.sentence
     assert 'take 7 more exposures' in check.sentence
+
+
+def test_model_that_does_not_follow_the_distortion_is_named():
+    """Its misfit is no noise of the image, beside which a correction would seem precise."""
+    job = calibrated('a', model='parametric')
+    request = CalibrationRequest(
+        {'a': exposures()['a']}, rig().phantom, CalibrationOptions(model='parametric')
+    )
+    verdict = validate(request, job.calibrations)
+    (check,) = [c for c in verdict.checks if c.name == 'precision']
+    assert not check.passed
+    assert 'choose another model (--model auto)' in check.sentence

@@ -42,7 +42,8 @@ def _check(evidence: Evidence, name: str) -> Check:
     advice = f'{more_exposures(len(evidence.frames[name]))}, or a phantom with more beads'
     if common.trend.size > common.trend.limit:
         # What a model cannot follow is in its residuals, and in its claim.
-        noise = float(np.sqrt(max(noise**2 - common.trend.size**2, 0.0)))
+        misfit = common.trend.size**2 / _redundancy(evidence, name)
+        noise = float(np.sqrt(max(noise**2 - misfit, 0.0)))
         if evidence.request.options.model_name != AUTO:
             advice = f'choose another model (--model auto), or {advice}'
     ratio = common.claimed_sd / noise if noise > 0 else np.inf
@@ -60,6 +61,14 @@ def _check(evidence: Evidence, name: str) -> Check:
             advice,
         ),
     )
+
+
+def _redundancy(evidence: Evidence, name: str) -> float:
+    """Mean redundancy number of the inliers, by which residuals are enlarged to noise."""
+    table = evidence.result.residuals
+    if table is None:
+        return 1.0
+    return float(np.mean(table.redundancy[(table.fluoroscope == name) & ~table.outlier]))
 
 
 PRECISION = Subject(check_precision)

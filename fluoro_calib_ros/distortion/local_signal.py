@@ -252,10 +252,15 @@ class _ShownBumps:
         """
         level = np.diagonal(self.products, axis1=1, axis2=2).T
         excess = np.sum(self.pulls**2 / np.maximum(level, MIN_LEVEL) - 1, axis=1)
-        bands = [rows[~taken[rows]] for rows in _bands(self.image_size)]
-        bands = [rows for rows in bands if len(rows) >= MIN_BAND]
-        score = [np.sum(excess[rows]) / np.sqrt(len(rows)) for rows in bands]
-        likely = [self._place(bands[i]) for i in np.argsort(score)[-LIKELY_BANDS:]]
+        bands = _bands(self.image_size)
+        number = bands @ ~taken
+        score = (bands @ np.where(taken, 0.0, excess)) / np.sqrt(np.maximum(number, 1))
+        score[number < MIN_BAND] = -np.inf
+        best = np.argsort(score)[-LIKELY_BANDS:]
+        likely = [
+            self._place(np.flatnonzero((bands[i] > 0) & ~taken))
+            for i in best[score[best] > -np.inf]
+        ]
         return max(likely, key=lambda band: band.gain, default=None)
 
     def _place(self, rows: np.ndarray) -> _Place:
@@ -281,16 +286,16 @@ def _windows(image_size: tuple[int, int], nodes: np.ndarray) -> list[np.ndarray]
 
 
 @lru_cache(maxsize=4)
-def _bands(image_size: tuple[int, int]) -> tuple[np.ndarray, ...]:
-    """Rows of all nodes within a distance of each of many lines across the image."""
+def _bands(image_size: tuple[int, int]) -> np.ndarray:
+    """Ones (b, n) for the bumps within a distance of each of many lines across the image."""
     nodes = _all_nodes(image_size)
     half = BAND * max(image_size) / NODES
     out = []
     for angle in np.arange(DIRECTIONS) * np.pi / DIRECTIONS:
         across = nodes @ [np.cos(angle), np.sin(angle)]
         lines = np.arange(across.min(), across.max() + half, half)
-        out += [np.flatnonzero(np.abs(across - line) <= half) for line in lines]
-    return tuple(out)
+        out.append(np.abs(across - lines[:, None]) <= half)
+    return np.concatenate(out).astype(float)
 
 
 def _largest_gain(pulls: np.ndarray, products: list[np.ndarray]) -> tuple[float, float]:

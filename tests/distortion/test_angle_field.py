@@ -147,6 +147,7 @@ def test_calibration_with_angles_fits_exposures_at_other_angles():
     assert without > 1.2 * at_rest
 
 
+@pytest.mark.long
 def test_change_is_found_and_stated():
     calibration = turning().calibrations['a']
     found = calibration.angle_field

@@ -170,6 +170,7 @@ def test_map_of_an_image_of_any_size(size, worst):
     assert np.array_equal(corrector.mask, corrector.status != INVALID)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('size, size_px', [((5, 9), 0.4), ((40, 30), 100.0)])
 def test_change_as_large_as_the_image_leaves_it_empty(size, size_px):
     corrector = AngleMaps(rigs.turning(rigs.pincushion('a', size), size_px=size_px)).at(0.6)

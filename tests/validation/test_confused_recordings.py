@@ -470,6 +470,7 @@ def test_adjusted_exposures_that_contradict_the_calibrations_are_doubtful():
     assert 'times the noise with which it was determined' in doubts[0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ('change', 'sentence'),
     [

@@ -16,7 +16,7 @@
 
 A few of them are left out and reported. Many are a fault of the whole input, such as a wrong image
 size or another phantom, and are left to `validate_frame`, which refuses the frame. Many targets at
-the same image point are a placeholder of some program for targets that are not seen, such as
+the same image point are a fill value of some program for targets that are not seen, such as
 (0, 0), and always left out.
 """
 
@@ -30,7 +30,7 @@ import numpy as np
 from .frame import Frame, points_on_image
 from .phantom import Phantom
 
-MIN_TOGETHER = 4  # targets at the same image point that are placeholders
+MIN_TOGETHER = 4  # targets at the same image point that are fill values
 MIN_SHARE_TOGETHER = 0.02  # the same, of the targets of the frame; the larger of both holds
 MAX_LISTED = 10  # targets in a sentence
 MAX_SHARE = 0.05  # of the image points of a frame that are left out; one always is
@@ -75,7 +75,7 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
             (unknown & single & ~off, 'not on the phantom'),
             (
                 together,
-                'at the image point of others, a placeholder for targets that are not seen',
+                'at the image point of others, a fill value for targets that are not seen',
             ),
         )
         if chosen.any()

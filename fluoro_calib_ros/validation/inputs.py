@@ -155,7 +155,7 @@ def find_wrong_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) 
         x, y, z = places[most]
         out.append(
             f'phantom: targets {_first(ids)} are all at ({x:g}, {y:g}, {z:g}) mm: a repeated row, '
-            'or a placeholder for targets that are not surveyed'
+            'or a fill value for targets that are not surveyed'
         )
     distance = np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)
     extent = float(np.quantile(distance, EXTENT_SHARE))
@@ -164,7 +164,7 @@ def find_wrong_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) 
         out.append(
             f'phantom: target {_first(seen_id[far])} is {distance[far].max():.0f} mm '
             f'from the middle of the others, most of which are within {extent:.0f} mm: a wrong '
-            'coordinate, another unit, or a placeholder for targets that are not surveyed'
+            'coordinate, another unit, or a fill value for targets that are not surveyed'
         )
     return out
 

@@ -205,7 +205,7 @@ WRONG_PHANTOM = {
     ),
     'a target in another unit': (
         lambda: placed(1, 100 * PHANTOM.xyz_mm[0]),
-        'a wrong coordinate, another unit, or a placeholder',
+        'a wrong coordinate, another unit, or a fill value',
     ),
 }
 
@@ -280,7 +280,7 @@ def test_one_fluoroscope_with_two_ways_to_write_its_name_is_refused():
         run_calibration(CalibrationRequest(seen, PHANTOM, FAST))
 
 
-def test_placeholders_of_targets_that_are_not_seen_are_left_out():
+def test_fill_values_of_targets_that_are_not_seen_are_left_out():
     seen = frames()
     unseen = np.setdiff1d(PHANTOM.target_id, seen[0].target_id)
     seen[0] = replace(
@@ -291,7 +291,7 @@ def test_placeholders_of_targets_that_are_not_seen_are_left_out():
     outcome = run_calibration(CalibrationRequest({'a': seen}, PHANTOM, FAST))
     (sentence,) = outcome.result.left_out
     assert sentence.startswith(f'fluoroscope a, exposure 1: {len(unseen)} image points, target ')
-    assert sentence.endswith('a placeholder for targets that are not seen')
+    assert sentence.endswith('a fill value for targets that are not seen')
     plain = run_calibration(CalibrationRequest({'a': frames()}, PHANTOM, FAST))
     interior = outcome.result.fluoroscopes['a'].interior
     assert np.array_equal(interior, plain.result.fluoroscopes['a'].interior)

@@ -1,18 +1,7 @@
 #!/usr/bin/env python3
 
-# Copyright 2026 fluoro_calib_ros maintainers
-#
-# Licensed under the Apache License, Version 2.0 (the "License");
-# you may not use this file except in compliance with the License.
-# You may obtain a copy of the License at
-#
-#     http://www.apache.org/licenses/LICENSE-2.0
-#
-# Unless required by applicable law or agreed to in writing, software
-# distributed under the License is distributed on an "AS IS" BASIS,
-# WITHOUT WARRANTIES OR CONDITIONS OF ANY KIND, either express or implied.
-# See the License for the specific language governing permissions and
-# limitations under the License.
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
 
 """Make or refresh the project's .venv: packages, ROS 2, messages, this package. Called by
 tools/setup.sh.
@@ -290,12 +279,12 @@ def make_venv() -> None:
 
 
 def locked_installers(lock: str) -> str:
-    """Return the part of a lock file that pins pip, setuptools and wheel, with their hashes."""
+    """Return the part of a lock file that pins what builds and installs, with its hashes."""
     requirements = re.findall(r'^\S+==.*(?:\n    .*)*', lock, re.MULTILINE)
     return '\n'.join(
         requirement
         for requirement in requirements
-        if requirement.split('==')[0] in ('pip', 'setuptools', 'wheel')
+        if requirement.split('==')[0] in ('pip', 'poetry-core', 'setuptools', 'wheel')
     )
 
 

@@ -22,14 +22,14 @@ help:
 	@echo 'make lock         resolve requirements.in into requirements.lock, with hashes'
 	@echo 'make audit        compare requirements.lock with known vulnerabilities (needs pypi.org or osv.dev)'
 	@echo 'make setup        create or update .venv: packages, ROS 2 and messages; demo, test, ... run it first'
-	@echo 'make bench        run the benchmarks and write docs/performance.md'
+	@echo 'make bench        run the benchmarks and write docs/how_good/speed.md'
 	@echo 'make online       benchmark the nodes at lab rates against relays, points in space and images (10 min)'
 	@echo 'make endurance    stream one hour of data faster than real time: frame counts and memory (15 min)'
-	@echo 'make validation   repeat and extend the experiment of the paper: docs/accuracy.md (10 min)'
-	@echo 'make precision    compare errors of 200 simulations with their standard deviations: docs/precision.md (3 min)'
-	@echo 'make convergence  calibrate 200 random rigs with poor start values: docs/convergence.md (5 min)'
-	@echo 'make pathologies  calibrate rigs unlike the virtual rig: docs/pathologies.md (30 min)'
-	@echo 'make real-data    calibrate public data of real cameras: docs/real_data.md (downloads 4 MB, 30 min)'
+	@echo 'make validation   repeat and extend the experiment of the paper: docs/how_good/accuracy.md (10 min)'
+	@echo 'make precision    compare errors of 200 simulations with their standard deviations: docs/how_good.md (3 min)'
+	@echo 'make convergence  calibrate 200 random rigs with poor start values: docs/how_good.md (5 min)'
+	@echo 'make pathologies  calibrate rigs unlike the virtual rig: docs/how_good/pathologies.md (30 min)'
+	@echo 'make real-data    calibrate public data of real cameras: docs/how_good/real_data.md (downloads 4 MB, 30 min)'
 	@echo 'make bags         regenerate the bags in bags/'
 	@echo 'make bag-readers  read bags of all kinds with mcap, rosbags and the npm packages of Foxglove (needs npm)'
 	@echo 'make faults       kill, interrupt and cut off programs, damage bags, join hosts: docs/reliability.md (2 h)'
@@ -53,7 +53,7 @@ oldest:
 	@.oldest/bin/python -m pytest tests -n $(WORKERS) --dist loadfile \
 	    --ignore tests/ros --ignore tests/nodes --ignore tests/test_lint.py \
 	    --ignore tests/test_packaging.py \
-	    --deselect tests/exchange/test_points.py::test_trc_is_read_by_opensim -m "not long and not ros" $(ARGS)
+	    --deselect tests/io/test_points.py::test_trc_is_read_by_opensim -m "not long and not ros" $(ARGS)
 
 lint: setup
 	@.venv/bin/ruff check .

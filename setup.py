@@ -22,7 +22,7 @@ setup(
     version='0.1.0',
     packages=find_packages(include=[package_name, package_name + '.*']),
     package_data={
-        package_name + '.bags': ['msg/*.msg'],
+        package_name + '.io.bags': ['msg/*.msg'],
         package_name + '.report': ['templates/*.html'],
     },
     data_files=[

@@ -23,6 +23,6 @@ for name, calibration in outcome.calibrations.items():
     print(f'{name}: xp {xp:.2f}, yp {yp:.2f}, c {c:.1f} px; RMSE {rmse[0]:.3f}, {rmse[1]:.3f} px')
 if outcome.validation is not None:
     print(f'verdict: {outcome.validation.verdict}')
-    for sentence in outcome.validation.findings:
-        print(f'  {sentence}')
+    for finding in outcome.validation.findings:
+        print(f'  {finding}')
 print(f'saved to {out}')

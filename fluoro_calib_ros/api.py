@@ -14,22 +14,23 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .calibration.calibrate import CalibrationResult
-from .calibration.options import CalibrationOptions
-from .calibration.request import CalibrationRequest
-from .calibration.result import CorrectedPoints, FluoroscopeCalibration
+from .checks.check import Validation
+from .checks.verdict import validate
+from .correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCalibration
 from .errors import DataError
-from .exchange.content import FileSettings
+from .estimation.options import CalibrationOptions, CalibrationRequest
+from .estimation.result import CalibrationResult
 from .exposures.frame import Frame
 from .exposures.moving_points import MovingPoints
 from .exposures.names import Names
 from .exposures.phantom import Phantom
-from .files.calibration_request import read_request
-from .files.phantom import read_moving_points, read_phantom
-from .files.reconstructed_points import write_reconstruction
-from .files.rig_orientation import load_orientation, save_orientation
-from .jobs.adjustment import adjust
-from .jobs.calibration import CalibrationOutcome, run_calibration
+from .findings import Finding, Kind, Severity
+from .io.calibration_request import read_request
+from .io.formats.content import FileSettings
+from .io.phantom import read_moving_points, read_phantom
+from .io.reconstructed_points import write_reconstruction
+from .io.rig_orientation import load_orientation, save_orientation
+from .jobs.calibration import CalibrationOutcome, adjust, run_calibration
 from .jobs.conversion import ConversionRequest, convert
 from .jobs.extraction import ExtractionOutcome, ExtractionRequest
 from .jobs.extraction import run_extraction as extract
@@ -47,8 +48,6 @@ from .jobs.sources import (
 )
 from .photogrammetry.known_orientation import KnownOrientation
 from .photogrammetry.rig_orientation import RigOrientation
-from .validation.check import Validation
-from .validation.verdict import validate
 
 __all__ = [
     'CalibrationOptions',
@@ -61,8 +60,10 @@ __all__ = [
     'ExtractionOutcome',
     'ExtractionRequest',
     'FileSettings',
+    'Finding',
     'FluoroscopeCalibration',
     'Frame',
+    'Kind',
     'KnownOrientation',
     'MovingPoints',
     'Names',
@@ -72,6 +73,7 @@ __all__ = [
     'ReconstructionOutcome',
     'Recording',
     'RigOrientation',
+    'Severity',
     'SimulationOptions',
     'Survey',
     'Validation',

@@ -5,6 +5,10 @@
 
 from __future__ import annotations
 
+from typing import Any
+
+from .findings import Finding, Kind, sentences
+
 MAX_MESSAGE = 800  # characters
 _ELLIPSIS = ' ... '
 _KEPT_END = 250  # characters; the cause is at the end
@@ -32,13 +36,50 @@ def shortened(text: str, limit: int = MAX_MESSAGE) -> str:
 
 
 class DataError(ValueError):
-    """A fault in the data; the message is one sentence that names place and cause.
+    """A fault in the data, as findings; the message is their sentences.
 
-    It may quote the data: control characters are escaped, and a long message is cut.
+    Parameters
+    ----------
+    *found : Finding or object
+        Anything but a Finding is the text of one: a sentence that names place and cause.
+    at : object, optional
+        Where it was found, such as a path; it is put in front of the places.
+    kind : Kind
+        Of a text.
+    **more
+        Further fields of the Finding of a text.
+
+    Attributes
+    ----------
+    findings : tuple of Finding
+        At least one.
+
+    Notes
+    -----
+    A text may quote the data: control characters are escaped, and a long message is cut.
     """
 
-    def __init__(self, message: object = '') -> None:
-        text = str(message)
-        if len(text) > MAX_MESSAGE:  # before megabytes are examined
-            text = shortened(text)
-        super().__init__(shortened(printable(text)))
+    def __init__(
+        self, *found: object, at: object = '', kind: Kind = Kind.DATA, **more: Any
+    ) -> None:
+        findings = (
+            one if isinstance(one, Finding) else Finding(kind, _shown(str(one)), **more)
+            for one in found or ('',)
+        )
+        self.findings = tuple(one.at(at) for one in findings)
+        super().__init__(_shown('. '.join(sentences(self.findings))))
+
+    @property
+    def finding(self) -> Finding:
+        """The first finding."""
+        return self.findings[0]
+
+    def at(self, where: object) -> DataError:
+        """Return the error with its findings at another place, such as a path."""
+        return DataError(*self.findings, at=where)
+
+
+def _shown(text: str) -> str:
+    if len(text) > MAX_MESSAGE:  # before megabytes are examined
+        text = shortened(text)
+    return shortened(printable(text))

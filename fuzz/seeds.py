@@ -16,13 +16,12 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fluoro_calib_ros.bags.definitions import known_definition
-from fluoro_calib_ros.bags.frames import message_from_frame
-from fluoro_calib_ros.bags.writer import BagWriter
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
+from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.io.bags.definitions import known_definition, message_from_frame
+from fluoro_calib_ros.io.bags.writer import BagWriter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
@@ -91,8 +90,8 @@ def bag_content(storage: str = 'mcap') -> bytes:
     """Return a bag file of the frames, without compression and checksums."""
     from mcap.writer import CompressionType, Writer
 
-    from fluoro_calib_ros.bags.definitions import TARGET_OBSERVATIONS, to_cdr
-    from fluoro_calib_ros.bags.qos import PROFILES, to_yaml
+    from fluoro_calib_ros.io.bags.definitions import TARGET_OBSERVATIONS, to_cdr
+    from fluoro_calib_ros.io.bags.metadata import PROFILES, to_yaml
 
     buffer = io.BytesIO()
     writer = Writer(

@@ -19,7 +19,7 @@ from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch_ros.actions import Node, SetParameter
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.files.rig_file import read_rig_file
+from fluoro_calib_ros.io.rig_file import read_rig_file
 
 PACKAGE = 'fluoro_calib_ros'
 SWITCH = ['true', 'false']

@@ -21,11 +21,11 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
 ROS = ('tests/ros 1', 'tests/ros 2')
 # Files whose tests share the calibrations of tests/rigs.py, so that one worker makes them once.
 SHARING = (
-    'tests/calibration/test_calibration.py',
-    'tests/calibration/test_orientation.py',
-    'tests/distortion/test_grid.py',
+    'tests/estimation/test_calibration.py',
+    'tests/estimation/test_orientation.py',
+    'tests/estimation/test_grid.py',
     'tests/images/test_undistortion.py',
-    'tests/validation/test_validation.py',
+    'tests/checks/test_validation.py',
 )
 
 if LoadFileScheduling is not None:

@@ -3,18 +3,21 @@
 
 """Shared fixtures: virtual rigs, cached calibrations of them and small networks."""
 
+import contextlib
 import functools
 from dataclasses import dataclass, replace
 
 import numpy as np
+import pytest
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
 from fluoro_calib_ros.cli import main
-from fluoro_calib_ros.distortion.angle_field import PACKED_SHAPES, AngleField
-from fluoro_calib_ros.distortion.none import no_correction
-from fluoro_calib_ros.distortion.registry import create_model
+from fluoro_calib_ros.correction.angle_field import PACKED_SHAPES, AngleField
+from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
+from fluoro_calib_ros.correction.models import no_correction
+from fluoro_calib_ros.correction.registry import create_model
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.photogrammetry.collinearity import project, project_with_jacobian
 from fluoro_calib_ros.photogrammetry.network import Network
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
@@ -22,6 +25,25 @@ from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 from fluoro_calib_ros.simulation.exposures import phantom_poses, simulate_exposures
 from fluoro_calib_ros.simulation.rig import looking_at_origin, virtual_rig
+
+
+@contextlib.contextmanager
+def refused(kind, **numbers):
+    """Context in which a DataError of a kind is raised, in one line; it holds the findings.
+
+    numbers are those that the first finding of the kind must have.
+    """
+    with pytest.raises(DataError) as caught:
+        yield caught
+    assert '\n' not in str(caught.value)
+    found = [one for one in caught.value.findings if one.kind is kind]
+    assert found, caught.value.findings
+    assert numbers.items() <= found[0].numbers.items()
+
+
+def kinds(findings):
+    """Kinds of findings, in their order."""
+    return [found.kind for found in findings]
 
 
 @functools.cache

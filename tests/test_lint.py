@@ -58,6 +58,15 @@ def test_every_file_names_its_licence():
     assert status == 0, output[-3000:]
 
 
+def test_every_source_names_its_licence_itself():
+    without = [
+        str(path.relative_to(ROOT))
+        for path in SOURCES
+        if 'SPDX-License-Identifier' not in path.read_text()[:200]
+    ]
+    assert not without
+
+
 def functions():
     """All functions of the package, with the name of their module."""
     for path in SOURCES:

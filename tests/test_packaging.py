@@ -104,7 +104,7 @@ def test_every_message_field_is_documented(path):
 
 def test_messages_without_ros():
     """The bag writer reads the message definitions from the package, without ROS."""
-    folder = ROOT / 'fluoro_calib_ros' / 'bags' / 'msg'
+    folder = ROOT / 'fluoro_calib_ros' / 'io' / 'bags' / 'msg'
     assert sorted(path.name for path in folder.glob('*.msg')) == sorted(
         path.name for path in INTERFACES if path.suffix == '.msg'
     )

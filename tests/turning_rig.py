@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from rigs import exposures, rig
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
+from fluoro_calib_ros.estimation.calibrate import calibrate
 
 CHANGE_PX = 2.0
 

@@ -35,7 +35,7 @@ from .rig import add_rig, find_rig
 from .termination import terminated_by_signals
 
 if TYPE_CHECKING:
-    from ..files.rig_file import RigFile
+    from ..io.rig_file import RigFile
 
 # A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, where
 # arguments depend on each other, check(arguments, error).

@@ -19,7 +19,7 @@ from .arguments import (
     bag_selection,
     file_settings,
 )
-from .output import print_note, print_notes, print_result, print_unpaired
+from .output import print_findings, print_notes, print_result, print_unpaired
 
 NAME = 'adjust'
 HELP = 'Adjust the exposures of a bag or CSV file with the calibration held (out-of-sample test).'
@@ -28,7 +28,7 @@ EXAMPLE = 'fluoro-calib adjust test --phantom phantom.csv --calibration result -
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from ..calibration.options import CalibrationOptions
+    from ..estimation.options import CalibrationOptions
 
     source = add_source(
         parser,
@@ -46,13 +46,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Adjust and write the result folder. Raises DataError."""
-    from ..files.names import read_names
-    from ..files.result_check import disagreements
-    from ..jobs.adjustment import adjust
+    from ..io.csv_table import read_names
+    from ..io.result_check import disagreements
+    from ..jobs.calibration import adjust
     from ..jobs.result_folder import check_result_folder, save_result, written_document
     from ..jobs.sources import read_calibrations, read_source, read_survey, select_calibrations
     from ..report.tables import summary_table
-    from ..validation.held_fit import held_doubts
 
     check_result_folder(
         arguments.out, (arguments.source, arguments.phantom, arguments.calibration)
@@ -73,10 +72,6 @@ def run(arguments: argparse.Namespace) -> None:
     frames = recording.frames
     calibrations = select_calibrations(calibrations, frames, arguments.calibration)
     result = adjust(frames, survey.phantom, calibrations, arguments.loss)
-    doubts = held_doubts(result, calibrations)
-    save_result(arguments.out, result, doubts, covariance=arguments.covariance)
-    for sentence in result.left_out:
-        print_note(f'not used: {sentence}')
-    for sentence in doubts:
-        print_note(f'doubtful: {sentence}')
-    print_result(arguments, written_document(result, doubts), summary_table(result))
+    save_result(arguments.out, result, covariance=arguments.covariance)
+    print_findings(result.findings, 'doubtful: ')
+    print_result(arguments, written_document(result), summary_table(result))

@@ -7,20 +7,23 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
+from ..io.rig_file import NAME
 from ..limits import ReadLimits, use_read_limits
 from ..options import Option, declared
-from .rig import NAME, JointOfRig
+from .rig import JointOfRig
 
 if TYPE_CHECKING:
-    from ..exchange.content import FileSettings
     from ..exposures.angles import AngleOptions
+    from ..io.formats.content import FileSettings
     from ..jobs.sources import BagSelection
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
+T = TypeVar('T')
 UNITS = ('mm', 'cm', 'm')
 READ_LIMITS = ('max_file_mb', 'max_image_megapixels', 'max_training_points')  # that are options
 
@@ -94,18 +97,37 @@ def add_option(parser: Parser, option: Option, **changes: Any) -> None:
     parser.add_argument('--' + option.name.replace('_', '-'), **settings)
 
 
+def add_options(
+    parser: Parser, kind: type, only: Iterable[str] = (), **changes: dict[str, Any]
+) -> None:
+    """Add the arguments of the options that a dataclass declares, by default of all of them.
+
+    changes: keyword arguments of `add_argument`, by option.
+    """
+    options = declared(kind)
+    for name in only or options:
+        add_option(parser, options[name], **changes.get(name, {}))
+
+
+def options_of(kind: type[T], arguments: argparse.Namespace, **values: Any) -> T:
+    """Return an options dataclass with the values of its arguments, and with other values.
+
+    An option without argument has its default. Raises ValueError.
+    """
+    given = {n: getattr(arguments, n) for n in declared(kind) if hasattr(arguments, n)}
+    return kind(**{**given, **values})
+
+
 def add_read_limits(parser: argparse.ArgumentParser) -> None:
     """Add the limits of what a command reads."""
     group = parser.add_argument_group('limits of what is read')
-    options = declared(ReadLimits)
-    for name in READ_LIMITS:
-        add_option(group, options[name], metavar='N')
+    metavar = {'metavar': 'N'}
+    add_options(group, ReadLimits, READ_LIMITS, **dict.fromkeys(READ_LIMITS, metavar))
 
 
 def set_read_limits(arguments: argparse.Namespace) -> None:
     """Use the limits of the arguments, the default ones for a command that has none."""
-    given = {name: getattr(arguments, name) for name in READ_LIMITS if hasattr(arguments, name)}
-    use_read_limits(ReadLimits(**given))
+    use_read_limits(options_of(ReadLimits, arguments))
 
 
 def _number(option: Option, kind: type) -> Callable[[str], Any]:
@@ -156,13 +178,9 @@ def add_bag_options(parser: argparse.ArgumentParser, pairing: bool = True) -> No
     if pairing:
         add_option(group, options['pair_by'])
     tolerance = options['tolerance_s']
-    group.add_argument(
-        '--pair-tolerance',
-        type=number_in(0.0, 1.0),
-        default=tolerance.default,
-        metavar='S',
-        help=f'{tolerance.description}, with --pair-by stamp [s] (default: {tolerance.default})',
-    )
+    description = f'{tolerance.description}, with --pair-by stamp'
+    tolerance = replace(tolerance, name='pair_tolerance', description=description)
+    add_option(group, tolerance, metavar='S')
     add_angle_options(group)
 
 
@@ -170,16 +188,14 @@ def add_angle_options(parser: Parser) -> None:
     """Add where the angle of the C-arm in the exposures of a bag comes from."""
     from ..exposures.angles import AngleOptions
 
-    options = declared(AngleOptions)
-    parser.add_argument(
-        '--angle-joint',
-        type=_angle_joint,
-        default='',
-        metavar='JOINT',
-        help='joint of the joint states in a bag whose position is the angle of the C-arm, or one '
-        f"for each fluoroscope: A:JOINT,B:JOINT; '' for none (default: that of {NAME}, else none)",
-    )
-    add_option(parser, options['angle_max_age'], metavar='S')
+    joint = {
+        'type': _angle_joint,
+        'metavar': 'JOINT',
+        'help': 'joint of the joint states in a bag whose position is the angle of the C-arm, or '
+        f"one for each fluoroscope: A:JOINT,B:JOINT; '' for none (default: that of {NAME}, else "
+        'none)',
+    }
+    add_options(parser, AngleOptions, angle_joint=joint, angle_max_age={'metavar': 'S'})
 
 
 def angle_options(arguments: argparse.Namespace) -> AngleOptions:
@@ -187,7 +203,9 @@ def angle_options(arguments: argparse.Namespace) -> AngleOptions:
     from ..exposures.angles import AngleOptions
 
     joint = arguments.angle_joint
-    return AngleOptions(str(joint), arguments.angle_max_age, isinstance(joint, JointOfRig))
+    return options_of(
+        AngleOptions, arguments, angle_joint=str(joint), of_rig=isinstance(joint, JointOfRig)
+    )
 
 
 def _angle_joint(text: str) -> str:
@@ -205,13 +223,12 @@ def bag_selection(arguments: argparse.Namespace, pairing: bool = True) -> BagSel
     """Return the selection of `add_bag_options`."""
     from ..jobs.sources import BagSelection
 
-    pair_by = arguments.pair_by if pairing else 'frame_number'
     return BagSelection(
-        arguments.start,
-        arguments.end,
-        pair_by,
-        arguments.pair_tolerance,
-        angle_options(arguments),
+        start_s=arguments.start,
+        end_s=arguments.end,
+        pair_by=arguments.pair_by if pairing else 'frame_number',
+        tolerance_s=arguments.pair_tolerance,
+        angles=angle_options(arguments),
     )
 
 
@@ -234,7 +251,7 @@ def add_file_options(parser: argparse.ArgumentParser) -> None:
 
 def file_settings(arguments: argparse.Namespace, **changes: Any) -> FileSettings:
     """Return the settings of `add_file_options`; changes replace some."""
-    from ..exchange.content import FileSettings
+    from ..io.formats.content import FileSettings
 
     settings: dict[str, Any] = {
         'image_size': getattr(arguments, 'image_size', None),

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import sys
@@ -15,13 +16,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from ..errors import printable
-from ..options import declared
-from .arguments import add_option, names, number_in
+from .arguments import add_options, names, number_in, options_of
 from .output import print_result
 
 if TYPE_CHECKING:
-    from ..bags.inspection import BagReport, TopicReport
-    from ..bags.salvage import Damage
+    from ..io.bags.salvage import BagReport, Damage, TopicReport
 
 NAME = 'bag'
 HELP = 'Record, play, look into and recover bags.'
@@ -30,7 +29,7 @@ EXAMPLE = 'fluoro-calib bag recover cut.mcap --out recovered'
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from ..bags.recording import RecordingOptions
+    from ..io.bags.recording import RecordingOptions
 
     actions = parser.add_subparsers(dest='action', required=True, metavar='ACTION')
     recover = _add_action(
@@ -52,8 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     record.add_argument(
         '--out', required=True, type=Path, metavar='FOLDER', help='new bag, which must not exist'
     )
-    for option in declared(RecordingOptions).values():
-        add_option(record, option)
+    add_options(record, RecordingOptions)
     play = _add_action(
         actions, 'play', 'Publish the messages of a bag as they were recorded (needs ROS 2).'
     )
@@ -110,7 +108,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 
 def _recover(arguments: argparse.Namespace) -> None:
-    from ..bags.recovery import recover_bag
+    from ..io.bags.salvage import recover_bag
 
     recovery = recover_bag(arguments.source, arguments.out)
     total = sum(recovery.counts.values())
@@ -135,7 +133,7 @@ def _recover(arguments: argparse.Namespace) -> None:
 
 
 def _info(arguments: argparse.Namespace) -> None:
-    from ..bags.inspection import inspect_bag
+    from ..io.bags.salvage import inspect_bag
 
     report = inspect_bag(arguments.source)
     faults = report.faults
@@ -151,9 +149,9 @@ def _info(arguments: argparse.Namespace) -> None:
 
 
 def _record(arguments: argparse.Namespace) -> None:
-    from ..bags.recording import RecordingOptions
+    from ..io.bags.recording import RecordingOptions
 
-    parameters = {name: getattr(arguments, name) for name in declared(RecordingOptions)}
+    parameters = dataclasses.asdict(options_of(RecordingOptions, arguments))
     parameters['folder'] = str(arguments.out.absolute())
     if arguments.topics:
         parameters['topics'] = arguments.topics

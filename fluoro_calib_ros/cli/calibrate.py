@@ -24,9 +24,11 @@ from .arguments import (
     bag_selection,
     file_settings,
     number_in,
+    options_of,
 )
 from .output import (
     ProgressBar,
+    print_findings,
     print_note,
     print_notes,
     print_result,
@@ -37,8 +39,7 @@ from .output import (
 )
 
 if TYPE_CHECKING:
-    from ..calibration.options import CalibrationOptions
-    from ..calibration.request import CalibrationRequest
+    from ..estimation.options import CalibrationRequest
     from ..jobs.calibration import CalibrationOutcome
     from ..jobs.sources import Recording, Survey
 
@@ -86,7 +87,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _add_adjustment(parser: argparse.ArgumentParser) -> None:
     """Add the options of correction model and adjustment."""
-    from ..calibration.options import CalibrationOptions
+    from ..estimation.options import CalibrationOptions
 
     model = parser.add_argument_group('correction model')
     adjustment = parser.add_argument_group('adjustment')
@@ -126,7 +127,7 @@ def _add_model(parser: argparse._ArgumentGroup, option: Option) -> None:
     """Add --model: the name of a model, or the user's own regressor."""
 
     def convert(text: str) -> Any:
-        from ..distortion.user_regressor import resolve_model
+        from ..estimation.user_regressor import resolve_model
 
         if ':' not in text:
             if text in option.choices:
@@ -159,7 +160,7 @@ _METAVARS = {
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
     """Call error with a sentence for arguments that exclude each other."""
-    from ..distortion.registry import neighbour_models
+    from ..correction.registry import neighbour_models
 
     models = neighbour_models()
     if arguments.k and arguments.model not in models:
@@ -205,9 +206,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _request(arguments: argparse.Namespace) -> CalibrationRequest:
     """Read what the arguments name. Raises DataError."""
-    from ..calibration.request import CalibrationRequest
+    from ..estimation.options import CalibrationOptions, CalibrationRequest
     from ..exposures.names import Names
-    from ..files.phantom import has_exposures, read_moving_points
+    from ..io.phantom import has_exposures, read_moving_points
     from ..jobs.sources import read_orientations, read_survey
 
     known = read_orientations(arguments.known_orientation, file_settings(arguments))
@@ -227,11 +228,11 @@ def _request(arguments: argparse.Namespace) -> CalibrationRequest:
     return CalibrationRequest(
         frames,
         phantom,
-        _options(arguments),
-        arguments.joint,
-        arguments.principal_distance,
-        names,
-        known,
+        options_of(CalibrationOptions, arguments),
+        joint=arguments.joint,
+        principal_distance=arguments.principal_distance,
+        names=names,
+        known_orientations=known,
     )
 
 
@@ -254,28 +255,15 @@ def _recording(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
     )
 
 
-def _options(arguments: argparse.Namespace) -> CalibrationOptions:
-    """Return the options of the calibration."""
-    from ..calibration.options import CalibrationOptions
-
-    names = [name for name in declared(CalibrationOptions) if name not in INTERNAL]
-    return CalibrationOptions(**{name: getattr(arguments, name) for name in names})
-
-
 def _print(arguments: argparse.Namespace, outcome: CalibrationOutcome) -> None:
     """Print notes, the summary, and the verdict with the report."""
-    from ..files.validation import validation_document
+    from ..io.result_document import validation_document
     from ..jobs.result_folder import written_document
     from ..report.tables import summary_table
     from ..report.verdict import verdict_line
 
-    if outcome.rig_note:
-        print_note(outcome.rig_note)
-    for sentence in outcome.result.left_out:
-        print_note(f'not used: {sentence}')
-    for sentence in outcome.doubts:
-        print_note(f'this cannot be right: {sentence}')
-    document = written_document(outcome.result, outcome.doubts, outcome.rig_note)
+    print_findings(outcome.result.findings, 'this cannot be right: ')
+    document = written_document(outcome.result)
     lines = [summary_table(outcome.result).rstrip()]
     if outcome.validation is not None:
         report = _report(arguments.out)
@@ -327,7 +315,7 @@ def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
             survey,
             arguments.fluoroscopes,
             arguments.principal_distance,
-            arguments.scheduler,
-            bar,
-            ImageAngles(angle_options(arguments)),
+            scheduler=arguments.scheduler,
+            progress=bar,
+            angles=ImageAngles(angle_options(arguments)),
         )

@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..findings import sentences
 from .output import print_notes, print_result
 
 NAME = 'compare'
@@ -28,9 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Compare, and draw the figure. Raises DataError."""
-    from ..files.atomic import write_bytes
-    from ..files.folder import check_output_file
-    from ..jobs.comparison import compare_folders
+    from ..io.atomic import write_bytes
+    from ..io.folder import check_output_file
+    from ..jobs.report import compare_folders
     from ..report.comparison import comparison_document, comparison_png, comparison_text
 
     if arguments.figure is not None:
@@ -38,14 +39,14 @@ def run(arguments: argparse.Namespace) -> None:
     compared = compare_folders(arguments.first, arguments.second)
     if arguments.figure is not None:
         write_bytes(arguments.figure, comparison_png(compared.comparisons))
-    print_notes(compared.notes)
+    print_notes(compared.findings)
     scales = compared.mm_per_px
     document = {
         'fluoroscopes': {
             name: comparison_document(comparison, scales.get(name))
             for name, comparison in compared.comparisons.items()
         },
-        'notes': list(compared.notes),
+        'notes': sentences(compared.findings),
     }
     texts = [comparison_text(c, scales.get(name)) for name, c in compared.comparisons.items()]
     print_result(arguments, document, '\n'.join(texts))

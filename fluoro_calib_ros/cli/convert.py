@@ -112,7 +112,7 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Convert. Raises DataError."""
-    from ..files.folder import check_output_file
+    from ..io.folder import check_output_file
     from ..jobs.conversion import ConversionRequest, convert
 
     inputs = [path for path in (arguments.source, arguments.calibration) if path is not None]
@@ -122,18 +122,18 @@ def run(arguments: argparse.Namespace) -> None:
         check_output_file(arguments.out, inputs)
     written = convert(
         ConversionRequest(
-            arguments.source,
-            arguments.to,
-            arguments.out,
-            arguments.source_kind,
-            arguments.exposure,
-            arguments.calibration,
-            arguments.corrected,
-            tuple(arguments.fluoroscopes or ()),
-            file_settings(arguments, rate_hz=arguments.rate),
-            arguments.out_units,
-            angle_of(arguments),
-            angle_options(arguments),
+            source=arguments.source,
+            kind=arguments.to,
+            out=arguments.out,
+            source_kind=arguments.source_kind,
+            exposure=arguments.exposure,
+            calibration=arguments.calibration,
+            corrected=arguments.corrected,
+            fluoroscopes=tuple(arguments.fluoroscopes or ()),
+            settings=file_settings(arguments, rate_hz=arguments.rate),
+            out_units=arguments.out_units,
+            angle=angle_of(arguments),
+            angles=angle_options(arguments),
         )
     )
     print_notes(written.notes)

@@ -23,7 +23,7 @@ from .arguments import (
 from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
-    from ..calibration.result import FluoroscopeCalibration
+    from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 
 NAME = 'correct'
 HELP = 'Correct image points (CSV file) or images (image, TIFF stack, folder or video).'
@@ -90,14 +90,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Correct image points or images. Raises DataError."""
-    from ..files.folder import check_output_file
-    from ..files.image_formats import (
-        READ_SUFFIXES,
-        is_image_source,
-        listed,
-        suffix_of,
-    )
-    from ..files.result_check import disagreements
+    from ..io.folder import check_output_file
+    from ..io.image_reading import READ_SUFFIXES, is_image_source, listed, suffix_of
+    from ..io.result_check import disagreements
     from ..jobs.sources import read_calibrations
 
     if arguments.source.is_file() or not arguments.out.is_dir():  # images can fill a folder
@@ -120,7 +115,7 @@ def run(arguments: argparse.Namespace) -> None:
 def _correct_points(
     arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
 ) -> None:
-    from ..files.image_points import correct_points, write_points
+    from ..io.observations import correct_points, write_points
     from ..jobs.sources import read_point_table
 
     size = next(iter(calibrations.values())).image_size
@@ -167,15 +162,15 @@ def _correct_images(
             )
         calibration = calibration.at_angle(angle_of(arguments))
     request = ImageCorrectionRequest(
-        source,
-        arguments.out,
-        calibration,
-        arguments.interpolation,
-        arguments.workers,
-        arguments.scheduler,
-        arguments.recursive,
-        arguments.keep_going,
-        angles,
+        source=source,
+        out=arguments.out,
+        calibration=calibration,
+        interpolation=arguments.interpolation,
+        workers=arguments.workers,
+        scheduler=arguments.scheduler,
+        recursive=arguments.recursive,
+        keep_going=arguments.keep_going,
+        angles=angles,
     )
     with ProgressBar(source.name) as progress:
         done = run_image_correction(request, progress)
@@ -221,7 +216,7 @@ def _angles_of_images(
     arguments: argparse.Namespace, calibration: FluoroscopeCalibration
 ) -> dict[int, float] | None:
     """Angles [rad] of the images by number, None where --angles is not given. Raises DataError."""
-    from ..files.image_angles import read_image_angles
+    from ..io.image_reading import read_image_angles
 
     if arguments.angles is None:
         return None

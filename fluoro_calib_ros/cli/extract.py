@@ -14,7 +14,7 @@ from ..errors import DataError
 from .arguments import (
     add_angle,
     add_angle_options,
-    add_option,
+    add_options,
     add_phantom,
     add_scheduler,
     add_workers,
@@ -23,14 +23,15 @@ from .arguments import (
     file_settings,
     names,
     number_in,
+    options_of,
 )
 from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
     from ..exposures.frame import Frame
+    from ..images.marker_ids import ClusterShape
     from ..jobs.extraction import ExtractionOutcome
     from ..jobs.marker_extraction import DoubtfulSpan, MarkerOutcome, MarkerRequest
-    from ..radiographs.marker_ids import ClusterShape
 
 NAME = 'extract'
 HELP = 'Find and measure the beads of a phantom in radiographs, or follow implanted markers.'
@@ -41,8 +42,7 @@ EXAMPLE = (
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    from ..options import declared
-    from ..radiographs.markers import MarkerOptions
+    from ..images.markers import MarkerOptions
     from .arguments import add_file_options
 
     parser.add_argument(
@@ -128,9 +128,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='coordinates target_id,x,y,z,sd [mm] of the markers of each --cluster in a frame of '
         'its own, or of any phantom format; without --markers, they give the ids',
     )
-    options = declared(MarkerOptions)
-    for option in ('shutter', 'gate', 'lost_after', 'search_every'):
-        add_option(group, options[option])
+    add_options(group, MarkerOptions, ('shutter', 'gate', 'lost_after', 'search_every'))
     angles = parser.add_argument_group('angle of a C-arm')
     add_angle_options(angles)
     add_angle(angles, 'of all images, where no joint gives it', 'unknown')
@@ -139,7 +137,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
     """Read the clusters; call error with a sentence for arguments that exclude each other."""
-    from ..drift.clusters import parse_clusters
+    from ..checks.cluster_watch import parse_clusters
 
     try:
         arguments.clusters = parse_clusters(arguments.cluster)
@@ -176,9 +174,9 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _run_phantom(arguments: argparse.Namespace) -> None:
     """Extract the beads of a phantom. Raises DataError."""
-    from ..files.access import check_safe_name
-    from ..files.extracted import write_extracted
-    from ..files.folder import check_output_file
+    from ..io.access import check_safe_name
+    from ..io.folder import check_output_file
+    from ..io.observations import write_extracted
     from ..jobs.extraction import ExtractionRequest, run_extraction
     from ..jobs.image_sources import ImageAngles
     from ..jobs.sources import read_survey
@@ -194,19 +192,19 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
         arguments.sources,
         survey.phantom,
         fluoroscope,
-        arguments.principal_distance,
-        arguments.overlay,
-        arguments.workers,
-        arguments.scheduler,
-        arguments.regular_grid,
-        angles,
+        principal_distance_px=arguments.principal_distance,
+        overlay=arguments.overlay,
+        workers=arguments.workers,
+        scheduler=arguments.scheduler,
+        regular_grid=arguments.regular_grid,
+        angles=angles,
     )
     with ProgressBar('extract') as bar:
         outcome = run_extraction(request, bar)
     observed = [(r.frame, r.overlapped) for r in outcome.results if r.frame is not None]
     write_extracted(arguments.out, observed, survey.names.target_names())
     for result in outcome.refused:
-        print_note(f'not used: {result.place}: {result.reason}')
+        print_note(f'not used: {result.finding}')
     print_notes(outcome.notes)
     print_result(arguments, _document(arguments.out, outcome), _text(arguments.out, outcome))
 
@@ -248,9 +246,9 @@ def _text(out: Path, outcome: ExtractionOutcome) -> str:
 
 def _run_markers(arguments: argparse.Namespace) -> None:
     """Follow markers through images. Raises DataError."""
-    from ..files.access import check_safe_name
-    from ..files.extracted import write_markers
-    from ..files.folder import check_output_file
+    from ..io.access import check_safe_name
+    from ..io.folder import check_output_file
+    from ..io.observations import write_markers
     from ..jobs.marker_extraction import run_marker_extraction
 
     for name in arguments.fluoroscope:
@@ -281,12 +279,12 @@ def _run_markers(arguments: argparse.Namespace) -> None:
 
 def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     """Read what is known of the markers and the fluoroscopes. Raises DataError."""
-    from ..files.rig_orientation import load_orientation, orientation_path
+    from ..images.markers import MarkerOptions
+    from ..io.rig_orientation import load_orientation, orientation_path
     from ..jobs.image_sources import ImageAngles
     from ..jobs.marker_extraction import MarkerRequest, sequences, shapes_of
     from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import read_calibrations, read_source, read_survey
-    from ..radiographs.markers import MarkerOptions
 
     angles = ImageAngles(angle_options(arguments), angle_of(arguments))
     angles.check(arguments.sources, arguments.fluoroscope)
@@ -309,12 +307,6 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         print_notes(survey.notes)
         shapes = shapes_of(arguments.clusters, survey.phantom, arguments.cluster_shapes)
         target_names = target_names or survey.names.target_names()
-    options = MarkerOptions(
-        gate=arguments.gate,
-        shutter=arguments.shutter,
-        lost_after=arguments.lost_after,
-        search_every=arguments.search_every,
-    )
     calibrations = {}
     orientation = None
     if len(sources) == 2:
@@ -324,18 +316,18 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         try:
             check_orientation(orientation, calibrations)
         except DataError as error:
-            raise DataError(f'{path}: {error}') from None
+            raise error.at(path) from None
     return MarkerRequest(
         sources,
         first,
-        options,
+        options_of(MarkerOptions, arguments),
         calibrations,
         orientation,
-        () if shapes else arguments.clusters,
-        shapes,
-        arguments.overlay,
-        target_names,
-        angles,
+        clusters=() if shapes else arguments.clusters,
+        shapes=shapes,
+        overlay=arguments.overlay,
+        target_names=target_names,
+        angles=angles,
     )
 
 

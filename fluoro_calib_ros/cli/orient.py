@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 
 from ..errors import DataError
+from ..findings import sentences
 from .arguments import (
     add_bag_options,
     add_calibration,
@@ -63,9 +64,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write DIR/rig_orientation.npz. Raises DataError."""
-    from ..files.names import read_names
-    from ..files.result_document import orientation_document
-    from ..files.rig_orientation import save_orientation
+    from ..io.csv_table import read_names
+    from ..io.result_document import orientation_document
+    from ..io.rig_orientation import save_orientation
     from ..jobs.orientation import orient
     from ..jobs.result_folder import belongs_to, saved_orientation
     from ..jobs.sources import read_calibrated_source, read_survey
@@ -95,15 +96,15 @@ def run(arguments: argparse.Namespace) -> None:
     try:
         outcome = orient(frames, survey.phantom, calibrations, arguments.frame_id, present=present)
     except DataError as error:
-        raise DataError(f'{arguments.source}: {error}') from None
+        raise error.at(arguments.source) from None
     path = save_orientation(arguments.calibration, outcome.orientation)
-    print_notes(outcome.notes)
+    print_notes(outcome.findings)
     document = {
         'out': path,
         **orientation_document(outcome.orientation),
         'targets': outcome.targets,
         'rms_mm': outcome.rms_mm,
-        'notes': list(outcome.notes),
+        'notes': sentences(outcome.findings),
     }
     lines = [orientation_text(outcome.orientation)]
     if outcome.targets:

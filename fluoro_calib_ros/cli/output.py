@@ -15,11 +15,12 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, TextIO
 
 from ..errors import printable
+from ..findings import Finding, Severity
 
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ..calibration.rounds import Round
+    from ..estimation.rounds import Round
 
 
 # Escape sequences (ECMA-48, select graphic rendition).
@@ -51,7 +52,7 @@ def print_result(
 ) -> None:
     """Print a result: as JSON with --json, else as text for people, with the next command."""
     if arguments.json:
-        from ..files.json_file import json_text
+        from ..io.text_files import json_text
 
         print(json_text(document).rstrip('\n'))
         return
@@ -61,15 +62,22 @@ def print_result(
         print(styled(f'Next: {command}', 'dim', sys.stdout))
 
 
-def print_note(text: str) -> None:
-    """Print a note on standard error."""
-    print(styled(printable(text), 'yellow', sys.stderr), file=sys.stderr)
+def print_note(note: object) -> None:
+    """Print a text or finding on standard error."""
+    print(styled(printable(str(note)), 'yellow', sys.stderr), file=sys.stderr)
 
 
-def print_notes(texts: Iterable[str]) -> None:
-    """Print notes on standard error, each once."""
-    for text in dict.fromkeys(texts):
+def print_notes(notes: Iterable[object]) -> None:
+    """Print texts and findings on standard error, each once."""
+    for text in dict.fromkeys(map(str, notes)):
         print_note(text)
+
+
+def print_findings(findings: Iterable[Finding], error: str) -> None:
+    """Print what was found of a calibration on standard error; error begins what is wrong."""
+    begin = {Severity.NOTE: 'not used: ', Severity.WARNING: '', Severity.ERROR: error}
+    for found in sorted(findings, key=lambda one: (1, 0, 2)[one.severity]):
+        print_note(f'{begin[found.severity]}{found}')
 
 
 def print_unpaired(source: Path, unpaired: Mapping[str, int]) -> None:

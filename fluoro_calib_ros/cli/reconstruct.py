@@ -11,14 +11,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ..errors import DataError
-from ..options import declared
 from .arguments import (
     add_bag_options,
     add_calibration,
-    add_option,
+    add_options,
     add_source,
     bag_selection,
     file_settings,
+    options_of,
 )
 from .output import print_note, print_notes, print_result, print_unpaired
 
@@ -44,9 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='FILE',
         help='orientation of the rig (default: rig_orientation.npz in the result folder)',
     )
-    options = declared(ReconstructionOptions)
-    add_option(parser, options['pair_by'])
-    add_option(parser, options['reject'], metavar='S')
+    add_options(parser, ReconstructionOptions, reject={'metavar': 'S'})
     parser.add_argument(
         '--cluster',
         action='append',
@@ -64,7 +62,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
     """Read the clusters; call error with a sentence for arguments that exclude each other."""
-    from ..drift.clusters import parse_clusters
+    from ..checks.cluster_watch import parse_clusters
     from ..jobs.sources import is_bag
 
     try:
@@ -82,9 +80,9 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the points of a recording. Raises DataError."""
-    from ..files.folder import check_output_file
-    from ..files.reconstructed_points import write_reconstruction
-    from ..files.rig_orientation import load_orientation, orientation_path
+    from ..io.folder import check_output_file
+    from ..io.reconstructed_points import write_reconstruction
+    from ..io.rig_orientation import load_orientation, orientation_path
     from ..jobs.reconstruction import ReconstructionOptions, check_orientation, reconstruct
     from ..jobs.sources import is_bag, read_calibrated_source
 
@@ -103,23 +101,23 @@ def run(arguments: argparse.Namespace) -> None:
     print_notes(recording.notes)
     frames = recording.frames
     orientation = load_orientation(path)
-    options = ReconstructionOptions(
-        arguments.pair_by,
-        arguments.reject,
-        not arguments.no_drift_watch,
-        arguments.clusters,
-        is_bag(arguments.source),
-        arguments.pair_tolerance,
+    options = options_of(
+        ReconstructionOptions,
+        arguments,
+        drift_watch=not arguments.no_drift_watch,
+        clusters=arguments.clusters,
+        has_stamps=is_bag(arguments.source),
+        pair_tolerance=arguments.pair_tolerance,
     )
     names = [name for name in orientation.fluoroscopes if name in frames]
     try:
         check_orientation(orientation.subset(names) if names else orientation, calibrations)
     except DataError as error:
-        raise DataError(f'{path}: {error}') from None
+        raise error.at(path) from None
     try:
         outcome = reconstruct(frames, calibrations, orientation, options)
     except DataError as error:
-        raise DataError(f'{arguments.source}: {error}') from None
+        raise error.at(arguments.source) from None
     write_reconstruction(arguments.out, outcome.frames, recording.names)
     print_unpaired(arguments.source, outcome.unpaired)
     if outcome.disagreement:
@@ -140,7 +138,7 @@ def run(arguments: argparse.Namespace) -> None:
 
 def _print(arguments: argparse.Namespace, outcome: ReconstructionOutcome) -> None:
     """Print what was reconstructed."""
-    from ..files.result_document import drift_document, orientation_document
+    from ..io.result_document import drift_document, orientation_document
 
     counts = outcome.status_counts
     total = sum(counts.values())

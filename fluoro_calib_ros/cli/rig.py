@@ -9,7 +9,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from ..files.rig_file import NAME, RigFile, read_rig_file
+from ..io.rig_file import NAME, RigFile, read_rig_file
 
 # Arguments whose default a rig.toml gives, by command; `out` is the key calibration.
 _ANGLE = ('angle_joint', 'angle_max_age')

@@ -9,8 +9,7 @@ import argparse
 import dataclasses
 from pathlib import Path
 
-from ..options import declared
-from .arguments import add_option
+from .arguments import add_options, options_of
 from .output import ProgressBar, print_result
 
 NAME = 'simulate'
@@ -23,19 +22,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     from ..jobs.simulation import SimulationOptions
 
     parser.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder to write')
-    for option in declared(SimulationOptions).values():
-        if option.name == 'images':
-            add_option(parser, option, nargs='?', const='clean')
-        else:
-            add_option(parser, option)
+    add_options(parser, SimulationOptions, images={'nargs': '?', 'const': 'clean'})
 
 
 def run(arguments: argparse.Namespace) -> None:
     """Write the data set. Raises DataError."""
     from ..jobs.simulation import SimulationOptions, simulate
 
-    values = {name: getattr(arguments, name) for name in declared(SimulationOptions)}
-    options = SimulationOptions(**values)
+    options = options_of(SimulationOptions, arguments)
     with ProgressBar('radiographs') as bar:
         simulate(arguments.out, options, bar)
     document = {'out': str(arguments.out), **dataclasses.asdict(options)}

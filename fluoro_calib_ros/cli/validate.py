@@ -62,19 +62,19 @@ def run(arguments: argparse.Namespace) -> None:
 
     Raises DataError, also for the verdict 'fail', after everything is written.
     """
-    from ..files.calibration_request import read_request
-    from ..files.names import read_names
-    from ..files.result_check import edited, exchanged, read_result
-    from ..files.validation import validation_document, write_validation
+    from ..checks.verdict import validate
+    from ..io.calibration_request import read_request
+    from ..io.csv_table import read_names
+    from ..io.result_check import edited, exchanged, read_result
+    from ..io.result_document import validation_document, write_validation
     from ..jobs.result_folder import saved_orientation, saved_rig_note
     from ..jobs.sources import BagSelection, read_calibrations, read_source, read_survey
     from ..report.verdict import verdict_text
-    from ..validation.verdict import validate
 
     calibrations = read_calibrations(arguments.directory, arguments.fluoroscopes)
     document = read_result(arguments.directory)
     mixed = exchanged(arguments.directory, document, calibrations)
-    if mixed:
+    if mixed is not None:
         raise DataError(mixed)
     frames = phantom = None
     known = read_names(arguments.directory)
@@ -96,9 +96,8 @@ def run(arguments: argparse.Namespace) -> None:
         phantom = survey.phantom
     request = read_request(arguments.directory, calibrations, frames, phantom)
     notes = (edited(arguments.directory, document), saved_rig_note(arguments.directory))
-    validation = replace(
-        validate(request, calibrations, print_step), notes=tuple(filter(None, notes))
-    )
+    validation = validate(request, calibrations, print_step)
+    validation = replace(validation, notes=tuple(filter(None, notes)))
     write_validation(arguments.directory, validation)
     passed = validation.verdict == 'pass'
     following = ('reconstruct', 'MEASURED', '--calibration', arguments.directory)
@@ -113,4 +112,6 @@ def run(arguments: argparse.Namespace) -> None:
     if validation.verdict == 'fail':
         failed = [check for check in validation.checks if check.passed is False]
         more = f', and {len(failed) - 1} more checks failed' if len(failed) > 1 else ''
-        raise DataError(f'{arguments.directory}: the verdict is fail: {failed[0].sentence}{more}')
+        raise DataError(
+            f'the verdict is fail: {failed[0]}{more}', at=arguments.directory, kind=failed[0].kind
+        )

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.result import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_quaternion
 from ..simulation.distortion import DistortionField
@@ -80,8 +80,8 @@ def image_errors(
                 points += [truth[number, i] for i in frame.target_id]
         ideal = _ideal_projection(rig[name], np.array(points))
         errors[name] = (
-            projective_misfit(np.concatenate(observed), ideal),
-            projective_misfit(np.concatenate(undistorted), ideal),
+            projective_lack_of_fit(np.concatenate(observed), ideal),
+            projective_lack_of_fit(np.concatenate(undistorted), ideal),
         )
     return errors
 
@@ -108,7 +108,7 @@ def calibration_errors(
         )
         observed = field.distort(ideal)
         u, v, *_ = calibration.correct_arrays(observed[:, 0], observed[:, 1])
-        errors[name] = projective_misfit(np.column_stack([u, v]), ideal)
+        errors[name] = projective_lack_of_fit(np.column_stack([u, v]), ideal)
     return errors
 
 
@@ -148,7 +148,7 @@ def space_figures(
     )
 
 
-def projective_misfit(uv: np.ndarray, ideal: np.ndarray) -> float:
+def projective_lack_of_fit(uv: np.ndarray, ideal: np.ndarray) -> float:
     """Return the RMSE of a coordinate after the best projective map of uv (n, 2) to ideal [px]."""
     x, y = (uv - IMAGE_CENTRE).T / IMAGE_SCALE
     u, v = (ideal - IMAGE_CENTRE).T / IMAGE_SCALE

@@ -14,15 +14,17 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ..bags.reader import read_frames
-from ..calibration.calibrate import CalibrationResult, calibrate
 from ..errors import DataError
+from ..estimation.calibrate import calibrate
+from ..estimation.result import CalibrationResult
 from ..exposures.collector import collect_recorded
-from ..files.atomic import write_text
-from ..files.phantom import read_phantom
+from ..io.atomic import write_text
+from ..io.bags.reader import read_frames
+from ..io.phantom import read_phantom
 from ..nodes.demo_client import DemoClient, DemoError, demo_clients
 from ..report.figures import write_figures
 from ..report.tables import markdown_table, summary_table
@@ -73,7 +75,7 @@ def run_graph(bags: Path, out: Path, client: DemoClient) -> int:
 
 def wait_for_stream(
     client: DemoClient,
-    player: subprocess.Popen,
+    player: subprocess.Popen[Any],
     nodes: NodeProcesses,
     tracked: Mapping[str, int],
 ) -> None:
@@ -262,7 +264,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
                 names,
                 {'coordinates': client.calibrations, 'images': from_images},
             )
-            good = report(options.bags, options.out, client, lost, start, comparison)
+            good = report(
+                options.bags,
+                options.out,
+                client=client,
+                lost=lost,
+                start=start,
+                comparison=comparison,
+            )
     except (DemoError, DataError, OSError) as error:
         print(f'fluoro_calib_demo: {error}', file=sys.stderr)
         sys.exit(1)

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 
-from ..bags.definitions import message_class
-from ..bags.images import IMAGE
-from ..bags.writer import BagWriter
-from ..calibration.result import FluoroscopeCalibration
-from ..jobs.rendering import SETTINGS, RenderedScene, Renderers
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..io.bags.definitions import message_class
+from ..io.bags.reader import IMAGE
+from ..io.bags.writer import BagWriter
+from ..jobs.simulation import SETTINGS, RenderedScene, Renderers
 from ..nodes.demo_client import DemoClient, DemoError
 from ..report.tables import markdown_table
 from ..simulation.exposures import simulate_exposures

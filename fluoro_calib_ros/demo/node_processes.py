@@ -6,22 +6,21 @@
 from __future__ import annotations
 
 import os
-import signal
 import socket
 import subprocess
-import sys
 from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
+from typing import Any
 
-END_TIMEOUT_S = 5
+from ..processes import Programs
+
 # UDP port of the first participant of a ROS domain (DDSI-RTPS 2.5, section 9.6.1.1).
 DISCOVERY_PORT = 7400
 PORTS_PER_DOMAIN = 250
 FIRST_PARTICIPANT = 10
 
 
-class NodeProcesses:
+class NodeProcesses(Programs):
     """Node processes that end together; a context manager.
 
     log_directory: the output of each node goes to NAME.log in it. namespace: of the nodes; with
@@ -29,47 +28,25 @@ class NodeProcesses:
     """
 
     def __init__(self, log_directory: Path, namespace: str = '') -> None:
+        super().__init__()
         self._directory = log_directory
         self._namespace = namespace
-        self._processes: list[subprocess.Popen] = []
 
-    def start(self, name: str, parameters: Mapping[str, object] | None = None) -> subprocess.Popen:
+    def start(
+        self, name: str, parameters: Mapping[str, object] | None = None
+    ) -> subprocess.Popen[Any]:
         """Start the node fluoro_calib_ros.nodes.NAME with parameters; returns the process."""
-        command = [sys.executable, '-m', f'fluoro_calib_ros.nodes.{name}', '--ros-args']
+        arguments = ['--ros-args']
         for key, value in (parameters or {}).items():
-            command += ['-p', f'{key}:={value}']
+            arguments += ['-p', f'{key}:={value}']
         if self._namespace:
-            command += ['-r', f'__ns:=/{self._namespace}']
+            arguments += ['-r', f'__ns:=/{self._namespace}']
         log_name = '_'.join(filter(None, (self._namespace, name)))
-        with open(self._directory / f'{log_name}.log', 'ab') as log:
-            # In a session of its own: an interrupt from the keyboard reaches the nodes from here,
-            # in order.
-            process = subprocess.Popen(command, stdout=log, stderr=log, start_new_session=True)
-        self._processes.append(process)
-        return process
-
-    def failed(self) -> list[subprocess.Popen]:
-        """Return the processes that have ended with a fault."""
-        return [p for p in self._processes if p.poll() not in (None, 0)]
-
-    def __enter__(self) -> NodeProcesses:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        running = [p for p in self._processes if p.poll() is None]
-        for process in running:
-            process.send_signal(signal.SIGINT)
-        for process in running:
-            try:
-                process.wait(timeout=END_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait()
+        return self.run(
+            f'fluoro_calib_ros.nodes.{name}',
+            *arguments,
+            log=self._directory / f'{log_name}.log',
+        )
 
 
 def isolate_ros_graph() -> None:

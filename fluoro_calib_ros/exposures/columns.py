@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Rules for columns of numbers that frames and phantoms share."""
+"""Rules for columns of numbers that frames and phantoms share, and cells of image points."""
 
 from __future__ import annotations
 
@@ -24,3 +24,12 @@ def first_repeated(target_id: ArrayLike) -> tuple[int, int] | None:
     if not len(repeated):
         return None
     return int(order[repeated[0]]), int(order[repeated[0] + 1])
+
+
+def cells_of(uv: ArrayLike, image_size: ArrayLike, count: int) -> NDArray[np.int64]:
+    """Return column and row (n, 2) of image points in a grid of count x count cells.
+
+    Points off the image belong to the nearest cell.
+    """
+    place = (np.asarray(uv, dtype=float) + 0.5) / np.asarray(image_size) * count
+    return np.clip(np.floor(place), 0, count - 1).astype(np.int64)

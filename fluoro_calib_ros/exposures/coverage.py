@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.ndimage import binary_dilation
 
+from .columns import cells_of
+
 # Across the image: at 1024 px a cell is 32 px, about the spacing of the points of 15 exposures.
 CELLS = 32
 # Areas of the image, in rows of three from the top left.
@@ -38,9 +40,8 @@ class Coverage:
 
     def add(self, uv: ArrayLike) -> None:
         """Add image points (n, 2) [px]."""
-        cell = np.floor((np.asarray(uv) + 0.5) / self._size * CELLS).astype(int)
-        cell = np.clip(cell, 0, CELLS - 1)
-        self._occupied[cell[:, 1], cell[:, 0]] = True
+        column, row = cells_of(uv, self._size, CELLS).T
+        self._occupied[row, column] = True
 
     @property
     def covered(self) -> np.ndarray:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
+from ..findings import Place
 from .columns import first_repeated, is_positive
 from .phantom import Phantom
 
@@ -51,13 +52,18 @@ class Frame:
 
     fluoroscope: str
     number: int
-    target_id: np.ndarray
-    uv: np.ndarray
+    target_id: NDArray[np.int64]
+    uv: NDArray[np.float64]
     image_size: tuple[int, int]
-    sigma: np.ndarray | None = None
+    sigma: NDArray[np.float64] | None = None
     stamp_ns: int = 0
     frame_id: str = field(default='', compare=False)
     angle: float | None = None
+
+    @property
+    def place(self) -> Place:
+        """Fluoroscope and exposure, as the place of a finding."""
+        return Place((self.fluoroscope,), (int(self.number),))
 
     def __post_init__(self) -> None:
         if self.angle is not None:
@@ -73,13 +79,13 @@ class Frame:
         return Frame(
             self.fluoroscope,
             int(self.number),
-            np.asarray(self.target_id, dtype=np.int64)[order],
-            np.asarray(self.uv, dtype=float)[order],
-            (int(width), int(height)),
-            None if self.sigma is None else np.asarray(self.sigma, dtype=float)[order],
-            int(self.stamp_ns),
-            self.frame_id,
-            self.angle,
+            target_id=np.asarray(self.target_id, dtype=np.int64)[order],
+            uv=np.asarray(self.uv, dtype=float)[order],
+            image_size=(int(width), int(height)),
+            sigma=None if self.sigma is None else np.asarray(self.sigma, dtype=float)[order],
+            stamp_ns=int(self.stamp_ns),
+            frame_id=self.frame_id,
+            angle=self.angle,
         )
 
 

@@ -31,10 +31,10 @@ class MovingPoints:
         Standard deviation of each coordinate [mm].
     """
 
-    exposure: np.ndarray
-    target_id: np.ndarray
-    xyz_mm: np.ndarray
-    sd_mm: np.ndarray
+    exposure: NDArray[np.int64]
+    target_id: NDArray[np.int64]
+    xyz_mm: NDArray[np.float64]
+    sd_mm: NDArray[np.float64]
 
     def __post_init__(self) -> None:
         for name in ('exposure', 'target_id'):

@@ -12,6 +12,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from ..errors import DataError
 
@@ -59,7 +60,7 @@ class Names:
         return {identity: name for name, identity in self.fluoroscopes.items()}
 
 
-def _merged(what: str, one: Mapping[str, object], other: Mapping[str, object]) -> dict:
+def _merged(what: str, one: Mapping[str, object], other: Mapping[str, object]) -> dict[str, Any]:
     for name, identity in other.items():
         if one.get(name, identity) != identity:
             raise DataError(f'{what} {name!r} has the id {one[name]}, and the id {identity}')

@@ -35,10 +35,10 @@ class Phantom:
         Of the beads [mm], where it is known.
     """
 
-    target_id: np.ndarray
-    xyz_mm: np.ndarray
-    sd_mm: np.ndarray
-    diameter_mm: np.ndarray | None = None
+    target_id: NDArray[np.int64]
+    xyz_mm: NDArray[np.float64]
+    sd_mm: NDArray[np.float64]
+    diameter_mm: NDArray[np.float64] | None = None
 
     def __post_init__(self) -> None:
         ids = np.asarray(self.target_id, dtype=np.int64)

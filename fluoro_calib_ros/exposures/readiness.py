@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from .coverage import Coverage
 
-RECOMMENDED_EXPOSURES = 15  # docs/usage.md; accuracy against their number: docs/accuracy.md
+RECOMMENDED_EXPOSURES = 15  # docs/usage.md; accuracy by number: docs/how_good/accuracy.md
 RECOMMENDED_COVERAGE = 0.9
 MAX_AREAS = 2  # named at once
 

@@ -3,10 +3,10 @@
 
 """Single image points that cannot be used: off the image, or of a target that is unknown.
 
-A few of them are left out and reported. Many are a fault of the whole input, such as a wrong image
+A few of them are excluded and reported. Many are a fault of the whole input, such as a wrong image
 size or another phantom, and are left to `validate_frame`, which refuses the frame. Many targets at
 the same image point are a fill value of some program for targets that are not seen, such as
-(0, 0), and always left out.
+(0, 0), and always excluded.
 """
 
 from __future__ import annotations
@@ -15,23 +15,25 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ..findings import Finding, Kind, Severity
 from .frame import Frame, points_on_image
 from .phantom import Phantom
 
 MIN_TOGETHER = 4  # targets at the same image point that are fill values
 MIN_SHARE_TOGETHER = 0.02  # the same, of the targets of the frame; the larger of both holds
 MAX_LISTED = 10  # targets in a sentence
-MAX_SHARE = 0.05  # of the image points of a frame that are left out; one always is
+MAX_SHARE = 0.05  # of the image points of a frame that are excluded; one always is
 
 
 def few(count: int, of: int) -> bool:
-    """Return whether so many image points of a frame or file can be left out."""
+    """Return whether so many image points of a frame or file can be excluded."""
     return 0 < count <= max(1, MAX_SHARE * of) and count < of
 
 
-def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame, str]:
-    """Return the frame without its few stray points, and a sentence about them, '' without any.
+def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame, Finding | None]:
+    """Return the frame without its few stray points, and a finding about them, None without any.
 
     phantom: its targets are known, by default all. A frame with many of them, or whose arrays do
     not belong together, is returned as it is.
@@ -39,7 +41,7 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
     ids = np.asarray(frame.target_id)
     uv = np.asarray(frame.uv)
     if uv.shape != (len(ids), 2) or (frame.sigma is not None and len(frame.sigma) != len(ids)):
-        return frame, ''
+        return frame, None
     finite = np.isfinite(uv).all(axis=1)
     together = finite & _together(uv)
     off = finite & ~together & ~points_on_image(uv, frame.image_size)
@@ -49,7 +51,7 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
         single = np.zeros(len(ids), dtype=bool)
     stray = single | together
     if not stray.any() or stray.all():
-        return frame, ''
+        return frame, None
     kept = ~stray
     cleaned = replace(
         frame,
@@ -69,23 +71,31 @@ def without_strays(frame: Frame, phantom: Phantom | None = None) -> tuple[Frame,
         )
         if chosen.any()
     ]
-    return cleaned, (
-        f'fluoroscope {frame.fluoroscope}, exposure {frame.number}: {stray.sum()} image '
-        f'point{"s" * bool(stray.sum() > 1)}, {" and ".join(causes)}'
+    count = int(stray.sum())
+    return cleaned, Finding(
+        Kind.STRAY_POINTS,
+        f'{count} image point{"s" * (count > 1)}, {" and ".join(causes)}',
+        replace(frame.place, target_id=tuple(ids[stray].tolist())),
+        severity=Severity.NOTE,
+        numbers={
+            'off_image': int(np.sum(off & single)),
+            'not_on_phantom': int(np.sum(unknown & single & ~off)),
+            'fill_values': int(together.sum()),
+        },
     )
 
 
 def frames_without_strays(
     frames: Mapping[str, Sequence[Frame]], phantom: Phantom
-) -> tuple[dict[str, list[Frame]], list[str]]:
-    """Return the frames by fluoroscope without their few stray points, and sentences on these."""
-    sentences = []
+) -> tuple[dict[str, list[Frame]], list[Finding]]:
+    """Return the frames by fluoroscope without their few stray points, and findings on these."""
+    findings = []
     out: dict[str, list[Frame]] = {}
     for name, exposures in frames.items():
         cleaned = [without_strays(frame, phantom) for frame in exposures]
         out[name] = [frame for frame, _ in cleaned]
-        sentences += [sentence for _, sentence in cleaned if sentence]
-    return out, sentences
+        findings += [found for _, found in cleaned if found is not None]
+    return out, findings
 
 
 def _together(uv: np.ndarray) -> np.ndarray:
@@ -96,6 +106,6 @@ def _together(uv: np.ndarray) -> np.ndarray:
     return count[place.reshape(-1)] >= max(MIN_TOGETHER, MIN_SHARE_TOGETHER * len(uv))
 
 
-def _listed(ids: Sequence[int]) -> str:
+def _listed(ids: NDArray[np.int64]) -> str:
     listed = ', '.join(str(i) for i in ids[:MAX_LISTED])
     return listed if len(ids) <= MAX_LISTED else f'{listed} and {len(ids) - MAX_LISTED} more'

@@ -1,4 +1,4 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whole images without distortion: where each pixel comes from, found once, and encoded images."""
+"""Images: beads and markers found and measured; images corrected."""

@@ -20,9 +20,9 @@ from functools import cached_property
 import cv2
 import numpy as np
 
-from ..calibration.result import FluoroscopeCalibration
-from ..distortion.angle_field import AngleField
-from ..distortion.status import CorrectionStatus
+from ..correction.angle_field import AngleField
+from ..correction.base import CorrectionStatus
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from .corrector import (
     LIMIT_PX,
     ROWS,
@@ -123,7 +123,7 @@ class _Base:
             u = np.tile(np.arange(width), len(rows)) - margin
             v = np.repeat(rows, width) - margin
             ideal = np.stack([u, v]).astype(float)
-            # A bend at the rim would not be interpolated well between nodes on both sides of it.
+            # A bend at the border would not be interpolated well between nodes on both sides.
             observed = iterated(self._grid, ideal, continued)
             error = np.abs(observed - continued(self._grid, observed) - ideal).max(axis=0)
             source[:, rows] = observed.reshape(2, -1, width)

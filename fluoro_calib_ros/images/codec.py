@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 
 from ..errors import DataError
+from ..findings import Kind
 from .declared_size import PNG_SIGNATURE, check_declared_size, declared_size
 
 # Higher levels take several times as long and save a few per cent of an image with noise.
@@ -70,14 +71,17 @@ def as_grey(image: np.ndarray) -> np.ndarray:
     Raises DataError if the colours differ, or if the pixels are not uint8 or uint16.
     """
     if image.dtype not in (np.uint8, np.uint16):
-        raise DataError(f'the image has pixels of {image.dtype}, not of 8 or 16 bits')
+        raise DataError(
+            f'the image has pixels of {image.dtype}, not of 8 or 16 bits', kind=Kind.IMAGE_ENCODING
+        )
     if image.ndim == 2:
         return image
     first = image[:, :, 0]
     if image.shape[2] >= 3 and not all(np.array_equal(first, image[:, :, k]) for k in (1, 2)):
         raise DataError(
             'this is a colour image, convert it to grey first: it is not known which of its '
-            'colours show X-rays'
+            'colours show X-rays',
+            kind=Kind.IMAGE_ENCODING,
         )
     return np.ascontiguousarray(first)
 

@@ -20,9 +20,9 @@ from typing import Protocol
 import cv2
 import numpy as np
 
-from ..calibration.result import FluoroscopeCalibration
-from ..distortion.grid import CorrectionGrid
-from ..distortion.status import CorrectionStatus
+from ..correction.base import CorrectionStatus
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.grid import CorrectionGrid
 from ..errors import DataError
 from ..limits import MAX_IMAGE_SIDE
 
@@ -131,7 +131,7 @@ class ImageCorrector:
         high = np.array(self.image_size, dtype=np.float32)[:, None, None] - 1
         for start in range(0, self.shape[0], STRIPE):
             rows = slice(start, start + STRIPE)
-            # A source in the outer half of a pixel at the rim takes the value of that pixel.
+            # A source in the outer half of a pixel at the border takes the value of that pixel.
             u, v = np.clip(self._sources.of_stripe(start), 0, high)
             cv2.patchNaNs(u, NOWHERE)
             cv2.patchNaNs(v, NOWHERE)
@@ -202,7 +202,7 @@ class ImageCorrector:
             )
 
     def _remap_cubic(self, image: np.ndarray, out: np.ndarray) -> None:
-        """Remap with the two pixels needed beyond the rim equal to the outermost ones."""
+        """Remap with the two pixels needed beyond the border equal to the outermost ones."""
         if image.dtype == np.uint8:  # OpenCV is three times as fast with 16 bits
             wide = cv2.remap(
                 image.astype(np.uint16),
@@ -261,9 +261,9 @@ def iterated(
 
     The iteration is observed = undistorted + (du, dv)(observed). Each step leaves the fraction of
     the error by which the correction changes per pixel, some hundredths. Off the image, the
-    correction continues as it is at the rim, so that a step too far comes back. Where it changes
-    so much that full steps do not converge, half steps may. look_up gives corrections (2, n) at
-    pixels (2, n), by default these.
+    correction continues as it is at the border, so that a step too far comes back. Where it
+    changes so much that full steps do not converge, half steps may. look_up gives corrections (2,
+    n) at pixels (2, n), by default these.
     """
     look_up = look_up or as_at_rim
     observed = undistorted.copy()
@@ -284,7 +284,7 @@ def as_at_rim(grid: CorrectionGrid, at: np.ndarray) -> np.ndarray:
 
 
 def continued(grid: CorrectionGrid, at: np.ndarray) -> np.ndarray:
-    """Corrections (2, n) at pixels (2, n), beyond the rim as steep as before it."""
+    """Corrections (2, n) at pixels (2, n), beyond the border as steep as before it."""
     out = as_at_rim(grid, at)
     off = np.flatnonzero(((at < -0.5) | (at > _end(grid))).any(axis=0))
     mirrored = 2 * np.clip(at[:, off], -0.5, _end(grid)) - at[:, off]

@@ -9,42 +9,94 @@ The command line, the calibration node, its worker process and Python users all 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import combinations
 
 import numpy as np
 
-from ..calibration.calibrate import CalibrationResult, calibrate_request
-from ..calibration.initial_network import MIN_EXPOSURES
-from ..calibration.known_rig import orientation_of_known
-from ..calibration.request import CalibrationRequest
-from ..calibration.result import FluoroscopeCalibration
-from ..calibration.rig_orientation import orientation_and_scatter
-from ..calibration.rounds import Round
-from ..errors import DataError
-from ..exposures.frame import Frame
-from ..exposures.strays import frames_without_strays
-from ..photogrammetry.rig_orientation import RigOrientation
-from ..validation.check import Validation
-from ..validation.inputs import (
+from ..checks.check import Validation
+from ..checks.held_out import corrected_already, misfits, poor_fits, uncorrected
+from ..checks.inputs import (
     copied_exposures,
     find_wrong_input,
     find_wrong_orientation,
     find_wrong_phantom,
+    implausible,
+    require_phantom,
     shared_exposures,
     valid_frames,
     validate_magnitudes,
     validate_names,
-    why_left_out,
+    why_excluded,
 )
-from ..validation.mixed_units import mixed_units
-from ..validation.plausibility import implausible
-from ..validation.rigidity import contradiction, doubtful, interchanged
-from ..validation.verdict import validate_or_report
+from ..checks.mixed_units import mixed_units
+from ..checks.rigidity import NOT_ORIENTED, contradiction, doubtful, interchanged
+from ..checks.verdict import validate_or_report
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError
+from ..estimation.calibrate import adjust_with_calibrations, calibrate_request
+from ..estimation.initial_network import MIN_EXPOSURES
+from ..estimation.options import CalibrationRequest
+from ..estimation.result import CalibrationResult
+from ..estimation.rig_orientation import orientation_and_scatter, orientation_of_known
+from ..estimation.rounds import Round
+from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
+from ..exposures.strays import frames_without_strays
+from ..findings import Finding, Kind, Place, Severity
+from ..photogrammetry.rig_orientation import RigOrientation
+from .sources import select_calibrations
+
+# The adjustment job: adjust exposures with calibrations fixed, an out-of-sample test.
+
+
+def adjust(
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    loss: str = 'student_t',
+) -> CalibrationResult:
+    """Adjust exposures of the phantom with interior orientations and corrections fixed.
+
+    A few image points that are off the image, or not of the phantom, are excluded.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        Exposures by fluoroscope.
+    phantom : Phantom
+    calibrations : mapping of str to FluoroscopeCalibration
+        At least those of the fluoroscopes in frames.
+    loss : {'student_t', 'huber', 'gaussian'}
+
+    Returns
+    -------
+    CalibrationResult
+        Its findings of severity ERROR say where the exposures do not fit the calibrations.
+
+    Raises
+    ------
+    DataError
+        For a missing calibration, and for frames that do not suffice, cannot be of the phantom, or
+        are corrected already.
+    """
+    used = select_calibrations(calibrations, frames)
+    cleaned, strays = frames_without_strays(frames, phantom)
+    require_phantom(cleaned, phantom)
+    result = adjust_with_calibrations(cleaned, phantom, used, loss)
+    if misfits(result, used):
+        without = adjust_with_calibrations(cleaned, phantom, uncorrected(used), loss)
+        corrected = corrected_already(result, without, used)
+        if corrected is not None:
+            raise DataError(corrected)
+    findings = (*strays, *result.findings, *poor_fits(result, used))
+    return replace(result, findings=findings)
+
 
 MAX_SHARED = 1 / 3  # of the exposures of a fluoroscope that another one has as well
 
+Frames = Mapping[str, Sequence[Frame]]
 Progress = Callable[[str, Round], None]
 Cancellation = Callable[[], None]
 
@@ -79,30 +131,16 @@ class CalibrationOutcome:
     rig : Rig
         The fluoroscopes that were not calibrated.
     orientation : RigOrientation or None
-        None where the exposures give none.
-    orientation_note : str
-        Why there is none, or what is doubtful about it; '' for nothing.
+        None where the exposures give none; the findings of the result say why.
     validation : Validation or None
         None where no validation was requested.
-    doubts : tuple of str
-        Why the calibration cannot be right; not empty only where it was forced.
     """
 
     request: CalibrationRequest
     result: CalibrationResult
     rig: Rig = field(default_factory=Rig)
     orientation: RigOrientation | None = None
-    orientation_note: str = ''
     validation: Validation | None = None
-    doubts: tuple[str, ...] = ()
-
-    @property
-    def rig_note(self) -> str:
-        """Why the rig has no orientation, or what is doubtful about it, as a sentence."""
-        if not self.orientation_note or len(self.calibrations) < 2:
-            return ''
-        none = 'no ' if self.orientation is None else ''
-        return f'{none}orientation of the rig: {self.orientation_note}'
 
     @property
     def calibrations(self) -> dict[str, FluoroscopeCalibration]:
@@ -126,7 +164,7 @@ def run_calibration(
 ) -> CalibrationOutcome:
     """Self-calibrate the fluoroscopes of a request, and orient the rig.
 
-    Exposures that repeat an earlier one are left out, and so are a few image points off the image
+    Exposures that repeat an earlier one are excluded, and so are a few image points off the image
     or of targets that the phantom does not have.
 
     Parameters
@@ -136,13 +174,13 @@ def run_calibration(
         Whether the calibration is validated with its own exposures.
     force : bool
         Whether to calibrate input that cannot be right, and return a result that is impossible;
-        the outcome then holds the doubts.
+        the findings of the result then say so.
     rig : Rig, optional
         Further fluoroscopes of the rig.
     progress : callable, optional
         Called with the names of the fluoroscopes and the Round after every round.
     report_step : callable, optional
-        Called as the progress of `validation.verdict.validate`.
+        Called as the progress of `checks.verdict.validate`.
     raise_if_cancelled : callable, optional
         Called before every step; may raise to stop the job.
 
@@ -160,37 +198,29 @@ def run_calibration(
     """
     validate_names((*request.frames, *(rig.frames if rig else ())))
     validate_magnitudes(request.frames, request.phantom)
-    request, left_out = _without_strays(request)
-    request, copies = _without_copies(request)
-    left_out += copies
-    request, shared = _without_shared(request)
-    left_out += shared
-    doubts = _wrong_input(request)
-    if doubts and not force:
-        raise DataError('. '.join(doubts))
+    request, excluded = _without_unusable(request)
+    wrong = _wrong_input(request)
+    if wrong and not force:
+        raise DataError(*wrong)
     result = _calibrated(request, progress, raise_if_cancelled)
-    result = replace(result, left_out=(*left_out, *_with_causes(request, result)))
-    doubts += implausible(request, result)
-    doubts += _interchanged(result)
-    if doubts and not force:
-        raise DataError('. '.join(doubts))
+    excluded += _with_causes(request, result)
+    wrong += [*implausible(request, result), *_interchanged(result)]
+    if wrong and not force:
+        raise DataError(*wrong)
     rig = rig or Rig()
-    orientation, note = _orientation(request, result, rig)
+    orientation, doubts = _orientation(request, result, rig)
+    result = replace(result, findings=(*excluded, *doubts, *wrong))
     validation = None
     if validate:
         validation = validate_or_report(
             request, result.calibrations, report_step, raise_if_cancelled
         )
-    outcome = CalibrationOutcome(
-        request, result, rig, orientation, note, validation, tuple(doubts)
-    )
-    if validation is None or not outcome.rig_note:
-        return outcome
-    return replace(outcome, validation=replace(validation, notes=(outcome.rig_note,)))
+        validation = replace(validation, notes=tuple(doubts))
+    return CalibrationOutcome(request, result, rig, orientation, validation)
 
 
-def _wrong_input(request: CalibrationRequest) -> list[str]:
-    """Return a sentence for everything in phantom and exposures that cannot be right."""
+def _wrong_input(request: CalibrationRequest) -> list[Finding]:
+    """Return a finding for everything in phantom and exposures that cannot be right."""
     frames = valid_frames(request.frames)  # the calibration reports the others
     known = request.known_orientations
     absent = [name for name in known if name not in request.frames]
@@ -203,12 +233,12 @@ def _wrong_input(request: CalibrationRequest) -> list[str]:
     # Points in motion may rest, and may come from far away.
     found = [
         *([] if known else find_wrong_phantom(frames, request.phantom)),
-        *find_wrong_input(unknown, request.phantom).values(),
+        *find_wrong_input(unknown, request.phantom),
     ]
-    mixed = '' if known else mixed_units(unknown, request.phantom, bool(found))
+    mixed = None if known else mixed_units(unknown, request.phantom, bool(found))
     return [
         *([mixed] if mixed else found),
-        *find_wrong_orientation(frames, request.phantom, known).values(),
+        *find_wrong_orientation(frames, request.phantom, known),
     ]
 
 
@@ -223,116 +253,132 @@ def _calibrated(
     except np.linalg.LinAlgError as error:
         raise DataError(
             f'the exposures do not determine the calibration: {str(error).lower()}; add exposures '
-            'with the phantom turned and moved, and check target ids and sigma'
+            'with the phantom turned and moved, and check target ids and sigma',
+            kind=Kind.UNDETERMINED,
         ) from None
 
 
-def _with_causes(request: CalibrationRequest, result: CalibrationResult) -> tuple[str, ...]:
-    """Return what was left out, with the causes of exposures that do not fit, where found."""
-    causes: dict[str, str] = {}
+def _with_causes(request: CalibrationRequest, result: CalibrationResult) -> list[Finding]:
+    """Return what was excluded, with the causes of exposures that do not fit, where known."""
+    causes: dict[Place, Finding | None] = {}
     for name, figures in result.fluoroscopes.items():
         used = {exposure.exposure for exposure in figures.exposures}
         frames = valid_frames({name: request.frames[name]})[name]
         if name not in request.known_orientations:
-            causes |= {
-                f'fluoroscope {name}, exposure {frame.number}: ': why_left_out(
-                    frame, request.phantom
-                )
-                for frame in frames
-                if frame.number not in used
-            }
-    out = []
-    for sentence in result.left_out:
-        found = [cause for start, cause in causes.items() if cause and sentence.startswith(start)]
-        out.append('; '.join([sentence, *found]))
-    return tuple(out)
+            for frame in frames:
+                if frame.number not in used:
+                    causes[frame.place] = why_excluded(frame, request.phantom)
+    return [found.explained_by(causes.get(found.place)) for found in result.findings]
 
 
-def _without_strays(request: CalibrationRequest) -> tuple[CalibrationRequest, list[str]]:
-    """Return the request without a few unusable image points, and sentences about these."""
-    cleaned, sentences = frames_without_strays(request.frames, request.phantom)
-    return (replace(request, frames=cleaned) if sentences else request), sentences
+def _without_unusable(request: CalibrationRequest) -> tuple[CalibrationRequest, list[Finding]]:
+    """Return the request without stray points and repeated exposures, and what was excluded.
+
+    Raises DataError where copies are many.
+    """
+    frames, strays = frames_without_strays(request.frames, request.phantom)
+    frames, copies = _without_copies(frames, request.known_orientations)
+    frames, shared = _without_shared(frames)
+    return replace(request, frames=frames), [*strays, *copies, *shared]
 
 
-def _without_copies(request: CalibrationRequest) -> tuple[CalibrationRequest, list[str]]:
-    """Return the request without repeated exposures, and a sentence for each of these."""
-    sentences = []
-    frames = {}
-    for name, exposures in request.frames.items():
-        # Of a fixed fluoroscope the same points may be seen again.
-        copies = [] if name in request.known_orientations else copied_exposures(exposures)
+def _without_copies(
+    frames: Frames, known: Container[str]
+) -> tuple[dict[str, list[Frame]], list[Finding]]:
+    """Return the frames without repeated exposures, and a finding for each of these.
+
+    Of a fixed fluoroscope, whose orientation is known, the same points may be seen again. Raises
+    DataError where too few are left.
+    """
+    out = {}
+    findings = []
+    for name, exposures in frames.items():
+        copies = [] if name in known else copied_exposures(exposures)
         numbers = {copy.number for copy, _ in copies}
-        frames[name] = [frame for frame in exposures if frame.number not in numbers]
-        if copies and len(frames[name]) < MIN_EXPOSURES:
+        out[name] = [frame for frame in exposures if frame.number not in numbers]
+        if copies and len(out[name]) < MIN_EXPOSURES:
             raise DataError(
-                f'fluoroscope {name}: {len(copies)} of {len(exposures)} exposures repeat the '
-                f'image points of another one, {MIN_EXPOSURES} different exposures are needed'
+                f'{len(copies)} of {len(exposures)} exposures repeat the image points of '
+                f'another one, {MIN_EXPOSURES} different exposures are needed',
+                kind=Kind.COPIED_EXPOSURE,
+                place=Place((name,), tuple(sorted(numbers)), name=f'fluoroscope {name}'),
             )
-        sentences += [
-            f'fluoroscope {name}, exposure {copy.number}: the image points are those of exposure '
-            f'{original.number}'
+        findings += [
+            Finding(
+                Kind.COPIED_EXPOSURE,
+                f'the image points are those of exposure {original.number}',
+                copy.place,
+                severity=Severity.NOTE,
+                numbers={'original': original.number},
+            )
             for copy, original in copies
         ]
-    return (replace(request, frames=frames) if sentences else request), sentences
+    return out, findings
 
 
-def _without_shared(request: CalibrationRequest) -> tuple[CalibrationRequest, list[str]]:
-    """Return the request without exposures that two fluoroscopes have in common.
+def _without_shared(frames: Frames) -> tuple[dict[str, list[Frame]], list[Finding]]:
+    """Return the frames without exposures that two fluoroscopes have in common.
 
-    Which of both they are of is not known. Returns a sentence for each, too. Raises DataError
+    Which of both they are of is not known. Returns a finding for each, too. Raises DataError
     where they are many.
     """
-    frames = {name: list(exposures) for name, exposures in request.frames.items()}
-    sentences = []
-    for one, other in combinations(frames, 2):
-        pairs = shared_exposures(request.frames[one], request.frames[other])
-        if not pairs:
-            continue
-        fewest = min(len(request.frames[one]), len(request.frames[other]))
-        if len(pairs) > MAX_SHARED * fewest:
+    out = {name: list(exposures) for name, exposures in frames.items()}
+    findings = []
+    for names in combinations(frames, 2):
+        one, other = (frames[name] for name in names)
+        pairs = shared_exposures(one, other)
+        if len(pairs) > MAX_SHARED * min(len(one), len(other)):
             raise DataError(
-                f'fluoroscopes {one} and {other}: {len(pairs)} exposures have the same image '
-                'points, as if one recording had been given for both'
+                f'{len(pairs)} exposures have the same image points, as if one recording had '
+                'been given for both',
+                kind=Kind.SHARED_EXPOSURE,
+                place=Place(names),
+                numbers={'exposures': len(pairs)},
             )
-        for k, name in enumerate((one, other)):
+        for k, name in enumerate(names):
             numbers = {pair[k].number for pair in pairs}
-            frames[name] = [frame for frame in frames[name] if frame.number not in numbers]
-        sentences += [
-            f'fluoroscopes {one} and {other}, exposure {a.number}'
-            f'{f" and {b.number}" * (a.number != b.number)}: both have the same image points'
+            out[name] = [frame for frame in out[name] if frame.number not in numbers]
+        findings += [
+            Finding(
+                Kind.SHARED_EXPOSURE,
+                'both have the same image points',
+                Place(names, tuple(dict.fromkeys((a.number, b.number)))),
+                severity=Severity.NOTE,
+            )
             for a, b in pairs
         ]
-    return (replace(request, frames=frames) if sentences else request), sentences
+    return out, findings
 
 
-def _interchanged(result: CalibrationResult) -> list[str]:
-    """Return a sentence for every two fluoroscopes whose frames are interchanged somewhere."""
+def _interchanged(result: CalibrationResult) -> list[Finding]:
+    """Return a finding for every two fluoroscopes whose frames are interchanged somewhere."""
     first, *others = result.fluoroscopes
     figures = result.fluoroscopes
     found = [interchanged((first, name), figures[first], figures[name]) for name in others]
-    return [sentence for sentence in found if sentence]
+    return [one for one in found if one is not None]
 
 
 def _orientation(
     request: CalibrationRequest, result: CalibrationResult, rig: Rig
-) -> tuple[RigOrientation | None, str]:
-    """Return the orientation of the rig and what is doubtful about it, or None and the reason."""
+) -> tuple[RigOrientation | None, list[Finding]]:
+    """Return the orientation of the rig and what is doubtful about it, or None and the reason.
+
+    A single fluoroscope is no rig, and needs no reason.
+    """
     frames = {**rig.frames, **request.frames}
     calibrations = {**rig.calibrations, **result.calibrations}
     names = [name for name in rig.fluoroscopes or calibrations if name in calibrations]
     if len(names) < 2:
-        return None, 'a single fluoroscope is calibrated'
+        return None, []
     if all(name in request.known_orientations for name in names):
         known = request.known_orientations
-        return orientation_of_known(known, result.fluoroscopes, result.calibrations), ''
+        return orientation_of_known(known, result.fluoroscopes, result.calibrations), []
     calibrated = [name for name in names if name in result.fluoroscopes]
     for name in calibrated[1:]:
         first = calibrated[0]
-        sentence = contradiction(
-            (first, name), result.fluoroscopes[first], result.fluoroscopes[name]
-        )
-        if sentence:
-            return None, sentence
+        found = contradiction((first, name), result.fluoroscopes[first], result.fluoroscopes[name])
+        if found is not None:
+            return None, [found]
     try:
         orientation, scatter = orientation_and_scatter(
             {name: frames[name] for name in names},
@@ -341,10 +387,11 @@ def _orientation(
             starts=result.starts,
         )
     except DataError as error:
-        return None, str(error)
+        why = f'{NOT_ORIENTED}: {error}'
+        return None, [Finding(Kind.RIG_NOT_ORIENTED, why, severity=Severity.WARNING)]
     side = max(max(calibration.image_size) for calibration in calibrations.values())
-    found = [doubtful(pairs, side) for pairs in scatter]
-    refused = '; '.join(refusal for refusal, _ in found if refusal)
+    found_of_pairs = [doubtful(pairs, side) for pairs in scatter]
+    refused = [one for usable, doubts in found_of_pairs for one in doubts if not usable]
     if refused:
         return None, refused
-    return orientation, '; '.join(note for _, note in found if note)
+    return orientation, [one for _, doubts in found_of_pairs for one in doubts]

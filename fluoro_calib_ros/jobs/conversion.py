@@ -14,13 +14,19 @@ from typing import Any
 
 import numpy as np
 
-from ..bags.joint_states import with_angles
-from ..bags.reader import read_frames
-from ..calibration.result import FluoroscopeCalibration
-from ..distortion.status import CorrectionStatus
+from ..correction.base import CorrectionStatus
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
-from ..exchange import registry
-from ..exchange.content import (
+from ..exposures.angles import AngleOptions
+from ..exposures.frame import Frame
+from ..images.corrector import ImageCorrector
+from ..io.bags.reader import read_frames, with_angles
+from ..io.calibration import SUFFIX, load_calibrations
+from ..io.calibration_request import OBSERVATIONS
+from ..io.calibration_request import PHANTOM as PHANTOM_FILE
+from ..io.csv_table import read_names
+from ..io.formats import registry
+from ..io.formats.content import (
     PARTS,
     Bodies,
     Camera,
@@ -30,21 +36,15 @@ from ..exchange.content import (
     Written,
     camera_at,
 )
-from ..exposures.angles import AngleOptions
-from ..exposures.frame import Frame
-from ..files.calibration import SUFFIX, load_calibrations
-from ..files.calibration_request import OBSERVATIONS
-from ..files.calibration_request import PHANTOM as PHANTOM_FILE
-from ..files.json_file import read_json
-from ..files.names import read_names
-from ..files.observations import read_observations_csv
-from ..files.phantom import read_phantom
-from ..files.rig_orientation import load_orientation, orientation_path
-from ..images.corrector import ImageCorrector
+from ..io.observations import read_observations_csv
+from ..io.phantom import read_phantom
+from ..io.result_check import RESULT_NAME as RESULT
+from ..io.rig_orientation import load_orientation, orientation_path
+from ..io.text_files import read_json
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
-from .dataset import write_bag
-from .result_folder import RESULT, belongs_to
+from .result_folder import belongs_to
+from .simulation import write_bag
 from .sources import is_bag, require_observed, select_calibrations
 
 BAG = 'bag'

@@ -5,28 +5,23 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import lru_cache, partial
 from itertools import groupby
 from pathlib import Path
 
 import cv2
 import numpy as np
 
-from ..bags.images import image_topics
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
-from ..files.access import check_safe_name, make_folder
-from ..files.atomic import write_bytes
-from ..radiographs.assumptions import assumed_lens, may_be_found, shared_lens
-from ..radiographs.extraction import Extraction, Nearby, extract_beads
-from ..radiographs.lattice import FlatGrid
-from ..radiographs.matching import PhantomModel
-from ..radiographs.overlay import draw_overlay
-from ..radiographs.view import Lens, View
+from ..findings import Finding, Kind, Place
+from ..images.lattice import FlatGrid
+from ..images.view import Lens, assumed_lens, may_be_found, shared_lens
+from ..io.access import check_safe_name, make_folder
+from ..io.atomic import write_bytes
+from ..io.bags.reader import image_topics
 from .image_sources import (
     ImageAngles,
     ImageSources,
@@ -35,6 +30,7 @@ from .image_sources import (
     is_image_bag,
     open_sources,
 )
+from .live_extraction import Observations, PhantomSettings
 from .scheduling import Workers, open_workers
 from .sources import Recording, Survey
 
@@ -45,8 +41,8 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class ImageResult:
-    """What was found in one image.
+class ImageResult(Observations):
+    """What was found in one image of a recording.
 
     Attributes
     ----------
@@ -54,33 +50,15 @@ class ImageResult:
     place : str
         File, page or message.
     frame : Frame or None
-        None where the image gives no observations; reason says why.
-    overlapped : (n,) ndarray of bool
-    reason : str
-    expected : int
-        Beads of the phantom in the field of view.
-    found, explained : float
-        Shares of the expected beads that are found, and of what is found that is expected.
-    view : View or None
-    followed : bool
-        The pose comes from the image before.
-    seconds : float
-    picture : bytes or None
-        Overlay as PNG, if it was asked for.
+        None where the image gives no observations; the finding says why.
+    png : bytes or None
+        Overlay, if it was asked for.
     """
 
-    exposure: int
-    place: str
+    exposure: int = 0
+    place: str = ''
     frame: Frame | None = None
-    overlapped: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    reason: str = ''
-    expected: int = 0
-    found: float = 0.0
-    explained: float = 0.0
-    view: View | None = None
-    followed: bool = False
-    seconds: float = 0.0
-    picture: bytes | None = None
+    png: bytes | None = None
 
 
 @dataclass(frozen=True)
@@ -142,84 +120,47 @@ class _Task:
     """Images for a worker: one, or some of a video."""
 
     images: tuple[SourceImage, ...]
-    fluoroscope: str
-    lens: Lens
-    overlay: bool
-    regular_grid: bool
+    settings: PhantomSettings
+    overlay: bool = False
 
 
-@lru_cache(maxsize=4)
-def _model_of(beads: bytes, diameters: bytes | None, regular: bool) -> PhantomModel:
-    """Return a phantom, prepared for matching; a worker keeps it between tasks."""
-    diameter_mm = None if diameters is None else np.frombuffer(diameters)
-    return PhantomModel.of(np.frombuffer(beads).reshape(-1, 3), diameter_mm, regular)
-
-
-def _extract(phantom: Phantom, task: _Task) -> list[ImageResult]:
+def _extract(task: _Task) -> list[ImageResult]:
     """Extract the images of a task, each from the pose of the one before, where that leads."""
-    diameters = None if phantom.diameter_mm is None else phantom.diameter_mm.tobytes()
-    model = _model_of(phantom.xyz_mm.tobytes(), diameters, task.regular_grid)
-    near: Nearby | None = None
+    follower = task.settings()
+    name = task.settings.fluoroscope
     results = []
     for source in task.images:
-        start = time.perf_counter()
-        result = ImageResult(source.exposure, source.place)
         image = source.image
         if isinstance(image, DataError):
-            results.append(replace(result, reason=_without_place(str(image), source.place)))
-            continue
-        extraction: Extraction | None = None
-        try:
-            _check_size(image, task.lens)
-            extraction = extract_beads(image, model, task.lens, near)
-            near = extraction.nearby
-            result = _observed(result, extraction, phantom, task, source.angle)
-        except DataError as error:
-            result = replace(result, reason=str(error))
-        if task.overlay:
-            picture = draw_overlay(image, extraction, result.reason)
-            result = replace(result, picture=cv2.imencode('.png', picture)[1].tobytes())
-        results.append(replace(result, seconds=time.perf_counter() - start))
+            found = Observations(finding=image.finding)
+        else:
+            overlays = (name,) if task.overlay else ()
+            found = follower.extract({name: image}, source.exposure, overlays)[name]
+            if found.finding is not None:
+                found = replace(found, finding=found.finding.at(source.place))
+        results.append(_result(found, source, task.settings))
     return results
 
 
-def _check_size(image: np.ndarray, lens: Lens) -> None:
-    """Raise DataError for an image of another size than the first one."""
-    size = image.shape[::-1]
-    if size != lens.image_size:
-        expected = lens.image_size
-        raise DataError(
-            f'the image is {size[0]} x {size[1]} px, but the first one is '
-            f'{expected[0]} x {expected[1]} px'
+def _result(found: Observations, source: SourceImage, settings: PhantomSettings) -> ImageResult:
+    """Return what was found as the result of an image."""
+    frame: Frame | None = None
+    if found.finding is None and settings.lens is not None:
+        frame = Frame(
+            settings.fluoroscope,
+            source.exposure,
+            found.target_id,
+            found.uv,
+            settings.lens.image_size,
+            sigma=found.sigma,
+            angle=source.angle,
         )
-
-
-def _observed(
-    result: ImageResult,
-    extraction: Extraction,
-    phantom: Phantom,
-    task: _Task,
-    angle: float | None,
-) -> ImageResult:
-    """Return a result with observations."""
-    frame = Frame(
-        task.fluoroscope,
-        result.exposure,
-        phantom.target_id[extraction.bead],
-        extraction.uv,
-        task.lens.image_size,
-        extraction.sigma,
-        angle=angle,
-    )
-    return replace(
-        result,
-        frame=frame,
-        overlapped=extraction.overlapped,
-        expected=extraction.match.expected,
-        found=extraction.match.found,
-        explained=extraction.match.explained,
-        view=extraction.view,
-        followed=extraction.followed,
+    png: bytes | None = None
+    if found.picture is not None:
+        png = cv2.imencode('.png', found.picture)[1].tobytes()
+    values = {**vars(found), 'picture': None}
+    return ImageResult(
+        **values, exposure=source.exposure, place=source.place, frame=frame, png=png
     )
 
 
@@ -255,7 +196,8 @@ def run_extraction(
         results = _first_pass(request, sources, workers, progress)
         _second_pass(request, sources, workers, results)
     if not any(result.frame is not None for result in results):
-        raise DataError(_mirrored(request, sources, results) or _all_refused(results))
+        mirrored = _mirrored(request, sources, results)
+        raise DataError(mirrored or _first_of(results, results[0].finding))
     results.sort(key=lambda result: result.exposure)
     angles = [result.frame.angle for result in results if result.frame is not None]
     notes = request.angles.note(request.fluoroscope, angles)
@@ -279,7 +221,7 @@ def _first_pass(
             yield _task(request, images, lens)
 
     results: list[ImageResult] = []
-    for done in workers.map(partial(_extract, request.phantom), tasks()):
+    for done in workers.map(_extract, tasks()):
         for result in done:
             results.append(_with_picture_written(request, result))
             if progress is not None:
@@ -294,14 +236,14 @@ def _second_pass(
     results: list[ImageResult],
 ) -> None:
     """Extract refused images with the distortion of the others; replaces the results."""
-    again = {number for number, result in enumerate(results) if may_be_found(result.reason)}
+    again = {number for number, result in enumerate(results) if may_be_found(result.finding)}
     views = [result.view for result in results if result.view is not None]
     lens = shared_lens(views[0].lens, views) if views else None
     if lens is None or not again:
         return
     images = (image for number, image in enumerate(sources.images()) if number in again)
     tasks = (_task(request, (image,), lens) for image in images)
-    done = workers.map(partial(_extract, request.phantom), tasks)
+    done = workers.map(_extract, tasks)
     for number, (result,) in zip(sorted(again), done):
         if result.frame is not None:
             results[number] = _with_picture_written(request, result)
@@ -321,20 +263,22 @@ def _group(number: int, image: SourceImage) -> tuple[int, int]:
 
 
 def _task(request: ExtractionRequest, images: tuple[SourceImage, ...], lens: Lens | None) -> _Task:
-    # Without a lens none of the images can be read, so that it is not used.
-    lens = lens or Lens((1, 1), 1.0)
-    overlay = request.overlay is not None
-    return _Task(images, request.fluoroscope, lens, overlay, request.regular_grid)
+    settings = PhantomSettings(
+        request.fluoroscope,
+        request.phantom,
+        # Without a lens none of the images can be read, so that it is not used.
+        lens=lens or Lens((1, 1), 1.0),
+        regular_grid=request.regular_grid,
+    )
+    return _Task(images, settings, overlay=request.overlay is not None)
 
 
 def _with_picture_written(request: ExtractionRequest, result: ImageResult) -> ImageResult:
     """Write the picture of a result; return the result without it."""
-    if result.picture is None or request.overlay is None:
+    if result.png is None or request.overlay is None:
         return result
-    write_bytes(
-        request.overlay / f'{request.fluoroscope}_{result.exposure:04d}.png', result.picture
-    )
-    return replace(result, picture=None)
+    write_bytes(request.overlay / f'{request.fluoroscope}_{result.exposure:04d}.png', result.png)
+    return replace(result, png=None)
 
 
 def recording_of_images(
@@ -398,7 +342,7 @@ def recording_of_images(
         )
         outcome = run_extraction(request, progress)
         frames[name] = outcome.frames
-        notes += [f'not used: {result.place}: {result.reason}' for result in outcome.refused]
+        notes += [f'not used: {result.finding}' for result in outcome.refused]
         notes += outcome.notes
     return Recording(frames, {}, survey.names, tuple(notes))
 
@@ -412,36 +356,34 @@ def _first_lens(request: ExtractionRequest, image: np.ndarray | DataError) -> Le
 
 def _mirrored(
     request: ExtractionRequest, sources: ImageSources, results: Sequence[ImageResult]
-) -> str:
-    """Return a sentence where the phantom is found in a mirrored image, '' where it is not.
+) -> Finding | None:
+    """Return a finding where the phantom is found in a mirrored image, None where it is not.
 
     Some images are tried, none of which gives observations as it is.
     """
-    found = [result.exposure for result in results if may_be_found(result.reason)]
+    found = [result.exposure for result in results if may_be_found(result.finding)]
     tried = set(found[:MAX_MIRRORED])
     for source in sources.images():
         if source.exposure not in tried or isinstance(source.image, DataError):
             continue
         flipped = replace(source, image=np.ascontiguousarray(source.image[:, ::-1]))
         task = _task(request, (flipped,), _first_lens(request, flipped.image))
-        (result,) = _extract(request.phantom, replace(task, overlay=False))
+        (result,) = _extract(replace(task, overlay=False))
         if result.frame is not None:
-            many = f'none of {len(results)} images gives observations, ' * (len(results) > 1)
-            return (
-                f'{many}{source.place}: the image is mirrored, the phantom is found in it when '
-                'left and right are interchanged: flip the images before they are extracted'
+            cause = (
+                'the image is mirrored, the phantom is found in it when left and right are '
+                'interchanged'
             )
-    return ''
+            advice = 'flip the images before they are extracted'
+            place = Place(name=source.place)
+            return _first_of(results, Finding(Kind.IMAGE_MIRRORED, cause, place, advice))
+    return None
 
 
-def _all_refused(results: Sequence[ImageResult]) -> str:
-    """Return a sentence for sources without a usable image."""
-    first = results[0]
+def _first_of(results: Sequence[ImageResult], found: Finding | None) -> Finding:
+    """Return why no image gives observations, from the finding on one of them."""
+    assert found is not None
     if len(results) == 1:
-        return f'{first.place}: {first.reason}'
-    return f'none of {len(results)} images gives observations, {first.place}: {first.reason}'
-
-
-def _without_place(text: str, place: str) -> str:
-    """Return the text of an error without the place that it begins with."""
-    return text.removeprefix(f'{place}: ')
+        return found
+    name = f'none of {len(results)} images gives observations, {found.place}'
+    return replace(found, place=replace(found.place, name=name))

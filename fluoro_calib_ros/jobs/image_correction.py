@@ -11,14 +11,19 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from ..calibration.result import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
-from ..files.image_files import CorrectedImages, correct_images
-from ..files.image_folder import ImageFolder, folder_like, list_images
-from ..files.image_formats import VIDEO_SUFFIXES, suffix_of
-from ..files.image_writing import Progress
 from ..images.angle_maps import AngleMaps
 from ..images.corrector import ImageCorrector
+from ..io.image_reading import VIDEO_SUFFIXES, suffix_of
+from ..io.image_writing import (
+    CorrectedImages,
+    ImageFolder,
+    Progress,
+    correct_images,
+    folder_like,
+    list_images,
+)
 from .scheduling import open_workers
 
 PER_PROCESS = 50  # images that are worth the start of a process

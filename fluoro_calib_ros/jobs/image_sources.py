@@ -13,19 +13,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ..bags.images import image_topics, images_of_topic
-from ..bags.joint_states import angles_in
-from ..bags.reader import topics_of
 from ..errors import DataError
 from ..exposures.angles import AngleOptions, JointAngles
-from ..files.image_formats import (
+from ..io.bags.reader import angles_in, image_topics, images_of_topic, topics_of
+from ..io.image_reading import (
     EXPOSURE_SUFFIXES,
     READ_SUFFIXES,
     VIDEO_SUFFIXES,
     listed,
+    open_images,
     suffix_of,
 )
-from ..files.image_reading import open_images
 
 BAG_SUFFIXES = ('.mcap', '.db3')
 

@@ -1,35 +1,40 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Extraction of a stream: image after image of one fluoroscope, each helped by those before."""
+"""Following of radiographs, live and offline: image after image, each helped by those before.
+
+A recording is a stream that ends: the jobs give its images to the same followers as the extraction
+node those of a camera.
+"""
 
 from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import lru_cache, partial
 from typing import Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DataError
 from ..exposures.phantom import Phantom
-from ..radiographs.assumptions import assumed_lens, may_be_found, shared_lens
-from ..radiographs.extraction import Extraction, Nearby, extract_beads
-from ..radiographs.following import Far, moved_on
-from ..radiographs.matching import PhantomModel
-from ..radiographs.overlay import draw_overlay
-from ..radiographs.view import Lens, View
-from .service_process import ServiceProcess
+from ..findings import Finding
+from ..images.extraction import Extraction, Nearby, extract_beads
+from ..images.following import Far, moved_on
+from ..images.matching import PhantomModel
+from ..images.overlay import draw_overlay
+from ..images.view import Lens, View, assumed_lens, may_be_found, shared_lens
+from ..processes import OF_STREAM, WorkerProcess
 
 VIEWS = 30  # solved images whose distortion helps where a pose is not found
 
 
 @dataclass(frozen=True)
-class LiveObservations:
-    """What was found in one image of a stream.
+class Observations:
+    """What was found in one image.
 
     Attributes
     ----------
@@ -39,14 +44,16 @@ class LiveObservations:
     sigma : (n,) ndarray
         Standard deviation of a coordinate [px].
     overlapped : (n,) ndarray of bool
-    reason : str
-        Why there are no observations; '' where there are.
+    finding : Finding or None
+        Why there are no observations; None where there are.
     note : str
         What should be known of the observations, such as ids that may have been exchanged.
     expected : int
         Targets that should be visible.
     found, explained : float
         Shares of the expected targets that are found, and of what is found that is expected.
+    view : View or None
+        Of the phantom.
     followed : bool
         Whether the image before gave the start.
     doubtful : int
@@ -56,50 +63,99 @@ class LiveObservations:
     seconds : float
     """
 
-    target_id: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    uv: np.ndarray = field(default_factory=lambda: np.zeros((0, 2)))
-    sigma: np.ndarray = field(default_factory=lambda: np.zeros(0))
-    overlapped: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    reason: str = ''
+    target_id: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    uv: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 2)))
+    sigma: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
+    overlapped: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    finding: Finding | None = None
     note: str = ''
     expected: int = 0
     found: float = 0.0
     explained: float = 0.0
+    view: View | None = None
     followed: bool = False
     doubtful: int = 0
     picture: np.ndarray | None = None
     seconds: float = 0.0
 
+    @property
+    def reason(self) -> str:
+        """Why there are no observations, without the place; '' where there are."""
+        return '' if self.finding is None else self.finding.cause
 
-class LiveExtractor(Protocol):
-    """Extracts the targets of one fluoroscope, image after image."""
 
-    def extract(self, image: np.ndarray, number: int, overlay: bool = False) -> LiveObservations:
-        """Return what is found in an image (h, w) of uint8 or uint16; never raises DataError.
+class Follower(Protocol):
+    """Extracts the targets of one fluoroscope, or of two together, exposure after exposure."""
 
-        number is that of its exposure: it grows, and tells how many images are left out.
+    def extract(
+        self,
+        images: Mapping[str, np.ndarray],
+        number: int,
+        overlays: Collection[str] = (),
+        angles: Mapping[str, float | None] | None = None,
+    ) -> dict[str, Observations]:
+        """Return what is found in the images of an exposure; never raises DataError.
+
+        Parameters
+        ----------
+        images : mapping of str to (h, w) ndarray of uint8 or uint16
+            By fluoroscope.
+        number : int
+            Of the exposure: it grows, and tells how many are left out.
+        overlays : collection of str
+            Fluoroscopes whose pictures are wanted.
+        angles : mapping of str to float or None
+            Of the C-arms [rad], None where they are unknown.
         """
 
 
-# Makes the extractor of a fluoroscope, in the process in which it is to run.
-MakeExtractor = Callable[[], LiveExtractor]
+class MakeFollower(Protocol):
+    """Settings of a follower, which can be pickled."""
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Fluoroscopes that are followed."""
+
+    def __call__(self) -> Follower:
+        """Return a new follower. Raises DataError for settings that do not fit together."""
 
 
-def extraction_process(make: MakeExtractor) -> ServiceProcess:
-    """Return a process that extracts the images of one fluoroscope; it is called as `extract`."""
-    return ServiceProcess(partial(_extract_of, make), 'the extraction')
+def follower_process(make: MakeFollower) -> WorkerProcess:
+    """Return a process with a follower; it is called as `extract`."""
+    return WorkerProcess(partial(_extract_of, make), 'the process of the extraction', OF_STREAM)
 
 
-def _extract_of(make: MakeExtractor) -> Callable[..., LiveObservations]:
+def _extract_of(make: MakeFollower) -> Callable[..., dict[str, Observations]]:
     return make().extract
 
 
 @dataclass(frozen=True)
 class PhantomSettings:
-    """What a PhantomFollower is made of: phantom, and principal distance [px] or None."""
+    """What a PhantomFollower is made of.
 
+    Attributes
+    ----------
+    fluoroscope : str
+    phantom : Phantom
+    principal_distance_px : float or None
+        None: not known.
+    lens : Lens or None
+        What is known of the fluoroscope in a recording, all of whose images come. None: a stream,
+        whose images may be shed, and whose distortion helps where a pose is not found.
+    regular_grid : bool
+        The phantom is a regular flat grid.
+    """
+
+    fluoroscope: str
     phantom: Phantom
     principal_distance_px: float | None = None
+    lens: Lens | None = None
+    regular_grid: bool = False
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The fluoroscope."""
+        return (self.fluoroscope,)
 
     def __call__(self) -> PhantomFollower:
         """Return a new PhantomFollower."""
@@ -107,24 +163,31 @@ class PhantomSettings:
 
 
 class PhantomFollower:
-    """Extracts the beads of a phantom: from the pose of the image before, else from nothing.
-
-    The observations are those of `run_extraction`: both extract an image by the same function.
-    """
+    """Extracts the beads of a phantom: from the pose of the image before, else from nothing."""
 
     def __init__(self, settings: PhantomSettings) -> None:
         phantom = settings.phantom
-        self._target_id = phantom.target_id
-        self._model = PhantomModel.of(phantom.xyz_mm, phantom.diameter_mm)
-        self._distance = settings.principal_distance_px
-        self._lens: Lens | None = None
+        diameters = None if phantom.diameter_mm is None else phantom.diameter_mm.tobytes()
+        self._settings = settings
+        self._model = _model_of(phantom.xyz_mm.tobytes(), diameters, settings.regular_grid)
+        self._lens = settings.lens
         self._views: deque[View] = deque(maxlen=VIEWS)
         self._near: Nearby | None = None
         # Numbers and views of the last two exposures that were solved.
         self._track: deque[tuple[int, View]] = deque(maxlen=2)
 
-    def extract(self, image: np.ndarray, number: int, overlay: bool = False) -> LiveObservations:
-        """Return what is found in an image (h, w) of uint8 or uint16."""
+    def extract(
+        self,
+        images: Mapping[str, np.ndarray],
+        number: int,
+        overlays: Collection[str] = (),
+        angles: Mapping[str, float | None] | None = None,
+    ) -> dict[str, Observations]:
+        """Return what is found in the image of an exposure; see Follower."""
+        name = self._settings.fluoroscope
+        return {name: self._observations(images[name], number, name in overlays)}
+
+    def _observations(self, image: np.ndarray, number: int, overlay: bool) -> Observations:
         start = time.perf_counter()
         extraction: Extraction | None = None
         try:
@@ -134,37 +197,45 @@ class PhantomFollower:
             self._track.append((number, extraction.view))
             self._views.append(extraction.view)
         except DataError as error:
-            result = LiveObservations(reason=str(error))
+            result = Observations(finding=error.finding)
         picture = draw_overlay(image, extraction, result.reason) if overlay else None
         return replace(result, picture=picture, seconds=time.perf_counter() - start)
 
     def _extraction(self, image: np.ndarray, number: int) -> Extraction:
-        """Extract the beads, if need be with the distortion of the images before.
+        """Extract the beads, in a stream if need be with the distortion of the images before.
 
         Raises DataError.
         """
-        size = (image.shape[1], image.shape[0])
-        if self._lens is None or self._lens.image_size != size:
-            self._lens = assumed_lens(size, self._distance)
-            self._views.clear()
-            self._track.clear()
-            self._near = None
+        lens = self._lens_of((image.shape[1], image.shape[0]))
         try:
-            return extract_beads(image, self._model, self._lens, self._nearby(number))
+            return extract_beads(image, self._model, lens, self._nearby(number))
         except DataError as error:
-            shared = shared_lens(self._lens, list(self._views))
-            if shared is None or not may_be_found(str(error)):
+            is_stream = self._settings.lens is None
+            shared = shared_lens(lens, list(self._views)) if is_stream else None
+            if shared is None or not may_be_found(error.finding):
                 raise
             return extract_beads(image, self._model, shared)
 
-    def _nearby(self, number: int) -> Nearby | None:
-        """Return the exposure before, and where the phantom may be after those left out.
+    def _lens_of(self, size: tuple[int, int]) -> Lens:
+        """Return what is assumed of the fluoroscope. Raises DataError for another image size."""
+        known = self._settings.lens
+        if known is not None and known.image_size != size:
+            expected = known.image_size
+            raise DataError(
+                f'the image is {size[0]} x {size[1]} px, but the first one is '
+                f'{expected[0]} x {expected[1]} px'
+            )
+        if self._lens is None or self._lens.image_size != size:
+            self._lens = assumed_lens(size, self._settings.principal_distance_px)
+            self._views.clear()
+            self._track.clear()
+            self._near = None
+        return self._lens
 
-        Without exposures left out, observations are those of `run_extraction`, to the bit, unless
-        the phantom has hardly moved.
-        """
-        if self._near is None:
-            return None
+    def _nearby(self, number: int) -> Nearby | None:
+        """Return the exposure before, and where the phantom may be after those left out."""
+        if self._near is None or self._settings.lens is not None:
+            return self._near
         last, view = self._track[-1]
         if number <= last + 1:
             return self._near
@@ -175,14 +246,22 @@ class PhantomFollower:
             ahead = moved_on(before, view, centre, (number - last) / (last - first))
         return replace(self._near, far=Far(ahead))
 
-    def _observed(self, extraction: Extraction) -> LiveObservations:
-        return LiveObservations(
-            self._target_id[extraction.bead],
+    def _observed(self, extraction: Extraction) -> Observations:
+        return Observations(
+            self._settings.phantom.target_id[extraction.bead],
             extraction.uv,
             extraction.sigma,
             extraction.overlapped,
             expected=extraction.match.expected,
             found=extraction.match.found,
             explained=extraction.match.explained,
+            view=extraction.view,
             followed=extraction.followed,
         )
+
+
+@lru_cache(maxsize=4)
+def _model_of(beads: bytes, diameters: bytes | None, regular: bool) -> PhantomModel:
+    """Return a phantom, prepared for matching; a worker keeps it from follower to follower."""
+    diameter_mm = None if diameters is None else np.frombuffer(diameters)
+    return PhantomModel.of(np.frombuffer(beads).reshape(-1, 3), diameter_mm, regular)

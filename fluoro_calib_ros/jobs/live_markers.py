@@ -6,22 +6,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
-from ..calibration.result import FluoroscopeCalibration
-from ..drift.clusters import Cluster
+from ..checks.cluster_watch import Cluster
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
+from ..findings import Finding, Kind, Place
+from ..images.marker_decisions import Decision
+from ..images.marker_ids import ClusterShape
+from ..images.marker_pair import MarkerPair, PairFrame
+from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
+from ..images.overlay import draw_markers, draw_overlay
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..radiographs.marker_overlay import draw_markers
-from ..radiographs.marker_pair import Decision, MarkerPair, PairFrame
-from ..radiographs.markers import Doubt, FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
-from ..radiographs.overlay import draw_overlay
-from .live_extraction import LiveObservations
-from .service_process import ServiceProcess
+from .live_extraction import Observations
 
 MIN_STARTED = 0.5  # of the given markers, in the first image
 DECIDED = {
@@ -32,90 +32,88 @@ DECIDED = {
 
 @dataclass(frozen=True)
 class MarkerSettings:
-    """What a MarkerFollower is made of: ids and places in the first image, and options."""
-
-    first: FirstMarkers
-    options: MarkerOptions = field(default_factory=MarkerOptions)
-
-    def __call__(self) -> MarkerFollower:
-        """Return a new MarkerFollower."""
-        return MarkerFollower(self)
-
-
-class MarkerFollower:
-    """Follows markers, from the first image on in which they are where they are said to be."""
-
-    def __init__(self, settings: MarkerSettings) -> None:
-        self._settings = settings
-        self._tracker = MarkerTracker(settings.options, first=settings.first)
-        self._begun = False
-
-    def extract(self, image: np.ndarray, number: int, overlay: bool = False) -> LiveObservations:
-        """Return the markers that are seen in an image (h, w) of uint8 or uint16."""
-        start = time.perf_counter()
-        picture: np.ndarray | None = None
-        try:
-            found = self._tracker.update(image, number)
-            if not self._begun:
-                self._check_start(found)
-            result = _observed(found, len(self._tracker.target_id))
-            picture = draw_markers(image, found) if overlay else None
-        except DataError as error:
-            result = LiveObservations(reason=str(error))
-            picture = draw_overlay(image, None, str(error)) if overlay else None
-        return replace(result, picture=picture, seconds=time.perf_counter() - start)
-
-    def _check_start(self, found: MarkerFrame) -> None:
-        """Begin, or wait for another image. Raises DataError."""
-        problem = _wrong_start(found, len(self._settings.first.target_id))
-        if problem:
-            self._tracker = MarkerTracker(self._settings.options, first=self._settings.first)
-            raise DataError(problem)
-        self._begun = True
-
-
-@dataclass(frozen=True)
-class PairSettings:
-    """What a PairFollower is made of.
+    """What a MarkerFollower is made of.
 
     Attributes
     ----------
     first : mapping of str to FirstMarkers
-        Ids and places in the first images of two fluoroscopes.
-    calibrations : mapping of str to FluoroscopeCalibration
-    orientation : RigOrientation
-    clusters : tuple of Cluster
+        Ids and places in the first images of one fluoroscope, or of two.
     options : MarkerOptions
+    calibrations : mapping of str to FluoroscopeCalibration
+        Of two fluoroscopes.
+    orientation : RigOrientation or None
+        Of two fluoroscopes.
+    clusters : tuple of Cluster
+        Markers that are rigid together, of two fluoroscopes.
+    shapes : tuple of ClusterShape
+        Clusters whose shapes are known.
     """
 
     first: Mapping[str, FirstMarkers]
-    calibrations: Mapping[str, FluoroscopeCalibration]
-    orientation: RigOrientation
-    clusters: tuple[Cluster, ...] = ()
     options: MarkerOptions = field(default_factory=MarkerOptions)
+    calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
+    orientation: RigOrientation | None = None
+    clusters: tuple[Cluster, ...] = ()
+    shapes: tuple[ClusterShape, ...] = ()
 
-    def __call__(self) -> PairFollower:
-        """Return a new PairFollower. Raises DataError as MarkerPair."""
-        return PairFollower(self)
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The fluoroscopes."""
+        return tuple(self.first)
+
+    def __call__(self) -> MarkerFollower:
+        """Return a new MarkerFollower. Raises DataError as MarkerPair."""
+        return MarkerFollower(self)
 
 
-class PairFollower:
-    """Follows markers in both views, from the first exposure on that shows them in both."""
+class MarkerFollower:
+    """Follows markers in one view, or in two that help each other.
 
-    def __init__(self, settings: PairSettings) -> None:
+    update() follows them from the first call on; extract() waits for images in which they are
+    where they are said to be.
+    """
+
+    def __init__(self, settings: MarkerSettings) -> None:
         self._settings = settings
-        self._pair = self._new_pair()
         self._begun = False
+        self._renew()
 
-    def _new_pair(self) -> MarkerPair:
+    def _renew(self) -> None:
+        """Begin again. Raises DataError."""
         settings = self._settings
-        return MarkerPair(
+        self._pair: MarkerPair | None = None
+        if len(settings.first) == 1:
+            self._trackers = {
+                name: MarkerTracker(settings.options, first=first)
+                for name, first in settings.first.items()
+            }
+            return
+        if settings.orientation is None:
+            raise DataError('two fluoroscopes are followed together only with their calibration')
+        self._pair = MarkerPair(
             settings.calibrations,
             settings.orientation,
             settings.options,
             first=settings.first,
             clusters=settings.clusters,
+            shapes=settings.shapes,
         )
+        self._trackers = self._pair.trackers
+
+    def update(
+        self,
+        images: Mapping[str, np.ndarray | None],
+        number: int,
+        angles: Mapping[str, float | None] | None = None,
+    ) -> PairFrame:
+        """Return the markers in the images of an exposure; None: an image that cannot be read.
+
+        Parameters are those of Follower. Raises DataError.
+        """
+        if self._pair is not None:
+            return self._pair.update(images, number, angles)
+        ((name, tracker),) = self._trackers.items()
+        return PairFrame({name: tracker.update(images[name], number)})
 
     def extract(
         self,
@@ -123,12 +121,8 @@ class PairFollower:
         number: int,
         overlays: Collection[str] = (),
         angles: Mapping[str, float | None] | None = None,
-    ) -> dict[str, LiveObservations]:
-        """Return the markers that are seen in the images of an exposure, by fluoroscope.
-
-        overlays names the fluoroscopes whose pictures are wanted; angles are those of the C-arms
-        [rad], None where they are unknown. Never raises DataError.
-        """
+    ) -> dict[str, Observations]:
+        """Return the markers that are seen in the images of an exposure; see Follower."""
         start = time.perf_counter()
         results = self._results(images, number, overlays, angles)
         seconds = (time.perf_counter() - start) / max(len(results), 1)
@@ -140,26 +134,27 @@ class PairFollower:
         number: int,
         overlays: Collection[str],
         angles: Mapping[str, float | None] | None,
-    ) -> dict[str, LiveObservations]:
-        if not self._begun and len(images) < len(self._pair.names):
-            return {name: LiveObservations(reason='the other view is missing') for name in images}
+    ) -> dict[str, Observations]:
+        if not self._begun and len(images) < len(self._trackers):
+            missing = Finding(Kind.OTHER_VIEW_MISSING, 'the other view is missing')
+            return {name: Observations(finding=missing) for name in images}
         try:
-            exposure = self._pair.update(images, number, angles)
+            exposure = self.update(images, number, angles)
             if not self._begun:
                 self._check_start(exposure)
         except DataError as error:
-            reason = str(error)
+            finding = error.finding
             return {
-                name: LiveObservations(
-                    reason=reason,
-                    picture=draw_overlay(image, None, reason) if name in overlays else None,
+                name: Observations(
+                    finding=finding,
+                    picture=draw_overlay(image, None, str(finding)) if name in overlays else None,
                 )
                 for name, image in images.items()
             }
         out = {}
         for name, image in images.items():
             found = exposure.views[name]
-            result = _observed(found, len(self._pair.trackers[name].target_id))
+            result = _observed(found, len(self._trackers[name].target_id))
             decided = [d for d in exposure.decisions if d.fluoroscope == name]
             notes = [result.note, *(_decision_text(d) for d in decided if d.kind in DECIDED)]
             picture = draw_markers(image, found) if name in overlays else None
@@ -171,28 +166,23 @@ class PairFollower:
         """Begin, or wait for another exposure. Raises DataError."""
         for name, view in exposure.views.items():
             problem = _wrong_start(view, len(self._settings.first[name].target_id))
-            if problem:
-                self._pair = self._new_pair()
-                raise DataError(f'fluoroscope {name}: {problem}')
+            if problem is not None:
+                self._renew()
+                place = Place((name,)) if self._pair is not None else Place()
+                raise DataError(replace(problem, place=place))
         self._begun = True
 
 
-def _wrong_start(found: MarkerFrame, expected: int) -> str:
-    """Return why the first image is not the one of the given markers, '' where it may be."""
-    if found.reason or len(found.target_id) >= MIN_STARTED * expected:
-        return found.reason
-    return (
-        f'only {len(found.target_id)} of {expected} markers are where they are said to be at first'
+def _wrong_start(found: MarkerFrame, expected: int) -> Finding | None:
+    """Return why the first image is not that of the given markers, None where it may be."""
+    count = len(found.target_id)
+    if found.finding is not None or count >= MIN_STARTED * expected:
+        return found.finding
+    return Finding(
+        Kind.FEW_MARKERS,
+        f'only {count} of {expected} markers are where they are said to be at first',
+        numbers={'found': count, 'expected': expected},
     )
-
-
-def pair_process(settings: PairSettings) -> ServiceProcess:
-    """Return a process that follows two views together; it is called as `extract`."""
-    return ServiceProcess(partial(_extract_pair_of, settings), 'the extraction')
-
-
-def _extract_pair_of(settings: PairSettings) -> Callable[..., dict[str, LiveObservations]]:
-    return settings().extract
 
 
 def _decision_text(decision: Decision) -> str:
@@ -205,26 +195,28 @@ def _decision_text(decision: Decision) -> str:
     )
 
 
-def _observed(found: MarkerFrame, expected: int) -> LiveObservations:
+def _observed(found: MarkerFrame, expected: int) -> Observations:
     """Return the observations of an image."""
-    reason = found.reason or ('' if len(found.target_id) else 'no marker is seen')
-    return LiveObservations(
+    finding = found.finding
+    if finding is None and not len(found.target_id):
+        finding = Finding(Kind.NO_MARKERS, 'no marker is seen')
+    return Observations(
         found.target_id,
         found.uv,
         found.sigma,
         found.overlapped,
-        reason=reason,
+        finding=finding,
         note='; '.join(_doubt_text(doubt) for doubt in found.doubts),
         expected=expected,
         found=len(found.target_id) / expected,
         explained=1.0,
-        followed=not reason,
+        followed=finding is None,
         doubtful=int(found.doubtful.sum()),
     )
 
 
-def _doubt_text(doubt: Doubt) -> str:
+def _doubt_text(doubt: Finding) -> str:
     """Return what may be wrong, in words."""
-    markers = ' and '.join(map(str, doubt.target_id))
-    what = 'may have been exchanged' if len(doubt.target_id) > 1 else 'may be something else'
-    return f'markers {markers} {what}: {doubt.reason}'
+    markers = ' and '.join(map(str, doubt.place.target_id))
+    what = 'may have been exchanged' if len(doubt.place.target_id) > 1 else 'may be something else'
+    return f'markers {markers} {what}: {doubt.cause}'

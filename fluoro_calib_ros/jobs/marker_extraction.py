@@ -20,24 +20,19 @@ import cv2
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from ..calibration.result import FluoroscopeCalibration
-from ..drift.clusters import Cluster
+from ..checks.cluster_watch import Cluster
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
-from ..files.access import make_folder
-from ..files.atomic import write_bytes
+from ..findings import Finding
+from ..images.marker_decisions import Decision, revise
+from ..images.marker_ids import ClusterShape, identify_markers
+from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
+from ..images.overlay import draw_markers
+from ..io.access import make_folder
+from ..io.atomic import write_bytes
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..radiographs.marker_ids import ClusterShape, identify_markers
-from ..radiographs.marker_overlay import draw_markers
-from ..radiographs.marker_pair import Decision, MarkerPair, revise
-from ..radiographs.markers import (
-    Doubt,
-    FirstMarkers,
-    MarkerFrame,
-    MarkerOptions,
-    MarkerTracker,
-)
 from .extraction import Progress
 from .image_sources import (
     ImageAngles,
@@ -47,6 +42,7 @@ from .image_sources import (
     is_image_bag,
     open_sources,
 )
+from .live_markers import MarkerFollower, MarkerSettings
 
 MAX_TRIES = 30  # exposures in which markers are identified by their shapes
 AHEAD = 3  # images that are read before they are wanted
@@ -164,7 +160,7 @@ class MarkerOutcome:
                     found.target_id,
                     found.uv,
                     self.image_size[name],
-                    found.sigma,
+                    sigma=found.sigma,
                     angle=result.angle,
                 )
                 out.append((frame, found.overlapped, found.doubtful))
@@ -175,11 +171,11 @@ class MarkerOutcome:
         out = []
         for name, results in self.results.items():
             open_spans: dict[int, DoubtfulSpan] = {}
-            causes: dict[int, Doubt] = {}
+            causes: dict[int, Finding] = {}
             for result in results:
                 found = result.markers
                 for doubt in found.doubts:
-                    for target in doubt.target_id:
+                    for target in doubt.place.target_id:
                         causes[target] = doubt
                 for target in found.target_id[~found.doubtful].tolist():
                     if target in open_spans:
@@ -188,11 +184,18 @@ class MarkerOutcome:
                     span = open_spans.get(target)
                     if span is None:
                         cause = causes.get(target)
-                        others = () if cause is None else cause.target_id
-                        reason = 'the views do not agree' if cause is None else cause.reason
+                        others = () if cause is None else cause.place.target_id
+                        reason = 'the views do not agree' if cause is None else cause.cause
                         others = tuple(i for i in others if i != target)
-                        first = result.exposure
-                        span = DoubtfulSpan(name, target, first, first, 0, others, reason)
+                        span = DoubtfulSpan(
+                            fluoroscope=name,
+                            target_id=target,
+                            first=result.exposure,
+                            last=result.exposure,
+                            images=0,
+                            others=others,
+                            reason=reason,
+                        )
                     open_spans[target] = replace(
                         span, last=result.exposure, images=span.images + 1
                     )
@@ -277,22 +280,22 @@ def run_marker_extraction(
     sources = {name: open_sources(request.sources[name], name, request.angles) for name in names}
     if request.overlay is not None:
         make_folder(request.overlay)
-    follower = _Follower(request)
+    recording = _Recording(request)
     total = max(source.count for source in sources.values())
     cv2.setNumThreads(1)
     with threadpool_limits(1):
         for number, images in enumerate(_exposures(sources), 1):
-            follower.add(images)
+            recording.add(images)
             if progress is not None:
                 progress(number, max(total, number))
-    outcome = follower.outcome()
+    outcome = recording.outcome()
     if request.overlay is not None:
         _write_pictures(request, sources, outcome)
     return outcome
 
 
-class _Follower:
-    """Follows markers from the first exposure that has some, and corrects earlier results."""
+class _Recording:
+    """Gives exposures to a follower from the first with markers on, and revises its results."""
 
     def __init__(self, request: MarkerRequest) -> None:
         self._request = request
@@ -307,8 +310,7 @@ class _Follower:
         for name in self._names:
             if not self._given[name] and not by_shape:
                 raise DataError(f'there are no given markers of fluoroscope {name}')
-        self._pair: MarkerPair | None = None
-        self._single: MarkerTracker | None = None
+        self._follower: MarkerFollower | None = None
         self._results: dict[str, list[MarkerImageResult]] = {name: [] for name in self._names}
         self._decisions: list[Decision] = []
         self._size: dict[str, tuple[int, int]] = {}
@@ -324,38 +326,28 @@ class _Follower:
             )
         return min(common)
 
-    @property
-    def _begun(self) -> bool:
-        return self._pair is not None or self._single is not None
-
     def add(self, images: Mapping[str, SourceImage]) -> None:
         """Follow the markers through the images of one exposure, by fluoroscope."""
         exposure = next(iter(images.values())).exposure
-        if not self._begun:
+        if self._follower is None:
             first = self._first_markers(images, exposure)
             if not first:
                 for name in images:
                     self._before[name] += 1
                 return
-            self._begin(images, first)
+            self._follower = self._begin(images, first)
         arrays = {
             name: None if isinstance(image.image, DataError) else image.image
             for name, image in images.items()
         }
-        if self._pair is not None:
-            found = self._pair.update(arrays, exposure, _angles_of(images))
-            views = found.views
-            self._decisions += found.decisions
-            for decision in found.decisions:
-                self._correct(decision)
-        else:
-            assert self._single is not None
-            name = self._names[0]
-            views = {name: self._single.update(arrays[name], exposure)}
+        found = self._follower.update(arrays, exposure, _angles_of(images))
+        self._decisions += found.decisions
+        for decision in found.decisions:
+            self._correct(decision)
         for name, image in images.items():
-            view = views[name]
+            view = found.views[name]
             if isinstance(image.image, DataError):
-                view = replace(view, reason=str(image.image))
+                view = replace(view, finding=image.image.finding)
             result = MarkerImageResult(exposure, image.place, view, image.angle)
             self._results[name].append(result)
 
@@ -401,26 +393,25 @@ class _Follower:
                 ) from None
             return {}
 
-    def _begin(self, images: Mapping[str, SourceImage], first: Mapping[str, FirstMarkers]) -> None:
-        """Make the tracker for the first images. Raises DataError for one that is damaged."""
+    def _begin(
+        self, images: Mapping[str, SourceImage], first: Mapping[str, FirstMarkers]
+    ) -> MarkerFollower:
+        """Return the follower from the first images on. Raises DataError for a damaged one."""
         for name in self._names:
             image = images[name].image
             if isinstance(image, DataError):
                 raise image
             self._size[name] = (image.shape[1], image.shape[0])
         request = self._request
-        if len(self._names) == 1:
-            self._single = MarkerTracker(request.options, first=first[self._names[0]])
-            return
-        if request.orientation is None:
-            raise DataError('two fluoroscopes are followed together only with their calibration')
-        self._pair = MarkerPair(
-            request.calibrations,
-            request.orientation,
-            request.options,
-            first=first,
-            clusters=request.clusters,
-            shapes=request.shapes,
+        return MarkerFollower(
+            MarkerSettings(
+                first,
+                request.options,
+                request.calibrations,
+                request.orientation,
+                clusters=request.clusters,
+                shapes=request.shapes,
+            )
         )
 
     def _correct(self, decision: Decision) -> None:
@@ -434,9 +425,9 @@ class _Follower:
 
     def outcome(self) -> MarkerOutcome:
         """Return all results. Raises DataError where following did not begin."""
-        if not self._begun and self._start is None:
+        if self._follower is None and self._start is None:
             raise DataError(f'the markers are in no exposure: {self._reason or "no images"}')
-        if not self._begun:
+        if self._follower is None:
             raise DataError(
                 f'the markers are given for exposure {self._start}, but there is no image of it '
                 f'of {" and ".join(self._names)}'

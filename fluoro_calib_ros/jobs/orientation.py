@@ -6,27 +6,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.special import chdtri
 
-from ..calibration.result import FluoroscopeCalibration
-from ..calibration.rig_orientation import orientation_of_capture, standing_frames
+from ..checks.held_out import uncorrected
+from ..checks.inputs import require_phantom
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
+from ..estimation.rig_orientation import orientation_of_capture, standing_frames
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
+from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import rotation_angle
 from ..reconstruction.intersection import Intersector
 from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_exposure
-from ..validation.held_fit import uncorrected
-from ..validation.inputs import require_phantom
 
 MIN_MET = 0.5  # share of the targets of two views whose rays meet
 MIN_MET_SURELY = 0.9  # less is doubtful
 MIN_MATCHED = 10  # targets of two views by which a capture is judged
 MAX_SD = 2.0  # median distance of a target from its survey over the expectation
-MEDIAN_CHI2 = 2.366  # of three degrees of freedom
 # Changes of the relative orientation since the one before that are mentioned.
 MAX_SHIFT = 0.002  # over the distance of the sources
 MAX_TURN_RAD = np.deg2rad(0.2)
@@ -43,14 +44,14 @@ class OrientationOutcome:
         Number of targets of the capture that were intersected again.
     rms_mm : float
         Root mean square of their distances from the survey, NaN without targets.
-    notes : tuple of str
+    findings : tuple of Finding
         What is doubtful about it, and what has changed.
     """
 
     orientation: RigOrientation
     targets: int
     rms_mm: float
-    notes: tuple[str, ...] = ()
+    findings: tuple[Finding, ...] = ()
 
 
 def orient(
@@ -94,14 +95,16 @@ def orient(
     met = _met(found, phantom)
     if not met.is_good and _fits_uncorrected(frames, phantom, calibrations, frame_id):
         raise DataError(
-            'the image points are corrected already, their rays meet without the correction of '
-            'the calibrations only: give the observed ones'
+            'the image points are corrected already, their rays meet without the correction '
+            'of the calibrations only',
+            kind=Kind.CORRECTED_ALREADY,
+            advice='give the observed ones',
         )
     offset = found.points.xyz_mm - phantom.xyz_mm[phantom.index(found.target_id)]
     offset = offset[np.isfinite(offset).all(axis=1)]
     rms = float(np.sqrt(np.mean(np.sum(offset**2, axis=1)))) if len(offset) else float('nan')
-    notes = [_doubt(met), _change(present, orientation)]
-    return OrientationOutcome(orientation, len(offset), rms, tuple(filter(None, notes)))
+    findings = (_doubt(met), _change(present, orientation))
+    return OrientationOutcome(orientation, len(offset), rms, tuple(filter(None, findings)))
 
 
 @dataclass(frozen=True)
@@ -147,7 +150,7 @@ def _met(found: ReconstructedFrame, phantom: Phantom) -> _Met:
     covariance = points.covariance[met] + spread[:, None, None] * np.eye(3)
     scaled = np.linalg.solve(covariance, offset[met][:, :, None])[:, :, 0]
     square = np.einsum('ni,ni->n', offset[met], scaled)
-    return _Met(matched, int(met.sum()), float(np.sqrt(np.median(square) / MEDIAN_CHI2)))
+    return _Met(matched, int(met.sum()), float(np.sqrt(np.median(square) / chdtri(3, 0.5))))
 
 
 def _fits_uncorrected(
@@ -167,31 +170,33 @@ def _fits_uncorrected(
         return False
 
 
-def _doubt(met: _Met) -> str:
-    """Return why an orientation is doubtful, '' where it is not.
+def _doubt(met: _Met) -> Finding | None:
+    """Return why an orientation is doubtful, None where it is not.
 
     Raises DataError where most rays do not meet.
     """
     if met.is_good:
-        return ''
-    causes = (
-        'the fluoroscopes are interchanged, their calibrations do not hold for these images, or '
-        'the frames are not of one exposure'
+        return None
+    found = Finding(
+        Kind.RAYS_DO_NOT_MEET,
+        f'the rays of only {met.met} of {met.matched} targets in two views meet',
+        advice='the fluoroscopes are interchanged, their calibrations do not hold for these '
+        'images, or the frames are not of one exposure',
+        numbers={'met': met.met, 'matched': met.matched, 'ratio': met.ratio},
     )
     if met.met < MIN_MET * met.matched:
-        raise DataError(
-            f'the rays of only {met.met} of {met.matched} targets in two views meet: {causes}'
-        )
-    return (
+        raise DataError(found)
+    cause = (
         f'doubtful: the rays of {met.met} of {met.matched} targets in two views meet, '
-        f'{met.ratio:.1f} times as far from their survey as expected: {causes}'
+        f'{met.ratio:.1f} times as far from their survey as expected'
     )
+    return replace(found, cause=cause, severity=Severity.WARNING)
 
 
-def _change(present: RigOrientation | None, new: RigOrientation) -> str:
-    """Return how the fluoroscopes stand to each other otherwise than before, '' if they do not."""
+def _change(present: RigOrientation | None, new: RigOrientation) -> Finding | None:
+    """Return how the fluoroscopes stand to each other otherwise than before, None as before."""
     if present is None or present.fluoroscopes != new.fluoroscopes:
-        return ''
+        return None
     first, *others = range(len(new.fluoroscopes))
     for b in others:
         turns = [o.rotation[b] @ o.rotation[first].T for o in (present, new)]
@@ -202,11 +207,18 @@ def _change(present: RigOrientation | None, new: RigOrientation) -> str:
         moved = float(np.linalg.norm(shifts[1] - shifts[0]))
         turned = float(rotation_angle(turns[1] @ turns[0].T))
         if moved > MAX_SHIFT * base or turned > MAX_TURN_RAD:
-            names = f'{new.fluoroscopes[first]} and {new.fluoroscopes[b]}'
-            return (
-                f'fluoroscopes {names} stand otherwise to each other than in the orientation '
-                f'before, by {moved:.1f} mm and {np.rad2deg(turned):.2f} degrees (distance of the '
-                f'sources {np.linalg.norm(shifts[1]) / base:.4f} times): one of them was moved '
-                'since, the frames are not of one exposure, or this is another phantom'
+            names = (new.fluoroscopes[first], new.fluoroscopes[b])
+            turned_deg = float(np.rad2deg(turned))
+            scale = float(np.linalg.norm(shifts[1])) / base
+            return Finding(
+                Kind.RIG_MOVED,
+                f'fluoroscopes {" and ".join(names)} stand otherwise to each other than in the '
+                f'orientation before, by {moved:.1f} mm and {turned_deg:.2f} degrees (distance of '
+                f'the sources {scale:.4f} times)',
+                place=Place(names, name=''),
+                advice='one of them was moved since, the frames are not of one exposure, or '
+                'this is another phantom',
+                severity=Severity.WARNING,
+                numbers={'shift_mm': moved, 'turn_deg': turned_deg, 'scale': scale},
             )
-    return ''
+    return None

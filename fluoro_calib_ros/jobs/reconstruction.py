@@ -10,15 +10,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..calibration.result import FluoroscopeCalibration
-from ..drift.clusters import Cluster
-from ..drift.recording_watch import DriftVerdict, RecordingDriftWatch
+from ..checks.cluster_watch import Cluster
+from ..checks.recording_watch import DriftVerdict, RecordingDriftWatch
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.pairing import PAIR_BY, PairingOptions, disagreement_of_recording
+from ..findings import Finding, Kind, Severity
 from ..options import option, validate_options
+from ..photogrammetry.noise import MAX_WIDENING, ObservedScatter
 from ..photogrammetry.rig_orientation import RigOrientation
-from ..photogrammetry.scatter import MAX_WIDENING, ObservedScatter
 from ..reconstruction.intersection import STATUS_NAMES, Intersector
 from ..reconstruction.mismatch import cause_of_misses, mismatch
 from ..reconstruction.reconstruct import ReconstructedFrame, reconstruct_recording
@@ -71,7 +72,7 @@ class ReconstructionOutcome:
     widening : float
         Factor of the limit of false matches at the end: above 1 where the rays miss each other by
         more than their standard deviations allow.
-    cause : str
+    cause : Finding or None
         Why, where the factor is the largest and a trial tells it.
     """
 
@@ -81,7 +82,7 @@ class ReconstructionOutcome:
     drift: DriftVerdict | None
     disagreement: str = ''
     widening: float = 1.0
-    cause: str = ''
+    cause: Finding | None = None
 
     @property
     def incomplete(self) -> int:
@@ -140,18 +141,18 @@ def reconstruct(
     found, unpaired = reconstruct_recording(
         frames,
         calibrations,
-        intersector,
-        options.pair_by,
-        watch,
-        options.pair_tolerance,
-        scatter,
+        intersector=intersector,
+        pair_by=options.pair_by,
+        watch=watch,
+        tolerance_s=options.pair_tolerance,
+        scatter=scatter,
     )
     if not found:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
     wrong = mismatch(found, frames, calibrations, intersector, options.pair_by)
-    if wrong:
+    if wrong is not None:
         raise DataError(wrong)
-    cause = ''
+    cause = None
     if scatter.factor >= MAX_WIDENING:
         cause = cause_of_misses(found, frames, calibrations, intersector, options.pair_by)
     disagreement = ''
@@ -159,7 +160,13 @@ def reconstruct(
         disagreement = disagreement_of_recording({name: frames[name] for name in names})
     drift = watch.verdict() if watch else drift
     return ReconstructionOutcome(
-        found, unpaired, orientation, drift, disagreement, scatter.factor, cause
+        found,
+        unpaired,
+        orientation=orientation,
+        drift=drift,
+        disagreement=disagreement,
+        widening=scatter.factor,
+        cause=cause,
     )
 
 
@@ -181,12 +188,11 @@ def _drift_watch(
     if not options.drift_watch:
         return None, None
     if not options.has_stamps:
-        return None, DriftVerdict(
-            'unknown',
-            'the file does not contain the times of its exposures, a drift cannot be detected',
-        )
+        why = 'the file does not contain the times of its exposures, a drift cannot be detected'
+        return None, DriftVerdict(Finding(Kind.NOT_WATCHED, why, severity=Severity.WARNING))
     sizes = {name: calibrations[name].image_size for name in orientation.fluoroscopes}
     try:
         return RecordingDriftWatch(orientation, sizes, clusters=options.clusters), None
     except DataError as error:
-        return None, DriftVerdict('unknown', f'a drift cannot be detected: {error}')
+        why = f'a drift cannot be detected: {error}'
+        return None, DriftVerdict(Finding(Kind.NOT_WATCHED, why, severity=Severity.WARNING))

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,83 @@ from typing import Any
 import numpy as np
 from jinja2 import UndefinedError
 
+from ..checks.comparison import Comparison, compare_calibrations
 from ..errors import DataError
-from ..files.atomic import write_text
-from ..files.calibration import load_calibrations
-from ..files.calibration_request import OPTIONS, read_request
-from ..files.json_file import read_json
-from ..files.names import read_names
-from ..files.result_check import edited, exchanged
-from ..files.validation import NAME as VALIDATION
+from ..findings import Finding, Kind, Place, Severity
+from ..io.atomic import write_text
+from ..io.calibration import load_calibrations
+from ..io.calibration_request import OPTIONS, read_request
+from ..io.csv_table import read_names
+from ..io.result_check import RESULT_NAME as RESULT
+from ..io.result_check import edited, exchanged
+from ..io.result_document import VALIDATION_NAME as VALIDATION
+from ..io.text_files import read_json
 from ..report.html import ReportInput, report_html
-from .result_folder import REPORT, RESULT, belongs_to, saved_orientation, saved_rig_note
+from .conversion import stations_of
+from .result_folder import REPORT, belongs_to, saved_orientation, saved_rig_note
+
+# The comparison job: what changed between two result folders.
+
+
+@dataclass(frozen=True)
+class ComparedFolders:
+    """Comparisons by fluoroscope, the scale at the phantom, and what could not be compared.
+
+    Attributes
+    ----------
+    comparisons : dict of str to Comparison
+    mm_per_px : dict of str to float
+        At the median distance of the phantom; without an entry where result.json is missing.
+    findings : tuple of Finding
+    """
+
+    comparisons: dict[str, Comparison]
+    mm_per_px: dict[str, float]
+    findings: tuple[Finding, ...]
+
+
+def compare_folders(
+    first: str | os.PathLike[str], second: str | os.PathLike[str]
+) -> ComparedFolders:
+    """Compare the calibrations of the fluoroscopes that two result folders have in common.
+
+    Raises DataError where there are none, and for calibrations that cannot be compared.
+    """
+    one = load_calibrations(first)
+    other = load_calibrations(second)
+    common = [name for name in one if name in other]
+    if not common:
+        raise DataError(
+            f'{second}: there are calibrations of {", ".join(other)}, and in {first} of '
+            f'{", ".join(one)}: no fluoroscope is in both'
+        )
+    findings = [
+        Finding(
+            Kind.NOT_IN_BOTH,
+            f'fluoroscope {name} is in {folder} only',
+            Place((name,), name=''),
+            severity=Severity.NOTE,
+        )
+        for folder, own, foreign in ((first, one, other), (second, other, one))
+        for name in own
+        if name not in foreign
+    ]
+    comparisons = {name: compare_calibrations(one[name], other[name]) for name in common}
+    distances = _distances(Path(first))
+    scales = {n: distances[n] / float(one[n].interior[2]) for n in common if n in distances}
+    return ComparedFolders(comparisons, scales, tuple(findings))
+
+
+def _distances(directory: Path) -> dict[str, float]:
+    """Return the median distance of the phantom from the source by fluoroscope [mm]."""
+    if not (directory / RESULT).exists():
+        return {}
+    found: dict[str, list[float]] = {}
+    for station in stations_of(directory / RESULT):
+        found.setdefault(station.fluoroscope, []).append(
+            float(np.linalg.norm(station.position_mm))
+        )
+    return {name: float(np.median(values)) for name, values in found.items()}
 
 
 def write_report(directory: str | os.PathLike[str]) -> str:
@@ -66,7 +134,7 @@ def read_report_input(directory: str | os.PathLike[str]) -> ReportInput:
     if not present:
         raise DataError(f'{directory / RESULT}: there are no figures of {", ".join(calibrations)}')
     mixed = exchanged(directory, result, present)
-    if mixed:
+    if mixed is not None:
         raise DataError(mixed)
     request = read_request(directory, present)
     orientation = saved_orientation(directory)
@@ -76,16 +144,16 @@ def read_report_input(directory: str | os.PathLike[str]) -> ReportInput:
     return ReportInput(
         directory.resolve().name,
         result,
-        present,
-        request.frames,
-        request.phantom,
-        read_json(directory / OPTIONS),
-        _validation(directory, {n: c.calibration_id for n, c in present.items()}),
-        orientation,
-        read_names(directory),
-        when.strftime('%Y-%m-%d %H:%M UTC'),
-        saved_rig_note(directory),
-        edited(directory, result),
+        calibrations=present,
+        frames=request.frames,
+        phantom=request.phantom,
+        settings=read_json(directory / OPTIONS),
+        validation=_validation(directory, {n: c.calibration_id for n, c in present.items()}),
+        orientation=orientation,
+        names=read_names(directory),
+        written=when.strftime('%Y-%m-%d %H:%M UTC'),
+        rig_note=saved_rig_note(directory),
+        edited=edited(directory, result),
     )
 
 

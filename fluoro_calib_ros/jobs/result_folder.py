@@ -1,39 +1,39 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The result folder of a calibration; its layout is described in docs/result_folder.md."""
+"""The result folder of a calibration; its layout is described in docs/files.md."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..calibration.calibrate import CalibrationResult
-from ..calibration.result import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
-from ..files import names, validation
-from ..files.calibration import SUFFIX, load_calibrations, save_calibration
-from ..files.calibration_request import (
+from ..estimation.result import CalibrationResult
+from ..findings import Finding, Kind, Severity
+from ..io import csv_table as names
+from ..io import result_document as validation
+from ..io.calibration import SUFFIX, load_calibrations, save_calibration
+from ..io.calibration_request import (
     KNOWN_ORIENTATION,
     OBSERVATIONS,
     OPTIONS,
     PHANTOM,
     write_request,
 )
-from ..files.covariance import SUFFIX as COVARIANCE
-from ..files.covariance import write_covariance
-from ..files.folder import FolderKind, check_output_folder, replaced_folder
-from ..files.json_file import write_json
-from ..files.result_check import NAME as RESULT
-from ..files.result_check import read_result, with_digest
-from ..files.result_document import result_document
-from ..files.result_tables import NAMES as TABLES
-from ..files.result_tables import write_tables
-from ..files.rig_orientation import NAME as ORIENTATION
-from ..files.rig_orientation import load_orientation, orientation_path, save_orientation
-from ..files.validation import write_validation
+from ..io.folder import FolderKind, check_output_folder, replaced_folder
+from ..io.result_check import RESULT_NAME as RESULT
+from ..io.result_check import read_result, with_digest
+from ..io.result_document import result_document, write_validation
+from ..io.result_tables import NAMES as TABLES
+from ..io.result_tables import SUFFIX as COVARIANCE
+from ..io.result_tables import write_covariance, write_tables
+from ..io.rig_orientation import NAME as ORIENTATION
+from ..io.rig_orientation import load_orientation, orientation_path, save_orientation
+from ..io.text_files import write_json
 from ..photogrammetry.rig_orientation import RigOrientation
 from .calibration import CalibrationOutcome
 
@@ -46,8 +46,8 @@ _OWN = (
     OPTIONS,
     KNOWN_ORIENTATION,
     ORIENTATION,
-    names.NAME,
-    validation.NAME,
+    names.NAMES_FILE,
+    validation.VALIDATION_NAME,
     *TABLES,
     'figures',
     REPORT,
@@ -103,7 +103,7 @@ def save_outcome(
         present or saved_orientation(directory), outcome.orientation, outcome.calibrations
     )
     with replaced_folder(directory, RESULT_FOLDER) as folder:
-        _write_result(folder, outcome.result, outcome.doubts, outcome.rig_note)
+        _write_result(folder, outcome.result)
         write_request(folder, outcome.request)
         if orientation is not None:
             save_orientation(folder, orientation)
@@ -117,17 +117,15 @@ def save_outcome(
 def save_result(
     directory: str | os.PathLike[str],
     result: CalibrationResult,
-    doubts: Sequence[str] = (),
     covariance: bool = False,
 ) -> None:
     """Write calibrations and result.json of a calibration or adjustment as a result folder.
 
-    doubts are the reasons why a forced calibration cannot be right; covariance: whether to write
-    the covariance matrix of all unknowns, too. An earlier folder is replaced as a whole and kept
-    as DIRECTORY.previous. Raises DataError.
+    covariance: whether to write the covariance matrix of all unknowns, too. An earlier folder is
+    replaced as a whole and kept as DIRECTORY.previous. Raises DataError.
     """
     with replaced_folder(directory, RESULT_FOLDER) as folder:
-        _write_result(folder, result, doubts)
+        _write_result(folder, result)
         if covariance:
             write_covariances(folder, result)
 
@@ -170,21 +168,16 @@ def check_result_folder(
     check_output_folder(directory, RESULT_FOLDER, inputs)
 
 
-def _write_result(
-    folder: Path, result: CalibrationResult, doubts: Sequence[str], rig_note: str = ''
-) -> None:
+def _write_result(folder: Path, result: CalibrationResult) -> None:
     for calibration in result.calibrations.values():
         save_calibration(folder, calibration)
-    write_json(folder / RESULT, written_document(result, doubts, rig_note))
+    write_json(folder / RESULT, written_document(result))
     write_tables(folder, result)
 
 
-def written_document(
-    result: CalibrationResult, doubts: Sequence[str] = (), rig_note: str = ''
-) -> dict[str, Any]:
+def written_document(result: CalibrationResult) -> dict[str, Any]:
     """Return the whole content of result.json."""
-    document = {**result_document(result), 'doubts': list(doubts), 'rig_note': rig_note}
-    return with_digest(document)
+    return with_digest(result_document(result))
 
 
 def _saved_ids(
@@ -206,16 +199,18 @@ def saved_orientation(directory: str | os.PathLike[str]) -> RigOrientation | Non
         return None
 
 
-def saved_rig_note(directory: str | os.PathLike[str]) -> str:
+def saved_rig_note(directory: str | os.PathLike[str]) -> Finding | None:
     """Return what result.json says about the orientation of the rig from its exposures.
 
-    '' for nothing, and where the folder has a captured orientation, which the exposures do not
+    None for nothing, and where the folder has a captured orientation, which the exposures do not
     concern. Raises DataError for a file that cannot be read.
     """
     note = read_result(directory).get('rig_note', '')
     orientation = saved_orientation(directory)
     captured = orientation is not None and orientation.source == 'capture'
-    return note if isinstance(note, str) and not captured else ''
+    if not note or not isinstance(note, str) or captured:
+        return None
+    return Finding(Kind.RIG_NOTE, note, severity=Severity.WARNING)
 
 
 def belongs_to(

@@ -5,21 +5,17 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
+import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
 from typing import Any, Protocol, TypeVar
 
-import cv2
-from threadpoolctl import threadpool_limits
-
 from ..errors import DataError
 from ..limits import ReadLimits, read_limits, use_read_limits
-from .parent_watch import interrupts_blocked, watch_parent
+from ..processes import ProcessEnded, WorkerProcess, one_core
 
 Task = TypeVar('Task')
 Result = TypeVar('Result')
@@ -61,45 +57,58 @@ def open_workers(
 
 
 class LocalWorkers:
-    """Processes of this machine; for a single one, the caller's own."""
+    """Processes of this machine, each called by a thread; for a single one, the caller's own."""
 
     def __init__(self, count: int) -> None:
         self._count = count
-        self._executor: ProcessPoolExecutor | None = None
-        if count > 1:
-            # A fork would copy the locks of other threads.
-            context = multiprocessing.get_context('spawn')
-            self._executor = ProcessPoolExecutor(
-                count, context, initializer=watch_parent, initargs=(os.getpid(),)
-            )
+        self._threads = ThreadPoolExecutor(count) if count > 1 else None
+        self._of_thread = threading.local()
+        self._processes: list[WorkerProcess] = []
 
     def __enter__(self) -> LocalWorkers:
         return self
 
     def __exit__(self, *error: object) -> None:
-        if self._executor is not None:
-            self._executor.shutdown(wait=True, cancel_futures=True)
+        if self._threads is not None:
+            self._threads.shutdown(wait=True, cancel_futures=True)
+        for process in self._processes:
+            process.close()
 
     def map(self, function: Callable[[Task], Result], tasks: Iterable[Task]) -> Iterator[Result]:
         """Yield the results of tasks in their order. Raises DataError for a worker that died."""
-        limits = read_limits()
-        if self._executor is None:
+        threads = self._threads
+        if threads is None:
             for task in tasks:
-                yield _alone(function, task, limits)
+                yield _alone(function, task, read_limits())
             return
-        executor = self._executor
-
-        def submit(task: Task) -> Future[Result]:
-            with interrupts_blocked():  # the executor starts processes when it needs them
-                return executor.submit(_alone, function, task, limits)
-
         try:
-            yield from _in_order(submit, tasks, QUEUED * self._count)
-        except BrokenProcessPool:
+            yield from _in_order(
+                lambda task: threads.submit(self._call, function, task),
+                tasks,
+                QUEUED * self._count,
+            )
+        except ProcessEnded:
             raise DataError(
                 'a worker process was ended from outside, perhaps for want of memory; start again '
                 'with fewer processes (--workers)'
             ) from None
+
+    def _call(self, function: Callable[[Task], Result], task: Task) -> Result:
+        """Return the result of a task, from the process of this thread."""
+        process: WorkerProcess | None = getattr(self._of_thread, 'process', None)
+        if process is None:
+            process = self._of_thread.process = WorkerProcess(_caller, 'a worker process')
+            self._processes.append(process)
+        return process(function, task)
+
+
+def _caller() -> Callable[[Callable[[Task], Result], Task], Result]:
+    """Return what a worker process does with a function and a task."""
+    return _applied
+
+
+def _applied(function: Callable[[Task], Result], task: Task) -> Result:
+    return function(task)
 
 
 class DaskWorkers:
@@ -154,8 +163,7 @@ class DaskWorkers:
 def _alone(function: Callable[[Task], Result], task: Task, limits: ReadLimits) -> Result:
     """Run a task on one core, as its worker has others beside it, with the caller's limits."""
     use_read_limits(limits)
-    cv2.setNumThreads(1)
-    with threadpool_limits(1):
+    with one_core():
         return function(task)
 
 

@@ -12,25 +12,24 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from ..bags.joint_states import joint_topics, with_angles
-from ..bags.reader import read_frames
-from ..calibration.result import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
-from ..exchange import registry
-from ..exchange.content import PARTS, Content, FileSettings
 from ..exposures.angles import AngleOptions
 from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
 from ..exposures.names import Names
 from ..exposures.pairing import PairingOptions, disagreement_of_recording
 from ..exposures.phantom import Phantom
-from ..files.access import check_regular_file
-from ..files.calibration import load_calibrations
-from ..files.image_points import PointsFile, points_of_frames, read_points
-from ..files.known_orientation import holds_known_orientations, read_known_orientations
-from ..files.names import read_names
-from ..files.observations import CORRECTED_BY
-from ..files.result_check import disagreements
+from ..findings import Kind, sentences
+from ..io.access import check_regular_file
+from ..io.bags.reader import joint_topics, read_frames, with_angles
+from ..io.calibration import load_calibrations
+from ..io.csv_table import read_names
+from ..io.formats import registry
+from ..io.formats.content import PARTS, Content, FileSettings
+from ..io.known_orientation import holds_known_orientations, read_known_orientations
+from ..io.observations import CORRECTED_BY, PointsFile, points_of_frames, read_points
+from ..io.result_check import disagreements
 from ..photogrammetry.known_orientation import KnownOrientation
 
 MAGIC = b'\x89MCAP'  # of a bag
@@ -45,7 +44,7 @@ class Recording:
     frames : dict of str to list of Frame
         By fluoroscope.
     unpaired : mapping of str to int
-        Numbers of frames without partner that were left out.
+        Numbers of frames without partner that were excluded.
     names : Names
         The known names and those of the source.
     notes : tuple of str
@@ -145,9 +144,11 @@ def read_content(
     kind = None if found else default if Path(path).suffix.lower() == '.csv' else None
     if found and part not in found.parts:
         has = ' and '.join(PARTS[name] for name in found.parts)
+        needed = f'{PARTS[part]} {"is" if part == "survey" else "are"} needed'
         raise DataError(
-            f'{path}: this looks like {found.title} ({found.kind}), which has {has}, but '
-            f'{PARTS[part]} are needed'.replace('a phantom are', 'a phantom is')
+            f'this looks like {found.title} ({found.kind}), which has {has}, but {needed}',
+            at=path,
+            kind=Kind.WRONG_FORMAT,
         )
     return registry.read(path, replace(settings, wanted=(part,)), kind)
 
@@ -165,7 +166,7 @@ def read_orientations(
 ) -> dict[str, KnownOrientation]:
     """Read known orientations of fluoroscopes by name.
 
-    paths: YAML files of docs/known_orientation.md, or files of cameras of any format, such as
+    paths: YAML files of docs/special_rigs.md, or files of cameras of any format, such as
     MayaCam 2. Raises DataError, also for a fluoroscope that occurs in two files.
     """
     out: dict[str, KnownOrientation] = {}
@@ -191,7 +192,7 @@ def _orientations_of_cameras(
         try:
             out[camera.name] = KnownOrientation.from_matrices(camera.matrix, *camera.pose)
         except DataError as error:
-            raise DataError(f'{path}, camera {camera.name}: {error}') from None
+            raise error.at(f'{path}, camera {camera.name}') from None
     return out
 
 
@@ -369,7 +370,7 @@ def read_calibrated_source(
     )
     select_calibrations(calibrations, recording.frames, directory)
     unknown = _unknown_angles(path, recording.frames, calibrations, selection)
-    mixed = disagreements(directory, calibrations)
+    mixed = sentences(disagreements(directory, calibrations))
     return replace(recording, notes=(*recording.notes, *unknown, *mixed)), calibrations
 
 

@@ -5,17 +5,11 @@
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-from contextlib import suppress
-from multiprocessing.connection import Connection
+from collections.abc import Callable
 
-from ..calibration.request import CalibrationRequest
+from ..estimation.options import CalibrationRequest
+from ..processes import OF_JOB, WorkerProcess
 from .calibration import CalibrationOutcome, Cancellation, Progress, Rig, run_calibration
-from .parent_watch import start_child
-
-POLL_S = 0.05  # interval at which the caller may cancel [s]
-NICE = 10  # lower priority than the live nodes
 
 
 def run_in_worker_process(
@@ -32,65 +26,25 @@ def run_in_worker_process(
     raise_if_cancelled is called repeatedly and may raise to terminate the process. Raises
     RuntimeError for any other failure of the process.
     """
-    context = multiprocessing.get_context('spawn')  # a fork would copy locks of other threads
-    receiver, sender = context.Pipe(duplex=False)
-    process = start_child(context, _work, sender, request, validate, rig)
-    sender.close()
+    process = WorkerProcess(_calibration, 'the worker process', OF_JOB)
     try:
-        return _outcome(receiver, progress, raise_if_cancelled)
-    except EOFError:
-        process.join()
-        raise RuntimeError(f'the worker process ended with status {process.exitcode}') from None
+        return process(
+            request, validate, rig, progress=progress, raise_if_cancelled=raise_if_cancelled
+        )
     finally:
-        process.terminate()
-        process.join()
-        receiver.close()
+        process.close()
+
+
+def _calibration() -> Callable[..., CalibrationOutcome]:
+    return _outcome
 
 
 def _outcome(
-    receiver: Connection,
-    progress: Progress | None,
-    raise_if_cancelled: Cancellation | None,
-) -> CalibrationOutcome:
-    """Receive rounds until the outcome, or the error, arrives."""
-    while True:
-        if raise_if_cancelled is not None:
-            raise_if_cancelled()
-        if not receiver.poll(POLL_S):
-            continue
-        kind, content = receiver.recv()
-        if kind == 'error':
-            raise content
-        if kind == 'outcome':
-            return content
-        if progress is not None:
-            progress(*content)
-
-
-def _work(
-    sender: Connection,
     request: CalibrationRequest,
     validate: bool,
     rig: Rig | None,
-) -> None:
-    """Run the job in the worker process.
-
-    Sends ('round', arguments of progress) after every round, and ('outcome', CalibrationOutcome)
-    or ('error', exception) at the end.
-    """
-    os.nice(NICE)
-    with suppress(BrokenPipeError):  # the parent has died; so does this process
-        try:
-            outcome = run_calibration(
-                request,
-                validate=validate,
-                rig=rig,
-                progress=lambda *content: sender.send(('round', content)),
-            )
-            sender.send(('outcome', outcome.without_runs()))
-        except BrokenPipeError:
-            raise
-        except ValueError as error:  # DataError among them
-            sender.send(('error', error))
-        except Exception as error:
-            sender.send(('error', RuntimeError(repr(error))))
+    progress: Progress | None = None,
+) -> CalibrationOutcome:
+    """Run the job in the worker process."""
+    outcome = run_calibration(request, validate=validate, rig=rig, progress=progress)
+    return outcome.without_runs()

@@ -13,12 +13,11 @@ import numpy as np
 from sensor_msgs.msg import JointState
 
 from ..exposures.angles import AngleOptions
-from .messages.joint_state import JointStates, decode_joint_state
-from .runtime.diagnostics import WARN
-from .runtime.errors import StartError
-from .runtime.logging import RateLimitedLogger
-from .runtime.qos import observations_qos
-from .runtime.stream_reader import FaultHandlers, StreamReader
+from .messages.observations import JointStates, decode_joint_state
+from .runtime.diagnostics import WARN, Health
+from .runtime.lifecycle import StreamNode
+from .runtime.logging import RateLimitedLogger, StartError
+from .runtime.streams import FaultHandlers, StreamReader, observations_qos
 
 TOPIC = 'joint_states'
 MAX_BYTES = 1_000_000  # of a message
@@ -64,21 +63,26 @@ class AngleInput:
         self._seen = dict.fromkeys(names, 0)  # of them, when the status was asked for last
         self._doubted: set[str] = set()
 
-    def subscribe(self, reader: StreamReader) -> None:
-        """Receive the states with the streams of a reader."""
+    def create_reader(self, node: StreamNode, faults: FaultHandlers) -> StreamReader:
+        """Return a new reader of a node that also receives the states.
+
+        faults: of its other topics.
+        """
+        reader = node.create_reader(self._guarded(faults))
         if self._angles.joints:
             reader.subscribe(
                 JointState,
                 TOPIC,
                 self._on_state,
                 observations_qos(),
-                decode_joint_state,
-                MAX_BYTES,
+                decode=decode_joint_state,
+                max_bytes=MAX_BYTES,
             )
             # An exposure that waits among others must not get the angle of the first of them.
             reader.take_first(TOPIC)
+        return reader
 
-    def guarded(self, faults: FaultHandlers) -> FaultHandlers:
+    def _guarded(self, faults: FaultHandlers) -> FaultHandlers:
         """Return the handlers of a reader, but for faults of the states of joints."""
 
         def undecodable(topic: str) -> None:
@@ -131,15 +135,15 @@ class AngleInput:
             'joint states refused': self._refused,
         }
 
-    def status(self, name: str, incompatible: Mapping[str, str]) -> tuple[bytes, str] | None:
-        """Return the status of a fluoroscope some of whose new frames had no angle, else None.
+    def health(self, name: str, incompatible: Mapping[str, str]) -> Health | None:
+        """Return the state of a fluoroscope some of whose new frames had no angle, else None.
 
         incompatible: messages about publishers that are not received, by topic.
         """
         before, self._seen[name] = self._seen[name], self._unknown[name]
         if self._unknown[name] == before:
             return None
-        return WARN, incompatible.get(TOPIC) or self._doubt(name)
+        return Health(WARN, incompatible.get(TOPIC) or self._doubt(name))
 
     def _doubt(self, name: str) -> str:
         """Return why the angle of the last exposure is unknown, or of some before it."""

@@ -20,10 +20,10 @@ from rclpy.subscription import Subscription
 
 from ..options import option
 from .recorder_node import adapted_qos, type_hash_text
-from .runtime.errors import StartError
+from .runtime.logging import StartError
 from .runtime.main import run
-from .runtime.message_types import definition_of, installed_type
 from .runtime.parameters import ParameterGroup, ParameterNode
+from .runtime.streams import TopicDiscovery, definition_of, installed_type
 
 DISCOVERY_S = 0.2  # period in which new topics, and new readers, are looked for
 DEPTH = 10  # messages that wait, of one topic
@@ -64,9 +64,8 @@ class BridgeNode(ParameterNode):
         super().__init__('bridge_node')
         settings = _NODE.declare(self)
         self._foxglove = _foxglove()
-        self._wanted = {self.resolve_topic_name(topic) for topic in settings.topics if topic}
+        self._topics_of_graph = TopicDiscovery(self, filter(None, settings.topics))
         self._shown: dict[str, _Shown] = {}
-        self._passed_over: set[str] = set()
         self._lock = threading.Lock()
         self._readers: Counter[str] = Counter()  # by topic; changed by the server's threads
         self._newcomers: set[str] = set()  # topics with a reader who missed the latched message
@@ -81,7 +80,7 @@ class BridgeNode(ParameterNode):
         """Start the WebSocket server. Raises StartError."""
         node = self
 
-        class Listener(self._foxglove.ServerListener):  # type: ignore[name-defined,misc]
+        class Listener(self._foxglove.ServerListener):  # type: ignore[name-defined]
             def on_subscribe(self, client: Any, channel: Any) -> None:
                 node._count_reader(channel.topic, 1)
 
@@ -125,17 +124,9 @@ class BridgeNode(ParameterNode):
                 shown.channel.log(shown.last)
 
     def _discover(self) -> None:
-        for topic, types in self.get_topic_names_and_types():
-            known = topic in self._shown or topic in self._passed_over
-            hidden = any(part.startswith('_') for part in topic.split('/'))
-            if known or hidden or (self._wanted and topic not in self._wanted):
-                continue
-            publishers = self.get_publishers_info_by_topic(topic)
-            if not publishers:
-                continue
+        for topic, types, publishers in self._topics_of_graph.new():
             kind = installed_type(types[0]) if len(types) == 1 else None
             if kind is None:
-                self._passed_over.add(topic)
                 self.get_logger().warning(f'{topic} is not shown: its type is not installed')
                 continue
             definition = definition_of(types[0], type_hash_text(publishers[0]))

@@ -12,7 +12,7 @@ from typing import Any
 from fluoro_calib_msgs.msg import FluoroscopeCalibration
 from rclpy.node import Node
 
-from ..calibration import result as calibration_result
+from ..correction import fluoroscope_calibration as calibration_result
 from ..errors import DataError
 from ..limits import read_limits
 from .messages.fluoroscope_calibration import (
@@ -20,10 +20,8 @@ from .messages.fluoroscope_calibration import (
     decode_fluoroscope_calibration,
     message_from_calibration,
 )
-from .runtime.discovery import publisher_conflict
-from .runtime.errors import one_line
-from .runtime.qos import latched_qos
-from .runtime.stream_reader import DECODING_ERRORS
+from .runtime.logging import one_line
+from .runtime.streams import DECODING_ERRORS, latched_qos, publisher_conflict
 
 # Calls of release() after which an undisputed calibration is used, in case a second node that is
 # seen has died.

@@ -5,59 +5,124 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from ..calibration.result import FluoroscopeCalibration
-from ..distortion.angle_field import AngleField
+from ..correction.angle_field import AngleField
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, printable
 from ..exposures.angles import AngleOptions
-from ..files.calibration import load_calibrations
-from ..files.result_check import disagreements
+from ..io.calibration import load_calibrations
+from ..io.result_check import disagreements
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
-from .runtime.diagnostics import ERROR, OK, WARN, LatencyWindow, Status
-from .runtime.errors import one_line
+from .runtime.conditions import (
+    StreamState,
+    inactive_node,
+    incompatible_publisher,
+    lost_messages,
+    missing_publisher,
+    refused_messages,
+    stalled_stream,
+)
+from .runtime.diagnostics import OK, Health, RefusalLog, Status, fault, health_of, warning
 from .runtime.lifecycle import StreamNode
-from .runtime.logging import RateLimitedLogger
+from .runtime.logging import one_line
 from .runtime.parameters import CalibratedParameters, expand_path
-from .runtime.refusals import RefusalLog
-from .runtime.stall import StallDetector
-from .runtime.stream_reader import FaultHandlers
+from .runtime.stream import Stream, stream_faults
+from .runtime.streams import FaultHandlers
 
 
-class Stream:
-    """Counts of one fluoroscope.
+class CorrectedStream(Stream):
+    """Stream of a fluoroscope that is corrected.
 
     Attributes
     ----------
-    received, corrected : int
+    corrected : int
         Number of frames or images.
     waiting : int
         Number of those that came before the first calibration.
-    refusals : RefusalLog
-    stall : StallDetector
-    latencies : LatencyWindow
-        From the arrival of a message to the publication of its correction.
     beyond : (float, AngleField) or None
         Angle [rad] of a message since the last diagnostics that is far from all calibrated ones.
     """
 
-    def __init__(self, name: str, item: str, logger: RateLimitedLogger) -> None:
-        self.name = name
-        self.received = 0
+    def __init__(self, name: str, refusals: RefusalLog) -> None:
+        super().__init__(name, refusals)
         self.corrected = 0
         self.waiting = 0
-        self.refusals = RefusalLog(item, logger)
-        self.stall = StallDetector()
-        self.latencies = LatencyWindow()
         self.beyond: tuple[float, AngleField] | None = None
 
     def count_corrected(self, info: Mapping[str, int]) -> None:
         """Count a message that was corrected and published; info: see StreamReader.subscribe."""
         self.corrected += 1
-        self.latencies.add(time.time_ns() - info['received_timestamp'])
+        self.add_latency(info['received_timestamp'])
+
+
+@dataclass(frozen=True)
+class CorrectingState(StreamState):
+    """What the diagnostics of a fluoroscope are decided by.
+
+    Attributes
+    ----------
+    stream : CorrectedStream
+    item : str
+        What is corrected: frame or image.
+    beyond : str
+        What becomes of the items at an angle far from all calibrated ones.
+    calibrations : CalibrationInput
+    angles : AngleInput
+    """
+
+    stream: CorrectedStream
+    item: str
+    beyond: str
+    calibrations: CalibrationInput
+    angles: AngleInput
+
+
+def several_nodes(state: CorrectingState) -> Health | None:
+    """Several calibration nodes serve the fluoroscope."""
+    return fault(state.calibrations.conflict(state.stream.name))
+
+
+def uncalibrated(state: CorrectingState) -> Health | None:
+    """There is no calibration yet."""
+    if state.calibrations.current(state.stream.name) is not None:
+        return None
+    return warning(f'no calibration yet: {state.stream.waiting} {state.item}s were not corrected')
+
+
+def doubtful_angle(state: CorrectingState) -> Health | None:
+    """The angle of the C-arm is unknown, or was not calibrated."""
+    stream = state.stream
+    unknown = state.angles.health(stream.name, state.incompatible)
+    beyond, stream.beyond = stream.beyond, None
+    if unknown:
+        return unknown.with_consequence('the mean correction over all angles is used')
+    if beyond is None:
+        return None
+    angle, field = beyond
+    return warning(f'{beyond_text(angle, field.angles)}: {state.beyond}')
+
+
+def correcting(state: CorrectingState) -> Health:
+    """Nothing is wrong."""
+    return Health(OK, 'correcting')
+
+
+CONDITIONS = (
+    lost_messages,
+    several_nodes,
+    incompatible_publisher,
+    uncalibrated,
+    inactive_node,
+    missing_publisher,
+    stalled_stream,
+    refused_messages,
+    doubtful_angle,
+    correcting,
+)
 
 
 class CorrectingNode(StreamNode):
@@ -105,9 +170,13 @@ class CorrectingNode(StreamNode):
         self.names = parameters.fluoroscopes
         self.reset()
 
-    def make_stream(self, name: str) -> Stream:
+    def make_stream(self, name: str) -> CorrectedStream:
         """Return the state of one fluoroscope before the first message."""
-        return Stream(name, self.item, self.limited_logger)
+        return CorrectedStream(name, self.refusal_log())
+
+    def refusal_log(self) -> RefusalLog:
+        """Return what counts the messages of a stream that are refused."""
+        return RefusalLog(self.item, self.limited_logger)
 
     def make_angles(self) -> dict[str, AngleInput]:
         """Return what gives the angles of each fluoroscope; threads must not share one."""
@@ -134,20 +203,6 @@ class CorrectingNode(StreamNode):
     def extra_values(self, stream: Any, prepared: Any) -> dict[str, object]:
         """Return further values for the diagnostics of a fluoroscope."""
         return {}
-
-    def _angle_verdict(
-        self, stream: Any, incompatible: Mapping[str, str]
-    ) -> tuple[bytes, str] | None:
-        """Return the status where an angle of the C-arm is unknown or was not calibrated."""
-        unknown = self.angles[stream.name].status(stream.name, incompatible)
-        beyond, stream.beyond = stream.beyond, None
-        if unknown:
-            level, reason = unknown
-            return level, f'{reason}; the mean correction over all angles is used'
-        if beyond is None:
-            return None
-        angle, field = beyond
-        return WARN, f'{beyond_text(angle, field.angles)}: {self.beyond}'
 
     def reset(self) -> None:
         """Start counting from zero."""
@@ -180,82 +235,47 @@ class CorrectingNode(StreamNode):
             for name in self.names:
                 self._on_refused_calibration(name, one_line(error))
             return
-        for sentence in disagreements(directory, loaded):
-            self.get_logger().warning(printable(sentence))
+        for found in disagreements(directory, loaded):
+            self.get_logger().warning(printable(str(found)))
         for name in self.names:
             self._calibrations.begin_with(name, loaded[name])
 
     @property
     def fault_handlers(self) -> FaultHandlers:
         """What a stream reader calls when something goes wrong."""
-        return FaultHandlers(
-            lambda topic: self._count_undecodable(self.stream_of(topic), topic),
-            lambda topic, error: self.stream_of(topic).refusals.fail(topic, error),
-            self.fail,
-            lambda topic, size: self._count_too_large(self.stream_of(topic), topic, size),
-        )
-
-    def stream_of(self, topic: str) -> Any:
-        """Return the Stream of a topic <fluoroscope>/<...>."""
-        return self.streams[topic.partition('/')[0]]
+        return stream_faults(self.streams, self.fail)
 
     def diagnose(self) -> list[Status]:
         """Return the status of every fluoroscope."""
         self._calibrations.release()
         incompatible = self.incompatible_publishers()
-        return [
-            Status(name, *self._verdict(stream, incompatible), self._values(stream))
-            for name, stream in self.streams.items()
-        ]
+        return [self._diagnose(stream, incompatible) for stream in self.streams.values()]
 
     def _on_refused_calibration(self, name: str, reason: str) -> None:
         self.streams[name].refusals.last_fault = reason
 
-    @staticmethod
-    def _count_undecodable(stream: Stream, topic: str) -> None:
-        stream.received += 1
-        stream.refusals.refuse_undecodable(topic)
-
-    @staticmethod
-    def _count_too_large(stream: Stream, topic: str, size: int) -> None:
-        stream.received += 1
-        stream.refusals.refuse_too_large(topic, size)
-
-    def _values(self, stream: Stream) -> dict[str, object]:
-        return {
+    def _diagnose(self, stream: CorrectedStream, incompatible: Mapping[str, str]) -> Status:
+        name = stream.name
+        state = CorrectingState(
+            node=self,
+            topics=tuple(f'{name}/{topic}' for topic in self.topics),
+            refusals=stream.refusals,
+            incompatible=incompatible,
+            stream=stream,
+            subject=self.subject,
+            item=self.item,
+            beyond=self.beyond,
+            calibrations=self._calibrations,
+            angles=self.angles[name],
+        )
+        values = {
             f'{self.item}s received': stream.received,
             f'{self.item}s corrected': stream.corrected,
             f'{self.item}s without calibration': stream.waiting,
             **stream.refusals.values(self.refusal_kinds),
             'last fault': stream.refusals.last_fault,
-            **self.extra_values(stream, self.prepared(stream.name)),
-            **self.angles[stream.name].values(stream.name),
+            **self.extra_values(stream, self.prepared(name)),
+            **self.angles[name].values(name),
             **stream.latencies.values(),
         }
-
-    def _verdict(self, stream: Stream, incompatible: Mapping[str, str]) -> tuple[bytes, str]:
-        """Return level and message of the diagnostics of a fluoroscope."""
-        failure = stream.refusals.failure_status()
-        if failure:
-            return failure
-        conflict = self._calibrations.conflict(stream.name)
-        if conflict:
-            return ERROR, conflict
-        topics = [f'{stream.name}/{topic}' for topic in self.topics]
-        for topic in topics:
-            if topic in incompatible:
-                return WARN, incompatible[topic]
-        if self.prepared(stream.name) is None:
-            return WARN, f'no calibration yet: {stream.waiting} {self.item}s were not corrected'
-        if not self.readers:
-            return WARN, 'the node is not active'
-        if not any(map(self.has_publisher, topics)):
-            return WARN, f'no publisher of {self.subject}'
-        stalled = stream.stall.message(stream.received)
-        if stalled:
-            return WARN, stalled
-        return (
-            stream.refusals.refusal_status()
-            or self._angle_verdict(stream, incompatible)
-            or (OK, 'correcting')
-        )
+        return Status(name, *health_of(state, CONDITIONS), values)

@@ -7,23 +7,27 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import partial
+from typing import Any
 
 import numpy as np
 from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from sensor_msgs.msg import CameraInfo
 
-from ..calibration.result import FluoroscopeCalibration
-from ..distortion.status import CorrectionStatus
+from ..correction.base import CorrectionStatus
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.angles import AngleOptions
 from ..limits import StreamLimits
-from .correcting_node import CorrectingNode, Stream
+from .correcting_node import CorrectedStream, CorrectingNode
 from .frame_validation import OBSERVED_REFUSALS, FrameValidator
 from .messages.camera_info import message_of_corrected_stream
-from .messages.corrected_observations import encode_corrected_observations
-from .messages.fields import NS_PER_S
-from .messages.target_observations import ObservedFrame, decode_target_observations
-from .runtime.logging import RateLimitedLogger
+from .messages.observations import (
+    NS_PER_S,
+    ObservedFrame,
+    decode_target_observations,
+    encode_corrected_observations,
+)
+from .runtime.diagnostics import RefusalLog, Refused
 from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,
@@ -31,8 +35,7 @@ from .runtime.parameters import (
     ParameterGroup,
     declare_read_limits,
 )
-from .runtime.qos import latched_qos, observations_qos
-from .runtime.refusals import Refused
+from .runtime.streams import latched_qos, observations_qos
 
 # An integer: comparing an array with an enum member takes longer than the rest of the node.
 INVALID = int(CorrectionStatus.INVALID)
@@ -42,11 +45,11 @@ _LIMITS = ParameterGroup(StreamLimits)
 PARAMETERS = (_NODE, _ANGLES, _LIMITS, READ_LIMITS)
 
 
-class _ObservationStream(Stream):
-    """State of one fluoroscope."""
+class ObservationStream(CorrectedStream):
+    """Stream of image points that are corrected."""
 
-    def __init__(self, name: str, item: str, logger: RateLimitedLogger) -> None:
-        super().__init__(name, item, logger)
+    def __init__(self, name: str, refusals: RefusalLog) -> None:
+        super().__init__(name, refusals)
         self.validator = FrameValidator(name)
         self.invalid_points = 0
         self.stamp: tuple[int, int] | None = None  # seconds and nanoseconds of the newest frame
@@ -67,9 +70,9 @@ class CorrectionNode(CorrectingNode):
         self._limits = _LIMITS.declare(self)
         self.use_parameters(_NODE.declare(self), _ANGLES.declare(self))
 
-    def make_stream(self, name: str) -> _ObservationStream:
+    def make_stream(self, name: str) -> ObservationStream:
         """Return the state of one fluoroscope before the first frame."""
-        return _ObservationStream(name, self.item, self.limited_logger)
+        return ObservationStream(name, self.refusal_log())
 
     def create_outputs(self) -> None:
         """Make the outputs and subscribe to calibrations."""
@@ -86,16 +89,15 @@ class CorrectionNode(CorrectingNode):
     def create_readers(self) -> None:
         """Receive the observations of all fluoroscopes in one thread."""
         angles = self.angles[self.names[0]]  # one for all fluoroscopes
-        reader = self.create_reader(angles.guarded(self.fault_handlers))
-        angles.subscribe(reader)
+        reader = angles.create_reader(self, self.fault_handlers)
         for name in self.names:
             reader.subscribe(
                 TargetObservations,
                 f'{name}/target_observations',
                 partial(self._on_frame, name),
                 observations_qos(),
-                decode_target_observations,
-                self._limits.max_bytes,
+                decode=decode_target_observations,
+                max_bytes=self._limits.max_bytes,
             )
 
     def prepare(self, calibration: FluoroscopeCalibration) -> FluoroscopeCalibration:
@@ -112,14 +114,14 @@ class CorrectionNode(CorrectingNode):
             f'(grid cells of {grid.cell_px:g} px, within {grid.error_px:.4f} px of the model)'
         )
 
-    def diagnose(self) -> list:
+    def diagnose(self) -> list[Any]:
         """Return the status of every fluoroscope, and publish its CameraInfo again."""
         for name in self.names:
             self._publish_info(name)
         return super().diagnose()
 
     def extra_values(
-        self, stream: _ObservationStream, prepared: FluoroscopeCalibration | None
+        self, stream: ObservationStream, prepared: FluoroscopeCalibration | None
     ) -> dict[str, object]:
         """Return further values for the diagnostics of a fluoroscope."""
         return {
@@ -168,7 +170,7 @@ class CorrectionNode(CorrectingNode):
 
     @staticmethod
     def _note_invalid_points(
-        stream: _ObservationStream, frame: ObservedFrame, status: np.ndarray
+        stream: ObservationStream, frame: ObservedFrame, status: np.ndarray
     ) -> None:
         """Count and log points of a published frame that are not on the image."""
         where = f'fluoroscope {stream.name}, frame {frame.frame_number}'

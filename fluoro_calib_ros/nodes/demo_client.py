@@ -28,14 +28,17 @@ from rclpy.node import Node
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo
 
-from ..calibration import result as calibration_result
-from .messages.corrected_observations import CorrectedFrame, decode_corrected_observations
+from ..correction import fluoroscope_calibration as calibration_result
 from .messages.fluoroscope_calibration import calibration_from_message
-from .messages.reconstructed_points import GoodPoints, good_points_of
+from .messages.observations import (
+    CorrectedFrame,
+    ObservedFrame,
+    decode_corrected_observations,
+    decode_target_observations,
+)
+from .messages.points import GoodPoints, good_points_of
 from .messages.self_calibration import feedback_text
-from .messages.target_observations import ObservedFrame, decode_target_observations
-from .runtime.qos import latched_qos, observations_qos
-from .runtime.stream_reader import FaultHandlers, StreamReader
+from .runtime.streams import FaultHandlers, StreamReader, latched_qos, observations_qos
 
 
 class DemoError(RuntimeError):
@@ -203,7 +206,10 @@ class DemoClient(Node):
 
     @staticmethod
     def _record(
-        frames: dict, name: str, frame: ObservedFrame | CorrectedFrame, info: Mapping[str, int]
+        frames: dict[Any, Any],
+        name: str,
+        frame: ObservedFrame | CorrectedFrame,
+        info: Mapping[str, int],
     ) -> None:
         frames[name, frame.frame_number] = (frame, info['source_timestamp'])
 

@@ -12,13 +12,12 @@ from fluoro_calib_msgs.srv import Reset
 from rclpy.client import Client
 from rclpy.publisher import Publisher
 
-from ..drift.clusters import Cluster, parse_clusters
-from ..drift.options import DriftOptions
-from ..drift.rig_watch import RigDriftWatch
-from ..drift.state import DriftState
+from ..checks.cluster_watch import Cluster, parse_clusters
+from ..checks.drift_options import DriftOptions, DriftState
+from ..checks.rig_watch import RigDriftWatch
 from ..options import option
 from ..photogrammetry.rig_orientation import RigOrientation
-from .messages.drift_status import ALARM, message_from_drift_state
+from .messages.status import ALARM, message_from_drift_state
 from .runtime.diagnostics import ERROR, OK, WARN, Status
 from .runtime.logging import Logger
 

@@ -8,84 +8,34 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from rclpy.task import Future
 
-from ..calibration.initial_network import MIN_TARGETS_OF_EXPOSURE
 from ..errors import DataError
-from ..exposures.collector import ExposureCollector, StillOptions
+from ..estimation.initial_network import MIN_TARGETS_OF_EXPOSURE
+from ..exposures.collector import ExposureCollector
 from ..exposures.frame import Frame, validate_frame
-from ..exposures.pairing import CompletePairer, PairingOptions
+from ..exposures.pairing import CompletePairer
 from ..exposures.phantom import Phantom
-from ..exposures.readiness import Readiness, readiness
-from ..limits import CollectLimits
-from .messages.target_observations import ObservedFrame, frame_from_observed
+from ..exposures.readiness import readiness
+from .calibration_settings import CalibrationSettings
+from .messages.observations import ObservedFrame, frame_from_observed
+from .messages.status import Collected
+from .runtime.diagnostics import RefusalLog
 from .runtime.logging import Logger, RateLimitedLogger
-from .runtime.refusals import RefusalLog
+from .runtime.stream import Stream
 
 
 def _no_angle() -> None:
     """Return that an angle is unknown."""
 
 
-@dataclass(frozen=True)
-class CollectOptions:
-    """How exposures are collected.
+class PhantomStream(Stream):
+    """Stream of a fluoroscope in which the phantom is looked for."""
 
-    Attributes
-    ----------
-    mode : str
-        'still': whenever the phantom stands still in a new pose; 'request': only for a capture.
-    still : StillOptions
-    pairing : PairingOptions
-    max_exposures : int
-        More are refused until a reset.
-    """
-
-    mode: str
-    still: StillOptions
-    pairing: PairingOptions
-    max_exposures: int = CollectLimits.max_exposures
-
-
-@dataclass(frozen=True)
-class Collected:
-    """What is collected of one fluoroscope.
-
-    Attributes
-    ----------
-    received, rejected, unpaired : int
-        Number of frames.
-    exposures, observations : int
-        Collected exposures, and the image points in them.
-    coverage : float
-        Covered part of the image, 0 to 1.
-    covered : ndarray or None
-        Whether cells (rows, columns) of the image are covered; None before the first exposure.
-    image_size : tuple of int or None
-    readiness : Readiness
-    """
-
-    received: int
-    rejected: int
-    unpaired: int
-    exposures: int
-    observations: int
-    coverage: float
-    covered: np.ndarray | None
-    image_size: tuple[int, int] | None
-    readiness: Readiness
-
-
-class ObservationStream:
-    """What is known of the frames of one fluoroscope."""
-
-    def __init__(self, name: str, logger: RateLimitedLogger) -> None:
-        self.name = name
-        self.received = 0
-        self.refusals = RefusalLog('frame', logger)
+    def __init__(self, name: str, refusals: RefusalLog) -> None:
+        super().__init__(name, refusals)
         self.image_size: tuple[int, int] | None = None
         self.other_targets: bytes | None = None  # ids of the last frame without the phantom
         self.is_other_object_logged = False
@@ -105,7 +55,7 @@ class ExposureInput:
         Fluoroscopes.
     phantom : Phantom or None
         Without one, frames are only counted.
-    options : CollectOptions
+    settings : CalibrationSettings
     on_pair : callable
         Called with every pair of frames of the phantom, in the thread of the streams.
     on_captured : callable
@@ -118,20 +68,21 @@ class ExposureInput:
         self,
         names: Sequence[str],
         phantom: Phantom | None,
-        options: CollectOptions,
+        settings: CalibrationSettings,
         on_pair: Callable[[Mapping[str, Frame]], None],
         on_captured: Callable[[], None],
         logger: Logger,
     ) -> None:
         self._names = tuple(names)
         self._phantom = phantom
-        self._options = options
+        self._settings = settings
         self._on_pair = on_pair
         self._on_captured = on_captured
         self._logger = logger
         self._limited_logger = RateLimitedLogger(logger)
         self.streams = {
-            name: ObservationStream(name, self._limited_logger) for name in self._names
+            name: PhantomStream(name, RefusalLog('frame', self._limited_logger))
+            for name in self._names
         }
         self._captures: deque[Future] = deque()  # one for every capture that waits for its pair
         self.capture_refusal = ''  # why the last pair was not captured
@@ -139,17 +90,17 @@ class ExposureInput:
         self._start()
 
     def _start(self) -> None:
-        self._pairer = CompletePairer(self._names, self._options.pairing)
-        self._collector = ExposureCollector(self._names, self._options.still)
+        self._pairer = CompletePairer(self._names, self._settings.pairing)
+        self._collector = ExposureCollector(self._names, self._settings.still)
 
     # -- the executor's thread
 
-    def use(self, options: CollectOptions) -> None:
-        """Use other options from now on; what is collected stays."""
+    def use(self, settings: CalibrationSettings) -> None:
+        """Use other settings from now on; what is collected stays."""
         with self._lock:
-            self._options = options
-            self._pairer.use(options.pairing)
-            self._collector.still = options.still
+            self._settings = settings
+            self._pairer.use(settings.pairing)
+            self._collector.still = settings.still
 
     def reset(self) -> int:
         """Discard all exposures; returns their number. The counts of frames stay."""
@@ -172,15 +123,15 @@ class ExposureInput:
             exposures = self._collector.exposures
             coverage = self._collector.coverage.get(name)
             return Collected(
-                stream.received,
-                stream.refusals.total + stream.refusals.failures,
-                self._pairer.unpaired[name],
-                len(exposures),
-                sum(len(pair[name].target_id) for pair in exposures),
-                coverage.fraction if coverage else 0.0,
-                coverage.covered if coverage else None,
-                stream.image_size,
-                readiness(len(exposures), coverage),
+                received=stream.received,
+                rejected=stream.refusals.total + stream.refusals.failures,
+                unpaired=self._pairer.unpaired[name],
+                exposures=len(exposures),
+                observations=sum(len(pair[name].target_id) for pair in exposures),
+                coverage=coverage.fraction if coverage else 0.0,
+                covered=coverage.covered if coverage else None,
+                image_size=stream.image_size,
+                readiness=readiness(len(exposures), coverage),
             )
 
     def disagreement(self) -> str:
@@ -230,21 +181,9 @@ class ExposureInput:
         except DataError as error:
             stream.refusals.refuse(error)
 
-    def refuse_undecodable(self, topic: str) -> None:
-        """Count a message on <fluoroscope>/<...> that cannot be decoded."""
-        stream = self.streams[topic.partition('/')[0]]
-        stream.received += 1
-        stream.refusals.refuse_undecodable(topic)
-
-    def refuse_too_large(self, topic: str, size: int) -> None:
-        """Count a message on <fluoroscope>/<...> that has more bytes than are read."""
-        stream = self.streams[topic.partition('/')[0]]
-        stream.received += 1
-        stream.refusals.refuse_too_large(topic, size)
-
     def _validated(
         self,
-        stream: ObservationStream,
+        stream: PhantomStream,
         observed: ObservedFrame,
         phantom: Phantom,
         angle: Callable[[], float | None],
@@ -275,7 +214,7 @@ class ExposureInput:
         """Collect a pair for the oldest capture, or because the phantom stands still."""
         self._on_pair(pair)
         collector = self._collector
-        if len(collector.exposures) >= self._options.max_exposures:
+        if len(collector.exposures) >= self._settings.limits.max_exposures:
             self._refuse_full(len(collector.exposures))
             return
         if self._captures:
@@ -284,7 +223,7 @@ class ExposureInput:
                 captured = pair[self._names[0]].number, len(collector.exposures)
                 self._captures.popleft().set_result(captured)
                 self._on_captured()
-        elif self._options.mode == 'still':
+        elif self._settings.node.collect == 'still':
             before = len(collector.exposures)
             refusal = collector.offer(pair)
             if len(collector.exposures) < before:

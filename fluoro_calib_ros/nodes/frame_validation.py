@@ -7,16 +7,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..calibration.result import FluoroscopeCalibration
-from ..exposures.frame import (
-    image_size_error,
-    length_error,
-    repeated_target_error,
-    sigma_error,
-)
-from .messages.corrected_observations import CorrectedFrame
-from .messages.target_observations import ObservedFrame
-from .runtime.refusals import TOO_LARGE, Refused
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..exposures.frame import image_size_error, length_error, repeated_target_error, sigma_error
+from .messages.observations import CorrectedFrame, ObservedFrame
+from .runtime.diagnostics import TOO_LARGE, Refused
 
 # Kinds of refusals.
 OBSERVED_REFUSALS = (

@@ -19,15 +19,14 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from ..calibration.result import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.angles import AngleOptions
 from ..images.angle_maps import AngleMaps
 from ..images.corrector import INTERPOLATIONS
 from ..options import option
 from .angle_input import AngleInput
-from .correcting_node import CorrectingNode, Stream
+from .correcting_node import CorrectedStream, CorrectingNode
 from .messages.camera_info import message_of_corrected_stream
-from .messages.fields import NS_PER_S
 from .messages.image import (
     COMPRESSIONS,
     IMAGE_REFUSALS,
@@ -35,7 +34,8 @@ from .messages.image import (
     compressed_message,
     use_single_thread,
 )
-from .runtime.logging import RateLimitedLogger
+from .messages.observations import NS_PER_S
+from .runtime.diagnostics import RefusalLog, Refused
 from .runtime.main import run
 from .runtime.parameters import (
     READ_LIMITS,
@@ -43,8 +43,7 @@ from .runtime.parameters import (
     ParameterGroup,
     declare_read_limits,
 )
-from .runtime.qos import images_qos, latched_qos
-from .runtime.refusals import Refused
+from .runtime.streams import images_qos, latched_qos
 
 RAW = (Image, 'image_raw')
 COMPRESSED = (CompressedImage, 'image_raw/compressed')
@@ -90,11 +89,11 @@ class _PreparedCalibration:
         self.info = message_of_corrected_stream(calibration, Time())
 
 
-class _ImageStream(Stream):
-    """State of one fluoroscope."""
+class CorrectedImages(CorrectedStream):
+    """Stream of images that are corrected."""
 
-    def __init__(self, name: str, item: str, logger: RateLimitedLogger) -> None:
-        super().__init__(name, item, logger)
+    def __init__(self, name: str, refusals: RefusalLog) -> None:
+        super().__init__(name, refusals)
         self.converter = ImageConverter(name)
         self.compressed = 0
 
@@ -120,9 +119,9 @@ class ImageNode(CorrectingNode):
     def _use_settings(self, settings: ImageParameters) -> None:
         self._settings = settings
 
-    def make_stream(self, name: str) -> _ImageStream:
+    def make_stream(self, name: str) -> CorrectedImages:
         """Return the state of one fluoroscope before the first image."""
-        return _ImageStream(name, self.item, self.limited_logger)
+        return CorrectedImages(name, self.refusal_log())
 
     def make_angles(self) -> dict[str, AngleInput]:
         """Return what gives the angles of each fluoroscope, in its own thread."""
@@ -150,8 +149,7 @@ class ImageNode(CorrectingNode):
     def create_readers(self) -> None:
         """Receive images, those of each fluoroscope in a thread of its own."""
         for name, angles in self.angles.items():
-            reader = self.create_reader(angles.guarded(self.fault_handlers))
-            angles.subscribe(reader)
+            reader = angles.create_reader(self, self.fault_handlers)
             for kind, topic in self._inputs:
                 reader.subscribe(
                     kind,
@@ -173,7 +171,7 @@ class ImageNode(CorrectingNode):
         )
 
     def extra_values(
-        self, stream: _ImageStream, prepared: _PreparedCalibration | None
+        self, stream: CorrectedImages, prepared: _PreparedCalibration | None
     ) -> dict[str, object]:
         """Return further values for the diagnostics of a fluoroscope."""
         return {

@@ -20,22 +20,23 @@ from rclpy.time import Time
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
-from ..bags.reader import TopicInfo, iterate_messages, topics_of
 from ..errors import DataError
+from ..io.bags.reader import TopicInfo, iterate_messages, topics_of
 from ..options import option
-from .runtime.discovery import wait_for_readers, wait_until_acknowledged
-from .runtime.errors import StartError, one_line
-from .runtime.logging import Trace
+from .runtime.logging import StartError, Trace, one_line
 from .runtime.main import run
-from .runtime.message_types import installed_type
 from .runtime.pace import Pace
-from .runtime.parameters import (
-    READ_LIMITS,
-    ParameterGroup,
-    ParameterNode,
-    declare_read_limits,
+from .runtime.parameters import READ_LIMITS, ParameterGroup, ParameterNode, declare_read_limits
+from .runtime.services import ServiceEntry, create_services
+from .runtime.streams import (
+    clock_qos,
+    installed_type,
+    observations_qos,
+    qos_overrides,
+    recorded_latched_qos,
+    wait_for_readers,
+    wait_until_acknowledged,
 )
-from .runtime.qos import clock_qos, observations_qos, qos_overrides, recorded_latched_qos
 
 OBSERVATIONS = 'TargetObservations'
 # Message types of the other streams that the nodes process, each with one reader at least.
@@ -95,8 +96,11 @@ class PlayerNode(ParameterNode):
         self._pace = Pace(self._settings.rate, self._settings.start_paused)
         self._start_ns: int | None = None  # of the recording, where playing begins
         _NODE.follow(self, self._use)
-        self.create_service(SetBool, '~/pause', self._on_pause)
-        self.create_service(Trigger, '~/step', self._on_step)
+        services = (
+            ServiceEntry('~/pause', SetBool, self._on_pause),
+            ServiceEntry('~/step', Trigger, self._on_step),
+        )
+        create_services(self, services)
         self._publish_clock()
         self.failed = False
         self._stopping = threading.Event()

@@ -8,22 +8,34 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from rclpy.duration import Duration
 from rclpy.qos import DurabilityPolicy, HistoryPolicy, QoSProfile, ReliabilityPolicy
 from rclpy.topic_endpoint_info import TopicEndpointInfo
 
-from ..bags.recording import MEGABYTE, Recording, RecordingOptions, TopicToRecord, lost_text
 from ..errors import DataError
+from ..io.bags.recording import MEGABYTE, Recording, RecordingOptions, TopicToRecord, lost_text
 from ..options import option
-from .runtime.diagnostics import ERROR, OK, WARN, DiagnosticsPublisher, Status
-from .runtime.errors import StartError
-from .runtime.logging import RateLimitedLogger
+from .runtime.diagnostics import (
+    OK,
+    DiagnosticsPublisher,
+    Health,
+    Status,
+    fault,
+    health_of,
+    warning,
+)
+from .runtime.logging import RateLimitedLogger, StartError
 from .runtime.main import run
-from .runtime.message_types import definition_of, installed_type
 from .runtime.parameters import ParameterGroup, ParameterNode, expand_path
-from .runtime.stream_reader import FaultHandlers, StreamReader
+from .runtime.streams import (
+    FaultHandlers,
+    StreamReader,
+    TopicDiscovery,
+    definition_of,
+    installed_type,
+)
 
 DISCOVERY_S = 0.1  # period in which new topics are looked for
 JOINT_STATES = 'joint_states'
@@ -49,6 +61,31 @@ _RECORDING = ParameterGroup(RecordingOptions)
 PARAMETERS = (_NODE, _RECORDING)
 
 
+class RecorderState(NamedTuple):
+    """Why nothing is written, and what was dropped; '' for nothing."""
+
+    fault: str
+    loss: str
+
+
+def failed_recording(state: RecorderState) -> Health | None:
+    """Nothing can be written any more."""
+    return fault(state.fault and (state.loss or state.fault))
+
+
+def dropped_messages(state: RecorderState) -> Health | None:
+    """Messages are dropped."""
+    return warning(state.loss)
+
+
+def running(state: RecorderState) -> Health:
+    """Nothing is wrong."""
+    return Health(OK, 'recording')
+
+
+CONDITIONS = (failed_recording, dropped_messages, running)
+
+
 class RecorderNode(ParameterNode):
     """Records the messages of topics as they are, from their first publisher on."""
 
@@ -67,9 +104,8 @@ class RecorderNode(ParameterNode):
         topics = [topic for topic in self._settings.topics if topic]
         if topics and self._settings.angle_joint:
             topics.append(JOINT_STATES)
-        self._wanted = {self.resolve_topic_name(topic) for topic in topics}
+        self._topics_of_graph = TopicDiscovery(self, topics)
         self._topics: dict[str, str] = {}  # type by topic
-        self._passed_over: set[str] = set()
         self._limited_logger = RateLimitedLogger(self.get_logger())
         self._reader = StreamReader(
             self,
@@ -88,17 +124,8 @@ class RecorderNode(ParameterNode):
 
     def _discover(self) -> None:
         """Subscribe to topics that have been published since the last time."""
-        for topic, types in self.get_topic_names_and_types():
-            if topic in self._topics or topic in self._passed_over:
-                continue
-            if self._wanted:
-                if topic not in self._wanted:
-                    continue
-            elif any(part.startswith('_') for part in topic.split('/')):
-                continue  # hidden
-            publishers = self.get_publishers_info_by_topic(topic)
-            if publishers:
-                self._subscribe(topic, types, publishers)
+        for topic, types, publishers in self._topics_of_graph.new():
+            self._subscribe(topic, types, publishers)
 
     def _subscribe(
         self, topic: str, types: Sequence[str], publishers: Sequence[TopicEndpointInfo]
@@ -112,7 +139,6 @@ class RecorderNode(ParameterNode):
                 else f'the type {types[0]} is not installed'
             )
             self.get_logger().warning(f'{topic} is not recorded: {reason}')
-            self._passed_over.add(topic)
             return
         qos = adapted_qos(publishers)
         is_latched = qos.durability == DurabilityPolicy.TRANSIENT_LOCAL
@@ -149,8 +175,6 @@ class RecorderNode(ParameterNode):
     def _on_timer(self) -> None:
         """Publish the diagnostics."""
         recording = self._recording
-        loss = self._loss()
-        level = ERROR if recording.fault else WARN if loss else OK
         if recording.fault:
             self._limited_logger.error(recording.fault)
         counts = {
@@ -160,8 +184,8 @@ class RecorderNode(ParameterNode):
             'files': recording.files,
             'waiting [MB]': f'{recording.waiting_bytes / MEGABYTE:.1f}',
         }
-        message = loss or recording.fault or 'recording'
-        self._diagnostics.publish([Status('recorder', level, message, counts)])
+        health = health_of(RecorderState(recording.fault, self._loss()), CONDITIONS)
+        self._diagnostics.publish([Status('recorder', *health, counts)])
 
     def stop(self) -> None:
         """Write what was received, and close the bag."""
@@ -171,7 +195,7 @@ class RecorderNode(ParameterNode):
         if loss or self._recording.fault:
             self.failed = self.failed or bool(self._recording.fault)
             self.get_logger().error(loss or self._recording.fault)
-        missing = sorted(self._wanted - set(self._topics))
+        missing = sorted(self._topics_of_graph.wanted - set(self._topics))
         if missing:
             self.get_logger().warning(f'nobody has published {", ".join(missing)}')
         self.get_logger().info(

@@ -19,27 +19,24 @@ from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
 from ..exposures.frame import Frame
-from ..jobs.rendering import (
-    MARKER_ATTENUATION,
-    MARKER_MM,
-    SETTINGS,
-    RenderedScene,
-    Renderers,
-)
+from ..jobs.simulation import MARKER_ATTENUATION, MARKER_MM, SETTINGS, RenderedScene, Renderers
 from ..options import option
 from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from ..simulation.exposures import Detection, detect_beads, phantom_poses
 from ..simulation.rig import virtual_rig
 from ..simulation.tracking import CLUSTER_MARKERS, simulate_grid, simulate_tracking
-from .messages.fields import stamp_from_nanoseconds
 from .messages.image import message_from_image
-from .messages.target_observations import message_from_frame, set_number_and_stamp
-from .runtime.discovery import wait_for_readers, wait_until_acknowledged
-from .runtime.errors import StartError
-from .runtime.logging import Trace
+from .messages.observations import message_from_frame, set_number_and_stamp, stamp_from_nanoseconds
+from .runtime.logging import StartError, Trace
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode, RigParameters
-from .runtime.qos import images_qos, observations_qos, qos_overrides
+from .runtime.streams import (
+    images_qos,
+    observations_qos,
+    qos_overrides,
+    wait_for_readers,
+    wait_until_acknowledged,
+)
 
 SCENES = ('phantom', 'standing', 'markers', 'grid')
 LOOP_S = 10.0  # length of a scene that is computed in advance and repeated

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import blas
 
-from .symmetric import mirror_lower
+from .rotations import mirror_lower
 
 ALL = slice(None)
 
@@ -72,8 +73,8 @@ class AdditionalParameters:
         last ones.
     """
 
-    functions: np.ndarray
-    prior: np.ndarray
+    functions: NDArray[np.float64]
+    prior: NDArray[np.float64]
     own: GroupedFunctions | None = None
 
     @property
@@ -98,7 +99,7 @@ class AdditionalParameters:
         k = self.functions.shape[1]
         return [(self.functions, slice(axis * k, (axis + 1) * k)) for axis in (0, 1)]
 
-    def correction(self, coefficients: np.ndarray) -> np.ndarray:
+    def correction(self, coefficients: np.ndarray) -> NDArray[np.float64]:
         """Corrections (N, 2) [px] for coefficients (P,)."""
         common = coefficients[: self._common]
         out = np.stack([f @ common[columns] for f, columns in self._by_axis()], axis=1)
@@ -210,7 +211,9 @@ class AdditionalParameters:
             out += self._own_covariance(self.own, covariance, part)
         return out
 
-    def correction_variance(self, covariance: np.ndarray, part: slice = ALL) -> np.ndarray:
+    def correction_variance(
+        self, covariance: np.ndarray, part: slice = ALL
+    ) -> NDArray[np.float64]:
         """Traces (n,) [px^2] of `correction_covariance`, for half to a third of its work."""
         common = covariance[: self._common, : self._common]
         if self.functions.ndim == 2:

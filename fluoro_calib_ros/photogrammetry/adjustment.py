@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .datum import transform_to_datum
 from .elimination import (
@@ -27,10 +28,9 @@ from .elimination import (
     choose_elimination,
 )
 from .network import Network
-from .noise import DEFAULT_NOISE, Noise
+from .noise import DEFAULT_NOISE, Noise, widening_by_group
 from .normal_equations import normal_equations, project_network, right_sides
 from .relative_orientation import discrepancies
-from .scatter import widening_by_group
 from .unknowns import Parameters
 
 # Relative increase of the cost that rounding errors can cause.
@@ -100,13 +100,13 @@ class Adjustment:
     """
 
     parameters: Parameters
-    residuals: np.ndarray
-    q: np.ndarray
+    residuals: NDArray[np.float64]
+    q: NDArray[np.float64]
     noise: Noise
     cost: float
     steps: int
     converged: bool
-    exposure: np.ndarray
+    exposure: NDArray[np.int64]
 
     @cached_property
     def inliers(self) -> np.ndarray:
@@ -138,22 +138,23 @@ def total_cost(network: Network, parameters: Parameters, q: np.ndarray, noise: N
     """
     if not np.isfinite(q).all():
         return np.inf
-    square = sum(
-        a @ additional.prior @ a
-        for additional, a in zip(network.additional, parameters.additional)
-        if additional is not None
-    )
+    square = 0.0
+    for f, additional in enumerate(network.additional):
+        if additional is not None:
+            coefficients = parameters.additional_of(f)
+            square += float(coefficients @ additional.prior @ coefficients)
     if network.datum == 'survey':
         survey_residuals = parameters.points_mm - network.survey_mm
-        square += np.sum((survey_residuals / network.survey_sd_mm[:, None]) ** 2)
-    if network.interior_sd is not None:
+        square += float(np.sum((survey_residuals / network.survey_sd_mm[:, None]) ** 2))
+    if network.interior_mean is not None:
         difference = parameters.interior - network.interior_mean
-        square += np.sum(network.interior_weight * difference**2)
+        square += float(np.sum(network.interior_weight * difference**2))
     if network.exterior is not None:
         off = network.exterior.discrepancies(parameters.rotation, parameters.position_mm)
-        square += np.sum(network.exterior.weights * off**2)
+        square += float(np.sum(network.exterior.weights * off**2))
     for constraint, pose in zip(network.relative, parameters.relative):
-        square += np.sum(discrepancies(constraint, pose, parameters) ** 2 @ constraint.weights)
+        off = discrepancies(constraint, pose, parameters)
+        square += float(np.sum(off**2 @ constraint.weights))
     value = noise.cost(q, network.sigma) + square / 2
     return float(value) if np.isfinite(value) else np.inf
 
@@ -371,7 +372,7 @@ class _LevenbergMarquardt:
 def adjust(
     network: Network,
     start: Parameters,
-    correction: np.ndarray | None = None,
+    correction: NDArray[np.float64] | None = None,
     noise: Noise = DEFAULT_NOISE,
     options: SolverOptions = DEFAULT_OPTIONS,
     raise_if_cancelled: Callable[[], None] | None = None,
@@ -396,7 +397,14 @@ def adjust(
     Adjustment
         `converged` is False where `max_steps` ended the iteration or no step was found.
     """
-    return adjust_with_matrix(network, start, correction, noise, options, raise_if_cancelled)[0]
+    return adjust_with_matrix(
+        network,
+        start,
+        correction=correction,
+        noise=noise,
+        options=options,
+        raise_if_cancelled=raise_if_cancelled,
+    )[0]
 
 
 def adjust_with_matrix(
@@ -422,14 +430,14 @@ def adjust_with_matrix(
         iteration.step()
     found = iteration.current
     adjustment = Adjustment(
-        transform_to_datum(network, found.parameters),
-        found.residuals,
-        found.q,
-        noise,
-        found.cost,
-        iteration.steps,
-        iteration.converged,
-        network.exposure,
+        parameters=transform_to_datum(network, found.parameters),
+        residuals=found.residuals,
+        q=found.q,
+        noise=noise,
+        cost=found.cost,
+        steps=iteration.steps,
+        converged=iteration.converged,
+        exposure=network.exposure,
     )
     used = iteration.used
     if used is None or used.mu > UNDAMPED or network.datum != 'survey':

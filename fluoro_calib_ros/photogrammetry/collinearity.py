@@ -10,11 +10,14 @@ the left, R -> exp([w]x) R, so that dX/dw = -[X]x.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .rotations import cross_matrix
 
 
-def to_sensor(rotation: np.ndarray, position: np.ndarray, points: np.ndarray) -> np.ndarray:
+def to_sensor(
+    rotation: np.ndarray, position: np.ndarray, points: np.ndarray
+) -> NDArray[np.float64]:
     """Points in the sensor frame (n, 3) [mm].
 
     rotation (n, 3, 3) phantom -> sensor; position and points (n, 3) [mm].
@@ -23,7 +26,10 @@ def to_sensor(rotation: np.ndarray, position: np.ndarray, points: np.ndarray) ->
 
 
 def project(
-    rotation: np.ndarray, position: np.ndarray, points: np.ndarray, interior: np.ndarray
+    rotation: NDArray[np.float64],
+    position: NDArray[np.float64],
+    points: NDArray[np.float64],
+    interior: NDArray[np.float64],
 ) -> np.ndarray:
     """Image points (n, 2) [px] of object points; NaN for a point that is not before the source.
 

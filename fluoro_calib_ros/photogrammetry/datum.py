@@ -18,6 +18,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .network import DATUM_DEFECT, Network
 from .relative_pose import RelativePose
@@ -41,13 +42,13 @@ class Gauge:
         B: the directions of the object points at the surveyed coordinates.
     """
 
-    exteriors: np.ndarray
-    points: np.ndarray
-    globals: np.ndarray
-    constraint: np.ndarray
+    exteriors: NDArray[np.float64]
+    points: NDArray[np.float64]
+    globals: NDArray[np.float64]
+    constraint: NDArray[np.float64]
 
 
-def similarity_directions(points: np.ndarray, centre: np.ndarray) -> np.ndarray:
+def similarity_directions(points: np.ndarray, centre: np.ndarray) -> NDArray[np.float64]:
     """Changes (n, 3, 7) of points (n, 3) [mm] by shift, turn and scale about a centre (3,)."""
     offset = points - centre
     shift = np.broadcast_to(np.eye(3), (len(points), 3, 3))
@@ -73,7 +74,7 @@ def open_gauge(network: Network, parameters: Parameters) -> Gauge | None:
     )
 
 
-def stabilising_factor(directions: np.ndarray, diagonal: np.ndarray) -> np.ndarray:
+def stabilising_factor(directions: np.ndarray, diagonal: np.ndarray) -> NDArray[np.float64]:
     """Matrix D (q, 7) such that adding D D^T to a normal matrix fixes its open directions.
 
     directions (q, 7) are open; diagonal (q,) is that of the normal matrix. D D^T is a projector in

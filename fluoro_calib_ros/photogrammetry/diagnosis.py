@@ -17,6 +17,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.linalg import eigh
 
+from ..findings import Finding, Kind, Place
 from .elimination import EliminatePoints
 from .network import Network
 from .noise import Noise
@@ -138,8 +139,8 @@ def undetermined_interiors(
     precision: Precision,
     fluoroscopes: Sequence[str],
     scale: float,
-) -> tuple[str, ...]:
-    """One sentence for every fluoroscope whose interior orientation is not determined.
+) -> tuple[Finding, ...]:
+    """One finding for every fluoroscope whose interior orientation is not determined.
 
     Parameters
     ----------
@@ -165,19 +166,24 @@ def undetermined_interiors(
         weighted = network.interior_weight[f, 2] > 0
         inseparable = not weighted and correlations[f] > MAX_DISTANCE_CORRELATION
         if sd[2] > MAX_RELATIVE_SD * c or inseparable:
-            out.append(
-                f'fluoroscope {name}: principal distance and distance to the phantom cannot be '
-                f'separated (standard deviation of c {100 * sd[2] / c:.0f} %, '
-                f'correlation {correlations[f]:.5f}){remark}; add exposures with '
-                'the phantom tilted towards the source, or hold the interior orientation'
+            cause = (
+                f'principal distance and distance to the phantom cannot be separated (standard '
+                f'deviation of c {100 * sd[2] / c:.0f} %, correlation {correlations[f]:.5f})'
+                f'{remark}; add exposures with the phantom tilted towards the source, or use a '
+                'fixed interior orientation'
             )
         elif max(sd[:2]) > MAX_RELATIVE_SD * c:
-            out.append(
-                f'fluoroscope {name}: the principal point cannot be separated from the position '
-                f'of the source (standard deviation {max(sd[:2]):.0f} px){remark}; '
-                'add exposures with the phantom turned about the axis of the image and tilted, '
-                'or hold the interior orientation'
+            cause = (
+                'the principal point cannot be separated from the position of the source '
+                f'(standard deviation {max(sd[:2]):.0f} px){remark}; add exposures with the '
+                'phantom turned about the axis of the image and tilted, or use a fixed interior '
+                'orientation'
             )
+        else:
+            continue
+        numbers = {'sd_c_px': float(sd[2]), 'correlation': float(correlations[f])}
+        numbers['sd_point_px'] = float(max(sd[:2]))
+        out.append(Finding(Kind.INTERIOR_UNDETERMINED, cause, Place((name,)), numbers=numbers))
     return tuple(out)
 
 

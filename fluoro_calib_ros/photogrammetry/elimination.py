@@ -17,12 +17,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import blas, cho_factor, cho_solve, lapack
 
 from .datum import Gauge, stabilising_factor
 from .network import Network
 from .normal_equations import NormalEquations
-from .symmetric import mirror_lower
+from .rotations import mirror_lower
 from .unknowns import EXTERIOR_SIZE, POINT_SIZE, ReducedLayout, UnknownVector
 
 
@@ -43,11 +44,11 @@ class BorderedSystem:
         Right sides b and r.
     """
 
-    blocks: np.ndarray
-    border: np.ndarray
-    rest: np.ndarray
-    block_right: np.ndarray
-    rest_right: np.ndarray
+    blocks: NDArray[np.float64]
+    border: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    block_right: NDArray[np.float64]
+    rest_right: NDArray[np.float64]
 
     def damped(self, mu: float) -> BorderedSystem:
         """A copy with the diagonal multiplied by 1 + mu."""
@@ -69,7 +70,7 @@ class BorderedSystem:
             )
             return float((undamped + damping) / 2)
 
-    def singular_schur_complement(self) -> np.ndarray:
+    def singular_schur_complement(self) -> NDArray[np.float64]:
         """Schur complement (q, q) of the rest by pseudo-inverses: the blocks may be singular."""
         inverse = np.linalg.pinv(self.blocks, hermitian=True)
         size = len(self.rest)
@@ -106,9 +107,9 @@ class BorderedFactor:
         Lower Cholesky factor of the Schur complement D - H^T H; its upper triangle is undefined.
     """
 
-    inverse: np.ndarray
-    half_border: np.ndarray
-    schur: np.ndarray
+    inverse: NDArray[np.float64]
+    half_border: NDArray[np.float64]
+    schur: NDArray[np.float64]
 
     def solve(
         self, block_right: np.ndarray, rest_right: np.ndarray
@@ -150,11 +151,11 @@ class BorderedCovariance:
         B^-1 C. The inverse between blocks i and j is (i = j) B^-1 - border[i] gain[j]^T.
     """
 
-    blocks: np.ndarray
-    border: np.ndarray
-    rest: np.ndarray
-    conditional: np.ndarray
-    gain: np.ndarray
+    blocks: NDArray[np.float64]
+    border: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    conditional: NDArray[np.float64]
+    gain: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -177,11 +178,11 @@ class CovarianceBlocks:
         points_between(p, q): blocks (k, 3, 3) of object points p (k,) with object points q (k,).
     """
 
-    ee: np.ndarray
-    pp: np.ndarray
-    gg: np.ndarray
-    eg: np.ndarray
-    pg: np.ndarray
+    ee: NDArray[np.float64]
+    pp: NDArray[np.float64]
+    gg: NDArray[np.float64]
+    eg: NDArray[np.float64]
+    pg: NDArray[np.float64]
     pe: Callable[[np.ndarray, np.ndarray], np.ndarray]
     between: Callable[[np.ndarray, np.ndarray], np.ndarray]
     points_between: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -326,14 +327,14 @@ class EliminatePoints(Elimination):
             return held - covariance.border[p] @ covariance.gain[q].transpose(0, 2, 1)
 
         return CovarianceBlocks(
-            ee,
-            covariance.blocks,
-            gg,
-            eg,
-            pg,
-            lambda e, p: pairs[p, :, e, :],
-            lambda e, f: covariance.rest[rows[e][:, :, None], rows[f][:, None, :]],
-            points_between,
+            ee=ee,
+            pp=covariance.blocks,
+            gg=gg,
+            eg=eg,
+            pg=pg,
+            pe=lambda e, p: pairs[p, :, e, :],
+            between=lambda e, f: covariance.rest[rows[e][:, :, None], rows[f][:, None, :]],
+            points_between=points_between,
         )
 
 
@@ -436,14 +437,14 @@ class EliminateExposures(Elimination):
             return held - border[e] @ gain[cell[f], place[f]].transpose(0, 2, 1)
 
         return CovarianceBlocks(
-            blocks[cell, place, :, place, :],
-            pp,
-            gg,
-            eg,
-            pg,
-            lambda e, p: pairs[e, :, p, :].transpose(0, 2, 1),
-            between,
-            lambda p, q: covariance.rest[rows[p][:, :, None], rows[q][:, None, :]],
+            ee=blocks[cell, place, :, place, :],
+            pp=pp,
+            gg=gg,
+            eg=eg,
+            pg=pg,
+            pe=lambda e, p: pairs[e, :, p, :].transpose(0, 2, 1),
+            between=between,
+            points_between=lambda p, q: covariance.rest[rows[p][:, :, None], rows[q][:, None, :]],
         )
 
     def _of_exposures(self, values: np.ndarray) -> np.ndarray:

@@ -14,9 +14,52 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
+from .rotations import vector_from_matrix
+
+# Exterior orientations that are known beforehand: weighted observations of the adjustment.
+
+# Standard deviations that stand for an orientation that is held: a thousandth of what images of
+# 0.25 px noise determine.
+HELD_SD_MM = 3e-4
+HELD_SD_RAD = 1e-7
+
+
+@dataclass(frozen=True)
+class ExteriorPrior:
+    """Exterior orientations of m exposures as observed.
+
+    Attributes
+    ----------
+    rotation : (m, 3, 3) ndarray
+        Rotations phantom -> sensor.
+    position_mm : (m, 3) ndarray
+        Positions of the sources.
+    sd : (m, 6) ndarray
+        Standard deviations of the positions [mm] and of the rotations about the axes of the
+        sensor [rad].
+    """
+
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
+    sd: NDArray[np.float64]
+
+    @property
+    def weights(self) -> NDArray[np.float64]:
+        """Weights (m, 6) of the components."""
+        return 1 / self.sd**2
+
+    def discrepancies(self, rotation: np.ndarray, position_mm: np.ndarray) -> NDArray[np.float64]:
+        """Discrepancies (m, 6) of orientations from the observed ones.
+
+        Those of a rotation R are log(R R0^T), whose derivative by a rotation on the left is the
+        unit matrix to first order (Barfoot, "State Estimation for Robotics", 2017, 7.1).
+        """
+        turned = rotation @ self.rotation.transpose(0, 2, 1)
+        return np.concatenate([position_mm - self.position_mm, vector_from_matrix(turned)], axis=1)
+
 
 MAX_SKEW = 0.05  # of a calibration matrix, and of its ratio of scales, which a correction takes up
 MAX_ROTATION_ERROR = 1e-3  # of R^T R from the unit matrix; a file has few digits
@@ -44,9 +87,9 @@ class KnownOrientation:
         they are held.
     """
 
-    interior: np.ndarray
-    rotation: np.ndarray
-    position_mm: np.ndarray
+    interior: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
     interior_sd: Sequence[float] | None = None
     exterior_sd: Sequence[float] | None = None
 
@@ -76,7 +119,7 @@ class KnownOrientation:
         object.__setattr__(self, name, numbers)
 
     @property
-    def is_held(self) -> bool:
+    def is_fixed(self) -> bool:
         """Whether interior and exterior orientation are both held."""
         return self.interior_sd is None and self.exterior_sd is None
 

@@ -9,9 +9,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .additional_parameters import AdditionalParameters
-from .exterior_prior import ExteriorPrior
+from .known_orientation import ExteriorPrior
 from .relative_orientation import exposures_after_step
 from .relative_pose import POSE_SIZE, RelativeConstraint
 from .rotations import matrix_from_vector
@@ -57,18 +58,18 @@ class Network:
         and inner constraints over the object points define the datum.
     """
 
-    uv: np.ndarray
-    sigma: np.ndarray
-    exposure: np.ndarray
-    point: np.ndarray
-    fluoroscope: np.ndarray
-    survey_mm: np.ndarray
-    survey_sd_mm: np.ndarray
-    interior_free: np.ndarray
+    uv: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    exposure: NDArray[np.int64]
+    point: NDArray[np.int64]
+    fluoroscope: NDArray[np.int64]
+    survey_mm: NDArray[np.float64]
+    survey_sd_mm: NDArray[np.float64]
+    interior_free: NDArray[np.bool_]
     additional: tuple[AdditionalParameters | None, ...] = ()
     relative: tuple[RelativeConstraint, ...] = ()
-    interior_mean: np.ndarray | None = None
-    interior_sd: np.ndarray | None = None
+    interior_mean: NDArray[np.float64] | None = None
+    interior_sd: NDArray[np.float64] | None = None
     exterior: ExteriorPrior | None = None
     datum: str = 'survey'
 
@@ -117,7 +118,7 @@ class Network:
         return self.layout.n_unknowns
 
     @cached_property
-    def interior_weight(self) -> np.ndarray:
+    def interior_weight(self) -> NDArray[np.float64]:
         """Weights (F, 3) [1/px^2] of the prior of the interior orientations."""
         if self.interior_sd is None:
             return np.zeros((self.n_fluoroscopes, 3))
@@ -132,7 +133,7 @@ class Network:
         """Rows of the image points of fluoroscope f."""
         return self._rows[f]
 
-    def additional_correction(self, parameters: Parameters) -> np.ndarray:
+    def additional_correction(self, parameters: Parameters) -> NDArray[np.float64]:
         """Corrections (N, 2) [px] by the additional parameters; zeros where there are none."""
         out = np.zeros_like(self.uv)
         for f, additional in enumerate(self.additional):
@@ -171,9 +172,9 @@ class Network:
         moved = Parameters(
             parameters.interior + interior_step,
             matrix_from_vector(step.exteriors[:, 3:]) @ parameters.rotation,
-            parameters.position_mm + step.exteriors[:, :3],
-            parameters.points_mm + step.points,
-            additional,
-            relative,
+            position_mm=parameters.position_mm + step.exteriors[:, :3],
+            points_mm=parameters.points_mm + step.points,
+            additional=additional,
+            relative=relative,
         )
         return exposures_after_step(self.relative, layout, parameters, moved, step)

@@ -17,6 +17,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .adjustment import DEFAULT_OPTIONS, Adjustment, SolverOptions, adjust, residuals_and_q
 from .elimination import CovarianceBlocks, factorize
@@ -38,7 +39,7 @@ MIN_NOISE_PX = 0.01
 def adjust_and_estimate_noise(
     network: Network,
     start: Parameters,
-    correction: np.ndarray | None = None,
+    correction: NDArray[np.float64] | None = None,
     noise: Noise = DEFAULT_NOISE,
     options: SolverOptions = DEFAULT_OPTIONS,
     raise_if_cancelled: Callable[[], None] | None = None,
@@ -81,7 +82,14 @@ def adjust_and_estimate_noise(
     parameters = start
     settled = False
     for _ in range(MAX_ROUNDS):
-        result = adjust(network, parameters, correction, noise, loose, raise_if_cancelled)
+        result = adjust(
+            network,
+            parameters,
+            correction=correction,
+            noise=noise,
+            options=loose,
+            raise_if_cancelled=raise_if_cancelled,
+        )
         parameters = result.parameters
         equations = normal_equations(network, parameters, correction, noise)
         blocks = covariance_blocks(factorize(network, equations, options.elimination))
@@ -90,7 +98,14 @@ def adjust_and_estimate_noise(
         if abs(noise.scale - last_scale) <= SETTLED * last_scale:
             settled = True
             break
-    result = adjust(network, parameters, correction, noise, options, raise_if_cancelled)
+    result = adjust(
+        network,
+        parameters,
+        correction=correction,
+        noise=noise,
+        options=options,
+        raise_if_cancelled=raise_if_cancelled,
+    )
     return replace(result, converged=result.converged and settled)
 
 

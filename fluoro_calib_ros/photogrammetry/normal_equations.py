@@ -14,6 +14,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .datum import Gauge, open_gauge
 from .network import Network
@@ -58,17 +59,17 @@ class NormalEquations:
         Directions that a free network leaves open.
     """
 
-    ee: np.ndarray
-    pp: np.ndarray
-    gg: np.ndarray
-    eg: np.ndarray
-    pg: np.ndarray
-    pe: np.ndarray
-    e: np.ndarray
-    p: np.ndarray
-    g: np.ndarray
-    coupled_pairs: np.ndarray
-    coupled: np.ndarray
+    ee: NDArray[np.float64]
+    pp: NDArray[np.float64]
+    gg: NDArray[np.float64]
+    eg: NDArray[np.float64]
+    pg: NDArray[np.float64]
+    pe: NDArray[np.float64]
+    e: NDArray[np.float64]
+    p: NDArray[np.float64]
+    g: NDArray[np.float64]
+    coupled_pairs: NDArray[np.int64]
+    coupled: NDArray[np.float64]
     gauge: Gauge | None = None
 
 
@@ -139,11 +140,11 @@ class _Linearised:
         Derivatives of u and v by the object point.
     """
 
-    root: np.ndarray
-    u: np.ndarray
-    v: np.ndarray
-    pu: np.ndarray
-    pv: np.ndarray
+    root: NDArray[np.float64]
+    u: NDArray[np.float64]
+    v: NDArray[np.float64]
+    pu: NDArray[np.float64]
+    pv: NDArray[np.float64]
 
     def by_image_point(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Arrays (k, 2, ...) with one image point a row.
@@ -297,7 +298,7 @@ def _image_sums(problem: _Linearisation) -> _ImageSums:
 def normal_equations(
     network: Network,
     parameters: Parameters,
-    correction: np.ndarray | float,
+    correction: NDArray[np.float64] | float,
     noise: Noise,
     image_factor: float = 1.0,
 ) -> NormalEquations:
@@ -331,18 +332,18 @@ def normal_equations(
     if sums.linearised:
         _add_additional(parameters, sums.linearised, blocks)
     return NormalEquations(
-        ee,
-        pp,
-        blocks.gg,
-        blocks.eg,
-        blocks.pg,
-        sums.pe,
-        e,
-        p,
-        blocks.g,
-        coupled_pairs,
-        coupled,
-        open_gauge(network, parameters),
+        ee=ee,
+        pp=pp,
+        gg=blocks.gg,
+        eg=blocks.eg,
+        pg=blocks.pg,
+        pe=sums.pe,
+        e=e,
+        p=p,
+        g=blocks.g,
+        coupled_pairs=coupled_pairs,
+        coupled=coupled,
+        gauge=open_gauge(network, parameters),
     )
 
 
@@ -382,7 +383,7 @@ def right_sides(
         of_globals[layout.all_interiors] += _interior_pull(network, parameters)
     for f, (additional, columns) in enumerate(zip(network.additional, layout.additional)):
         if additional is not None:
-            pull = additional.prior @ parameters.additional[f]
+            pull = additional.prior @ parameters.additional_of(f)
             of_globals[columns] = additional.right_side(weighted[network.rows(f)]) - pull
     return UnknownVector(exteriors, points.T + _survey_pull(network, parameters), of_globals)
 
@@ -408,6 +409,7 @@ def _exterior_pull(network: Network, parameters: Parameters) -> np.ndarray:
 
 def _interior_pull(network: Network, parameters: Parameters) -> np.ndarray:
     """What the prior of the interior orientations adds (3 F,) to the right side."""
+    assert network.interior_mean is not None
     return (network.interior_weight * (network.interior_mean - parameters.interior)).ravel()
 
 
@@ -514,5 +516,5 @@ def _add_additional(
         blocks.gg[interior, columns] = mixed
         blocks.gg[columns, interior] = mixed.T
         blocks.gg[columns, columns] = additional.normal_matrix(root[rows] ** 2) + additional.prior
-        prior_pull = additional.prior @ parameters.additional[f]
+        prior_pull = additional.prior @ parameters.additional_of(f)
         blocks.g[columns] = additional.right_side(w[:, 0] * r[rows]) - prior_pull

@@ -17,6 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from .adjustment import Adjustment
@@ -63,13 +64,13 @@ class Outliers:
         Numbers of image points and of targets that could be tested.
     """
 
-    image_point: np.ndarray
-    value: np.ndarray
+    image_point: NDArray[np.int64]
+    value: NDArray[np.float64]
     critical_image: float
-    target: np.ndarray
-    target_value: np.ndarray
+    target: NDArray[np.int64]
+    target_value: NDArray[np.float64]
     critical_target: float
-    offset_mm: np.ndarray
+    offset_mm: NDArray[np.float64]
     tested: tuple[int, int]
 
 
@@ -89,10 +90,10 @@ class TargetTest:
         Statistics of the image points at the intersected targets.
     """
 
-    value: np.ndarray
+    value: NDArray[np.float64]
     critical: float
-    offset_mm: np.ndarray
-    ray_square: np.ndarray
+    offset_mm: NDArray[np.float64]
+    ray_square: NDArray[np.float64]
 
 
 def find_outliers(
@@ -112,14 +113,14 @@ def find_outliers(
     explained = np.isin(network.point, wrong) & (targets.ray_square <= critical_image)
     found = np.flatnonzero((image > critical_image) & ~explained)
     return Outliers(
-        found,
-        image[found],
-        critical_image,
-        wrong,
-        targets.value[wrong],
-        targets.critical,
-        targets.offset_mm[wrong],
-        (int(np.isfinite(image).sum()), int(np.isfinite(targets.value).sum())),
+        image_point=found,
+        value=image[found],
+        critical_image=critical_image,
+        target=wrong,
+        target_value=targets.value[wrong],
+        critical_target=targets.critical,
+        offset_mm=targets.offset_mm[wrong],
+        tested=(int(np.isfinite(image).sum()), int(np.isfinite(targets.value).sum())),
     )
 
 

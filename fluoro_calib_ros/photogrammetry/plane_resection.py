@@ -19,6 +19,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..errors import DataError
 from .noise import Noise
@@ -49,10 +50,10 @@ class Plane:
         Right-handed axes as rows: two in the plane, and its normal.
     """
 
-    centre_mm: np.ndarray
-    axes: np.ndarray
+    centre_mm: NDArray[np.float64]
+    axes: NDArray[np.float64]
 
-    def coordinates(self, xyz: np.ndarray) -> np.ndarray:
+    def coordinates(self, xyz: np.ndarray) -> NDArray[np.float64]:
         """Coordinates (n, 2) [mm] in the plane of targets (n, 3)."""
         return (xyz - self.centre_mm) @ self.axes[:2].T
 
@@ -73,7 +74,9 @@ def plane_of(xyz: np.ndarray) -> Plane:
     return Plane(centre, axes)
 
 
-def homography(xy: np.ndarray, uv: np.ndarray, weights: np.ndarray | None = None) -> np.ndarray:
+def homography(
+    xy: np.ndarray, uv: np.ndarray, weights: np.ndarray | None = None
+) -> NDArray[np.float64]:
     """Homographies (..., 3, 3) with uv ~ H (xy, 1) by the direct linear transformation.
 
     xy (..., n, 2), uv (..., n, 2) and weights (..., n) of n >= 4 points. Coordinates are
@@ -109,7 +112,7 @@ def _normalised(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (points - mean) / size, back
 
 
-def robust_homography(xy: np.ndarray, uv: np.ndarray, seed: int = 0) -> np.ndarray:
+def robust_homography(xy: np.ndarray, uv: np.ndarray, seed: int = 0) -> NDArray[np.float64]:
     """Homography (3, 3) of targets of which up to half may be falsely matched.
 
     The sample with the least median of squared residuals (Rousseeuw 1984) is refined on all points

@@ -10,9 +10,10 @@ C_r = C_l - A C_x A^T (Foerstner and Wrobel, "Photogrammetric Computer Vision", 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .additional_parameters import AdditionalParameters
 from .adjustment import Adjustment
@@ -21,9 +22,9 @@ from .datum import Gauge, STransformation
 from .elimination import CovarianceBlocks, Elimination, FactorizedNormalMatrix, factorize
 from .network import Network
 from .noise import Noise
-from .normal_equations import normal_equations, right_sides
+from .normal_equations import NormalEquations, normal_equations, right_sides
 from .relative_orientation import discrepancies_with_jacobian
-from .symmetric import square_of_lower
+from .rotations import square_of_lower
 from .unknowns import Parameters, UnknownVector
 
 # Smallest weight of a gross error, so that its variance stays finite.
@@ -70,18 +71,18 @@ class Precision:
         Of all object points with each other; None where they are too many.
     """
 
-    interior: np.ndarray
-    exterior: np.ndarray
-    points: np.ndarray
-    residual: np.ndarray
-    redundancy: np.ndarray
-    survey_redundancy: np.ndarray
-    additional: tuple[np.ndarray | None, ...]
-    relative: tuple[np.ndarray, ...]
-    relative_redundancy: tuple[np.ndarray, ...]
-    all_global: np.ndarray
-    exterior_global: np.ndarray
-    joint_points: np.ndarray | None = None
+    interior: NDArray[np.float64]
+    exterior: NDArray[np.float64]
+    points: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    redundancy: NDArray[np.float64]
+    survey_redundancy: NDArray[np.float64]
+    additional: tuple[NDArray[np.float64] | None, ...]
+    relative: tuple[NDArray[np.float64], ...]
+    relative_redundancy: tuple[NDArray[np.float64], ...]
+    all_global: NDArray[np.float64]
+    exterior_global: NDArray[np.float64]
+    joint_points: NDArray[np.float64] | None = None
 
 
 def covariance_blocks(matrix: FactorizedNormalMatrix) -> CovarianceBlocks:
@@ -104,14 +105,14 @@ def _in_datum(
 
     free = matrix.network.layout.free
     return CovarianceBlocks(
-        s.transform(blocks.ee, s.exteriors, s.exteriors),
-        s.transform(blocks.pp, s.points, s.points),
-        s.transform(blocks.gg, s.globals, s.globals) * np.outer(free, free),
-        s.transform(blocks.eg, s.exteriors, s.globals) * free,
-        s.transform(blocks.pg, s.points, s.globals) * free,
-        lambda e, p: s.transform(blocks.pe(e, p), points(p), exteriors(e)),
-        lambda e, f: s.transform(blocks.between(e, f), exteriors(e), exteriors(f)),
-        lambda p, q: s.transform(blocks.points_between(p, q), points(p), points(q)),
+        ee=s.transform(blocks.ee, s.exteriors, s.exteriors),
+        pp=s.transform(blocks.pp, s.points, s.points),
+        gg=s.transform(blocks.gg, s.globals, s.globals) * np.outer(free, free),
+        eg=s.transform(blocks.eg, s.exteriors, s.globals) * free,
+        pg=s.transform(blocks.pg, s.points, s.globals) * free,
+        pe=lambda e, p: s.transform(blocks.pe(e, p), points(p), exteriors(e)),
+        between=lambda e, f: s.transform(blocks.between(e, f), exteriors(e), exteriors(f)),
+        points_between=lambda p, q: s.transform(blocks.points_between(p, q), points(p), points(q)),
     )
 
 
@@ -122,7 +123,7 @@ def _covariance_times_points(matrix: FactorizedNormalMatrix, values: np.ndarray)
     return elimination.to_unknowns(*solution)
 
 
-def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> np.ndarray:
+def information_of_additional(matrix: FactorizedNormalMatrix, f: int) -> NDArray[np.float64]:
     """Information (p, p) of the additional parameters of fluoroscope f, prior included.
 
     All other unknowns are eliminated. The last rows of a Cholesky factor are the factor of their
@@ -192,7 +193,7 @@ def covariance_of_projection(
 
 def variance_of_projection(
     network: Network, parameters: Parameters, blocks: CovarianceBlocks
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Traces (N,) [px^2] of `covariance_of_projection`, for less work."""
     out = np.empty(network.n_image_points)
     for f, local, a in _design(network, parameters):
@@ -274,7 +275,7 @@ def _mixed_covariance(
 def precision(
     network: Network,
     adjustment: Adjustment,
-    correction: np.ndarray | None = None,
+    correction: NDArray[np.float64] | None = None,
     elimination: type[Elimination] | None = None,
 ) -> Precision:
     """Covariances and redundancy numbers of an adjustment.
@@ -350,12 +351,12 @@ class JointCovariance:
     globals, exteriors_globals, points_globals : (G, G), (6m, G) and (3n, G) ndarray
     """
 
-    exteriors: np.ndarray
-    points: np.ndarray
-    points_exteriors: np.ndarray
-    globals: np.ndarray
-    exteriors_globals: np.ndarray
-    points_globals: np.ndarray
+    exteriors: NDArray[np.float64]
+    points: NDArray[np.float64]
+    points_exteriors: NDArray[np.float64]
+    globals: NDArray[np.float64]
+    exteriors_globals: NDArray[np.float64]
+    points_globals: NDArray[np.float64]
 
     @property
     def matrix(self) -> np.ndarray:
@@ -387,10 +388,10 @@ def joint_covariance(blocks: CovarianceBlocks) -> JointCovariance:
     return JointCovariance(
         assembled(blocks.between, m, m),
         assembled(blocks.points_between, n, n),
-        assembled(lambda p, e: blocks.pe(e, p), n, m),
-        blocks.gg,
-        blocks.eg.reshape(-1, size),
-        blocks.pg.reshape(-1, size),
+        points_exteriors=assembled(lambda p, e: blocks.pe(e, p), n, m),
+        globals=blocks.gg,
+        exteriors_globals=blocks.eg.reshape(-1, size),
+        points_globals=blocks.pg.reshape(-1, size),
     )
 
 
@@ -429,7 +430,7 @@ def residual_covariance(
     adjustment: Adjustment,
     blocks: CovarianceBlocks,
     projected: np.ndarray | None = None,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Covariances C_r (N, 2, 2) [px^2] of the residuals.
 
     projected: A C_x A^T from covariance_of_projection; computed where it is None.
@@ -451,3 +452,82 @@ def geometric_redundancy(network: Network, parameters: Parameters, noise: Noise)
     blocks = covariance_blocks(factorize(network, equations))
     variance = (noise.scale * network.sigma) ** 2
     return 1 - variance_of_projection(network, parameters, blocks) / (2 * variance)
+
+
+# Precision of an adjustment that holds interior orientations which are not known exactly.
+#
+# What is held has the covariance S, and moves the other unknowns by J = -N^-1 B, where N is their
+# normal matrix and B its mixed blocks with what is held. Their covariance is N^-1 + J S J^T, with
+# "consider parameters" (Tapley, Schutz and Born, "Statistical Orbit Determination", 2004, 6.2).
+# It is a block of the inverse of the normal matrix with D = S^-1 + B^T N^-1 B for what is held,
+# in which the observations do not improve it.
+
+MIN_SD_PX = 1e-6  # of an interior orientation that is held
+
+
+def precision_with_fixed_interiors(
+    network: Network,
+    adjustment: Adjustment,
+    correction: NDArray[np.float64],
+    precise: Precision,
+    covariances: NDArray[np.float64],
+) -> Precision:
+    """Return the precision of an adjustment with the uncertainty of its held interiors.
+
+    Parameters
+    ----------
+    network : Network
+        With interior orientations that are held.
+    adjustment : Adjustment
+    correction : (N, 2) ndarray
+        Correction of the image points [px] in the adjustment.
+    precise : Precision
+        Of the adjustment as if the interior orientations were known.
+    covariances : (F, 3, 3) ndarray
+        Of the interior orientations [px^2].
+
+    Returns
+    -------
+    Precision
+        Residuals and redundancy numbers are those of `precise`: the interiors are held.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where the network does not determine the unknowns.
+    """
+    free, equations = equations_with_fixed_interiors(network, adjustment, correction, covariances)
+    blocks = covariance_blocks(factorize(free, equations))
+    return replace(
+        precise,
+        interior=np.stack([blocks.gg[own, own] for own in free.layout.interiors]),
+        exterior=blocks.ee,
+        points=blocks.pp,
+        all_global=blocks.gg,
+        exterior_global=blocks.eg,
+        joint_points=(
+            joint_covariance(blocks).points if network.n_points <= MAX_JOINT_POINTS else None
+        ),
+    )
+
+
+def equations_with_fixed_interiors(
+    network: Network, adjustment: Adjustment, correction: np.ndarray, covariances: np.ndarray
+) -> tuple[Network, NormalEquations]:
+    """Network and normal equations whose inverse holds the uncertainty of held interiors.
+
+    See `precision_with_fixed_interiors` for the arguments.
+    """
+    free = replace(network, interior_free=np.ones(network.n_fluoroscopes, dtype=bool))
+    factor = adjustment.noise.information_factor(adjustment.q)
+    equations = normal_equations(free, adjustment.parameters, correction, adjustment.noise, factor)
+    prior = np.zeros_like(equations.gg)
+    for own, covariance in zip(free.layout.interiors, covariances):
+        prior[own, own] = np.linalg.inv(covariance + MIN_SD_PX**2 * np.eye(3))
+    with_prior = replace(equations, gg=equations.gg + prior)
+    schur = np.tril(factorize(free, with_prior).factor.schur)
+    # The last rows of a Cholesky factor are the factor of their Schur complement.
+    size = len(prior)
+    last = schur[-size:, -size:]
+    absorbed = with_prior.gg - last @ last.T
+    return free, replace(equations, gg=prior + absorbed)

@@ -17,6 +17,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .relative_pose import POSE_SIZE, RelativeConstraint, RelativePose
 from .rotations import cross_matrix, matrix_from_vector, vector_from_matrix
@@ -54,7 +55,7 @@ def relative_poses(parameters: Parameters, pairs: np.ndarray) -> tuple[np.ndarra
 
 def discrepancies(
     constraint: RelativeConstraint, pose: RelativePose, parameters: Parameters
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Discrepancies (k, 6) of the pairs from a pose: translation [mm], rotation [rad]."""
     turn, shift = relative_poses(parameters, constraint.pairs)
     scale, _ = _translation_scale(constraint, pose)
@@ -132,7 +133,7 @@ def exposures_from_pose(
     parameters: Parameters,
     constraint: RelativeConstraint,
     pose: RelativePose,
-    offset: np.ndarray | None = None,
+    offset: NDArray[np.float64] | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Exterior orientations of b's exposures from those of a and a relative orientation.
 

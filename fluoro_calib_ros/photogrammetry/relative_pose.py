@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .rotations import matrix_from_vector
 
@@ -40,13 +41,13 @@ class RelativeConstraint:
     """
 
     fluoroscopes: tuple[int, int]
-    pairs: np.ndarray
+    pairs: NDArray[np.int64]
     sd_mm: float
     sd_rad: float
     length_mm: float | None = None
 
     @property
-    def weights(self) -> np.ndarray:
+    def weights(self) -> NDArray[np.float64]:
         """Weights (6,) of the components of the constraint."""
         return np.repeat([self.sd_mm**-2.0, self.sd_rad**-2.0], 3)
 

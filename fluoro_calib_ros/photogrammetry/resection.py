@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import rq
 
 from ..errors import DataError
@@ -60,10 +61,10 @@ class Resection:
     inliers : (n,) ndarray of bool
     """
 
-    rotation: np.ndarray
-    position_mm: np.ndarray
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
     scale: float
-    inliers: np.ndarray
+    inliers: NDArray[np.bool_]
 
 
 def least_vectors(forms: np.ndarray) -> np.ndarray:
@@ -88,7 +89,7 @@ def direct_linear_transformation(
     uv: np.ndarray,
     weights: np.ndarray | None = None,
     least: Callable[[np.ndarray], np.ndarray] = least_vectors,
-) -> np.ndarray:
+) -> NDArray[np.float64]:
     """Projection matrices (..., 3, 4) with uv ~ P (xyz, 1).
 
     xyz (..., n, 3), uv (..., n, 2) and weights (..., n) of n >= 6 points. Coordinates are
@@ -159,7 +160,7 @@ def robust_variance(squared: np.ndarray) -> float:
     return max(np.median(squared) / (2 * np.log(2)), MIN_VARIANCE)
 
 
-def robust_dlt(xyz: np.ndarray, uv: np.ndarray, seed: int = 0) -> np.ndarray:
+def robust_dlt(xyz: np.ndarray, uv: np.ndarray, seed: int = 0) -> NDArray[np.float64]:
     """Projection matrix (3, 4) of targets of which up to half may be falsely matched.
 
     xyz (n, 3) [mm] and uv (n, 2) [px] of n >= 8 targets. Raises DataError where the targets are
@@ -250,10 +251,10 @@ def principal_distance_of(projection: np.ndarray) -> float:
 
 
 def resect(
-    xyz: np.ndarray,
-    uv: np.ndarray,
-    interior: np.ndarray,
-    projection: np.ndarray | None = None,
+    xyz: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    interior: NDArray[np.float64],
+    projection: NDArray[np.float64] | None = None,
     max_steps: int = 100,
     tolerance: float = TOLERANCE,
 ) -> Resection:
@@ -379,7 +380,7 @@ class _Problem:
         weighted = (np.repeat(w, 2)[:, None] * jacobian).T
         return _System(weighted @ jacobian, weighted @ r.ravel(), squared, noise)
 
-    def squared_residuals(self, rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
+    def squared_residuals(self, rotation: np.ndarray, position: np.ndarray) -> NDArray[np.float64]:
         """Squared residuals (n,) [px^2]; NaN behind the source."""
         n = len(self.xyz)
         predicted = project(

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
 from .collinearity import project_with_jacobian
@@ -70,10 +70,10 @@ class RigOrientation:
     """
 
     fluoroscopes: tuple[str, ...]
-    interior: np.ndarray
-    rotation: np.ndarray
-    position_mm: np.ndarray
-    covariance: np.ndarray
+    interior: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     frame_id: str
     source: str
     calibration_ids: tuple[str, ...]
@@ -160,17 +160,17 @@ class RigOrientation:
         return digest.hexdigest()
 
     @property
-    def sd_mm(self) -> np.ndarray:
+    def sd_mm(self) -> NDArray[np.float64]:
         """Standard deviations (F, 3) of the positions [mm]."""
         return self._sd(slice(0, 3))
 
     @property
-    def sd_rad(self) -> np.ndarray:
+    def sd_rad(self) -> NDArray[np.float64]:
         """Standard deviations (F, 3) of the rotations about the axes of the sensors [rad]."""
         return self._sd(slice(3, 6))
 
     @property
-    def sd_interior(self) -> np.ndarray:
+    def sd_interior(self) -> NDArray[np.float64]:
         """Standard deviations (F, 3) of xp, yp, c [px]."""
         return self._sd(slice(6, 9))
 
@@ -234,7 +234,7 @@ class RigOrientation:
                     'the orientation has to be determined again'
                 )
 
-    def covariance_root(self) -> np.ndarray:
+    def covariance_root(self) -> NDArray[np.float64]:
         """Matrix L (9F, 9F) with L L^T the covariance, which may be singular."""
         sd = np.sqrt(np.diagonal(self.covariance))
         scale = np.where(sd > 0, sd, 1.0)  # mm, rad and px differ by orders of magnitude
@@ -257,7 +257,7 @@ def with_datum_of_points(orientation: RigOrientation, points_mm: ArrayLike) -> R
     return replace(orientation, covariance=(covariance + covariance.T) / 2).rounded()
 
 
-def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> np.ndarray:
+def datum_transformation(orientation: RigOrientation, points_mm: ArrayLike) -> NDArray[np.float64]:
     """Matrix S (9F, 9F) that transforms errors of an orientation into the datum of points.
 
     points_mm (n, 3), see with_datum_of_points.

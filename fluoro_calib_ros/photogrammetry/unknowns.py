@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .relative_pose import POSE_SIZE, RelativePose
 
@@ -86,14 +87,14 @@ class UnknownLayout:
     interiors: tuple[slice, ...]
     relative: tuple[slice, ...]
     additional: tuple[slice, ...]
-    free: np.ndarray
+    free: NDArray[np.bool_]
     datum_defect: int
 
     @classmethod
     def of(
         cls,
         shape: tuple[int, int],
-        interior_free: np.ndarray,
+        interior_free: NDArray[np.bool_],
         n_relative: int,
         additional_sizes: Sequence[int],
         datum_defect: int,
@@ -193,9 +194,9 @@ class UnknownVector:
         Of the global unknowns; zeros where held.
     """
 
-    exteriors: np.ndarray
-    points: np.ndarray
-    globals: np.ndarray
+    exteriors: NDArray[np.float64]
+    points: NDArray[np.float64]
+    globals: NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -218,9 +219,15 @@ class Parameters:
         Relative orientation of each constraint of the network.
     """
 
-    interior: np.ndarray
-    rotation: np.ndarray
-    position_mm: np.ndarray
-    points_mm: np.ndarray
-    additional: tuple[np.ndarray | None, ...] = ()
+    interior: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
+    points_mm: NDArray[np.float64]
+    additional: tuple[NDArray[np.float64] | None, ...] = ()
     relative: tuple[RelativePose, ...] = ()
+
+    def additional_of(self, f: int) -> NDArray[np.float64]:
+        """Coefficients of the additional parameters of fluoroscope f, which has some."""
+        coefficients = self.additional[f]
+        assert coefficients is not None
+        return coefficients

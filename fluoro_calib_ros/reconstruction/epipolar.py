@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
@@ -45,13 +45,13 @@ class EpipolarResiduals:
         normal; factor_a^2 + factor_b^2 = 1.
     """
 
-    residual: np.ndarray
-    sd: np.ndarray
-    sd_total: np.ndarray
-    normal_a: np.ndarray
-    normal_b: np.ndarray
-    factor_a: np.ndarray
-    factor_b: np.ndarray
+    residual: NDArray[np.float64]
+    sd: NDArray[np.float64]
+    sd_total: NDArray[np.float64]
+    normal_a: NDArray[np.float64]
+    normal_b: NDArray[np.float64]
+    factor_a: NDArray[np.float64]
+    factor_b: NDArray[np.float64]
 
 
 class EpipolarGeometry:

@@ -22,12 +22,12 @@ from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri, erfc
 
 from ..errors import DataError
+from ..photogrammetry.noise import ObservedScatter
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
-from ..photogrammetry.scatter import ObservedScatter
 
 
 class PointStatus(IntEnum):
@@ -96,17 +96,17 @@ class IntersectedPoints:
         (n,), number of the fluoroscope whose ray was dropped as false, else -1.
     """
 
-    xyz_mm: np.ndarray
-    covariance: np.ndarray
-    covariance_noise: np.ndarray
-    residual: np.ndarray
-    rays: np.ndarray
-    standardised: np.ndarray
+    xyz_mm: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    covariance_noise: NDArray[np.float64]
+    residual: NDArray[np.float64]
+    rays: NDArray[np.float64]
+    standardised: NDArray[np.float64]
     status: np.ndarray
-    dropped_view: np.ndarray
+    dropped_view: NDArray[np.float64]
 
     @property
-    def sd_mm(self) -> np.ndarray:
+    def sd_mm(self) -> NDArray[np.float64]:
         """Standard deviations (n, 3) of the coordinates [mm]."""
         return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
 
@@ -116,7 +116,7 @@ class _Solution:
     """Least-squares solution of n points.
 
     failed (n,): the rays have no intersection; by_rig (n,): part of the expected square of the
-    misfit that is by the orientation of the rig.
+    lack of fit that is by the orientation of the rig.
     """
 
     xyz: np.ndarray
@@ -287,11 +287,11 @@ class Intersector:
         return _Solution(
             xyz,
             inverse + by_point @ by_point.transpose(0, 2, 1),
-            inverse,
-            residual,
-            np.sqrt(squares.sum(axis=1) / expected),
-            ~in_front | ~(determinant > MIN_DETERMINANT),
-            1 - freedom / expected,
+            noise=inverse,
+            residual=residual,
+            standardised=np.sqrt(squares.sum(axis=1) / expected),
+            failed=~in_front | ~(determinant > MIN_DETERMINANT),
+            by_rig=1 - freedom / expected,
         )
 
     def _start(self, uv: np.ndarray, flat: np.ndarray) -> np.ndarray:
@@ -349,21 +349,26 @@ class Intersector:
             rows = np.flatnonzero(wrong & (rays > 2))
             if len(rows):
                 solution, dropped_view[rows] = self._drop_one_ray(
-                    uv[rows], weight[rows], rays[rows], rows, solution, limit
+                    uv[rows],
+                    weight[rows],
+                    rays=rays[rows],
+                    rows=rows,
+                    solution=solution,
+                    limit=limit,
                 )
                 rays = rays - (dropped_view >= 0)
                 wrong = wrong & (dropped_view < 0)
             solution = _without_points(solution, wrong)
         status = np.where(wrong, np.where(solution.failed, FAILED, REJECTED), OK).astype(np.uint8)
         return IntersectedPoints(
-            solution.xyz,
-            solution.covariance,
-            solution.noise,
-            solution.residual,
-            rays,
-            solution.standardised,
-            status,
-            dropped_view,
+            xyz_mm=solution.xyz,
+            covariance=solution.covariance,
+            covariance_noise=solution.noise,
+            residual=solution.residual,
+            rays=rays,
+            standardised=solution.standardised,
+            status=status,
+            dropped_view=dropped_view,
         )
 
     def _drop_one_ray(
@@ -377,10 +382,10 @@ class Intersector:
     ) -> tuple[_Solution, np.ndarray]:
         """Replace points of a solution by those without their false ray.
 
-        Each ray of the image points uv (m, F, 2) of the points in rows (m,) is dropped in turn.
-        If the remaining rays agree in exactly one case, that is the solution. Otherwise the false
-        ray cannot be identified. limit (F + 1,): largest misfit by the number of rays. Returns the
-        solution and the number (m,) of the dropped fluoroscope, -1 where there is none.
+        Each ray of the image points uv (m, F, 2) of the points in rows (m,) is dropped in turn. If
+        the remaining rays agree in exactly one case, that is the solution. Otherwise the false ray
+        cannot be identified. limit (F + 1,): largest lack of fit by the number of rays. Returns
+        the solution and the number (m,) of the dropped fluoroscope, -1 where there is none.
         """
         m, count = weight.shape
         remaining = (weight[:, None, :] * (1 - np.eye(count))).reshape(m * count, count)
@@ -414,14 +419,14 @@ def _expanded(found: IntersectedPoints, enough: np.ndarray, rays: np.ndarray) ->
     """Points of all n targets, given those that enough (n,) fluoroscopes see."""
     n = len(enough)
     out = IntersectedPoints(
-        np.full((n, 3), np.nan),
-        np.full((n, 3, 3), np.nan),
-        np.full((n, 3, 3), np.nan),
-        np.full(n, np.nan),
-        rays.copy(),
-        np.full(n, np.nan),
-        np.full(n, SINGLE_VIEW, dtype=np.uint8),
-        np.full(n, -1),
+        xyz_mm=np.full((n, 3), np.nan),
+        covariance=np.full((n, 3, 3), np.nan),
+        covariance_noise=np.full((n, 3, 3), np.nan),
+        residual=np.full(n, np.nan),
+        rays=rays.copy(),
+        standardised=np.full(n, np.nan),
+        status=np.full(n, SINGLE_VIEW, dtype=np.uint8),
+        dropped_view=np.full(n, -1),
     )
     for field in fields(IntersectedPoints):
         getattr(out, field.name)[enough] = getattr(found, field.name)
@@ -443,10 +448,10 @@ def _inverse(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _limits(reject: float, count: int) -> np.ndarray:
-    """Largest standardised misfit (count + 1,) of points of 0, 1, ... rays that agree.
+    """Largest standardised lack of fit (count + 1,) of points of 0, 1, ... rays that agree.
 
-    Q = r^T W r is chi-square with 2 rays - 3 degrees of freedom, and the misfit is the root of Q
-    over that number. Two rays have one degree of freedom, and reject is their limit.
+    Q = r^T W r is chi-square with 2 rays - 3 degrees of freedom, and the lack of fit is the root
+    of Q over that number. Two rays have one degree of freedom, and reject is their limit.
     """
     freedom = np.maximum(2.0 * np.arange(count + 1) - 3, 1)
     tail = erfc(reject / np.sqrt(2))
@@ -456,7 +461,7 @@ def _limits(reject: float, count: int) -> np.ndarray:
 
 
 def _medians(count: int) -> np.ndarray:
-    """Median standardised misfit (count + 1,) of points of 0, 1, ... rays that agree."""
+    """Median standardised lack of fit (count + 1,) of points of 0, 1, ... rays that agree."""
     freedom = np.maximum(2.0 * np.arange(count + 1) - 3, 1)
     return np.sqrt(chdtri(freedom, 0.5) / freedom)
 

@@ -17,9 +17,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..calibration.result import FluoroscopeCalibration
-from ..distortion.none import no_correction
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.models import no_correction
 from ..exposures.frame import Frame
+from ..findings import Finding, Kind
 from .intersection import (
     FAILED,
     OK,
@@ -34,15 +35,18 @@ from .reconstruct import ReconstructedFrame, reconstruct_recording
 
 MIN_POINTS = 20  # of two views, by which a recording is judged
 MAX_REJECTED = 0.5  # share of the points of two views
-CORRECTED = 'the image points are corrected already'
+CORRECTED = Finding(Kind.CORRECTED_ALREADY, 'the image points are corrected already')
 MAX_TRIED = 10  # exposures
-UNKNOWN = (
+UNKNOWN = Finding(
+    Kind.RAYS_DO_NOT_MEET,
     'the frames, target ids or image coordinates do not belong together, the fluoroscopes are '
-    'interchanged, or one was moved since its orientation was determined'
+    'interchanged, or one was moved since its orientation was determined',
 )
-UNMATCHED = (
-    'no target is seen by two fluoroscopes in one exposure: the target ids of the fluoroscopes, '
-    'or the numbers of their frames, do not belong together'
+UNMATCHED = Finding(
+    Kind.NO_COMMON_TARGETS,
+    'no target is seen by two fluoroscopes in one exposure',
+    advice='the target ids of the fluoroscopes, or the numbers of their frames, do not belong '
+    'together',
 )
 RECENT = 100  # exposures of a stream
 # Share of rejected points of a trial, and median miss of one, over those of the recording, from
@@ -51,7 +55,7 @@ BETTER = 0.3
 CLOSER = 0.6
 
 Frames = Mapping[str, Sequence[Frame]]
-Trial = tuple[str, dict[str, list[Frame]]]
+Trial = tuple[Finding, dict[str, list[Frame]]]
 
 
 class RecentMisses:
@@ -68,10 +72,16 @@ class RecentMisses:
         """Return a sentence where points of the recent exposures cannot be right, else ''."""
         bad, total, single = (sum(column) for column in zip(*list(self._recent) or [(0, 0, 0)]))
         if not total and single >= MIN_POINTS:
-            return UNMATCHED
+            return UNMATCHED.sentence
         if total < MIN_POINTS or bad <= MAX_REJECTED * total:
             return ''
-        return f'{100 * bad / total:.0f} % of the rays miss each other: {UNKNOWN}'
+        return _missing(bad / total, UNKNOWN).sentence
+
+
+def _missing(share: float, why: Finding) -> Finding:
+    """Return the finding that a share of the rays miss each other for a reason."""
+    cause = f'{100 * share:.0f} % of the rays miss each other: {why.cause}'
+    return replace(why, cause=cause, numbers={**why.numbers, 'share': share})
 
 
 def share_rejected(found: Sequence[ReconstructedFrame]) -> tuple[float, int]:
@@ -94,21 +104,21 @@ def mismatch(
     calibrations: Mapping[str, FluoroscopeCalibration],
     intersector: Intersector,
     pair_by: str,
-) -> str:
-    """Return a sentence where a reconstruction cannot be right, and its cause; else ''."""
+) -> Finding | None:
+    """Return why a reconstruction cannot be right, None where nothing is wrong with it."""
     share, total = share_rejected(found)
     seen = sum(len(frame.target_id) for frame in found)
     if not total and seen >= MIN_POINTS:
         return UNMATCHED
     if total < MIN_POINTS or share <= MAX_REJECTED:
-        return ''
+        return None
     names = intersector.orientation.fluoroscopes
-    for sentence, changed in _trials(frames, names, _largest(found)):
+    for why, changed in _trials(frames, names, _largest(found)):
         tried, _ = reconstruct_recording(changed, calibrations, intersector, pair_by)
         rejected, count = share_rejected(tried)
         if count >= MIN_POINTS and rejected < BETTER * share:
-            return f'{100 * share:.0f} % of the rays miss each other: {sentence}'
-    return f'{100 * share:.0f} % of the rays miss each other: {UNKNOWN}'
+            return _missing(share, why)
+    return _missing(share, UNKNOWN)
 
 
 def cause_of_misses(
@@ -117,8 +127,8 @@ def cause_of_misses(
     calibrations: Mapping[str, FluoroscopeCalibration],
     intersector: Intersector,
     pair_by: str,
-) -> str:
-    """Return why rays miss each other by more than they should, '' where no trial tells it.
+) -> Finding | None:
+    """Return why rays miss each other by more than they should, None where no trial tells it.
 
     The trials are those of `mismatch`, and image points that are corrected already.
     """
@@ -132,12 +142,12 @@ def cause_of_misses(
     tried = {name: [f for f in frames[name] if f.number in numbers] for name in names}
     trials = [(CORRECTED, tried), *_trials(frames, names, numbers)]
     misses = []
-    for sentence, changed in trials:
-        used = uncorrected if sentence == CORRECTED else calibrations
+    for why, changed in trials:
+        used = uncorrected if why is CORRECTED else calibrations
         again, _ = reconstruct_recording(changed, used, intersector, pair_by)
         misses.append(_miss(again))
     best = int(np.argmin(misses))
-    return trials[best][0] if misses[best] < limit else ''
+    return trials[best][0] if misses[best] < limit else None
 
 
 def _largest(found: Sequence[ReconstructedFrame]) -> set[int]:
@@ -156,7 +166,7 @@ def _miss(found: Sequence[ReconstructedFrame]) -> float:
 
 
 def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Trial]:
-    """Return sentences on what may be confused, each with the frames put right.
+    """Return findings on what may be confused, each with the frames put right.
 
     numbers are those of the frames to try.
     """
@@ -169,30 +179,35 @@ def _trials(frames: Frames, names: Sequence[str], numbers: set[int]) -> list[Tri
                 one: [replace(frame, fluoroscope=one) for frame in tried[other]],
                 other: [replace(frame, fluoroscope=other) for frame in tried[one]],
             }
-            out.append((f'fluoroscopes {one} and {other} are interchanged', exchanged))
+            cause = f'fluoroscopes {one} and {other} are interchanged'
+            out.append((Finding(Kind.FLUOROSCOPES_INTERCHANGED, cause), exchanged))
     for name in names[1:]:
         for step, word in ((1, 'small'), (-1, 'large')):
             numbered = [replace(f, number=f.number + step) for f in frames[name]]
             numbered = [f for f in numbered if f.number in numbers]
             labelled = [replace(f, target_id=f.target_id + step) for f in tried[name]]
-            out += [
-                (f'the {what} of fluoroscope {name} are too {word} by 1', {**tried, name: changed})
-                for what, changed in (('frame numbers', numbered), ('target ids', labelled))
-            ]
+            for kind, what, right in (
+                (Kind.FRAMES_SHIFTED, 'frame numbers', numbered),
+                (Kind.IDS_SHIFTED, 'target ids', labelled),
+            ):
+                cause = f'the {what} of fluoroscope {name} are too {word} by 1'
+                out.append(
+                    (Finding(kind, cause, numbers={'shift': -step}), {**tried, name: right})
+                )
     return out + _other_axes(tried)
 
 
 def _other_axes(frames: Mapping[str, list[Frame]]) -> list[Trial]:
     """Return trials of other directions of u and v, in all fluoroscopes or one."""
     out = []
-    for sentence, change in (
-        ('u and v are interchanged', _transposed),
-        ('v runs upwards', _upside_down),
+    for kind, cause, change in (
+        (Kind.IMAGE_TRANSPOSED, 'u and v are interchanged', _transposed),
+        (Kind.IMAGE_MIRRORED, 'v runs upwards', _upside_down),
     ):
         everywhere = {name: [change(f) for f in of_one] for name, of_one in frames.items()}
-        out.append((sentence, everywhere))
+        out.append((Finding(kind, cause), everywhere))
         out += [
-            (f'{sentence} in fluoroscope {name}', {**frames, name: changed})
+            (Finding(kind, f'{cause} in fluoroscope {name}'), {**frames, name: changed})
             for name, changed in everywhere.items()
         ]
     return out

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib import style
 from matplotlib.figure import Figure
 
-from ..validation.comparison import Comparison
+from ..checks.comparison import Comparison
 from .style import BLACK, STYLE, new_figure, png_bytes
 
 ARROWS = 16  # along the longer side of the image

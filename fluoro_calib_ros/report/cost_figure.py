@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator
 
-from ..calibration.rounds import SETTLED_PX, SelfCalibration
+from ..estimation.rounds import SETTLED_PX, SelfCalibration
 from .style import BLACK, BLUE, GREY, RED, new_figure
 
 MARKER: dict[str, Any] = {'marker': 'o', 'markersize': 4}

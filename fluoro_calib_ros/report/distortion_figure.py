@@ -14,7 +14,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ..distortion.base import Correction, CorrectionModel
+from ..correction.base import Correction, CorrectionModel
 from .style import BLACK, new_figure
 from .text import model_text
 
@@ -22,7 +22,7 @@ from .text import model_text
 FIELD_CELLS = 160
 FIELD_ARROWS = 17
 SCALE_CELLS = 48
-# Of the longer side, around the image for the arrows at its rim, and twice that below it.
+# Of the longer side, around the image for the arrows at its border, and twice that below it.
 MARGIN = 0.09
 MIN_ARROW_PX = 1e-6
 ROUND_NUMBERS = (1, 1.5, 2, 3, 5, 7)

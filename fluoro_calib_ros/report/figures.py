@@ -15,10 +15,10 @@ import numpy as np
 from matplotlib import style
 from matplotlib.figure import Figure
 
-from ..calibration.calibrate import CalibrationResult
-from ..calibration.rounds import SelfCalibration
-from ..files.access import check_safe_name, make_folder
-from ..files.atomic import write_bytes
+from ..estimation.result import CalibrationResult
+from ..estimation.rounds import SelfCalibration
+from ..io.access import check_safe_name, make_folder
+from ..io.atomic import write_bytes
 from ..photogrammetry.noise import MIN_REDUNDANCY
 from ..photogrammetry.precision import geometric_redundancy
 from .cost_figure import cost_figure

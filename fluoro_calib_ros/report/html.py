@@ -16,10 +16,11 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from matplotlib import style
 from matplotlib.figure import Figure
 
-from ..calibration.result import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.frame import Frame
 from ..exposures.names import Names
 from ..exposures.phantom import Phantom
+from ..findings import Finding, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .distortion_figure import Scale, common_scale, distortion_figure
@@ -67,10 +68,10 @@ class ReportInput:
     names : Names
     written : str
         Date of result.json, as text.
-    rig_note : str
-        Why the rig has no orientation, or what is doubtful about it; '' for nothing.
-    edited : str
-        What is wrong with result.json itself; '' for nothing.
+    rig_note : Finding or None
+        Why the rig has no orientation, or what is doubtful about it.
+    edited : Finding or None
+        What is wrong with result.json itself.
     """
 
     title: str
@@ -83,8 +84,8 @@ class ReportInput:
     orientation: RigOrientation | None = None
     names: Names = field(default_factory=Names)
     written: str = ''
-    rig_note: str = ''
-    edited: str = ''
+    rig_note: Finding | None = None
+    edited: Finding | None = None
 
 
 def report_html(given: ReportInput) -> str:
@@ -121,10 +122,10 @@ def report_html(given: ReportInput) -> str:
 def _verdict(given: ReportInput) -> dict[str, Any]:
     """Return verdict, its sentence, and what to do."""
     verdict = None if given.validation is None else given.validation.get('verdict')
-    findings = list(given.validation.get('findings', [])) if given.validation else []
+    findings = sentences(filter(None, [given.edited]))
+    findings += given.validation.get('findings', []) if given.validation else []
     findings += [f'This cannot be right: {doubt}' for doubt in given.result.get('doubts', [])]
-    findings = [given.edited, *findings, _sentence(given.rig_note)]
-    findings = [sentence for sentence in findings if sentence]
+    findings += sentences(filter(None, [given.rig_note]))
     if verdict is None:
         findings.insert(
             0, 'Run fluoro-calib validate on this folder, then write the report again.'
@@ -138,10 +139,6 @@ def _verdict(given: ReportInput) -> dict[str, Any]:
         'findings': findings,
         'checks': given.validation.get('checks', []) if given.validation else [],
     }
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:]
 
 
 def _residuals(given: ReportInput, name: str) -> Residuals:

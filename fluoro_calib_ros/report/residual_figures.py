@@ -8,8 +8,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
-from ..calibration.rounds import SelfCalibration
+from ..estimation.rounds import SelfCalibration
 from ..photogrammetry.adjustment import Adjustment
 from .style import AFTER, BEFORE, BLACK, GREY, new_figure
 from .text import model_text
@@ -22,7 +23,7 @@ COORDINATES = ('u', 'v')
 
 
 def normalised_residuals(
-    run: SelfCalibration, rows: np.ndarray, redundancy: np.ndarray
+    run: SelfCalibration, rows: NDArray[np.int64], redundancy: NDArray[np.float64]
 ) -> tuple[np.ndarray, np.ndarray]:
     """Inlier residuals in units of their standard deviation, before (n, 2) and after (m, 2).
 
@@ -142,7 +143,14 @@ def position_figure(
         ):
             inliers = adjustment.inliers[rows]
             residual = adjustment.residuals[rows, axis]
-            _plot_residuals(axes, uv[:, axis], residual, inliers, own_limit, colour)
+            _plot_residuals(
+                axes,
+                uv[:, axis],
+                residual=residual,
+                inliers=inliers,
+                limit=own_limit,
+                colour=colour,
+            )
             _plot_running_median(axes, uv[inliers, axis], residual[inliers], image_size[axis])
             axes.set(xlim=(-0.5, image_size[axis] - 0.5), ylim=(-own_limit, own_limit))
             rmse = np.sqrt(np.mean(residual[inliers] ** 2))
@@ -176,7 +184,7 @@ def _plot_residuals(
 ) -> None:
     """Residuals (n,) over positions (n,): dots, and crosses for outliers.
 
-    Outliers beyond the limit are drawn at the rim of the panel.
+    Outliers beyond the limit are drawn at the border of the panel.
     """
     axes.plot(position[inliers], residual[inliers], '.', color=colour, markersize=3, alpha=0.6)
     outliers = np.clip(residual[~inliers], -0.97 * limit, 0.97 * limit)

@@ -9,8 +9,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from ..calibration.result import FluoroscopeCalibration
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.frame import Frame
 from ..photogrammetry.collinearity import project
 
@@ -34,13 +35,13 @@ class Residuals:
         Of the C-arm [rad], NaN where it is unknown; None: it is nowhere known.
     """
 
-    exposure: np.ndarray
-    target_id: np.ndarray
-    uv: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-    inlier: np.ndarray
-    angle: np.ndarray | None = None
+    exposure: NDArray[np.int64]
+    target_id: NDArray[np.int64]
+    uv: NDArray[np.float64]
+    before: NDArray[np.float64]
+    after: NDArray[np.float64]
+    inlier: NDArray[np.bool_]
+    angle: NDArray[np.float64] | None = None
 
     def of_exposures(self) -> list[tuple[int, int, float, float]]:
         """Return number, inliers, and RMS before and after [px] of every exposure."""
@@ -61,7 +62,7 @@ def residuals_of(
     calibration: FluoroscopeCalibration,
     frames: Sequence[Frame],
     poses: Mapping[int, Pose],
-    points_mm: Mapping[int, np.ndarray],
+    points_mm: Mapping[int, NDArray[np.float64]],
     outliers: set[tuple[int, int]],
 ) -> Residuals:
     """Return the residuals of the frames of a fluoroscope.
@@ -108,7 +109,7 @@ def residuals_of(
     if not exposure:
         empty = np.zeros((0, 2))
         none = np.zeros(0, dtype=int)
-        return Residuals(none, none, empty, empty, empty, none.astype(bool))
+        return Residuals(none, none, uv=empty, before=empty, after=empty, inlier=none.astype(bool))
     numbers, ids, observed, expected = map(np.concatenate, (exposure, target_id, uv, computed))
     angles = np.concatenate(angle)
     corrected = calibration.correct(observed, exact=True, angle=angles).uv
@@ -116,9 +117,9 @@ def residuals_of(
     return Residuals(
         numbers,
         ids,
-        observed,
-        observed - expected,
-        corrected - expected,
-        inlier.astype(bool),
-        angles,
+        uv=observed,
+        before=observed - expected,
+        after=corrected - expected,
+        inlier=inlier.astype(bool),
+        angle=angles,
     )

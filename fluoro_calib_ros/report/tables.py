@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ..calibration.calibrate import CalibrationResult, FluoroscopeResult
-from ..calibration.result import FluoroscopeCalibration
-from ..distortion.angle_field import AngleField
+from ..correction.angle_field import AngleField
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..estimation.result import CalibrationResult, FluoroscopeResult
+from ..findings import Severity, sentences
 from .text import TERMINAL_WIDTH, number_text
 
 # Widths of the columns of quantities and of fluoroscopes.
@@ -41,7 +42,7 @@ def summary_table(result: CalibrationResult, latency_ms: Mapping[str, float] | N
     text = '\n\n'.join(blocks)
     targets = len(result.targets.target_id)
     text += f'\n\nAll fluoroscopes: {targets} targets, {result.seconds:.1f} s'
-    for sentence in result.left_out:
+    for sentence in sentences(result.findings, Severity.NOTE):
         text += '\n' + textwrap.fill(
             f'Not used: {sentence}', TERMINAL_WIDTH, subsequent_indent='    '
         )
@@ -95,7 +96,7 @@ def _median_sd(calibration: FluoroscopeCalibration) -> float:
 
 
 def _noise_text(calibration: FluoroscopeCalibration) -> str:
-    """Standard deviation of an image coordinate [px]; in the middle and at the rim."""
+    """Standard deviation of an image coordinate [px]; in the middle and at the border."""
     profile = calibration.noise_profile
     if profile is None:
         return number_text(calibration.image_sd)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from ..distortion.base import CorrectionModel
+from ..correction.base import CorrectionModel
 
 TERMINAL_WIDTH = 100  # columns
 

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import textwrap
 
-from ..validation.check import Validation
+from ..checks.check import Validation
+from ..findings import sentences
 from .text import TERMINAL_WIDTH, number_text
 
 HEADER = ('check', 'fluoroscope', 'value', 'limit', 'unit', '')
@@ -22,7 +23,7 @@ def verdict_text(validation: Validation) -> str:
         rows.append(
             (
                 check.name,
-                _shortened(check.fluoroscope or 'all'),
+                _shortened(check.place.fluoroscope or 'all'),
                 number_text(check.value),
                 number_text(check.limit),
                 check.unit,
@@ -44,7 +45,7 @@ def verdict_text(validation: Validation) -> str:
     lines += ['', f'Verdict: {validation.verdict} ({validation.seconds:.1f} s)']
     for name, sd in validation.achieved_sd_px.items():
         lines.append(f'Achieved, fluoroscope {_shortened(name)}: corrections to {sd:.3f} px (sd)')
-    for sentence in (*validation.findings, *validation.notes):
+    for sentence in sentences((*validation.findings, *validation.notes)):
         lines += textwrap.wrap(f'- {sentence}', TERMINAL_WIDTH, subsequent_indent='  ')
     return '\n'.join(lines) + '\n'
 

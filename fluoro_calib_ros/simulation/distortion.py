@@ -14,7 +14,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 EDGE_PX = 512.0  # half the width of an image; the parts of a field are given by their size there
 MAX_ITERATIONS = 100
@@ -38,11 +38,11 @@ class DistortionField:
         (k, 5), Gaussian bumps: centre u, v, width, and height along u and v [px].
     """
 
-    centre: np.ndarray
+    centre: NDArray[np.float64]
     pincushion: float
-    s_shape: np.ndarray
+    s_shape: NDArray[np.float64]
     spiral: float
-    ripples: np.ndarray
+    ripples: NDArray[np.float64]
 
     def __call__(self, uv: ArrayLike) -> np.ndarray:
         """Corrections (n, 2) [px] of observed pixels uv (n, 2)."""
@@ -75,7 +75,7 @@ def random_field(
 ) -> DistortionField:
     """Draw a field at random.
 
-    At strength 1 it is some 15 px along the rim of the image and 26 to 35 px in its corners.
+    At strength 1 it is some 15 px along the border of the image and 26 to 35 px in its corners.
     """
     sign = rng.choice([-1.0, 1.0], size=4)
     centre = np.asarray(image_size) / 2 - 0.5 + rng.uniform(-20, 20, 2)

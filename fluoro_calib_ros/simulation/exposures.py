@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..exposures.frame import Frame, points_on_image
 from ..photogrammetry.rotations import matrix_from_vector
@@ -52,7 +53,7 @@ class SimulatedExposures:
 
     frames: Mapping[str, list[Frame]]
     poses: Sequence[Pose]
-    undistorted: Mapping[str, list[np.ndarray]]
+    undistorted: Mapping[str, list[NDArray[np.float64]]]
 
 
 def phantom_poses(rng: np.random.Generator, count: int) -> list[Pose]:
@@ -113,8 +114,8 @@ def simulate_exposures(
 def detect_beads(
     rng: np.random.Generator,
     fluoroscope: VirtualFluoroscope,
-    points_mm: np.ndarray,
-    target_id: np.ndarray,
+    points_mm: NDArray[np.float64],
+    target_id: NDArray[np.int64],
     detection: Detection | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Simulate the detection of beads in one image.

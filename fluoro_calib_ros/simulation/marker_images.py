@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from ..photogrammetry.rotations import matrix_from_vector
 from .radiographs import (
@@ -101,8 +102,8 @@ class MarkerImage:
     """
 
     image: np.ndarray
-    uv: np.ndarray
-    seen: np.ndarray
+    uv: NDArray[np.float64]
+    seen: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -398,7 +399,16 @@ def _discs(
         radius = rng.uniform(*HIDING_PX)
         drift = radius * np.array([np.cos(angle), np.sin(angle)])
         marker = int(rng.integers(len(markers.target_id)))
-        out.append(_Disc(fluoroscope, marker, first, first + length, radius, drift))
+        out.append(
+            _Disc(
+                fluoroscope,
+                marker,
+                first=first,
+                last=first + length,
+                radius_px=radius,
+                drift=drift,
+            )
+        )
     return out
 
 

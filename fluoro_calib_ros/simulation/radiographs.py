@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from .rig import CUBE_MM, Pose, VirtualFluoroscope
 
@@ -119,10 +120,10 @@ class Radiography:
 
     def image(
         self,
-        points_mm: np.ndarray,
+        points_mm: NDArray[np.float64],
         pose: Pose,
         seed: int = 0,
-        diameter_mm: np.ndarray | None = None,
+        diameter_mm: NDArray[np.float64] | None = None,
         plates: bool = True,
     ) -> np.ndarray:
         """Take a radiograph.
@@ -293,7 +294,7 @@ def _depth_in_field(
 def illumination(
     uv: np.ndarray, image_size: tuple[int, int], settings: RadiographSettings
 ) -> np.ndarray:
-    """Open beam (h, w) from 0 to 1 at pixels (h, w, 2): darker to the rim and to the anode."""
+    """Open beam (h, w) from 0 to 1 at pixels (h, w, 2): darker to the border and to the anode."""
     x = (uv - (np.asarray(image_size) - 1) / 2) / (max(image_size) / 2)
     light = 1 - 0.16 * np.sum(x * x, axis=-1) + 0.06 * x[..., 0] - 0.05 * x[..., 1] ** 3
     depth = _depth_in_field(uv, image_size, settings)

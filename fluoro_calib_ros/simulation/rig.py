@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from ..exposures.phantom import Phantom
 from ..photogrammetry.collinearity import project
@@ -50,9 +50,9 @@ class VirtualFluoroscope:
     """
 
     name: str
-    interior: np.ndarray
-    rotation: np.ndarray
-    position_mm: np.ndarray
+    interior: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
     distortion: DistortionField
     image_size: tuple[int, int] = IMAGE_SIZE
 

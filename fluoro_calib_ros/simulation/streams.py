@@ -38,12 +38,12 @@ class StreamStart:
         target_id (n,) and observed (n, 2) [px] are its image points.
         """
         return Frame(
-            fluoroscope.name,
-            self.number + index,
-            target_id,
-            observed,
-            fluoroscope.image_size,
-            None,
-            self.stamp_ns + round(time_s * 1e9),
-            f'{fluoroscope.name}_optical',
+            fluoroscope=fluoroscope.name,
+            number=self.number + index,
+            target_id=target_id,
+            uv=observed,
+            image_size=fluoroscope.image_size,
+            sigma=None,
+            stamp_ns=self.stamp_ns + round(time_s * 1e9),
+            frame_id=f'{fluoroscope.name}_optical',
         )

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..exposures.frame import Frame
 from ..photogrammetry.rotations import matrix_from_vector
@@ -50,9 +51,9 @@ class SimulatedTracking:
     """
 
     frames: Mapping[str, list[Frame]]
-    marker_id: np.ndarray
-    points_mm: np.ndarray
-    ideal: Mapping[str, np.ndarray]
+    marker_id: NDArray[np.int64]
+    points_mm: NDArray[np.float64]
+    ideal: Mapping[str, NDArray[np.float64]]
 
 
 def simulate_tracking(

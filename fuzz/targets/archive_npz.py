@@ -8,7 +8,7 @@ from __future__ import annotations
 import io
 import zipfile
 
-from fluoro_calib_ros.files.calibration import load_calibration, save_calibration
+from fluoro_calib_ros.io.calibration import load_calibration, save_calibration
 
 from ..harness import Target
 from ..seeds import calibration, in_folder

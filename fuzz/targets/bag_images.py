@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
+
 """Images in bags: raw and compressed ones, as the extraction reads them."""
 
 from __future__ import annotations
@@ -11,8 +12,8 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from fluoro_calib_ros.bags.definitions import known_definition, message_class, to_cdr
-from fluoro_calib_ros.bags.images import COMPRESSED_IMAGE, IMAGE
+from fluoro_calib_ros.io.bags.definitions import known_definition, message_class, to_cdr
+from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, IMAGE
 from fluoro_calib_ros.jobs.image_sources import open_sources
 
 from ..harness import Target, check_message

@@ -8,10 +8,8 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-from fluoro_calib_ros.bags.images import image_topics
-from fluoro_calib_ros.bags.inspection import inspect_bag
-from fluoro_calib_ros.bags.reader import iterate_messages, read_frames
-from fluoro_calib_ros.bags.recovery import recover_bag
+from fluoro_calib_ros.io.bags.reader import image_topics, iterate_messages, read_frames
+from fluoro_calib_ros.io.bags.salvage import inspect_bag, recover_bag
 
 from ..harness import Target, both
 from ..seeds import bag_content

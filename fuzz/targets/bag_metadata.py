@@ -9,13 +9,12 @@ from pathlib import Path
 
 import yaml
 
-from fluoro_calib_ros.bags.foreign import is_foreign
-from fluoro_calib_ros.bags.qos import parse_profiles
-from fluoro_calib_ros.bags.reader import topics_of
-from fluoro_calib_ros.bags.recovery import Salvage
-from fluoro_calib_ros.bags.storage import storage_files
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.files.access import read_text
+from fluoro_calib_ros.io.access import read_text
+from fluoro_calib_ros.io.bags.mcap_file import is_foreign, storage_files
+from fluoro_calib_ros.io.bags.metadata import parse_profiles
+from fluoro_calib_ros.io.bags.reader import topics_of
+from fluoro_calib_ros.io.bags.salvage import Salvage
 
 from ..harness import Target, both
 from ..seeds import bag_content, bag_folder, in_folder

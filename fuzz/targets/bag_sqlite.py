@@ -10,9 +10,13 @@ from pathlib import Path
 
 from rosbags.rosbag2 import StoragePlugin, Writer
 
-from fluoro_calib_ros.bags.definitions import TARGET_OBSERVATIONS, to_cdr, typestore
-from fluoro_calib_ros.bags.frames import message_from_frame
-from fluoro_calib_ros.bags.reader import iterate_messages, read_frames, topics_of
+from fluoro_calib_ros.io.bags.definitions import (
+    TARGET_OBSERVATIONS,
+    message_from_frame,
+    to_cdr,
+    typestore,
+)
+from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames, topics_of
 
 from ..harness import Target, both
 from ..seeds import frames

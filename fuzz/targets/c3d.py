@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
+
 """C3D; the process in which ezc3d runs is forked here, which is a hundred times faster."""
 
 from __future__ import annotations
@@ -17,8 +18,8 @@ from unittest import mock
 import ezc3d
 import numpy as np
 
-from fluoro_calib_ros.exchange import c3d, c3d_process
-from fluoro_calib_ros.exchange.content import Content, FileSettings, points_without_precision
+from fluoro_calib_ros.io.formats import c3d, c3d_process
+from fluoro_calib_ros.io.formats.content import Content, FileSettings, points_without_precision
 
 from ..harness import Target
 from ..seeds import written
@@ -28,16 +29,14 @@ SECONDS = 10  # of a child
 assert ezc3d  # loaded before the forks
 
 
-def _run(
-    command: list[str], timeout: float, **_others: object
-) -> subprocess.CompletedProcess[bytes]:
-    """Do what `subprocess.run` does with the command of the reader."""
+def _run(name: str, path: str, timeout_s: float) -> subprocess.CompletedProcess[bytes]:
+    """Do what `run_module` does with the program of the reader."""
     pipes = [os.pipe(), os.pipe()]
     child = os.fork()
     if not child:
         for (_, end), target in zip(pipes, (1, 2)):
             os.dup2(end, target)
-        _work(command[-1])
+        _work(path)
     contents = []
     for ours, theirs in pipes:
         os.close(theirs)
@@ -45,8 +44,8 @@ def _run(
             contents.append(stream.read())
     status = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
     if status == -signal.SIGALRM:
-        raise subprocess.TimeoutExpired(command, timeout)
-    return subprocess.CompletedProcess(command, status, *contents)
+        raise TimeoutError(f'{name}: {timeout_s:g} s')
+    return subprocess.CompletedProcess([name, path], status, *contents)
 
 
 def _work(path: str) -> NoReturn:
@@ -70,7 +69,7 @@ def _work(path: str) -> NoReturn:
 
 
 def _read(path: Path) -> None:
-    with mock.patch.object(c3d.subprocess, 'run', _run):
+    with mock.patch.object(c3d, 'run_module', _run):
         c3d.read(path, SETTINGS)
 
 

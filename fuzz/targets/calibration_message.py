@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
+
 """Messages of calibrations and orientations; the ids are made to match what was changed."""
 
 from __future__ import annotations

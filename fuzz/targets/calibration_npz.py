@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from functools import partial
 
-from fluoro_calib_ros.files.calibration import load_calibration, save_calibration
+from fluoro_calib_ros.io.calibration import load_calibration, save_calibration
 
 from ..harness import Target
 from ..seeds import archive_of, calibration, flattened, in_folder

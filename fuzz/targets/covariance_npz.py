@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
+
 """The covariance matrix of an adjustment; the fuzzer sees its arrays without the archive."""
 
 from __future__ import annotations
@@ -8,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.joint_precision import JointPrecision
-from fluoro_calib_ros.files.covariance import read_covariance, write_covariance
+from fluoro_calib_ros.estimation.fixed_calibration import JointPrecision
+from fluoro_calib_ros.io.result_tables import read_covariance, write_covariance
 
 from ..harness import Broken, Target
 from ..seeds import archive_of, flattened, written

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fluoro_calib_ros.files.image_reading import open_images
+from fluoro_calib_ros.io.image_reading import open_images
 
 from ..harness import Target
 from ..seeds import images, written

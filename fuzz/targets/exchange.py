@@ -11,8 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.exchange import registry
-from fluoro_calib_ros.exchange.content import (
+from fluoro_calib_ros.io.formats import registry
+from fluoro_calib_ros.io.formats.content import (
     Bodies,
     Camera,
     Content,

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
+
 """Messages of images, raw and compressed, as the nodes read them."""
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from sensor_msgs.msg import CompressedImage, Image
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.nodes.messages.image import ImageConverter
-from fluoro_calib_ros.nodes.runtime.refusals import Refused
+from fluoro_calib_ros.nodes.runtime.diagnostics import Refused
 
 from ..harness import Target, both
 from ..seeds import encoded_images, images

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import tifffile
 
-from fluoro_calib_ros.files.image_reading import open_images
+from fluoro_calib_ros.io.image_reading import open_images
 
 from ..harness import Target, both
 from ..seeds import encoded_images, images

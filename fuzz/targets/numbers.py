@@ -13,13 +13,12 @@ from pathlib import Path
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame, validate_frame
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.files.observations import read_observations_csv, write_observations_csv
-from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
+from fluoro_calib_ros.io.observations import read_observations_csv, write_observations_csv
+from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 

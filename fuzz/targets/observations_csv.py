@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from fluoro_calib_ros.exposures.names import Names
-from fluoro_calib_ros.files.observations import (
+from fluoro_calib_ros.io.observations import (
     read_named_observations,
     read_observations_csv,
     write_observations_csv,

@@ -8,9 +8,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.files.calibration_request import read_options
-from fluoro_calib_ros.files.json_file import json_text, read_json
+from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.io.calibration_request import read_options
+from fluoro_calib_ros.io.text_files import json_text, read_json
 
 from ..harness import Target, both
 

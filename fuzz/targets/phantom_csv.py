@@ -9,8 +9,8 @@ from pathlib import Path
 
 from fluoro_calib_ros.exposures.names import Names
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.files.names import NAME, read_names
-from fluoro_calib_ros.files.phantom import (
+from fluoro_calib_ros.io.csv_table import NAMES_FILE, read_names
+from fluoro_calib_ros.io.phantom import (
     read_moving_points,
     read_named_phantom,
     read_phantom,
@@ -23,7 +23,7 @@ from ..seeds import rig, written
 
 def _read(path: Path) -> None:
     def names() -> None:
-        (path.parent / NAME).write_bytes(path.read_bytes())
+        (path.parent / NAMES_FILE).write_bytes(path.read_bytes())
         read_names(path.parent)
 
     both(

@@ -8,8 +8,8 @@ from __future__ import annotations
 import functools
 from pathlib import Path
 
-from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
-from fluoro_calib_ros.files.image_points import correct_points, read_points, write_points
+from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
+from fluoro_calib_ros.io.observations import correct_points, read_points, write_points
 
 from ..harness import Target
 from ..seeds import calibration

@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
+
 """result.json of a result folder, as `report` and `convert` read it."""
 
 from __future__ import annotations
@@ -10,12 +11,12 @@ import tempfile
 from pathlib import Path
 from unittest import mock
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
+from fluoro_calib_ros.io.result_check import RESULT_NAME as RESULT
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.conversion import stations_of
 from fluoro_calib_ros.jobs.report import write_report
-from fluoro_calib_ros.jobs.result_folder import RESULT, save_outcome
+from fluoro_calib_ros.jobs.result_folder import save_outcome
 from fluoro_calib_ros.report import html
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fluoro_calib_ros.exchange import registry
-from fluoro_calib_ros.exchange.content import FileSettings
-from fluoro_calib_ros.files.rig_file import read_rig_file
+from fluoro_calib_ros.io.formats import registry
+from fluoro_calib_ros.io.formats.content import FileSettings
+from fluoro_calib_ros.io.rig_file import read_rig_file
 
 from ..harness import Target, both
 

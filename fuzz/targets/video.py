@@ -1,5 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
+
 """Videos: AVI, MP4 and others."""
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fluoro_calib_ros.files.image_reading import ImageSource, open_images
-from fluoro_calib_ros.files.image_writing import write_video
+from fluoro_calib_ros.io.image_reading import ImageSource, open_images
+from fluoro_calib_ros.io.image_writing import write_video
 
 from ..harness import Target
 from ..seeds import images

@@ -13,8 +13,10 @@ import numpy as np
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from rclpy.serialization import deserialize_message, serialize_message
 
-from fluoro_calib_ros.nodes.messages.corrected_observations import decode_corrected_observations
-from fluoro_calib_ros.nodes.messages.target_observations import decode_target_observations
+from fluoro_calib_ros.nodes.messages.observations import (
+    decode_corrected_observations,
+    decode_target_observations,
+)
 
 from ..harness import Broken, Target
 

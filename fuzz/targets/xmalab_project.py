@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from fluoro_calib_ros.exchange import registry
-from fluoro_calib_ros.exchange.content import FileSettings
+from fluoro_calib_ros.io.formats import registry
+from fluoro_calib_ros.io.formats.content import FileSettings
 
 from ..harness import Target
 from ..seeds import SEPARATOR, archive_of, encoded_images

@@ -18,9 +18,9 @@ import pytest
 from rigs import run
 
 from fluoro_calib_ros.cli import COMMANDS, main
-from fluoro_calib_ros.distortion.status import CorrectionStatus
-from fluoro_calib_ros.files.calibration import load_calibration
-from fluoro_calib_ros.jobs.dataset import write_bag
+from fluoro_calib_ros.correction.base import CorrectionStatus
+from fluoro_calib_ros.io.calibration import load_calibration
+from fluoro_calib_ros.jobs.simulation import write_bag
 
 ROOT = pathlib.Path(__file__).resolve().parents[2]
 IMAGE = ('--image-size', '1024x1024')

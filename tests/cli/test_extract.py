@@ -14,17 +14,16 @@ import cv2
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.bags.definitions import message_class, to_cdr
-from fluoro_calib_ros.bags.images import COMPRESSED_IMAGE, IMAGE
-from fluoro_calib_ros.bags.joint_states import JOINT_STATE
-from fluoro_calib_ros.bags.writer import BagWriter
 from fluoro_calib_ros.cli import main
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.angles import AngleOptions
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.files.observations import read_observations_csv
-from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.images.codec import encode
+from fluoro_calib_ros.io.bags.definitions import message_class, to_cdr
+from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, IMAGE, JOINT_STATE
+from fluoro_calib_ros.io.bags.writer import BagWriter
+from fluoro_calib_ros.io.observations import read_observations_csv
+from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.jobs.extraction import recording_of_images
 from fluoro_calib_ros.jobs.image_sources import ImageAngles, contains_images, open_sources
 from fluoro_calib_ros.jobs.sources import read_survey

@@ -13,7 +13,7 @@ from fluoro_calib_ros.cli import COMMANDS, main, make_parser
 from fluoro_calib_ros.cli.arguments import angle_options
 from fluoro_calib_ros.cli.output import styled
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.files.rig_file import RigFile, read_rig_file
+from fluoro_calib_ros.io.rig_file import RigFile, read_rig_file
 
 
 @pytest.fixture

@@ -11,8 +11,8 @@ import pytest
 import rigs
 import turning_rig
 
-from fluoro_calib_ros.distortion.registry import create_model
-from fluoro_calib_ros.distortion.status import CorrectionStatus
+from fluoro_calib_ros.correction.base import CorrectionStatus
+from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector

@@ -12,9 +12,9 @@ import pytest
 import tifffile
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.files.image_reading import open_images
 from fluoro_calib_ros.images.codec import decode
 from fluoro_calib_ros.images.declared_size import declared_size
+from fluoro_calib_ros.io.image_reading import open_images
 
 SIZE = (37, 23)
 IMAGE = np.arange(SIZE[0] * SIZE[1], dtype=np.uint8).reshape(SIZE[::-1])

@@ -12,8 +12,8 @@ import pytest
 import rigs
 from scipy.ndimage import map_coordinates
 
-from fluoro_calib_ros.distortion.registry import create_model
-from fluoro_calib_ros.distortion.status import CorrectionStatus
+from fluoro_calib_ros.correction.base import CorrectionStatus
+from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import LIMIT_PX, ImageCorrector
 from fluoro_calib_ros.simulation.bead_images import BEAD_PX, background, bead_image

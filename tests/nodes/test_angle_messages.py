@@ -13,23 +13,22 @@ from rclpy.serialization import serialize_message
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import JointState
 
-from fluoro_calib_ros.bags.definitions import (
+from fluoro_calib_ros.correction.angle_field import packed_angles
+from fluoro_calib_ros.correction.noise_profile import NoiseProfile
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.io.bags.definitions import (
     ADDED,
     FLUOROSCOPE_CALIBRATION,
     earlier_text,
     from_cdr,
     present_cdr,
 )
-from fluoro_calib_ros.distortion.angle_field import packed_angles
-from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
-    ANGLES,
     calibration_from_message,
     decode_fluoroscope_calibration,
     message_from_calibration,
 )
-from fluoro_calib_ros.nodes.messages.joint_state import decode_joint_state
-from fluoro_calib_ros.photogrammetry.noise_profile import NoiseProfile
+from fluoro_calib_ros.nodes.messages.observations import decode_joint_state
 
 # Of FluoroscopeCalibration before it had angles, and before it had a noise profile (REP-2016).
 EARLIER_HASHES = (
@@ -81,7 +80,7 @@ def test_angle_field_of_a_message_is_the_same_to_the_last_bit(turning):
 
 def test_calibration_without_angles_has_empty_arrays(plain):
     message = message_from_calibration(plain)
-    assert not any(len(getattr(message, name)) for name in ANGLES)
+    assert not any(len(getattr(message, name)) for name in ADDED[FLUOROSCOPE_CALIBRATION][0])
     assert calibration_from_message(message).angle_field is None
 
 
@@ -89,10 +88,10 @@ def test_calibration_without_angles_has_empty_arrays(plain):
     'name, values, said',
     [
         ('angle_coefficients', [0.0] * 79, 'angle_coefficients has 79 values, 80 are expected'),
-        ('angle_coefficients', [], 'angle_coefficients has 0 values, 80 are expected'),
+        ('angle_coefficients', [], 'coefficients of an angle field have shape'),
         ('angle_variances', [0.0] * 33, 'angle_variances has 33 values, 15246 are expected'),
         ('angles', [], 'angles of an angle field'),
-        ('angles', [np.nan] * 5, 'angles of an angle field are not all finite'),
+        ('angles', [np.nan] * 5, 'angles holds nan'),
         ('angles', [90.0] * 5, 'angles'),
         ('angle_coefficients', [1e300] * 80, 'angle_coefficients'),
     ],
@@ -151,10 +150,10 @@ def test_noise_profile_of_a_message_is_the_same_to_the_last_bit(plain):
     'values, said',
     [
         ([1.0, 2.0], 'has 2 values, 3 are expected'),
-        ([1.0, 1e9, 1.0], 'factors that no image has'),
+        ([1.0, 1e9, 1.0], 'noise_profile holds a value beyond'),
         ([0.0, 1.0, 1.0], 'factors that no image has'),
-        ([1.0, np.nan, 1.0], 'factors that no image has'),
-        ([1.0, 1.0, -1.0], 'factors that no image has'),
+        ([1.0, np.nan, 1.0], 'noise_profile holds nan'),
+        ([1.0, 1.0, -1.0], 'noise_profile holds -1.0'),
     ],
 )
 def test_damaged_noise_profile_is_refused_in_one_sentence(plain, values, said):

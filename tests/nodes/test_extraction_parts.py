@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from fluoro_calib_ros.exposures.numbering import ExposureNumbers
-from fluoro_calib_ros.jobs.live_extraction import LiveObservations, extraction_process
+from fluoro_calib_ros.jobs.live_extraction import Observations, follower_process
 from fluoro_calib_ros.nodes.runtime.exposure_queue import ExposureQueue
 
 MS = 1_000_000
@@ -37,15 +37,25 @@ def test_images_without_a_stamp_are_counted_by_fluoroscope():
     assert [numbers.number(name, 0) for name in 'aabab'] == [1, 2, 1, 3, 2]
 
 
+def next_of(queue, name):
+    """Return the next item of a fluoroscope, None once the queue is closed."""
+    exposure = queue.get([name])
+    return exposure and exposure[1][name]
+
+
 def test_a_full_queue_sheds_the_oldest_exposure_that_is_not_begun():
     queue = ExposureQueue('ab', 2)
     lost = [queue.put(name, number, (name, number)) for number in (1, 2) for name in 'ab']
     assert lost == [[]] * 4
-    assert queue.get('a') == ('a', 1)
+    assert next_of(queue, 'a') == ('a', 1)
     assert queue.put('a', 3, ('a', 3)) == []
     assert queue.put('b', 3, ('b', 3)) == ['a', 'b']  # exposure 2: its partner has begun 1
     assert queue.put('a', 2, ('a', 2)) == ['a']  # too late
-    assert [queue.get('b'), queue.get('b'), queue.get('a')] == [('b', 1), ('b', 3), ('a', 3)]
+    assert [next_of(queue, 'b'), next_of(queue, 'b'), next_of(queue, 'a')] == [
+        ('b', 1),
+        ('b', 3),
+        ('a', 3),
+    ]
     assert queue.waiting('a') == queue.waiting('b') == 0
 
 
@@ -53,9 +63,9 @@ def test_a_queue_whose_exposures_are_all_begun_sheds_the_oldest_item():
     queue = ExposureQueue('ab', 1)
     for number in (1, 2):
         queue.put('a', number, number)
-        queue.get('a')
+        next_of(queue, 'a')
     assert queue.put('b', 1, 1) == [] and queue.put('b', 2, 2) == ['b']
-    assert queue.get('b') == 2
+    assert next_of(queue, 'b') == 2
 
 
 def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
@@ -63,20 +73,20 @@ def test_an_exposure_is_given_out_whole_or_when_its_partner_is_lost():
     for name, number in (('a', 1), ('b', 1), ('a', 2), ('b', 3)):
         queue.put(name, number, (name, number))
     forever = 600.0  # what is lost is not waited for
-    assert queue.get_exposure(forever) == (1, {'a': ('a', 1), 'b': ('b', 1)})
-    assert queue.get_exposure(forever) == (2, {'a': ('a', 2)})  # b is at 3
-    assert queue.get_exposure(0.0) == (3, {'b': ('b', 3)})  # of which a may still come
+    assert queue.get('ab', forever) == (1, {'a': ('a', 1), 'b': ('b', 1)})
+    assert queue.get('ab', forever) == (2, {'a': ('a', 2)})  # b is at 3
+    assert queue.get('ab', 0.0) == (3, {'b': ('b', 3)})  # of which a may still come
     for number in (4, 5):
         queue.put('a', number, ('a', number))
-    assert queue.get_exposure(forever) == (4, {'a': ('a', 4)})  # b is an exposure late
+    assert queue.get('ab', forever) == (4, {'a': ('a', 4)})  # b is an exposure late
     queue.close()
-    assert queue.get_exposure(forever) is None
+    assert queue.get('ab', forever) is None
 
 
 def test_closing_a_queue_ends_the_wait():
     queue = ExposureQueue('a', 1)
     found = []
-    waiting = threading.Thread(target=lambda: found.append(queue.get('a')))
+    waiting = threading.Thread(target=lambda: found.append(next_of(queue, 'a')))
     waiting.start()
     queue.close()
     waiting.join(10)
@@ -84,12 +94,13 @@ def test_closing_a_queue_ends_the_wait():
 
 
 class Fragile:
-    """Extractor that counts images, and fails as the first pixel says."""
+    """Follower that counts images, and fails as the first pixel says."""
 
     def __init__(self):
         self.count = 0
 
-    def extract(self, image, number, overlay=False):
+    def extract(self, images, number, overlays=(), angles=None):
+        image = images['a']
         self.count += 1
         if image[0, 0] == 1:
             raise ZeroDivisionError('one')
@@ -97,14 +108,14 @@ class Fragile:
             raise SystemExit(3)
         if image[0, 0] == 3:
             threading.Event().wait()  # until it is ended
-        return LiveObservations(expected=self.count)
+        return {'a': Observations(expected=self.count)}
 
 
 def test_a_failure_loses_one_image_an_interrupt_none_and_closing_ends_the_one_in_work():
-    process = extraction_process(Fragile)
+    process = follower_process(Fragile)
 
     def extract(value):
-        return process(np.full((2, 2), value, np.uint8), 1).expected
+        return process({'a': np.full((2, 2), value, np.uint8)}, 1)['a'].expected
 
     assert extract(0) == 1
     with pytest.raises(RuntimeError, match='one'):

@@ -14,20 +14,19 @@ import pytest
 import rigs
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros import limits
-from fluoro_calib_ros.distortion.registry import create_model
+from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.nodes.calibration_node import CalibrationNode
-from fluoro_calib_ros.nodes.exposure_input import CollectOptions, ExposureInput
+from fluoro_calib_ros.nodes.calibration_files import check_folders
+from fluoro_calib_ros.nodes.exposure_input import ExposureInput
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
     calibration_from_message,
     message_from_calibration,
 )
+from fluoro_calib_ros.nodes.messages.observations import decode_target_observations
 from fluoro_calib_ros.nodes.messages.rig_orientation import (
     message_from_orientation,
     orientation_from_message,
 )
-from fluoro_calib_ros.nodes.messages.target_observations import decode_target_observations
 from fluoro_calib_ros.nodes.runtime.logging import MAX_LINE, PrintableLogger, RateLimitedLogger
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
@@ -180,7 +179,7 @@ def test_log_line_cannot_be_forged(level):
 
 
 def test_traceback_keeps_its_lines_which_are_marked():
-    from fluoro_calib_ros.nodes.runtime.refusals import RefusalLog
+    from fluoro_calib_ros.nodes.runtime.diagnostics import RefusalLog
 
     inner = Lines()
     log = RefusalLog('frame', RateLimitedLogger(PrintableLogger(inner)))
@@ -230,10 +229,10 @@ def test_wrong_arguments_of_ros_are_told_in_a_sentence(tmp_path, arguments, sent
 def test_exposures_are_limited():
     """Each new one is compared with all: without a limit a peer could stop the stream."""
     frames = rigs.exposures()
-    options = CollectOptions('still', SimpleNamespace(still_time_s=0.1), None, max_exposures=0)
+    settings = SimpleNamespace(limits=SimpleNamespace(max_exposures=0))
     exposures = ExposureInput.__new__(ExposureInput)
     inner = Lines()
-    exposures._options = options
+    exposures._settings = settings
     exposures._collector = SimpleNamespace(exposures=[])
     exposures._limited_logger = RateLimitedLogger(PrintableLogger(inner))
     exposures._on_pair = lambda pair: None
@@ -249,12 +248,11 @@ def test_exposures_are_limited():
 def test_folders_that_peers_can_make_are_limited(tmp_path, place, allowed):
     base = tmp_path / 'rig'
     (base / 'old').mkdir(parents=True)
-    node = SimpleNamespace(_directory=base, _limits=limits.CollectLimits(max_folders=3))
     if allowed:
-        CalibrationNode._check_folders(node, base / place)
+        check_folders(base / place, base, 3)
         return
     with pytest.raises(DataError, match='as many folders as max_folders allows'):
-        CalibrationNode._check_folders(node, base / place)
+        check_folders(base / place, base, 3)
 
 
 # ---- found by fuzzing

@@ -10,8 +10,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from fluoro_calib_ros.nodes.runtime.node_help import asks_for_help, help_text
-from fluoro_calib_ros.nodes.runtime.parameters import parameters_of, unknown_parameters
+from fluoro_calib_ros.nodes.runtime.parameters import (
+    asks_for_help,
+    help_text,
+    parameters_of,
+    unknown_parameters,
+)
 
 NODES = (
     'bridge_node',

@@ -8,7 +8,6 @@ import subprocess
 import sys
 import threading
 from array import array
-from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -19,19 +18,21 @@ import rigs
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
-from fluoro_calib_ros.distortion.registry import create_model
+from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import ImageCorrector
+from fluoro_calib_ros.nodes import orientation_service
 from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
     calibration_from_message,
     message_from_calibration,
 )
 from fluoro_calib_ros.nodes.messages.image import ImageConverter
-from fluoro_calib_ros.nodes.orientation_service import CaptureSettings, OrientationService
-from fluoro_calib_ros.nodes.runtime.errors import one_line
+from fluoro_calib_ros.nodes.orientation_service import OrientationService
+from fluoro_calib_ros.nodes.runtime.diagnostics import Refused
+from fluoro_calib_ros.nodes.runtime.logging import one_line
 from fluoro_calib_ros.nodes.runtime.parameters import check_timeout, expand_path
-from fluoro_calib_ros.nodes.runtime.refusals import Refused
+from fluoro_calib_ros.nodes.runtime.services import Requests
 
 SIZE = (64, 48)
 ROOT = Path(__file__).parents[2]
@@ -190,24 +191,26 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
     outcome = SimpleNamespace(
         orientation=SimpleNamespace(fluoroscopes=('a', 'b'), calibration_ids=('a-old', 'b-old'))
     )
-    present = dict(old)
+    output = SimpleNamespace(calibrations=dict(old), orientation=None)
     node = SimpleNamespace(
-        create_publisher=lambda *_: None,
-        create_service=lambda *_, **__: None,
         create_timer=lambda *_, **__: None,
         destroy_timer=lambda _: None,
         readers=['active'],
         executor=None,
     )
-    settings = CaptureSettings(('a', 'b'), rigs.rig().phantom, 'rig', 5.0, Path())
-    service = OrientationService(node, lambda: settings, lambda: present, nullcontext, None)
+    rig = SimpleNamespace(
+        names=('a', 'b'),
+        required_phantom=lambda: rigs.rig().phantom,
+        settings=lambda: SimpleNamespace(node=SimpleNamespace(rig_frame='rig')),
+    )
+    service = OrientationService(node, rig, output, Requests())
 
-    async def recalibrated(function):
-        present.update(new)
+    async def recalibrated():
+        output.calibrations.update(new)
         return outcome
 
-    monkeypatch.setattr(service, '_in_thread', recalibrated)
-    capture = service._orient(SimpleNamespace(timeout_sec=1.0, frames=1), settings)
+    monkeypatch.setattr(orientation_service, 'in_thread', lambda *_: (recalibrated(), None))
+    capture = service._orient(SimpleNamespace(timeout_sec=1.0, frames=1))
     capture.send(None)  # it waits for its frames
     service.add({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})
     with pytest.raises(DataError, match='the calibrations have changed meanwhile'):

@@ -3,7 +3,6 @@
 
 """Parameters: declared once, and the same in the nodes, in config/ and in docs/."""
 
-import importlib.util
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -14,8 +13,8 @@ import yaml
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.nodes.runtime.errors import StartError
+from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.nodes.runtime.logging import StartError
 from fluoro_calib_ros.nodes.runtime.parameters import (
     ParameterGroup,
     ParameterNode,
@@ -23,16 +22,13 @@ from fluoro_calib_ros.nodes.runtime.parameters import (
     parameters_of,
 )
 from fluoro_calib_ros.options import declared, option
+from tools import write_tables
+from tools.sections import with_section
 
 ROOT = Path(__file__).parents[2]
-_spec = importlib.util.spec_from_file_location(
-    'write_parameters', ROOT / 'tools' / 'write_parameters.py'
-)
-write_parameters = importlib.util.module_from_spec(_spec)
-_spec.loader.exec_module(write_parameters)
 
 
-@pytest.mark.parametrize('node', write_parameters.CONFIGURED)
+@pytest.mark.parametrize('node', write_tables.CONFIGURED)
 def test_config_holds_every_parameter_with_its_default(node):
     config = yaml.safe_load((ROOT / 'config' / 'fluoro_calib.yaml').read_text())
     values = config[f'/**/{node}']['ros__parameters']
@@ -40,33 +36,39 @@ def test_config_holds_every_parameter_with_its_default(node):
         name: list(declaration.default)
         if isinstance(declaration.default, tuple)
         else declaration.default
-        for name, declaration in write_parameters.parameters(node).items()
+        for name, declaration in write_tables.parameters(node).items()
     }
     assert values == expected
     assert all(type(values[name]) is type(expected[name]) for name in expected)
 
 
 def test_config_is_generated_from_the_declarations():
-    """Comments included; `python tools/write_parameters.py` writes it."""
-    assert (ROOT / 'config' / 'fluoro_calib.yaml').read_text() == write_parameters.yaml_text()
+    """Comments included; `python -m tools.write_tables` writes it."""
+    assert (ROOT / 'config' / 'fluoro_calib.yaml').read_text() == write_tables.yaml_text()
 
 
 def test_tables_of_the_docs_are_generated_from_the_declarations():
     text = (ROOT / 'docs' / 'nodes.md').read_text()
-    assert write_parameters.docs_text(text) == text
+    assert write_tables.docs_text(text) == text
+
+
+def test_table_of_the_calibration_file_is_generated_from_its_record():
+    text = (ROOT / 'docs' / 'files.md').read_text()
+    table = write_tables.record_table()
+    assert with_section(text, 'fields of a calibration', table) == text
 
 
 def test_parameters_of_the_calibration_are_its_options():
     """Choices, range and description are those of the command line."""
-    parameters = write_parameters.parameters('calibration_node')
+    parameters = write_tables.parameters('calibration_node')
     options = declared(CalibrationOptions)
     for name in ('model', 'interior', 'loss', 'max_iterations', 'relative_orientation', 'datum'):
         assert parameters[name] == options[name]
 
 
-@pytest.mark.parametrize('node', write_parameters.NODES)
+@pytest.mark.parametrize('node', write_tables.NODES)
 def test_every_parameter_is_described(node):
-    for declaration in write_parameters.parameters(node).values():
+    for declaration in write_tables.parameters(node).values():
         descriptor = descriptor_of(declaration)
         assert declaration.description in descriptor.description and descriptor.read_only
         number = isinstance(declaration.default, (int, float)) and not isinstance(
@@ -214,8 +216,8 @@ def test_what_cannot_be_set_says_why_and_changes_nothing(settings, name, value, 
     assert settings.get_parameter(name).value == before and not settings.used
 
 
-@pytest.mark.parametrize('node', write_parameters.NODES)
+@pytest.mark.parametrize('node', write_tables.NODES)
 def test_settable_parameters_are_declared_and_not_read_only(node):
-    settable = write_parameters.settable(node)
-    assert settable <= set(write_parameters.parameters(node))
+    settable = write_tables.settable(node)
+    assert settable <= set(write_tables.parameters(node))
     assert not settable & {'fluoroscopes', 'autostart', 'phantom', 'calibration_directory'}

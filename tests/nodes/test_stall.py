@@ -3,7 +3,7 @@
 
 """A stream that stops."""
 
-from fluoro_calib_ros.nodes.runtime.stall import StallDetector
+from fluoro_calib_ros.nodes.runtime.diagnostics import StallDetector
 
 
 class Clock:

@@ -14,18 +14,19 @@ from fluoro_calib_msgs.msg import CorrectedObservations, ReconstructedPoints, Ta
 from rclpy.serialization import deserialize_message, serialize_message
 from std_msgs.msg import Header
 
-from fluoro_calib_ros.bags.definitions import from_cdr, typestore
-from fluoro_calib_ros.nodes.messages.corrected_observations import (
+from fluoro_calib_ros.io.bags.definitions import from_cdr, typestore
+from fluoro_calib_ros.nodes.messages.observations import (
     decode_corrected_observations,
+    decode_target_observations,
     encode_corrected_observations,
+    float64_field,
+    uint32_field,
 )
-from fluoro_calib_ros.nodes.messages.fields import float64_field, uint32_field
-from fluoro_calib_ros.nodes.messages.reconstructed_points import (
+from fluoro_calib_ros.nodes.messages.points import (
     PointsContent,
     encode_reconstructed_points,
     message_from_points,
 )
-from fluoro_calib_ros.nodes.messages.target_observations import decode_target_observations
 from fluoro_calib_ros.reconstruction.intersection import IntersectedPoints
 
 OBSERVED, CORRECTED, POINTS = (

@@ -12,10 +12,10 @@ import rigs
 from scipy import optimize
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.robust_adjustment import adjusted_with_precision
-from fluoro_calib_ros.distortion.priors import gauge_precision
-from fluoro_calib_ros.distortion.series import Functions
+from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.initial_network import adjusted_with_precision
+from fluoro_calib_ros.estimation.priors import gauge_precision
 from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
 from fluoro_calib_ros.photogrammetry.adjustment import (
     SolverOptions,
@@ -392,7 +392,7 @@ def test_image_points_with_small_sigma_dominate():
     uv = project(*network.per_image_point(truth))
     uv += np.where(rough[:, None], 5.0, 0.0) * np.random.default_rng(1).normal(size=uv.shape)
     uv += 0.01 * np.random.default_rng(2).normal(size=uv.shape)
-    interior_held = replace(
+    interior_fixed = replace(
         network,
         uv=uv,
         survey_mm=truth.points_mm,
@@ -404,7 +404,7 @@ def test_image_points_with_small_sigma_dominate():
             np.mean(
                 (
                     adjust_and_estimate_noise(
-                        replace(interior_held, sigma=s), truth
+                        replace(interior_fixed, sigma=s), truth
                     ).parameters.points_mm
                     - truth.points_mm
                 )

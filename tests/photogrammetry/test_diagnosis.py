@@ -11,13 +11,14 @@ import rigs
 from test_relative import dense, disturbed, rigid_network
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.initial_network import measured_network
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.self_calibration import self_calibrate
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.initial_network import measured_network
+from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.estimation.self_calibration import self_calibrate
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.findings import Kind, Place
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.diagnosis import (
@@ -227,10 +228,9 @@ def test_undetermined_principal_point_is_reported():
     precise = precision(network, adjust_and_estimate_noise(network, truth))
     assert not undetermined_interiors(network, truth, precise, ('a',), 0.3)
     worse = replace(precise, interior=precise.interior + np.diag([300.0**2, 0, 0]))
-    (sentence,) = undetermined_interiors(network, truth, worse, ('a',), 0.3)
-    assert sentence.startswith(
-        'fluoroscope a: the principal point cannot be separated from the position of the source'
-    )
+    (found,) = undetermined_interiors(network, truth, worse, ('a',), 0.3)
+    assert found.kind is Kind.INTERIOR_UNDETERMINED and found.place == Place(('a',))
+    assert found.numbers['sd_point_px'] > 250
     assert not undetermined_interiors(network, truth, worse, ('a',), 5.0)
     assert not undetermined_interiors(
         replace(network, interior_free=np.array([False])), truth, worse, ('a',), 0.3

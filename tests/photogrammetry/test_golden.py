@@ -14,12 +14,12 @@ from rigs import disturbed, small_network
 from sklearn.model_selection import GridSearchCV, PredefinedSplit
 from sklearn.neighbors import KNeighborsRegressor
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.initial_network import measured_network
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.distortion.cross_validation import CrossValidation
-from fluoro_calib_ros.distortion.estimation import exposure_folds
-from fluoro_calib_ros.distortion.knn import KnnModel
+from fluoro_calib_ros.correction.neighbours import KnnModel
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.estimator import exposure_folds
+from fluoro_calib_ros.estimation.initial_network import measured_network
+from fluoro_calib_ros.estimation.neighbour_regression import CrossValidation
+from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
 from fluoro_calib_ros.photogrammetry.precision import precision
@@ -56,22 +56,22 @@ def real_problem():
     )
 
 
-def all_held(network):
+def all_fixed(network):
     """All object points stay at their survey; exposures share only the interior orientation."""
     return np.ones(len(network.survey_mm), dtype=bool)
 
 
-def few_held(network):
+def few_fixed(network):
     """Every tenth object point, and those seen in two exposures only, define the datum."""
     return (np.arange(len(network.survey_mm)) % 10 == 0) | (np.bincount(network.point) < 3)
 
 
-@pytest.mark.parametrize('held_points', [all_held, few_held])
+@pytest.mark.parametrize('fixed_points', [all_fixed, few_fixed])
 @pytest.mark.parametrize('problem', [small_problem, real_problem])
-def test_adjustment_equals_colmap(problem, held_points):
+def test_adjustment_equals_colmap(problem, fixed_points):
     """Cost, unknowns and standard deviations of the interior orientation for Student-t noise."""
     network, start, noise = problem()
-    held = held_points(network)
+    held = fixed_points(network)
     assert held.sum() >= 3 and (held.all() or (~held).sum() > len(held) / 2)
     network = with_datum(network, held)
     ours = adjust(network, start, None, noise, SolverOptions(tolerance=1e-10))

@@ -10,9 +10,8 @@ import pytest
 import rigs
 
 from fluoro_calib_ros.photogrammetry.adjustment import adjust
-from fluoro_calib_ros.photogrammetry.held_precision import precision_with_held_interiors
 from fluoro_calib_ros.photogrammetry.noise import Noise
-from fluoro_calib_ros.photogrammetry.precision import precision
+from fluoro_calib_ros.photogrammetry.precision import precision, precision_with_fixed_interiors
 
 NOISE = Noise('gaussian', 0.3)
 SD_PX = np.array([2.0, 3.0, 4.0])  # of xp, yp and c
@@ -32,7 +31,7 @@ def test_covariances_are_those_of_consider_parameters(shape):
     covariance = np.diag(SD_PX**2) + 0.5
     network, result = held(network, truth, truth.interior)
     precise = precision(network, result)
-    found = precision_with_held_interiors(network, result, 0.0, precise, covariance[None])
+    found = precision_with_fixed_interiors(network, result, 0.0, precise, covariance[None])
     m, n = network.n_exposures, network.n_points
     everything = rigs.dense_normal_matrix(replace(network, interior_free=[True]), result)
     own = slice(6 * m + 3 * n)
@@ -58,7 +57,7 @@ def test_errors_of_sources_agree_with_their_covariances():
         interior = truth.interior + rng.normal(0, SD_PX)
         network, result = held(network, truth, interior)
         known = precision(network, result)
-        precise = precision_with_held_interiors(
+        precise = precision_with_fixed_interiors(
             network, result, 0.0, known, np.diag(SD_PX**2)[None]
         )
         error = result.parameters.position_mm - truth.position_mm

@@ -6,7 +6,7 @@
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.photogrammetry.scatter import (
+from fluoro_calib_ros.photogrammetry.noise import (
     MAX_WIDENING,
     ObservedScatter,
     widening,

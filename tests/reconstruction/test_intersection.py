@@ -11,13 +11,12 @@ import pytest
 from rigs import calibrated
 from scipy.optimize import least_squares
 
-from fluoro_calib_ros.drift.clusters import parse_clusters
+from fluoro_calib_ros.checks.cluster_watch import parse_clusters
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.photogrammetry.noise import ObservedScatter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
-from fluoro_calib_ros.photogrammetry.scatter import ObservedScatter
-from fluoro_calib_ros.reconstruction.correspondence import CorrectedView, match_views
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry, epipolar_residuals
 from fluoro_calib_ros.reconstruction.intersection import (
     FAILED,
@@ -28,7 +27,11 @@ from fluoro_calib_ros.reconstruction.intersection import (
     Intersector,
     _derivative_functions,
 )
-from fluoro_calib_ros.reconstruction.reconstruct import reconstruct_recording
+from fluoro_calib_ros.reconstruction.reconstruct import (
+    CorrectedView,
+    match_views,
+    reconstruct_recording,
+)
 from fluoro_calib_ros.simulation.rig import virtual_rig
 
 SIGMA = 0.25

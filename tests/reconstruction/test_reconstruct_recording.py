@@ -12,19 +12,20 @@ import numpy as np
 import pytest
 from rigs import run, true_calibrations, true_orientation
 
-from fluoro_calib_ros.drift.clusters import parse_clusters
-from fluoro_calib_ros.drift.options import DriftOptions
-from fluoro_calib_ros.drift.recording_watch import RecordingDriftWatch
-from fluoro_calib_ros.drift.rig_watch import RigDriftWatch
-from fluoro_calib_ros.drift.state import ERROR
-from fluoro_calib_ros.files.calibration import save_calibration
-from fluoro_calib_ros.files.observations import write_observations_csv
-from fluoro_calib_ros.files.rig_orientation import save_orientation
-from fluoro_calib_ros.jobs.dataset import write_bag
-from fluoro_calib_ros.reconstruction.correspondence import CorrectedView, match_views
+from fluoro_calib_ros.checks.cluster_watch import parse_clusters
+from fluoro_calib_ros.checks.drift_options import ERROR, DriftOptions
+from fluoro_calib_ros.checks.recording_watch import RecordingDriftWatch
+from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
+from fluoro_calib_ros.findings import Kind, Severity
+from fluoro_calib_ros.io.calibration import save_calibration
+from fluoro_calib_ros.io.observations import write_observations_csv
+from fluoro_calib_ros.io.rig_orientation import save_orientation
+from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.reconstruction.intersection import OK, SINGLE_VIEW, Intersector
 from fluoro_calib_ros.reconstruction.reconstruct import (
+    CorrectedView,
     intersect_exposure,
+    match_views,
     reconstruct_recording,
     watch_exposure,
 )
@@ -198,11 +199,8 @@ def test_a_drift_of_a_recording_is_found_and_reported():
     assert (
         16 < (found.found_ns - start) / 1e9 < 22 and abs((found.began_ns - start) / 1e9 - 16) < 1.5
     )
-    assert found.message.startswith('ERROR: the image of fluoroscope b has drifted by')
-    assert found.message.endswith(
-        f'found {(found.found_ns - start) / 1e9:.1f} s after the beginning: '
-        'the calibration no longer holds'
-    )
+    assert found.finding.kind is Kind.IMAGE_DRIFT and found.finding.severity is Severity.ERROR
+    assert found.finding.place.fluoroscopes == ('b',)
     assert 18 < found.watched_s < 21
 
 
@@ -258,30 +256,23 @@ def test_a_healthy_recording_is_ok():
         None,
         'ok',
     )
-    assert (
-        found.message == f'no drift is seen in {found.watched_s:.1f} s'
-        and 18 < found.watched_s < 21
-    )
+    assert found.finding.kind is Kind.NO_DRIFT and 18 < found.watched_s < 21
+    assert found.finding.numbers['watched_s'] == found.watched_s
 
 
 def test_an_undecided_verdict_is_not_ok():
     """Too short, without common markers, and with too few of them."""
     frames = tracking(30.0, 30.0, 'ab').frames
     short = watched({name: of_one[:320] for name, of_one in frames.items()}, 'ab').verdict()
-    assert short.level == 'learning' and short.message == (
-        'the recording is too short to detect a drift: it has 10.6 s, '
-        'of which the first 10 s are learned'
-    )
+    assert short.level == 'learning' and short.finding.kind is Kind.SHORT_RECORDING
+    assert short.finding.numbers['length_s'] == pytest.approx(10.6, abs=0.05)
     apart = {**frames, 'b': [replace(f, target_id=f.target_id + 100) for f in frames['b']]}
     few = {
         name: [replace(f, target_id=f.target_id[:2], uv=f.uv[:2]) for f in of_one]
         for name, of_one in frames.items()
     }
     for found in (watched(apart, 'ab').verdict(), watched(few, 'ab').verdict()):
-        assert (
-            found.level == 'unknown'
-            and found.message == 'there are too few markers in two views to detect a drift'
-        )
+        assert found.level == 'unknown' and found.finding.kind is Kind.NOT_WATCHED
     assert watched({'a': [], 'b': []}, 'ab').verdict().level == 'learning'
 
 

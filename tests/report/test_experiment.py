@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
-from fluoro_calib_ros.distortion.none import no_correction
+from fluoro_calib_ros.correction.models import no_correction
+from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.simulation.distortion import random_field
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed

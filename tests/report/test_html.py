@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from rigs import calibrated, exposures, rig, run, turning
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.names import Names
-from fluoro_calib_ros.files.calibration_request import write_request
+from fluoro_calib_ros.io.calibration_request import write_request
 from fluoro_calib_ros.jobs.report import read_report_input
 from fluoro_calib_ros.jobs.result_folder import save_result
 from fluoro_calib_ros.report import html as html_report

@@ -13,9 +13,10 @@ import pytest
 import rigs
 from PIL import Image
 
-from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
-from fluoro_calib_ros.calibration.options import CalibrationOptions
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
+from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.findings import Finding, Kind, Place, Severity
 from fluoro_calib_ros.report.cost_figure import relative_costs
 from fluoro_calib_ros.report.figures import write_figures
 from fluoro_calib_ros.report.residual_figures import normalised_residuals
@@ -202,7 +203,14 @@ def test_summary_fits_a_terminal(job):
         fluoroscopes=dict.fromkeys(names, job.fluoroscopes['a']),
         calibrations=dict.fromkeys(names, job.calibrations['a']),
         runs={},
-        left_out=('fluoroscope a, exposure 7: ' + 'too few targets ' * 10,),
+        findings=(
+            Finding(
+                Kind.FEW_TARGETS,
+                'too few targets ' * 10,
+                Place(('a',), (7,)),
+                severity=Severity.NOTE,
+            ),
+        ),
     )
     text = summary_table(many)
     assert max(map(len, text.splitlines())) <= 100

@@ -12,7 +12,7 @@ import pytest
 from node_server import NodeServer
 from ros_graph import BAGS, ROOT, Graph, entry_point, free_domain
 
-from fluoro_calib_ros.bags.reader import read_frames
+from fluoro_calib_ros.io.bags.reader import read_frames
 
 
 def pytest_collection_modifyitems(items):

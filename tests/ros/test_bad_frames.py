@@ -10,9 +10,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from fluoro_calib_ros.files.calibration import load_calibrations
-from fluoro_calib_ros.nodes.messages.fields import float64_field
-from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
+from fluoro_calib_ros.io.calibration import load_calibrations
+from fluoro_calib_ros.nodes.messages.observations import float64_field, message_from_frame
 
 BOTH = ('calibration_node', 'correction_node')
 COLLECTS = ('calibration_node',)

@@ -13,8 +13,7 @@ from fluoro_calib_msgs.msg import TargetObservations
 from rclpy.serialization import deserialize_message, serialize_message
 from ros_graph import NAMES, value_of
 
-from fluoro_calib_ros.nodes.messages.fields import float64_field
-from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
+from fluoro_calib_ros.nodes.messages.observations import float64_field, message_from_frame
 
 
 def shorter(message):

@@ -10,9 +10,9 @@ from fluoro_calib_msgs.srv import Calibrate
 from ros_graph import JOB_DEADLINE, NAMES, value_of
 from small_disk import Disk
 
-from fluoro_calib_ros.bags.reader import iterate_messages
-from fluoro_calib_ros.bags.recovery import recover_bag
-from fluoro_calib_ros.files.calibration import load_calibrations
+from fluoro_calib_ros.io.bags.reader import iterate_messages
+from fluoro_calib_ros.io.bags.salvage import recover_bag
+from fluoro_calib_ros.io.calibration import load_calibrations
 
 
 @pytest.fixture

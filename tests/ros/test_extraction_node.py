@@ -14,16 +14,15 @@ from rclpy.serialization import serialize_message
 from ros_graph import NAMES
 from sensor_msgs.msg import CompressedImage, Image
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.files.observations import write_observations_csv
-from fluoro_calib_ros.files.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.images.codec import encode
+from fluoro_calib_ros.io.observations import write_observations_csv
+from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
-from fluoro_calib_ros.nodes.messages.fields import stamp_from_nanoseconds
-from fluoro_calib_ros.nodes.runtime.qos import images_qos
+from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
+from fluoro_calib_ros.nodes.runtime.streams import images_qos
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.rig import virtual_rig

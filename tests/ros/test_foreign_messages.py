@@ -16,9 +16,9 @@ from ros_graph import DEADLINE, NAMES, value_of
 from sensor_msgs.msg import CameraInfo
 
 from fluoro_calib_ros.nodes.correction_node import CorrectionNode
-from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
+from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.nodes.runtime import diagnostics
-from fluoro_calib_ros.nodes.runtime.qos import latched_qos, observations_qos
+from fluoro_calib_ros.nodes.runtime.streams import latched_qos, observations_qos
 
 
 def test_camera_info_without_image_size_is_ignored(graph, by_command, tracking):

@@ -14,11 +14,11 @@ import pytest
 from fluoro_calib_msgs.msg import FluoroscopeCalibration, RigOrientation
 from ros_graph import ROOT, Process, value_of
 
-from fluoro_calib_ros.distortion.registry import create_model
-from fluoro_calib_ros.files.calibration import load_calibration
+from fluoro_calib_ros.correction.registry import create_model
+from fluoro_calib_ros.io.calibration import load_calibration
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
-from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
-from fluoro_calib_ros.nodes.runtime.qos import latched_qos
+from fluoro_calib_ros.nodes.messages.observations import message_from_frame
+from fluoro_calib_ros.nodes.runtime.streams import latched_qos
 
 FRAMES = 100
 LARGE = 10  # messages of the flood that are seen to be shed

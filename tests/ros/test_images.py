@@ -16,14 +16,14 @@ from rclpy.qos import qos_profile_sensor_data
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from fluoro_calib_ros.distortion.none import no_correction
-from fluoro_calib_ros.files.calibration import load_calibrations
+from fluoro_calib_ros.correction.models import no_correction
 from fluoro_calib_ros.images.codec import decode, encode
 from fluoro_calib_ros.images.corrector import ImageCorrector
+from fluoro_calib_ros.io.calibration import load_calibrations
 from fluoro_calib_ros.nodes.messages.camera_info import message_of_corrected_stream
-from fluoro_calib_ros.nodes.messages.fields import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
-from fluoro_calib_ros.nodes.runtime.qos import images_qos, latched_qos
+from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
+from fluoro_calib_ros.nodes.runtime.streams import images_qos, latched_qos
 from fluoro_calib_ros.simulation.bead_images import bead_image
 
 SIZE = (1024, 1024)

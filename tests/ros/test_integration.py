@@ -13,10 +13,10 @@ import sys
 from fluoro_calib_msgs.srv import Calibrate, LoadCalibration, Orient
 from ros_graph import BAGS, NAMES, ROOT, standing, value_of
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
-from fluoro_calib_ros.files.phantom import read_phantom
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
+from fluoro_calib_ros.io.phantom import read_phantom
 
 
 def ids_in_use(client, node='correction_node'):
@@ -167,9 +167,9 @@ def test_job_ends_with_its_killed_node(tmp_path):
     program = f"""
 import sys
 sys.path.insert(0, {str(ROOT / 'tests')!r})
-from fluoro_calib_ros.bags.reader import read_frames
-from fluoro_calib_ros.calibration.request import CalibrationRequest
-from fluoro_calib_ros.files.phantom import read_phantom
+from fluoro_calib_ros.io.bags.reader import read_frames
+from fluoro_calib_ros.estimation.options import CalibrationRequest
+from fluoro_calib_ros.io.phantom import read_phantom
 from fluoro_calib_ros.jobs.worker_process import run_in_worker_process
 import multiprocessing, threading
 

@@ -11,7 +11,7 @@ import numpy as np
 from fluoro_calib_msgs.srv import LoadCalibration, SaveCalibration
 from ros_graph import NAMES
 
-from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
+from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
 
 
 def ids_in(folder):

@@ -17,27 +17,26 @@ from ros_graph import BAGS, NAMES, value_of
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from sensor_msgs.msg import Image, JointState
 
-import tests.radiographs.test_markers as markers
-from fluoro_calib_ros.bags.definitions import (
+import tests.images.test_markers as markers
+from fluoro_calib_ros.correction.fluoroscope_calibration import digest_of_sources
+from fluoro_calib_ros.exposures.angles import AngleOptions
+from fluoro_calib_ros.images.angle_maps import AngleMaps
+from fluoro_calib_ros.images.markers import FirstMarkers
+from fluoro_calib_ros.io.bags.definitions import (
     ADDED,
     FLUOROSCOPE_CALIBRATION,
     Definition,
     earlier_text,
     from_cdr,
 )
-from fluoro_calib_ros.bags.writer import BagWriter
-from fluoro_calib_ros.calibration.result import digest_of_sources
-from fluoro_calib_ros.exposures.angles import AngleOptions
-from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
-from fluoro_calib_ros.files.phantom import read_phantom
-from fluoro_calib_ros.images.angle_maps import AngleMaps
-from fluoro_calib_ros.jobs.live_markers import PairSettings
+from fluoro_calib_ros.io.bags.writer import BagWriter
+from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
+from fluoro_calib_ros.io.phantom import read_phantom
+from fluoro_calib_ros.jobs.live_markers import MarkerSettings
 from fluoro_calib_ros.jobs.sources import BagSelection, read_calibrated_source
-from fluoro_calib_ros.nodes.messages.fields import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
-from fluoro_calib_ros.nodes.runtime.qos import images_qos
-from fluoro_calib_ros.nodes.runtime.stream_reader import FaultHandlers, StreamReader
-from fluoro_calib_ros.radiographs.markers import FirstMarkers
+from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
+from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader, images_qos
 from fluoro_calib_ros.simulation.bead_images import bead_image
 
 START_NS = 10**18
@@ -327,8 +326,8 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
     clusters = markers.followed_clusters()
 
     def offline(known):
-        follower = PairSettings(
-            first, markers.turning(), markers.turning_orientation(), clusters, markers.OPTIONS
+        follower = MarkerSettings(
+            first, markers.OPTIONS, markers.turning(), markers.turning_orientation(), clusters
         )()
         return [
             follower.extract(images, n, (), markers.angles_of_exposure(n) if known else None)

@@ -3,8 +3,8 @@
 
 """A model that is added to the registry is described by the calibration node's parameter."""
 
-from fluoro_calib_ros.distortion import registry
-from fluoro_calib_ros.distortion.knn import KnnModel
+from fluoro_calib_ros.correction import registry
+from fluoro_calib_ros.correction.neighbours import KnnModel
 from fluoro_calib_ros.nodes.calibration_node import PARAMETERS
 from fluoro_calib_ros.nodes.runtime.parameters import descriptor_of, parameters_of
 

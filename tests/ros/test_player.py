@@ -10,7 +10,7 @@ from ros_graph import BAGS
 from rosgraph_msgs.msg import Clock
 from std_srvs.srv import SetBool, Trigger
 
-from fluoro_calib_ros.bags.reader import iterate_messages
+from fluoro_calib_ros.io.bags.reader import iterate_messages
 
 TOPIC = '/a/target_observations'
 OFFSET_S = 0.5

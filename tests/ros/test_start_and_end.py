@@ -18,9 +18,9 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import serialize_message
 from ros_graph import BAGS, NAMES, standing, value_of
 
-from fluoro_calib_ros.files.calibration import load_calibrations
+from fluoro_calib_ros.io.calibration import load_calibrations
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
-from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
+from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 
 TROUBLE = ('Traceback', 'Exception', 'exception', 'Error:', 'never retrieved', 'never awaited')
 
@@ -42,7 +42,7 @@ def damaged_bag(folder):
 
 
 def foreign_bag(folder):
-    from fluoro_calib_ros.bags.writer import BagWriter
+    from fluoro_calib_ros.io.bags.writer import BagWriter
 
     with BagWriter(folder / 'bag'):
         pass
@@ -323,7 +323,7 @@ def test_impossible_requests_are_answered(graph, tmp_path):
 
 def test_player_latches_recorded_latched_topics(graph, by_command):
     """A late subscriber receives a recorded latched calibration."""
-    from fluoro_calib_ros.bags.qos import PROFILES, to_yaml
+    from fluoro_calib_ros.io.bags.metadata import PROFILES, to_yaml
 
     calibration = load_calibrations(by_command)['a']
     with open(graph.directory / 'latched.mcap', 'wb') as file:

@@ -10,7 +10,7 @@ from dataclasses import replace
 import pytest
 from ros_graph import NAMES, value_of
 
-from fluoro_calib_ros.files.calibration import load_calibrations
+from fluoro_calib_ros.io.calibration import load_calibrations
 
 COUNT = 40
 POINTS = 'reconstruction/points_with_covariance'

@@ -14,9 +14,9 @@ from fluoro_calib_msgs.srv import Calibrate, LoadCalibration, Orient
 from ros_graph import entry_point, value_of
 
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.jobs.dataset import write_bag
-from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
-from fluoro_calib_ros.nodes.runtime.qos import observations_qos
+from fluoro_calib_ros.jobs.simulation import write_bag
+from fluoro_calib_ros.nodes.messages.observations import message_from_frame
+from fluoro_calib_ros.nodes.runtime.streams import observations_qos
 from fluoro_calib_ros.simulation.exposures import detect_beads, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.simulation.streams import START_NS, StreamStart

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from ros_graph import NAMES, Graph
 
-from fluoro_calib_ros.files.calibration import load_calibrations, save_calibration
+from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
 
 
 @pytest.fixture

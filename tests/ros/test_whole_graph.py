@@ -12,7 +12,7 @@ from fluoro_calib_msgs.msg import CalibrationStatus, CorrectedObservations
 from fluoro_calib_msgs.srv import Calibrate
 from ros_graph import BAGS, JOB_DEADLINE, NAMES, SUCCEEDED
 
-from fluoro_calib_ros.files.calibration import load_calibrations
+from fluoro_calib_ros.io.calibration import load_calibrations
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import calibration_from_message
 from fluoro_calib_ros.photogrammetry.collinearity import project
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_quaternion

@@ -38,9 +38,8 @@ LOG_LINES = 6
 
 def session_text(state: SessionState) -> Group:
     """Return the whole session as a renderable of rich."""
-    return Group(
-        *_title(state), _fluoroscopes(state), Text(), _nodes(state), Text(), _results(state)
-    )
+    parts = [_fluoroscopes(state), Text(), _nodes(state), Text(), _results(state)]
+    return Group(*_title(state), *parts)
 
 
 def plain(text: str) -> str:

@@ -8,7 +8,7 @@ from __future__ import annotations
 from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CameraInfo
 
-from ...calibration.result import FluoroscopeCalibration
+from ...correction.fluoroscope_calibration import FluoroscopeCalibration
 from ...errors import DataError
 
 

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from array import array
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,17 +14,18 @@ from builtin_interfaces.msg import Time
 from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header
 
-from ...calibration.result import FluoroscopeCalibration
+from ...correction.fluoroscope_calibration import FluoroscopeCalibration
 from ...errors import DataError
+from ...findings import Kind
 from ...images.codec import decode, encode
-from ..runtime.refusals import Refused
+from ..runtime.diagnostics import TOO_LARGE, Refused
 
 # Pixel type of each encoding; 8UC1 and 16UC1 are the same without saying that they are grey.
 PIXEL_TYPES = {'mono8': np.uint8, '8UC1': np.uint8, 'mono16': np.uint16, '16UC1': np.uint16}
 ENCODINGS = {np.dtype(np.uint8): 'mono8', np.dtype(np.uint16): 'mono16'}
 COMPRESSIONS = {'png': '.png', 'jpeg': '.jpg'}
 # Kinds of refusals.
-IMAGE_REFUSALS = ('undecodable', 'encoding', 'image size', 'frame id', 'damaged')
+IMAGE_REFUSALS = ('undecodable', TOO_LARGE, 'encoding', 'image size', 'frame id', 'damaged')
 
 
 class ImageConverter:
@@ -32,7 +34,7 @@ class ImageConverter:
     def __init__(self, fluoroscope: str) -> None:
         self._fluoroscope = fluoroscope
         # Of one (encoding, shape): message, and its data as an array.
-        self._output: dict[tuple, tuple[Image, np.ndarray]] = {}
+        self._output: dict[tuple[Any, ...], tuple[Image, np.ndarray]] = {}
 
     def to_array(
         self, message: Image | CompressedImage, calibration: FluoroscopeCalibration
@@ -119,7 +121,8 @@ class ImageConverter:
         try:
             return decode(message.data)
         except DataError as error:
-            kind = 'encoding' if 'colour' in str(error) or 'pixels of' in str(error) else 'damaged'
+            is_encoding = error.finding.kind is Kind.IMAGE_ENCODING
+            kind = 'encoding' if is_encoding else 'damaged'
             raise self.refusal(
                 kind, message, f'{message.format or "no format"}: {error}'
             ) from None

@@ -7,12 +7,48 @@ from __future__ import annotations
 
 import numpy as np
 from fluoro_calib_msgs.msg import RigOrientation
+from geometry_msgs.msg import TransformStamped
+from tf2_msgs.msg import TFMessage
 
 from ...errors import DataError
 from ...limits import read_limits
 from ...photogrammetry import rig_orientation as rig
 from ...photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
-from .fields import float64_field, nanoseconds_from_stamp, stamp_from_nanoseconds
+from .observations import float64_field, nanoseconds_from_stamp, stamp_from_nanoseconds
+
+# Static transforms of the optical frames of a rig.
+
+
+def transforms_of_orientation(message: RigOrientation, rig_frame: str) -> TFMessage:
+    """Return the optical frames as children of the rig frame.
+
+    An orientation from the calibration is given in the optical frame of its first fluoroscope;
+    the rig frame then coincides with it. So every optical frame has the same parent whatever the
+    source of the orientation is, and no transform of an earlier one stays valid.
+    """
+    out = TFMessage()
+    given = message.header.frame_id
+    if given != rig_frame and given not in message.optical_frame_id:
+        out.transforms.append(_transform(message, rig_frame, given))
+    for i, child in enumerate(message.optical_frame_id):
+        if child == rig_frame:
+            continue
+        stamped = _transform(message, rig_frame, child)
+        for name in 'xyz':
+            setattr(stamped.transform.translation, name, getattr(message, name)[i])
+        for name in 'xyzw':
+            setattr(stamped.transform.rotation, name, getattr(message, f'q{name}')[i])
+        out.transforms.append(stamped)
+    return out
+
+
+def _transform(message: RigOrientation, parent: str, child: str) -> TransformStamped:
+    """Return the identity with the stamp of a message."""
+    stamped = TransformStamped(child_frame_id=child)
+    stamped.header.stamp = message.header.stamp
+    stamped.header.frame_id = parent
+    return stamped
+
 
 _INTERIOR = ('xp', 'yp', 'c')
 _POSITION = ('x', 'y', 'z')
@@ -90,17 +126,17 @@ def content_of_orientation(message: RigOrientation) -> rig.RigOrientation:
     if not (norm > MIN_QUATERNION_NORM).all():
         raise DataError('rig orientation: an attitude is not a unit quaternion')
     return rig.RigOrientation(
-        tuple(message.fluoroscope),
-        np.stack([columns[name] for name in _INTERIOR], axis=1),
-        matrix_from_quaternion(attitude).transpose(0, 2, 1),
-        1000 * np.stack([columns[name] for name in _POSITION], axis=1),
-        covariance,
-        message.header.frame_id,
-        message.source,
-        tuple(message.calibration_id),
-        nanoseconds_from_stamp(message.header.stamp),
-        message.exposures,
-        tuple(message.optical_frame_id),
+        fluoroscopes=tuple(message.fluoroscope),
+        interior=np.stack([columns[name] for name in _INTERIOR], axis=1),
+        rotation=matrix_from_quaternion(attitude).transpose(0, 2, 1),
+        position_mm=1000 * np.stack([columns[name] for name in _POSITION], axis=1),
+        covariance=covariance,
+        frame_id=message.header.frame_id,
+        source=message.source,
+        calibration_ids=tuple(message.calibration_id),
+        stamp_ns=nanoseconds_from_stamp(message.header.stamp),
+        exposures=message.exposures,
+        optical_frame_ids=tuple(message.optical_frame_id),
     ).rounded()
 
 

@@ -12,11 +12,12 @@ from typing import Any
 import numpy as np
 from fluoro_calib_msgs.action import SelfCalibrate
 
-from ...calibration.calibrate import CalibrationResult
-from ...calibration.options import CalibrationOptions
-from ...calibration.result import FluoroscopeCalibration
-from ...calibration.rounds import Round
-from ...validation.check import Validation
+from ...checks.check import Validation
+from ...correction.fluoroscope_calibration import FluoroscopeCalibration
+from ...estimation.options import CalibrationOptions
+from ...estimation.result import CalibrationResult
+from ...estimation.rounds import Round
+from ...findings import sentences
 
 Request = Any  # Calibrate.Request or SelfCalibrate.Goal
 Result = Any  # Calibrate.Response or SelfCalibrate.Result
@@ -98,5 +99,5 @@ def fill_result(
 def fill_verdict(result: Result, validation: Validation) -> None:
     """Fill in the verdict on a calibration that succeeded."""
     result.verdict = validation.verdict
-    result.findings = list(validation.findings)
+    result.findings = sentences(validation.findings)
     result.message += f'; verdict: {validation.verdict}'

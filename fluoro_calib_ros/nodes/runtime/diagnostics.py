@@ -5,16 +5,197 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import time
+import traceback
+from collections import Counter
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from typing import NamedTuple, TypeAlias, TypeVar
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.node import Node
 
+from ...errors import DataError
+from .logging import RateLimitedLogger, Trace, one_line
+
+# Messages that a node refuses: counted by kind, logged, and shown in the diagnostics.
+
+# Names in a message may have any length, and error messages go into log and diagnostics.
+MAX_LENGTH = 500
+TOO_LARGE = 'too large'
+# Parameters that limit the bytes of a message, by the item in it.
+_LIMITS = {'frame': 'max_points', 'image': 'max_image_megapixels'}
+
+
+class Refused(DataError):
+    """Reason why a message is refused, and its kind, by which refusals are counted."""
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message if len(message) <= MAX_LENGTH else f'{message[:MAX_LENGTH]}...')
+        self.kind = kind
+
+
+class RefusalLog:
+    """Counts the refused messages of one input and logs the reasons.
+
+    Attributes
+    ----------
+    counts : Counter
+        Refused messages by kind.
+    failures : int
+        Messages lost by an unexpected exception, that is, by a bug.
+    last_fault : str
+        The last reason; empty before the first.
+    """
+
+    def __init__(self, item: str, logger: RateLimitedLogger) -> None:
+        self._item = item
+        self._logger = logger
+        self.counts: Counter[str] = Counter()
+        self.failures = 0
+        self.last_fault = ''
+        self._last_failure = ''
+
+    @property
+    def total(self) -> int:
+        """Number of refused messages."""
+        return self.counts.total()
+
+    def refuse(self, error: DataError) -> None:
+        """Count a refused message and log the reason."""
+        self.counts[getattr(error, 'kind', 'invalid')] += 1
+        self.last_fault = str(error)
+        self._logger.warning(f'{self._item} refused: {error}')
+
+    def refuse_undecodable(self, topic: str) -> None:
+        """Count a message that cannot be decoded, on the topic <fluoroscope>/<...>."""
+        fluoroscope = topic.partition('/')[0]
+        self.refuse(
+            Refused(
+                'undecodable',
+                f'fluoroscope {fluoroscope}: a message on {topic} cannot be decoded',
+            )
+        )
+
+    def refuse_too_large(self, topic: str, size: int) -> None:
+        """Count a message of so many bytes, more than are read, on <fluoroscope>/<...>."""
+        fluoroscope = topic.partition('/')[0]
+        self.refuse(
+            Refused(
+                TOO_LARGE,
+                f'fluoroscope {fluoroscope}: a message on {topic} has {size} bytes, more than '
+                f'the parameter {_LIMITS[self._item]} allows',
+            )
+        )
+
+    def note(self, text: str) -> None:
+        """Log a fault that does not lead to a refusal."""
+        self.last_fault = text
+        self._logger.warning(text)
+
+    def fail(self, topic: str, error: Exception) -> None:
+        """Count a message on a topic that was lost by an unexpected exception, and log it."""
+        self.failures += 1
+        self._last_failure = f'topic {topic}: {type(error).__name__}: {one_line(error)}'
+        self.last_fault = self._last_failure
+        trace = ''.join(traceback.format_exception(error))
+        self._logger.error(
+            Trace(f'{self._item} lost by an internal error, topic {topic}\n{trace}')
+        )
+
+    def values(self, kinds: Iterable[str]) -> dict[str, object]:
+        """Return the counts for the diagnostics."""
+        return {
+            f'{self._item}s refused': self.total,
+            **{f'refused: {kind}': self.counts[kind] for kind in kinds},
+            f'{self._item}s lost by internal errors': self.failures,
+        }
+
+    def failure(self) -> str:
+        """Return a message where messages were lost by internal errors, else ''."""
+        count = self.failures
+        lost = f'{count} {self._item}s lost by internal errors: {self._last_failure}'
+        return lost if count else ''
+
+    def refusal(self) -> str:
+        """Return a message where messages were refused, else ''."""
+        return f'{self.total} {self._item}s refused: {self.last_fault}' if self.total else ''
+
+
+# Detection of a stream that has stopped.
+
+MIN_RATE_HZ = 5.0  # of a stream; exposures that are taken one by one are slower
+MAX_SILENCE_S = 0.9  # diagnostics ask every second, so a stop is told within two
+
+
+class StallDetector:
+    """Tells from the count of received frames that a stream has stopped.
+
+    now: returns the time [s], by default of the monotonic clock.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        self._count = 0
+        self._changed_at = now()
+        self._rate_hz = 0.0
+
+    def message(self, count: int) -> str:
+        """Return a message where the stream has stopped, else ''; to be called periodically.
+
+        count: frames received up to now.
+        """
+        now = self._now()
+        elapsed = now - self._changed_at
+        if count != self._count:
+            self._rate_hz = max(count - self._count, 0) / max(elapsed, 1e-3)
+            self._count = count
+            self._changed_at = now
+            return ''
+        if self._rate_hz < MIN_RATE_HZ or elapsed < MAX_SILENCE_S:
+            return ''
+        return f'no frame for {elapsed:.0f} s; before, there were {self._rate_hz:.0f} a second'
+
+
 OK = DiagnosticStatus.OK
 WARN = DiagnosticStatus.WARN
 ERROR = DiagnosticStatus.ERROR
+
+State = TypeVar('State')
+
+
+class Health(NamedTuple):
+    """Level (OK, WARN or ERROR) and message of a Status."""
+
+    level: bytes
+    message: str
+
+    def with_consequence(self, text: str) -> Health:
+        """Return the same with what follows from it."""
+        return self._replace(message=f'{self.message}; {text}')
+
+
+def warning(message: str) -> Health | None:
+    """Return a WARN, None for an empty message."""
+    return Health(WARN, message) if message else None
+
+
+def fault(message: str) -> Health | None:
+    """Return an ERROR, None for an empty message."""
+    return Health(ERROR, message) if message else None
+
+
+# Returns what is to be said about a state, None where the condition does not hold.
+Condition: TypeAlias = Callable[[State], Health | None]
+
+
+def health_of(state: State, conditions: Iterable[Condition[State]]) -> Health:
+    """Return what the first condition that holds says: the gravest comes first, OK last.
+
+    Those behind it are not evaluated.
+    """
+    return next(health for condition in conditions if (health := condition(state)) is not None)
 
 
 @dataclass(frozen=True)

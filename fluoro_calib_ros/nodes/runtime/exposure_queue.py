@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict, deque
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable, Mapping
 from typing import Generic, TypeVar
 
 T = TypeVar('T')
@@ -43,32 +43,22 @@ class ExposureQueue(Generic[T]):
             self._changed.notify_all()
             return lost
 
-    def get(self, fluoroscope: str) -> T | None:
-        """Wait for the next item of a fluoroscope; None once the queue is closed."""
-        waiting = self._waiting[fluoroscope]
-        with self._changed:
-            self._changed.wait_for(lambda: self._closed or waiting)
-            if self._closed:
-                return None
-            number, item = waiting.popitem(last=False)
-            self._begun.append(number)
-            return item
-
-    def get_exposure(self, patience_s: float) -> tuple[int, dict[str, T]] | None:
+    def get(
+        self, fluoroscopes: Collection[str], patience_s: float = 0.0
+    ) -> tuple[int, dict[str, T]] | None:
         """Wait for the items of an exposure, the lowest number that waits; None once it is closed.
 
-        Items of other fluoroscopes are waited for while they may still come, at most so long.
+        Items of the other fluoroscopes are waited for while they may still come, at most so long.
         """
+        views = {name: self._waiting[name] for name in fluoroscopes}
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or any(self._waiting.values()))
-            self._changed.wait_for(self._is_complete, patience_s)
+            self._changed.wait_for(lambda: self._closed or any(views.values()))
+            self._changed.wait_for(lambda: self._closed or _is_complete(views), patience_s)
             if self._closed:
                 return None
-            number = self._lowest()
+            number = _lowest(views)
             self._begun.append(number)
-            return number, {
-                name: items.pop(number) for name, items in self._waiting.items() if number in items
-            }
+            return number, {n: items.pop(number) for n, items in views.items() if number in items}
 
     @property
     def closed(self) -> bool:
@@ -85,20 +75,6 @@ class ExposureQueue(Generic[T]):
             self._closed = True
             self._changed.notify_all()
 
-    def _lowest(self) -> int:
-        """Return the lowest number that waits."""
-        return min(number for items in self._waiting.values() for number in items)
-
-    def _is_complete(self) -> bool:
-        """Return whether the lowest exposure that waits has all items that it will have."""
-        if self._closed:
-            return True
-        number = self._lowest()
-        # A fluoroscope with a later exposure has lost this one, and one that is an exposure late
-        # is not waited for.
-        overdue = any(number in items and len(items) > 1 for items in self._waiting.values())
-        return overdue or all(number in items or items for items in self._waiting.values())
-
     def _shed_one(self, full: OrderedDict[int, T]) -> list[str]:
         """Remove an exposure; returns the fluoroscopes that have lost an item."""
         fresh = [number for number in full if number not in self._begun]
@@ -110,3 +86,17 @@ class ExposureQueue(Generic[T]):
         for name in lost:
             del self._waiting[name][fresh[0]]
         return lost
+
+
+def _lowest(views: Mapping[str, Mapping[int, object]]) -> int:
+    """Return the lowest number that waits."""
+    return min(number for items in views.values() for number in items)
+
+
+def _is_complete(views: Mapping[str, Mapping[int, object]]) -> bool:
+    """Return whether the lowest exposure that waits has all items that it will have."""
+    number = _lowest(views)
+    # A fluoroscope with a later exposure has lost this one, and one that is an exposure late is
+    # not waited for.
+    overdue = any(number in items and len(items) > 1 for items in views.values())
+    return overdue or all(number in items or items for items in views.values())

@@ -5,25 +5,74 @@
 
 from __future__ import annotations
 
+import inspect
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack
 from typing import Any, TypeVar
 
 import rclpy
+from rcl_interfaces.msg import SetParametersResult
+from rcl_interfaces.srv import SetParameters, SetParametersAtomically
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.lifecycle.node import LifecycleState
+from rclpy.node import Node
 from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
+from rclpy.service import Service
 
-from .diagnostics import DiagnosticsPublisher, Status
-from .discovery import best_effort_message
-from .errors import USER_ERRORS, StartError, one_line
-from .logging import RateLimitedLogger, Trace
+from .diagnostics import DiagnosticsPublisher, RefusalLog, Status
+from .logging import USER_ERRORS, RateLimitedLogger, StartError, Trace, one_line
 from .parameters import ParameterNode
-from .qos import qos_overrides
-from .refusals import RefusalLog
-from .stream_reader import FaultHandlers, StreamReader
+from .streams import FaultHandlers, StreamReader, best_effort_message, qos_overrides
+
+# Services that answer a request that cannot be handled, instead of ending the node.
+#
+# rclpy raises from its own services where a transition does not fit the state of a managed node,
+# and where a parameter has an unknown type. Without a guard one such request of any peer ends the
+# node.
+
+Callback = Callable[[Any, Any], Any]
+
+
+def guard_services(node: Node, services: Iterable[Service]) -> None:
+    """Let services of a node refuse the requests at which their callbacks raise."""
+    for service in services:
+        service.callback = _guarded(node, service.srv_name, service.callback)
+
+
+def _guarded(node: Node, name: str, callback: Callback) -> Callback:
+    def refused(request: Any, response: Any, error: Exception) -> Any:
+        reason = one_line(error)
+        node.get_logger().error(f'service {name}: request refused: {reason}')
+        return _refusal_of(request, type(response)(), reason)
+
+    def guarded(request: Any, response: Any) -> Any:
+        try:
+            return callback(request, response)
+        except Exception as error:  # a request may contain anything
+            return refused(request, response, error)
+
+    async def guarded_coroutine(request: Any, response: Any) -> Any:
+        try:
+            return await callback(request, response)
+        except Exception as error:
+            return refused(request, response, error)
+
+    return guarded_coroutine if inspect.iscoroutinefunction(callback) else guarded
+
+
+def _refusal_of(request: Any, response: Any, reason: str) -> Any:
+    """Return the response that says that nothing was done; its flags are false by default."""
+    refusal = SetParametersResult(successful=False, reason=reason)
+    if isinstance(request, SetParameters.Request):
+        response.results = [refusal] * len(request.parameters)
+    elif isinstance(request, SetParametersAtomically.Request):
+        response.result = refusal
+    elif hasattr(response, 'message'):
+        response.message = reason
+    return response
+
 
 T = TypeVar('T')
 

@@ -9,10 +9,29 @@ import os
 import time
 from typing import Any, TypeAlias
 
+from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.impl import rcutils_logger
 from rclpy.impl.rcutils_logger import RcutilsLogger
 
-from ...errors import printable, shortened
+from ...errors import DataError, printable, shortened
+
+# Errors that a user can cause, as opposed to bugs.
+
+MAX_LENGTH = 1000  # of an error message in one line
+
+
+class StartError(RuntimeError):
+    """Reason why a node cannot start, in one sentence."""
+
+
+# Raised for invalid names, parameters and QoS overrides; rclpy's RCLError is a RuntimeError.
+USER_ERRORS = (ParameterException, NameValidationException, RuntimeError, DataError)
+
+
+def one_line(error: BaseException) -> str:
+    """Return the message of an exception in one line, or its type where it has none."""
+    return printable(' '.join(str(error).split())[:MAX_LENGTH]) or type(error).__name__
+
 
 MAX_LINE = 4000  # characters
 MAX_TRACE = 20_000

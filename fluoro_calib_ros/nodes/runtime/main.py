@@ -25,12 +25,10 @@ from rclpy.node import Node
 from rclpy.signals import SignalHandlerOptions
 
 from ...errors import DataError
-from ...files.access import check_regular_file
-from .errors import USER_ERRORS, StartError, one_line
-from .guard import guard_services
-from .logging import log_line
-from .node_help import asks_for_help, help_text
-from .parameters import unknown_parameters
+from ...io.access import check_regular_file
+from .lifecycle import guard_services
+from .logging import USER_ERRORS, StartError, log_line, one_line
+from .parameters import asks_for_help, help_text, unknown_parameters
 
 MAX_FAILURES = 100  # of callbacks within a second: nothing else works
 INTERRUPTED = 130  # exit status after a second interrupt
@@ -71,7 +69,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
         executor.add_node(node)
         for sentence in unknown_parameters(node):
             node.get_logger().warning(sentence)
-        guard_services(node)
+        guard_services(node, node.services)
         getattr(node, 'bring_up', lambda: None)()
         try:
             _spin(executor, node, ended)

@@ -11,7 +11,7 @@ import unittest
 import launch_testing
 from shipped import BAGS, DEADLINE, FOLDER, rig
 
-from fluoro_calib_ros.bags.reader import read_frames
+from fluoro_calib_ros.io.bags.reader import read_frames
 
 TOPICS = [f'/launched/{name}/target_observations' for name in 'ab']
 

@@ -1,4 +1,0 @@
-# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
-
-"""Bags: MCAP as rosbag2 (Jazzy) writes it, written and read without ROS."""

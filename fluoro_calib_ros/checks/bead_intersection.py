@@ -1,0 +1,314 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Beads intersected from the images alone, compared with their survey."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..estimation.result import CalibrationResult
+from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
+from ..photogrammetry.collinearity import project_with_jacobian
+from ..photogrammetry.noise import INLIER_Q
+from ..photogrammetry.rotations import matrix_from_quaternion
+
+MIN_VIEWS = 3  # that agree: with fewer, a false match could pass for a displaced bead
+STEPS_L1 = 12  # of least absolute lengths
+STEPS_L2 = 6  # of least squares
+MAX_SD_MM = 2.0  # of a bead that counts
+DAMPING = 1e-9  # [1/mm^2]: a bead that is seen once stays where it is along its ray
+
+
+@dataclass(frozen=True)
+class Beads:
+    """Beads intersected from images, and their survey.
+
+    Attributes
+    ----------
+    target_id : (n,) ndarray of int
+    xyz_mm : (n, 3) ndarray
+    covariance : (n, 3, 3) ndarray
+        [mm^2]
+    views : (n,) ndarray of int
+        Number of image points that agree.
+    survey_mm : (n, 3) ndarray
+    survey_sd_mm : (n,) ndarray
+    """
+
+    target_id: NDArray[np.int64]
+    xyz_mm: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    views: NDArray[np.int64]
+    survey_mm: NDArray[np.float64]
+    survey_sd_mm: NDArray[np.float64]
+
+    def without(self, target_id: np.ndarray) -> Beads:
+        """Return the beads except those with a target id."""
+        keep = ~np.isin(self.target_id, target_id)
+        return Beads(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+    @property
+    def misclosure(self) -> np.ndarray:
+        """Images - survey (n, 3) [mm]."""
+        return self.xyz_mm - self.survey_mm
+
+    @property
+    def total_covariance(self) -> np.ndarray:
+        """Covariance (n, 3, 3) of the misclosures, of images and survey together [mm^2]."""
+        return self.covariance + self.survey_sd_mm[:, None, None] ** 2 * np.eye(3)
+
+    @property
+    def chi2(self) -> NDArray[np.float64]:
+        """Squared misclosures (n,), weighted with their covariance; expected: 3."""
+        weight = np.linalg.inv(self.total_covariance)
+        return np.einsum('na,nab,nb->n', self.misclosure, weight, self.misclosure)
+
+
+@dataclass(frozen=True)
+class DistanceComparison:
+    """Distances between beads compared with the survey.
+
+    Attributes
+    ----------
+    rmse_mm, expected_mm : float
+        RMS difference from the survey, and its expectation [mm].
+    freedom : float
+        Degrees of freedom of the chi-square distribution that the squared RMS difference has,
+        nearly.
+    scale, scale_sd : float
+        Scale of the images relative to the survey - 1, and its standard deviation.
+    """
+
+    rmse_mm: float
+    expected_mm: float
+    freedom: float
+    scale: float
+    scale_sd: float
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Image points with the orientation of their exposure.
+
+    Attributes
+    ----------
+    rotation : (n, 3, 3) ndarray
+    position_mm : (n, 3) ndarray
+    interior : (n, 3) ndarray
+        xp, yp, c [px].
+    uv : (n, 2) ndarray
+        Corrected [px].
+    variance : (n,) ndarray
+        Of a coordinate, of observation and correction together [px^2].
+    target_id : (n,) ndarray of int
+    """
+
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
+    interior: NDArray[np.float64]
+    uv: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    target_id: NDArray[np.int64]
+
+
+def intersect(
+    job: CalibrationResult, frames: Mapping[str, Sequence[Frame]], phantom: Phantom
+) -> Beads:
+    """Intersect the beads of an adjustment from the images of all its fluoroscopes.
+
+    The survey only takes part through the orientations, which depend on all beads together. The
+    intersection is robust: least absolute lengths first, then least squares of the image points
+    that agree.
+    """
+    rays = _rays(job, frames)
+    target_id, bead = np.unique(rays.target_id, return_inverse=True)
+    start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target_id)]
+    return _beads(rays, target_id, bead, start, phantom)
+
+
+def least_chi2_without_a_ray(
+    job: CalibrationResult,
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    target_id: NDArray[np.int64],
+) -> NDArray[np.float64]:
+    """Smallest squared misclosures (n,) of beads with any one of their rays excluded.
+
+    A false match that agrees with the other rays by chance displaces a bead; without it the bead
+    is in place. Zero where too few rays are left.
+
+    Parameters
+    ----------
+    job, frames, phantom
+        As in `intersect`.
+    target_id : (n,) ndarray of int
+        Beads.
+
+    Returns
+    -------
+    (n,) ndarray
+    """
+    rays = _rays(job, frames)
+    out = np.zeros(len(target_id))
+    for number, target in enumerate(target_id):
+        own = np.flatnonzero(rays.target_id == target)
+        count = len(own)
+        # One copy of the bead for each ray that it lacks.
+        copy, used = np.nonzero(~np.eye(count, dtype=bool))
+        part = Rays(*(getattr(rays, name)[own[used]] for name in rays.__dataclass_fields__))
+        start = job.targets.xyz_mm[np.searchsorted(job.targets.target_id, target)]
+        ids = np.full(count, target)
+        found = _beads(part, ids, copy, np.tile(start, (count, 1)), phantom)
+        if len(found.target_id) == count:
+            out[number] = found.chi2.min()
+    return out
+
+
+def _beads(
+    rays: Rays, target_id: np.ndarray, bead: np.ndarray, start: np.ndarray, phantom: Phantom
+) -> Beads:
+    """Intersect beads from rays.
+
+    Parameters
+    ----------
+    rays : Rays
+    target_id : (n,) ndarray of int
+    bead : (N,) ndarray of int
+        Row of the bead of each ray.
+    start : (n, 3) ndarray
+        Start values [mm].
+    phantom : Phantom
+
+    Returns
+    -------
+    Beads
+        Those that are well determined.
+    """
+    points = start.copy()
+    for step in range(STEPS_L1 + STEPS_L2):
+        ideal, _, d_point, _ = project_with_jacobian(
+            rays.rotation, rays.position_mm, points[bead], rays.interior
+        )
+        r = rays.uv - ideal
+        q = np.nan_to_num(np.sum(r * r, axis=1) / rays.variance, nan=np.inf)
+        agree = q <= INLIER_Q
+        weight = 1 / np.sqrt(np.maximum(q, 1.0)) if step < STEPS_L1 else agree
+        weight = weight / rays.variance
+        normal = np.zeros((len(points), 3, 3))
+        right = np.zeros((len(points), 3))
+        np.add.at(normal, bead, weight[:, None, None] * (d_point.transpose(0, 2, 1) @ d_point))
+        np.add.at(
+            right, bead, weight[:, None] * np.einsum('nia,ni->na', d_point, np.nan_to_num(r))
+        )
+        normal += DAMPING * np.eye(3)
+        points = points + np.linalg.solve(normal, right[..., None])[..., 0]
+    covariance = np.asarray(np.linalg.inv(normal), dtype=np.float64)
+    views = np.bincount(bead, agree, len(points)).astype(int)
+    seen = np.bincount(bead, minlength=len(points))
+    valid = (views >= MIN_VIEWS) & (2 * views > seen)
+    valid &= np.sqrt(np.trace(covariance, axis1=1, axis2=2)) < MAX_SD_MM
+    row = phantom.index(target_id[valid])
+    return Beads(
+        target_id[valid],
+        points[valid],
+        covariance=covariance[valid],
+        views=views[valid],
+        survey_mm=phantom.xyz_mm[row],
+        survey_sd_mm=phantom.sd_mm[row],
+    )
+
+
+def distances(beads: Beads) -> DistanceComparison:
+    """Compare the distances between all pairs of two or more beads with the survey."""
+    i, j = np.triu_indices(len(beads.target_id), 1)
+    found = beads.xyz_mm[j] - beads.xyz_mm[i]
+    surveyed = beads.survey_mm[j] - beads.survey_mm[i]
+    length = np.linalg.norm(surveyed, axis=1)
+    direction = surveyed / np.maximum(length, 1e-9)[:, None]
+    total = beads.total_covariance
+    variance = np.stack([_variance_along(direction, total[k]) for k in (i, j)])
+    error = np.linalg.norm(found, axis=1) - length
+    scale, scale_sd = _scale(beads)
+    return DistanceComparison(
+        float(np.sqrt(np.mean(error**2))),
+        float(np.sqrt(np.mean(variance.sum(axis=0)))),
+        _degrees_of_freedom(direction, total, variance),
+        scale,
+        scale_sd,
+    )
+
+
+def _degrees_of_freedom(
+    direction: np.ndarray, covariance: np.ndarray, variance: np.ndarray
+) -> float:
+    """Return those of the sum of squared errors of all distances between n beads.
+
+    It is a quadratic form e^T A e of the errors e of the beads, with covariance C, and distributed
+    nearly as chi-square with (tr AC)^2 / tr (AC)^2 degrees of freedom (Box, "Some theorems on
+    quadratic forms", Annals of Mathematical Statistics 25, 1954). A has the blocks -d d^T for
+    directions d (n (n - 1) / 2, 3) of distances, as numpy.triu_indices orders them, and their sums
+    in the diagonal. covariance (n, 3, 3); variance (2, n (n - 1) / 2): d^T C d of both beads.
+    """
+    diagonal = np.zeros_like(covariance)
+    products = direction[:, :, None] * direction[:, None, :]
+    for index in np.triu_indices(len(covariance), 1):
+        np.add.at(diagonal, index, products)
+    own = diagonal @ covariance
+    squares = 2 * np.sum(variance[0] * variance[1]) + np.sum(own * own.transpose(0, 2, 1))
+    return float(np.sum(variance) ** 2 / squares)
+
+
+def _rays(job: CalibrationResult, frames: Mapping[str, Sequence[Frame]]) -> Rays:
+    """Return the image points of all exposures of an adjustment."""
+    parts = []
+    for name, figures in job.fluoroscopes.items():
+        calibration = job.calibrations[name]
+        by_number = {frame.number: frame.sorted() for frame in frames[name]}
+        for e in figures.exposures:
+            frame = by_number[e.exposure]
+            n = len(frame.target_id)
+            correction = calibration.correction(frame.uv, frame.angle)
+            sigma = calibration.image_sd_at(frame.uv)
+            if frame.sigma is not None:
+                sigma = calibration.sigma0 * frame.sigma
+            parts.append(
+                (
+                    np.broadcast_to(matrix_from_quaternion(e.quaternion_wxyz), (n, 3, 3)),
+                    np.broadcast_to(e.position_mm, (n, 3)),
+                    np.broadcast_to(figures.interior, (n, 3)),
+                    frame.uv - correction.duv,
+                    sigma**2 + correction.sd**2,
+                    frame.target_id,
+                )
+            )
+    return Rays(*(np.concatenate(column) for column in zip(*parts)))
+
+
+def _variance_along(direction: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return the variances (n,) along directions (n, 3) of covariances (n, 3, 3)."""
+    return np.einsum('na,nab,nb->n', direction, covariance, direction)
+
+
+def _scale(beads: Beads) -> tuple[float, float]:
+    """Return the scale - 1 of the similarity from survey to images, and its standard deviation."""
+    x = beads.survey_mm - beads.survey_mm.mean(axis=0)
+    design = np.zeros((len(x), 3, 7))
+    design[:, :, :3] = np.eye(3)  # translation
+    design[:, 0, 4] = x[:, 2]  # rotation
+    design[:, 0, 5] = -x[:, 1]
+    design[:, 1, 3] = -x[:, 2]
+    design[:, 1, 5] = x[:, 0]
+    design[:, 2, 3] = x[:, 1]
+    design[:, 2, 4] = -x[:, 0]
+    design[:, :, 6] = x  # scale
+    information = np.linalg.inv(beads.total_covariance)
+    normal = np.einsum('nai,nab,nbj->ij', design, information, design)
+    right = np.einsum('nai,nab,nb->i', design, information, beads.misclosure)
+    covariance = np.linalg.pinv(normal, hermitian=True)
+    return float((covariance @ right)[6]), float(np.sqrt(covariance[6, 6]))

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What changed between two calibrations of a fluoroscope: the interior orientation and the field.
+
+The corrections of two calibrations may differ by what shifts, turns and scales the image: their
+interior and exterior orientations absorb it (the gauge). What is left is compared with the
+standard deviations of both, which are taken as independent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.special import chdtri
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration, at_common_angle
+from ..errors import DataError
+from ..estimation.gauge import gauge_basis
+from ..exposures.columns import cells_of
+
+# Comparison of two independent calibrations of one fluoroscope, and names of image areas.
+#
+# The comparison is the cross-validation of mrcal (D. Kogan, mrcal documentation, "A tour of
+# mrcal: cross-validation"): two calibrations that share no exposure predict the same, except for
+# what the orientation absorbs and for their noise.
+
+GRID = 24  # points across the image at which predictions are compared
+MIN_POINTS = 20  # of the grid inside both calibrated areas
+MIN_SD_PX = 1e-3  # of a prediction: a model without uncertainty would cause a division by 0
+
+
+@dataclass(frozen=True)
+class FieldDifference:
+    """Difference of the predictions of two calibrations.
+
+    Attributes
+    ----------
+    uv : (n, 2) ndarray
+        Observed pixels.
+    duv : (n, 2) ndarray
+        Difference [px], without what orientations absorb.
+    sd : (n,) ndarray
+        Its predicted standard deviation [px].
+    """
+
+    uv: NDArray[np.float64]
+    duv: NDArray[np.float64]
+    sd: NDArray[np.float64]
+
+    @property
+    def normalised(self) -> float:
+        """RMS of the differences divided by their predicted standard deviations; expected: 1."""
+        return float(np.sqrt(np.mean(np.sum(self.duv**2, axis=1) / (2 * self.sd**2))))
+
+    @property
+    def rms_px(self) -> float:
+        """RMS of a coordinate of the differences [px]."""
+        return float(np.sqrt(np.mean(self.duv**2)))
+
+    @property
+    def worst(self) -> NDArray[np.float64]:
+        """Pixel (2,) with the largest difference divided by its standard deviation."""
+        return self.uv[np.argmax(np.linalg.norm(self.duv, axis=1) / self.sd)]
+
+
+def image_grid(image_size: tuple[int, int]) -> np.ndarray:
+    """Return pixels (GRID^2, 2), evenly spaced over an image (width, height)."""
+    u, v = ((np.arange(GRID) + 0.5) / GRID * size - 0.5 for size in image_size)
+    return np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+
+
+def orientation_fields(xy: ArrayLike) -> NDArray[np.float64]:
+    """Return the displacements (2n, 6) of points xy (n, 2) that orientations absorb.
+
+    Coordinates are in units of the principal distance. The columns are a shift of the image in
+    both directions, its scale, its rotation, and its tilt about both axes (the linearised
+    projective map of a rotated sensor).
+    """
+    x, y = np.asarray(xy, dtype=float).T
+    one = np.ones_like(x)
+    zero = np.zeros_like(x)
+    u = np.stack([one, zero, x, -y, x * x, x * y], axis=1)
+    v = np.stack([zero, one, y, x, x * y, y * y], axis=1)
+    return np.stack([u, v], axis=1).reshape(-1, 6)
+
+
+def difference(
+    one: FluoroscopeCalibration, other: FluoroscopeCalibration
+) -> FieldDifference | None:
+    """Compare what two calibrations predict in the area that both cover.
+
+    An observed pixel u stands for the ray (u - du - (xp, yp)) / c. The rays are compared, as
+    pixels at the mean principal distance, after the best combination of `orientation_fields` is
+    removed. Returns None for an area that is too small.
+    """
+    grid = image_grid(one.image_size)
+    corrections = at_common_angle(grid, one, other)
+    both = ~(corrections[0].outside | corrections[1].outside)
+    if both.sum() < MIN_POINTS:
+        return None
+    uv = grid[both]
+    rays = [
+        (uv - correction.duv[both] - calibration.interior[:2]) / calibration.interior[2]
+        for calibration, correction in zip((one, other), corrections)
+    ]
+    c_mean = (one.interior[2] + other.interior[2]) / 2
+    variance = sum(correction.sd[both] ** 2 for correction in corrections)
+    sd = np.maximum(np.sqrt(variance), MIN_SD_PX)
+    offset = c_mean * (rays[0] - rays[1])
+    basis = orientation_fields((rays[0] + rays[1]) / 2)
+    weight = 1 / np.repeat(sd, 2)
+    fit, *_ = np.linalg.lstsq(basis * weight[:, None], offset.ravel() * weight, rcond=None)
+    return FieldDifference(uv, offset - (basis @ fit).reshape(-1, 2), sd)
+
+
+def place_name(uv: ArrayLike, image_size: tuple[int, int]) -> str:
+    """Return the ninth of the image with a pixel (2,): 'upper left', ..., 'lower right'."""
+    column, row = cells_of(uv, image_size, 3)
+    across = ('left', 'middle', 'right')[column]
+    down = ('upper', 'middle', 'lower')[row]
+    return 'middle' if across == down else f'{down} {across}'
+
+
+def describe_place(uv: ArrayLike, image_size: tuple[int, int]) -> str:
+    """Return a pixel (2,) in words and numbers."""
+    u, v = np.asarray(uv)
+    return f'the {place_name(uv, image_size)} of the image (about u {u:.0f}, v {v:.0f})'
+
+
+CELLS = 64  # along the longer side of the image
+LEVEL = 0.99
+MIN_COMMON = 20  # cells that both calibrations cover
+# Of the area: this much differs at the level by chance, doubled for the cells' correlation.
+CHANCE = 2 * (1 - LEVEL)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Difference of two calibrations of a fluoroscope, the second minus the first.
+
+    Attributes
+    ----------
+    fluoroscope : str
+    image_size : (int, int)
+    interior, interior_sd : (3,) ndarray
+        Difference of xp, yp, c [px] and its standard deviation.
+    interior_test, interior_limit : float
+        Weighted square sum of the difference, and its 99 % quantile; NaN where both were fixed.
+    uv : (n, 2) ndarray
+        Pixels that both calibrations cover.
+    duv : (n, 2) ndarray
+        Difference of the corrections there, without gauge [px].
+    sd : (n,) ndarray
+        Its standard deviation in each coordinate [px].
+    """
+
+    fluoroscope: str
+    image_size: tuple[int, int]
+    interior: NDArray[np.float64]
+    interior_sd: NDArray[np.float64]
+    interior_test: float
+    interior_limit: float
+    uv: NDArray[np.float64]
+    duv: NDArray[np.float64]
+    sd: NDArray[np.float64]
+
+    @property
+    def size(self) -> NDArray[np.float64]:
+        """Lengths (n,) of the differences [px]."""
+        return np.hypot(*self.duv.T)
+
+    @property
+    def significant(self) -> np.ndarray:
+        """Whether (n,) a difference exceeds its 99 % quantile."""
+        return self.size**2 > chdtri(2, 1 - LEVEL) * self.sd**2
+
+    @property
+    def rms_px(self) -> float:
+        """RMS of the differences, of both coordinates together [px]."""
+        return float(np.sqrt(np.mean(self.size**2)))
+
+    @property
+    def largest(self) -> tuple[float, tuple[float, float]]:
+        """The largest difference [px], and its pixel."""
+        index = int(np.argmax(self.size))
+        u, v = self.uv[index].tolist()
+        return float(self.size[index]), (u, v)
+
+    @property
+    def field_changed(self) -> bool:
+        """Whether the field differs in more of the image than by chance."""
+        return bool(self.significant.mean() > CHANCE)
+
+    @property
+    def interior_changed(self) -> bool:
+        """Whether the interior orientation differs significantly."""
+        return bool(self.interior_test > self.interior_limit)
+
+
+def compare_calibrations(
+    first: FluoroscopeCalibration, second: FluoroscopeCalibration
+) -> Comparison:
+    """Compare two calibrations of a fluoroscope.
+
+    Raises DataError for different image sizes, and for calibrated areas that hardly overlap.
+    """
+    name = first.fluoroscope
+    if first.image_size != second.image_size:
+        sizes = [f'{w} x {h} px' for w, h in (first.image_size, second.image_size)]
+        raise DataError(f'fluoroscope {name}: the images are {sizes[0]} and {sizes[1]}')
+    uv = _cells(first.image_size)
+    fields = at_common_angle(uv, first, second)
+    common = ~(fields[0].outside | fields[1].outside)
+    if common.sum() < MIN_COMMON:
+        raise DataError(
+            f'fluoroscope {name}: the calibrated areas have hardly any image in common'
+        )
+    uv = uv[common]
+    duv = fields[1].duv[common] - fields[0].duv[common]
+    sd = np.hypot(fields[0].sd[common], fields[1].sd[common])
+    difference = second.interior - first.interior
+    covariance = first.interior_covariance + second.interior_covariance
+    test, limit = _test(difference, covariance)
+    return Comparison(
+        name,
+        first.image_size,
+        interior=difference,
+        interior_sd=np.sqrt(np.diag(covariance)),
+        interior_test=test,
+        interior_limit=limit,
+        uv=uv,
+        duv=_without_gauge(uv, duv, first.interior),
+        sd=sd,
+    )
+
+
+def _cells(image_size: tuple[int, int]) -> np.ndarray:
+    """Return centres (n, 2) of cells over the image."""
+    step = max(image_size) / CELLS
+    axes = [-0.5 + step / 2 + step * np.arange(max(1, round(size / step))) for size in image_size]
+    u, v = np.meshgrid(*axes)
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
+def _without_gauge(uv: np.ndarray, duv: np.ndarray, interior: np.ndarray) -> np.ndarray:
+    """Return differences (n, 2) without their part in the gauge."""
+    basis = gauge_basis(uv, interior)
+    part, *_ = np.linalg.lstsq(basis.reshape(-1, basis.shape[2]), duv.ravel(), rcond=None)
+    return duv - basis @ part
+
+
+def _test(difference: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:
+    """Return the weighted square sum of a difference (3,) and its limit; NaN without variance."""
+    free = np.diag(covariance) > 0
+    if not free.any():
+        return float('nan'), float('nan')
+    part = difference[free]
+    test = float(part @ np.linalg.solve(covariance[np.ix_(free, free)], part))
+    return test, float(chdtri(int(free.sum()), 1 - LEVEL))

@@ -1,0 +1,295 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Evidence of a drift, and where it is: control charts together with the newest blocks.
+
+Epipolar residuals and distances in clusters each have charts of their own. Both find the area and
+the size of a drift in the same way, and differ in how they tell which fluoroscope it belongs to.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .charts import MIN_INFORMATION, CusumCharts
+from .cluster_watch import COMPONENTS, ClusterBlock
+
+WINDOW_S = 30.0  # newest blocks from which place and size of a drift are estimated
+# Log-likelihood of another fluoroscope, over that of the likeliest one, from which both are named.
+SIMILAR = 0.8
+MIN_CONFIRMATION = 3.0  # standard deviations by which the other clusters must show a drift too
+# Fraction of the systematic standard deviation that distances in an area have in common. Measured:
+# a fifth to two fifths, since their reference is what they were at the start, and beads some
+# centimetres apart have errors of their own.
+COMMON_SYSTEMATIC = 0.5
+REFERENCES = ('calibration', 'start')  # of the charts of epipolar residuals
+EPIPOLAR = 'epipolar'  # source of a drift that residuals show
+SERIES_OF_PAIR = 4  # images a and b against the calibration, then against the start
+
+
+@dataclass(frozen=True)
+class BlockRecord:
+    """One block: time of its begin and statistics (K, A) of the series.
+
+    detail: normals (pairs, 2, A, 2) of the epipolar lines, or a ClusterBlock.
+    """
+
+    begin_ns: int
+    score: np.ndarray
+    information: np.ndarray
+    systematic: np.ndarray
+    detail: Any
+
+
+@dataclass(frozen=True)
+class DriftEstimate:
+    """A drift as the newest blocks show it.
+
+    Attributes
+    ----------
+    fluoroscopes : tuple of str
+        The likeliest one first, then those that are about as likely.
+    area : int
+        Number of the area.
+    size, sd : float
+        Signed size along `direction` and its standard deviation [px].
+    direction : ndarray
+        (2,), unit vector in the image.
+    against : str
+        One of REFERENCES.
+    source : str
+        'epipolar' or 'cluster NAME'.
+    confirmed : bool
+        False where a single cluster shows it, in which a bead may have moved.
+    begin_ns : int
+        Estimated begin.
+    """
+
+    fluoroscopes: tuple[str, ...]
+    area: int
+    size: float
+    sd: float
+    direction: NDArray[np.float64]
+    against: str
+    source: str
+    confirmed: bool
+    begin_ns: int
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """The series and area in which a fluoroscope has most likely drifted."""
+
+    likelihood: float
+    series: int
+    area: int
+
+
+class Evidence(ABC):
+    """Charts of one kind of observations and the newest blocks.
+
+    Parameters
+    ----------
+    charts : CusumCharts
+    fluoroscopes : sequence of str
+    window : int
+        Number of blocks from which a drift is estimated.
+    """
+
+    def __init__(self, charts: CusumCharts, fluoroscopes: Sequence[str], window: int) -> None:
+        self.charts = charts
+        self._names = tuple(fluoroscopes)
+        self._records: deque[BlockRecord] = deque(maxlen=window)
+
+    @property
+    def peak(self) -> float:
+        """Largest evidence of all charts."""
+        return float(self.charts.evidence.max())
+
+    def update(self, record: BlockRecord, band: np.ndarray, testing: np.ndarray) -> None:
+        """Add a block; band and testing (K, A) as in CusumCharts.update."""
+        charts = self.charts
+        charts.update(record.score, record.information, band, testing, record.begin_ns)
+        self._records.append(record)
+
+    def estimate(self, min_evidence: float) -> DriftEstimate:
+        """The drift that is most likely among the charts with at least this evidence."""
+        charts = self.charts
+        candidates = charts.evidence >= min_evidence
+        likelihood = self._preferred(np.where(candidates, charts.log_likelihood(), -1))
+        peak = np.unravel_index(np.argmax(likelihood), likelihood.shape)
+        chart = int(peak[1])
+        begin, run = self._run(chart, int(peak[2]), int(charts.begin[peak]))
+        score = np.asarray(sum(record.score for record in run))
+        information = np.asarray(sum(record.information for record in run))
+        factor = float(np.median(charts.variance_factor()[chart]))
+        with np.errstate(divide='ignore', invalid='ignore'):
+            size = score / information
+        likelihood = np.nan_to_num(score * size / (2 * factor))
+        names, series, area = self._likeliest(likelihood, chart)
+        systematic = np.nansum(
+            [r.systematic[series, area] * r.information[series, area] for r in run]
+        )
+        total = information[series, area]
+        direction, source, confirmed = self._direction(run, series, area)
+        return DriftEstimate(
+            names,
+            area,
+            size=float(size[series, area]),
+            sd=float(np.hypot(np.sqrt(factor / total), systematic / total)),
+            direction=direction,
+            against=self._reference(series),
+            source=source,
+            confirmed=confirmed,
+            begin_ns=begin,
+        )
+
+    def _run(self, series: int, area: int, begin_ns: int) -> tuple[int, list[BlockRecord]]:
+        """Begin of a drift [ns] and the blocks since: the newest ones of largest likelihood.
+
+        begin_ns, that of the run of the chart, holds where the drift is older than the window.
+        """
+        records = list(self._records)
+        sums = np.cumsum(
+            [[r.score[series, area], r.information[series, area]] for r in reversed(records)],
+            axis=0,
+        )
+        likelihood = sums[:, 0] ** 2 / np.maximum(sums[:, 1], MIN_INFORMATION)
+        first = len(records) - 1 - int(np.argmax(likelihood))
+        begin = records[first].begin_ns
+        return (min(begin_ns, begin) if first == 0 else begin), records[first:]
+
+    def _ranked(self, candidates: dict[str, _Candidate]) -> tuple[tuple[str, ...], int, int]:
+        """Names of the likeliest fluoroscopes, and series and area of the first of them."""
+        order = sorted(candidates, key=lambda name: -candidates[name].likelihood)
+        best = candidates[order[0]]
+        limit = SIMILAR * best.likelihood
+        names = tuple(name for name in order if candidates[name].likelihood >= limit)
+        return names, best.series, best.area
+
+    @abstractmethod
+    def _preferred(self, likelihood: np.ndarray) -> np.ndarray:
+        """The likelihood (2, K, A), -1 for series to which others are preferred."""
+
+    @abstractmethod
+    def _likeliest(self, likelihood: np.ndarray, series: int) -> tuple[tuple[str, ...], int, int]:
+        """Names of the likeliest fluoroscopes, and series and area of the first of them.
+
+        likelihood (K, A); series: that of the largest likelihood.
+        """
+
+    @abstractmethod
+    def _direction(
+        self, run: list[BlockRecord], series: int, area: int
+    ) -> tuple[np.ndarray, str, bool]:
+        """Direction (2,) of a drift, its source, and whether it is confirmed."""
+
+    @abstractmethod
+    def _reference(self, series: int) -> str:
+        """One of REFERENCES."""
+
+
+class EpipolarEvidence(Evidence):
+    """Evidence from epipolar residuals: for each pair of views the four series of a PairBlock."""
+
+    def __init__(self, charts: CusumCharts, fluoroscopes: Sequence[str], window: int) -> None:
+        super().__init__(charts, fluoroscopes, window)
+        self._pairs = list(combinations(self._names, 2))
+
+    def _preferred(self, likelihood: np.ndarray) -> np.ndarray:
+        # Those against the start know the errors of the calibration, so they are sharper.
+        start = np.arange(likelihood.shape[1]) % SERIES_OF_PAIR >= 2
+        if likelihood[:, start].max() >= 0:
+            likelihood[:, ~start] = -1
+        return likelihood
+
+    def _likeliest(self, likelihood: np.ndarray, series: int) -> tuple[tuple[str, ...], int, int]:
+        reference = series % SERIES_OF_PAIR // 2
+        candidates = {}
+        for name in self._names:
+            own = [
+                SERIES_OF_PAIR * number + 2 * reference + pair.index(name)
+                for number, pair in enumerate(self._pairs)
+                if name in pair
+            ]
+            total = likelihood[own].sum(axis=0)
+            area = int(np.argmax(total))
+            best = own[int(np.argmax(likelihood[own, area]))]
+            candidates[name] = _Candidate(float(total[area]), best, area)
+        return self._ranked(candidates)
+
+    def _direction(
+        self, run: list[BlockRecord], series: int, area: int
+    ) -> tuple[np.ndarray, str, bool]:
+        pair = series // SERIES_OF_PAIR
+        normal = sum(record.detail[pair, series % 2, area] for record in run)
+        return normal / max(np.linalg.norm(normal), MIN_INFORMATION), EPIPOLAR, True
+
+    def _reference(self, series: int) -> str:
+        return REFERENCES[series % SERIES_OF_PAIR // 2]
+
+
+class ClusterEvidence(Evidence):
+    """Evidence from distances in clusters: the series are drifts along u and v of each view.
+
+    clusters: their names, in the order of the ClusterBlocks.
+    """
+
+    def __init__(
+        self,
+        charts: CusumCharts,
+        fluoroscopes: Sequence[str],
+        window: int,
+        clusters: Sequence[str],
+    ) -> None:
+        super().__init__(charts, fluoroscopes, window)
+        self._clusters = tuple(clusters)
+
+    def _preferred(self, likelihood: np.ndarray) -> np.ndarray:
+        return likelihood
+
+    def _likeliest(self, likelihood: np.ndarray, series: int) -> tuple[tuple[str, ...], int, int]:
+        candidates = {}
+        for view, name in enumerate(self._names):
+            first = COMPONENTS * view
+            own = likelihood[first : first + COMPONENTS]
+            component, area = np.unravel_index(np.argmax(own), own.shape)
+            value = float(own[component, area])
+            candidates[name] = _Candidate(value, int(first + component), int(area))
+        return self._ranked(candidates)
+
+    def _direction(
+        self, run: list[BlockRecord], series: int, area: int
+    ) -> tuple[np.ndarray, str, bool]:
+        score = sum(record.detail.score[:, series, area] for record in run)
+        information = sum(record.detail.information[:, series, area] for record in run)
+        sign = np.sign(score.sum())
+        significance = sign * score / np.sqrt(np.maximum(information, MIN_INFORMATION))
+        strongest = int(np.argmax(significance))
+        factor = float(np.median(self.charts.variance_factor()[series]))
+        others = np.arange(len(score)) != strongest
+        noise = np.sqrt(max(information[others].sum() * factor, MIN_INFORMATION))
+        confirmed = bool(sign * score[others].sum() / noise > MIN_CONFIRMATION)
+        source = f'cluster {self._clusters[strongest]}'
+        return np.eye(COMPONENTS)[series % COMPONENTS], source, confirmed
+
+    def _reference(self, series: int) -> str:
+        return 'start'
+
+
+def common_systematic(block: ClusterBlock) -> NDArray[np.float64]:
+    """Systematic standard deviations (2F, A) [px] of what all clusters show together.
+
+    It is the weighted mean, times the fraction that they have in common.
+    """
+    with np.errstate(divide='ignore', invalid='ignore'):
+        weighted = np.nansum(block.systematic * block.information, axis=0)
+        return COMMON_SYSTEMATIC * weighted / block.information.sum(axis=0)

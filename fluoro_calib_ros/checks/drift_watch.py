@@ -1,0 +1,349 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The drift watch: tells from ordinary tracked markers that the calibration no longer holds.
+
+A calibration is off by a little from its first day, and the markers see that everywhere: a test of
+'mean zero' would raise an alarm at once. So the mean of the epipolar residuals in an area of an
+image is accepted while it stays within a dead band. There are two: what the calibration's own
+uncertainty allows (against the calibration), and a narrower one of what remains unknown after the
+first seconds of markers have shown the errors of the calibration (against the start). A drift
+along an epipolar line does not show in the residuals; it shows in the distances within rigid
+clusters of beads (see cluster_watch).
+
+The test is a CUSUM in every area (see charts); its thresholds follow from the mean time between
+false alarms that is asked for. The variance comes from the data, from differences of successive
+blocks and from the correlation of a marker's noise in successive frames, and is never taken
+smaller than predicted. This covers noise that markers share, noise larger than expected and noise
+that is correlated in time (measured: up to 0.9 in frames of 120 Hz). Single residuals are clipped
+(Huber, Annals of Mathematical Statistics 35, 1964), and so is what a block can add to a chart.
+
+Not detected: a drift that exists from the start and is within what the calibration claims; along
+the epipolar lines, one without clusters, or one that moves all beads of a cluster alike, as the
+shift of a whole image does; and any drift where there are no markers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import combinations
+
+import numpy as np
+
+from ..findings import Finding, Kind, Place, Severity
+from ..photogrammetry.rig_orientation import RigOrientation
+from .block_clock import BlockClock
+from .charts import EVIDENCE_CAP, CusumCharts, ImageAreas
+from .cluster_watch import CHUNK_S, COMPONENTS, Cluster, ClusterWatch
+from .drift_evidence import (
+    EPIPOLAR,
+    SERIES_OF_PAIR,
+    WINDOW_S,
+    BlockRecord,
+    ClusterEvidence,
+    DriftEstimate,
+    EpipolarEvidence,
+    common_systematic,
+)
+from .drift_observations import EpipolarObservations, PointObservations
+from .drift_options import ERROR, LEVEL_NAMES, OK, WARN, DriftOptions, DriftState
+from .pair_watch import PairWatch
+
+CLUSTER_STEP = 2.0  # times step_px in the charts of the clusters, which have less information
+HYSTERESIS = 0.5  # times the threshold of WARN: an alarm ends below it
+
+
+class DriftWatch:
+    """The drift watch of a rig.
+
+    Parameters
+    ----------
+    image_sizes : mapping of str to tuple of int
+        Width and height of the images by fluoroscope [px], in the order of the orientation.
+    options : DriftOptions, optional
+    clusters : sequence of Cluster
+    orientation : RigOrientation, optional
+        Needed for clusters only.
+
+    Attributes
+    ----------
+    thresholds : tuple of float
+        Evidence at which the levels WARN and ERROR begin.
+    state : DriftState
+
+    Raises
+    ------
+    ValueError
+        For fewer than two fluoroscopes, for clusters without orientation, and as ClusterWatch.
+    """
+
+    def __init__(
+        self,
+        image_sizes: Mapping[str, tuple[int, int]],
+        options: DriftOptions | None = None,
+        clusters: Sequence[Cluster] = (),
+        orientation: RigOrientation | None = None,
+    ) -> None:
+        if len(image_sizes) < 2:
+            raise ValueError(f'a drift watch needs two fluoroscopes, not {len(image_sizes)}')
+        options = options or DriftOptions()
+        self.options = options
+        self._sizes = {name: tuple(size) for name, size in image_sizes.items()}
+        self._names = tuple(self._sizes)
+        self._areas = ImageAreas(int(options.cells))
+        self._pairs = list(combinations(self._names, 2))
+        self._cluster_watch = None
+        if clusters:
+            if orientation is None:
+                raise ValueError('clusters need the orientation of the rig')
+            sizes = list(self._sizes.values())
+            self._cluster_watch = ClusterWatch(clusters, orientation, sizes, self._areas, options)
+        series = SERIES_OF_PAIR * len(self._pairs)
+        if clusters:
+            series += COMPONENTS * len(self._names)
+        charts = 2 * series * len(self._areas)
+        self.thresholds = tuple(
+            float(np.log(charts * hours * 3600 / options.block_s))
+            for hours in (options.warn_interval_h, options.error_interval_h)
+        )
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything, for a new calibration or orientation."""
+        options = self.options
+        cap = EVIDENCE_CAP * self.thresholds[1]
+        areas = len(self._areas)
+        self._watches = [
+            PairWatch([self._sizes[name] for name in pair], self._areas, options)
+            for pair in self._pairs
+        ]
+        window = max(4, round(WINDOW_S / options.block_s))
+        self._epipolar = EpipolarEvidence(
+            CusumCharts(SERIES_OF_PAIR * len(self._pairs), areas, options.step_px, cap),
+            self._names,
+            window,
+        )
+        self._clusters = ClusterEvidence(
+            CusumCharts(COMPONENTS * len(self._names), areas, CLUSTER_STEP * options.step_px, cap),
+            self._names,
+            window,
+            self._cluster_watch.names if self._cluster_watch else (),
+        )
+        self._collected: list[list[EpipolarObservations]] = [[] for _ in self._pairs]
+        self._learned_blocks = [0] * len(self._pairs)
+        self._learned_cluster_blocks = 0
+        self._tested_blocks = 0
+        self._clock = BlockClock(options.block_s)
+        self._observations = 0
+        self._level = OK
+        if self._cluster_watch:
+            self._cluster_watch.clear()
+        self.state = self._present_state()
+
+    @property
+    def watched_s(self) -> float:
+        """Time after the start in which a drift could have been detected somewhere [s]."""
+        return self._tested_blocks * self.options.block_s
+
+    def add_residuals(
+        self, stamp_ns: int, a: str, b: str, observations: EpipolarObservations
+    ) -> DriftState:
+        """Add the epipolar residuals of one pair of frames of fluoroscopes a and b.
+
+        Returns the present state. Raises ValueError for an unknown pair of fluoroscopes.
+        """
+        number, swapped = self._pair_number(a, b)
+        self._advance(stamp_ns)
+        if len(observations):
+            self._collected[number].append(observations.swapped() if swapped else observations)
+        return self.state
+
+    def add_points(self, stamp_ns: int, points: PointObservations) -> DriftState:
+        """Add intersected points for the clusters; without clusters they are ignored.
+
+        Returns the present state. Raises ValueError for points of another number of views.
+        """
+        if len(points.uv) != len(self._names):
+            raise ValueError(
+                f'the points must have pixels of {len(self._names)} views, not {len(points.uv)}'
+            )
+        self._advance(stamp_ns)
+        if self._cluster_watch:
+            self._cluster_watch.add(self._clock.continued_ns(stamp_ns) / 1e9, points)
+        return self.state
+
+    def _pair_number(self, a: str, b: str) -> tuple[int, bool]:
+        """Number of a pair, and whether its fluoroscopes are in the other order."""
+        if (a, b) in self._pairs:
+            return self._pairs.index((a, b)), False
+        if (b, a) in self._pairs:
+            return self._pairs.index((b, a)), True
+        raise ValueError(
+            f'there is no pair of fluoroscopes {a!r} and {b!r}, only of {", ".join(self._names)}'
+        )
+
+    def _advance(self, stamp_ns: int) -> None:
+        """Update the charts with the present block if this stamp is after it, and the state."""
+        ended_ns = self._clock.advance(stamp_ns)
+        if ended_ns is None:
+            return
+        tested = self._close_residuals(ended_ns)
+        tested |= self._close_distances(ended_ns)
+        self._tested_blocks += bool(tested)
+        self.state = self._present_state()
+
+    def _close_residuals(self, begin_ns: int) -> bool:
+        """Update the charts of the residuals; returns whether a drift could be detected."""
+        options = self.options
+        shape = (SERIES_OF_PAIR * len(self._pairs), len(self._areas))
+        score, information, systematic = np.zeros((3, *shape))
+        normals = np.zeros((len(self._pairs), 2, shape[1], 2))
+        record = BlockRecord(begin_ns, score, information, systematic, normals)
+        testing = np.zeros(shape, dtype=bool)
+        seen = []
+        for number, collected in enumerate(self._collected):
+            if not collected:
+                continue
+            self._collected[number] = []
+            observations = EpipolarObservations.concatenate(collected).usable()
+            if not len(observations):
+                continue
+            block = self._watches[number].block(observations)
+            own = slice(SERIES_OF_PAIR * number, SERIES_OF_PAIR * (number + 1))
+            seen.append(number)
+            self._observations += len(observations)
+            record.score[own] = block.score
+            record.information[own] = block.information
+            record.systematic[own] = block.systematic
+            record.detail[number] = block.normals
+            testing[own] = block.enough & self._has_learned(self._learned_blocks[number])
+        if not seen:
+            return False
+        stretch = np.array([watch.stretch() for watch in self._watches])
+        self._epipolar.charts.stretch[:, 0] = np.repeat(stretch, SERIES_OF_PAIR)
+        self._clusters.charts.stretch[:] = stretch.max()
+        bands = np.repeat([options.band_calibration, options.band_start], 2)
+        bands = np.tile(bands, len(self._pairs))[:, None]
+        self._epipolar.update(record, self._dead_band(bands, record.systematic), testing)
+        for number in seen:
+            self._learn(number)
+        return bool(testing.any())
+
+    def _close_distances(self, begin_ns: int) -> bool:
+        """Update the charts of the distances; returns whether a drift could be detected."""
+        watch = self._cluster_watch
+        block = watch.block() if watch else None
+        if watch is None or block is None:
+            return False
+        options = self.options
+        self._observations += block.count
+        enough = block.pairs > 2 * options.block_s / CHUNK_S
+        testing = enough & self._has_learned(self._learned_cluster_blocks)
+        score = block.score.sum(axis=0)
+        information = block.information.sum(axis=0)
+        record = BlockRecord(begin_ns, score, information, common_systematic(block), block)
+        band = self._dead_band(options.band_start, record.systematic)
+        self._clusters.update(record, band, testing)
+        self._learned_cluster_blocks += 1
+        if self._has_learned(self._learned_cluster_blocks):
+            watch.learn()
+        return bool(testing.any())
+
+    def _dead_band(self, factor: float | np.ndarray, systematic: np.ndarray) -> np.ndarray:
+        """Dead bands [px] of a number of systematic standard deviations [px]."""
+        return np.hypot(self.options.tolerance_px, factor * np.nan_to_num(systematic))
+
+    def _has_learned(self, blocks: int) -> bool:
+        """Whether so many blocks cover the start."""
+        return blocks * self.options.block_s >= self.options.learn_s
+
+    def _learn(self, number: int) -> None:
+        """Count a block of the start of a pair; after the last one estimate its error field."""
+        if self._has_learned(self._learned_blocks[number]):
+            return
+        self._learned_blocks[number] += 1
+        if self._has_learned(self._learned_blocks[number]):
+            first = SERIES_OF_PAIR * number
+            factor = self._epipolar.charts.variance_factor()[first : first + 2]
+            self._watches[number].field.estimate(float(np.median(factor)))
+
+    def _is_learning(self) -> bool:
+        """Whether no start has begun yet, or one is still being learned."""
+        counts = [*self._learned_blocks, self._learned_cluster_blocks]
+        begun = [count for count in counts if count]
+        return not begun or not all(self._has_learned(count) for count in begun)
+
+    def _present_state(self) -> DriftState:
+        """State by the charts as they are."""
+        warn, error = self.thresholds
+        strongest = max((self._epipolar, self._clusters), key=lambda evidence: evidence.peak)
+        peak = strongest.peak
+        level: Severity = OK
+        if peak >= error:
+            level = ERROR
+        elif peak >= warn:
+            level = WARN
+        if level < self._level and peak >= HYSTERESIS * warn:
+            level = self._level
+        self._level = level
+        if level != OK:
+            estimate = strongest.estimate(min(peak, warn))
+            return self._drift_state(level, estimate, peak)
+        learning = self._is_learning()
+        if not self._observations:
+            found = Finding(Kind.NO_MARKERS, 'no markers were seen', severity=OK)
+        elif learning:
+            found = Finding(Kind.LEARNING, 'the start is being learned', severity=OK)
+        else:
+            found = Finding(Kind.NO_DRIFT, 'no drift is seen', severity=OK)
+        return DriftState(found, peak, warn, error, self._observations, learning=learning)
+
+    def _drift_state(self, level: Severity, estimate: DriftEstimate, peak: float) -> DriftState:
+        """State of an alarm; peak is the largest evidence."""
+        corners, place = self._areas.describe(estimate.area, self._sizes[estimate.fluoroscopes[0]])
+        since_s = max(self._clock.newest_ns - estimate.begin_ns, 0) / 1e9
+        warn, error = self.thresholds
+        return DriftState(
+            _alarm(level, estimate, place, since_s),
+            peak,
+            warn,
+            error,
+            self._observations,
+            learning=self._is_learning(),
+            fluoroscope=' or '.join(estimate.fluoroscopes),
+            area=corners,
+            place=place,
+            size=abs(estimate.size),
+            sd=estimate.sd,
+            direction=_signed_direction(estimate),
+            against=estimate.against,
+            source=estimate.source,
+            since_s=since_s,
+        )
+
+
+def _signed_direction(estimate: DriftEstimate) -> tuple[float, ...]:
+    """Direction (2,) in which a drift has a positive size."""
+    return tuple(float(x) for x in np.sign(estimate.size) * estimate.direction)
+
+
+def _alarm(level: Severity, estimate: DriftEstimate, place: str, since_s: float) -> Finding:
+    """What an alarm says of a drift."""
+    size = abs(estimate.size)
+    direction = _signed_direction(estimate)
+    seen_in = estimate.source
+    if seen_in == EPIPOLAR:
+        seen_in = 'the epipolar residuals'
+    elif not estimate.confirmed:
+        seen_in += ', in which a bead may have moved, as no other cluster shows it'
+    return Finding(
+        Kind.IMAGE_DRIFT if estimate.confirmed else Kind.CLUSTER_CHANGE,
+        f'{LEVEL_NAMES[level].upper()}: the image of fluoroscope '
+        f'{" or ".join(estimate.fluoroscopes)} has drifted by '
+        f'{size:.2f} px (sd {estimate.sd:.2f}) towards '
+        f'({direction[0]:.1f}, {direction[1]:.1f}), {place}, for {since_s:.1f} s, '
+        f'held against the {estimate.against}; seen in {seen_in}',
+        Place(estimate.fluoroscopes, name=''),
+        severity=level,
+        numbers={'size_px': size, 'sd_px': estimate.sd, 'since_s': since_s},
+    )

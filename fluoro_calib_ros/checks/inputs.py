@@ -1,0 +1,651 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Find input that cannot be right before it is calibrated, and say what is wrong with it.
+
+Each exposure is compared with the phantom by a robust direct linear transformation, which knows
+neither the interior orientation nor the pose and follows a part of the distortion: with the right
+phantom and ids its median residual is a few pixels, also with 40 % false matches or strong
+distortion. Where it is not, the ways in which files are confused are tried in turn: ids that are
+off by one or reversed. A projection matrix of a mirrored image fits as well as the right one, but
+puts all targets behind the source (Hartley and Zisserman, "Multiple View Geometry", 2nd ed., 2004,
+21.1: a reflection changes the sign of the depth).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.series import sd_grid_pixels
+from ..errors import DataError
+from ..estimation.gauge import interior_about
+from ..estimation.options import CalibrationRequest
+from ..estimation.result import CalibrationResult, FluoroscopeResult
+from ..exposures.frame import Frame, validate_frame
+from ..exposures.phantom import Phantom
+from ..findings import Finding, Kind, Place
+from ..photogrammetry.collinearity import project
+from ..photogrammetry.known_orientation import KnownOrientation
+from ..photogrammetry.plane_resection import flatness, plane_of, robust_homography
+from ..photogrammetry.resection import MIN_FLATNESS, decompose, robust_dlt, squared_residuals
+from .mixed_units import DISTANCES_MM, mixed_units
+
+MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
+MIN_TESTED = 20  # targets of a single exposure that is tested
+FIT = 0.004  # median residual over the longer side of the image of ids that are certainly right
+MISFIT = 0.03  # median residual over the longer side of the image from which nothing fits
+BETTER = 0.35  # median residual of other ids over that of the given ones from which they are right
+GOOD_MISFIT = 0.01  # median residual over the longer side of the image of ids that are right
+UNITS_MM = {'cm': 10.0, 'inches': 25.4, 'm': 1000.0}
+MAX_COORDINATE_MM = 1e6
+EXTENT_SHARE = 0.9  # of the targets, within the extent of the phantom
+MAX_EXTENT = 6.0  # distance of a target from the middle over that extent
+MAX_LISTED = 5  # targets in a sentence
+SD_MM = (1e-6, 1e3)  # of surveyed coordinates
+SIGMA_PX = (1e-4, 1e3)  # of image points
+MIN_REACH = 0.6  # of the image points over the image, to the right and down
+MIN_SHARE = 0.5  # of the targets that other ids must have on the phantom
+# Median residual of a known orientation over the longer side of the image from which it is wrong.
+WRONG_ORIENTATION = 0.1
+SAME_PX = 1e-6  # image points of two exposures that agree so closely are copies
+MIN_COMMON = 8  # targets in two exposures that are compared
+COPIED = 0.9  # share of common image points that are the same in a copied exposure
+
+Relabel = Callable[[np.ndarray, Phantom], np.ndarray]
+
+_PHANTOM = Place(name='phantom')
+_MIRRORED = Finding(
+    Kind.IMAGE_MIRRORED,
+    'the image is mirrored: v must run down and u to the right, and neither they nor the axes of '
+    'the phantom may be interchanged',
+)
+_OTHER_PHANTOM = Finding(
+    Kind.OTHER_PHANTOM,
+    'the image points do not fit the phantom: this is another phantom, or the target ids are '
+    'wrong',
+)
+_RIGHT_IDS = 'with the right ones the image points fit the phantom'
+# The ways in which ids are confused, and the ids that are then right.
+CONFUSIONS: tuple[tuple[Finding, Relabel], ...] = (
+    (
+        Finding(
+            Kind.IDS_SHIFTED,
+            f'the target ids are too large by 1: {_RIGHT_IDS}',
+            numbers={'shift': 1},
+        ),
+        lambda ids, phantom: ids - 1,
+    ),
+    (
+        Finding(
+            Kind.IDS_SHIFTED,
+            f'the target ids are too small by 1: {_RIGHT_IDS}',
+            numbers={'shift': -1},
+        ),
+        lambda ids, phantom: ids + 1,
+    ),
+    (
+        Finding(Kind.IDS_REVERSED, f'the target ids run in the opposite order: {_RIGHT_IDS}'),
+        lambda ids, phantom: phantom.target_id[0] + phantom.target_id[-1] - ids,
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well an exposure fits the phantom.
+
+    misfit_px is the median residual of the robust direct linear transformation, depth the sign of
+    the depth of the targets: -1 where they lie behind the source; distance_mm is that of the
+    source from their middle. A plane that is mirrored is one seen from behind, and its distance is
+    unknown.
+    """
+
+    misfit_px: float
+    depth: int
+    distance_mm: float | None
+
+
+def validate_magnitudes(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> None:
+    """Raise DataError for numbers that no measurement has, and that spoil every calculation."""
+    large = np.abs(phantom.xyz_mm).max(axis=1) > MAX_COORDINATE_MM
+    if large.any():
+        target = int(phantom.target_id[large][0])
+        raise DataError(
+            f'the coordinates of target {target} are larger than {MAX_COORDINATE_MM:g} mm',
+            kind=Kind.IMPLAUSIBLE_NUMBER,
+            place=replace(_PHANTOM, target_id=(target,)),
+        )
+    low, high = SD_MM
+    wrong = (phantom.sd_mm < low) | (phantom.sd_mm > high)
+    if wrong.any():
+        target = int(phantom.target_id[wrong][0])
+        sd = float(phantom.sd_mm[wrong][0])
+        raise DataError(
+            f'the standard deviation of target {target} is {sd:g} mm, between {low:g} and '
+            f'{high:g} mm are plausible',
+            kind=Kind.IMPLAUSIBLE_NUMBER,
+            place=replace(_PHANTOM, target_id=(target,)),
+            numbers={'sd_mm': sd},
+        )
+    if np.ptp(phantom.xyz_mm, axis=0).max() <= 0:
+        raise DataError(
+            'all targets have the same coordinates', kind=Kind.REPEATED_COORDINATES, place=_PHANTOM
+        )
+    for frame in (frame for exposures in frames.values() for frame in exposures):
+        _validate_sigma(frame)
+
+
+def validate_names(names: Iterable[str]) -> None:
+    """Raise DataError for names of fluoroscopes that differ only in capital letters.
+
+    They are one fluoroscope written in two ways, and one file where capitals do not count.
+    """
+    seen: dict[str, str] = {}
+    for name in names:
+        other = seen.setdefault(name.lower(), name)
+        if other != name:
+            raise DataError(
+                f'fluoroscopes {other} and {name} differ in capital letters only',
+                kind=Kind.DUPLICATE_NAME,
+                place=Place((other, name), name=''),
+                advice='this is one fluoroscope, or name them otherwise',
+            )
+
+
+def why_excluded(frame: Frame, phantom: Phantom) -> Finding | None:
+    """Return why an exposure that does not fit is excluded, None where the cause is not found."""
+    cause = _cause(frame, phantom)
+    return None if cause is None or cause.kind is Kind.OTHER_PHANTOM else cause
+
+
+def find_wrong_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> list[Finding]:
+    """Return a finding for every kind of targets in frames whose coordinates cannot be right."""
+    every = [frame.target_id for exposures in frames.values() for frame in exposures]
+    seen = np.isin(phantom.target_id, np.concatenate(every or [np.empty(0, int)]))
+    if not seen.any():
+        return []
+    seen_id = phantom.target_id[seen]
+    xyz = phantom.xyz_mm[seen]
+    if np.linalg.matrix_rank(xyz - xyz.mean(axis=0)) < 2:
+        return []  # all on a line: the calibration says so
+    out = []
+    places, place, count = np.unique(xyz, axis=0, return_inverse=True, return_counts=True)
+    if count.max() > 1:
+        most = int(np.argmax(count))
+        ids = seen_id[place.reshape(-1) == most]
+        x, y, z = places[most]
+        out.append(
+            Finding(
+                Kind.REPEATED_COORDINATES,
+                f'targets {_first(ids)} are all at ({x:g}, {y:g}, {z:g}) mm',
+                replace(_PHANTOM, target_id=tuple(ids.tolist())),
+                'a repeated row, or a fill value for targets that are not surveyed',
+            )
+        )
+    distance = np.linalg.norm(xyz - np.median(xyz, axis=0), axis=1)
+    extent = float(np.quantile(distance, EXTENT_SHARE))
+    far = distance > MAX_EXTENT * extent
+    if extent > 0 and far.any():
+        out.append(
+            Finding(
+                Kind.REMOTE_TARGETS,
+                f'target {_first(seen_id[far])} is {distance[far].max():.0f} mm from the middle '
+                f'of the others, most of which are within {extent:.0f} mm',
+                replace(_PHANTOM, target_id=tuple(seen_id[far].tolist())),
+                'a wrong coordinate, another unit, or a fill value for targets that are not '
+                'surveyed',
+                numbers={'distance_mm': float(distance[far].max()), 'extent_mm': extent},
+            )
+        )
+    return out
+
+
+def _first(ids: np.ndarray) -> str:
+    """Return some ids as text."""
+    listed = ', '.join(map(str, ids[:MAX_LISTED]))
+    return listed if len(ids) <= MAX_LISTED else f'{listed} and {len(ids) - MAX_LISTED} more'
+
+
+def _validate_sigma(frame: Frame) -> None:
+    if frame.sigma is None:
+        return
+    low, high = SIGMA_PX
+    sigma = np.asarray(frame.sigma)
+    wrong = (sigma < low) | (sigma > high)
+    if wrong.any():
+        target = int(np.asarray(frame.target_id)[wrong][0])
+        raise DataError(
+            f'sigma of target {target} is {sigma[wrong][0]:g} px, between {low:g} and '
+            f'{high:g} px are plausible',
+            kind=Kind.IMPLAUSIBLE_NUMBER,
+            place=replace(frame.place, target_id=(target,)),
+            numbers={'sigma_px': float(sigma[wrong][0])},
+        )
+
+
+def fit_to_phantom(frame: Frame, phantom: Phantom, target_id: np.ndarray) -> Fit | None:
+    """Fit an exposure, with target_id (n,) for its ids, to the phantom.
+
+    Returns None where too few targets are on the phantom, or where they lie on a line.
+    """
+    rows = phantom.index(target_id)
+    on_phantom = rows >= 0
+    if np.mean(on_phantom) < MIN_SHARE:
+        return None
+    xyz = phantom.xyz_mm[rows[on_phantom]]
+    uv = np.asarray(frame.uv, dtype=float)[on_phantom]
+    if flatness(xyz) < MIN_FLATNESS:
+        return _fit_of_plane(xyz, uv)
+    try:
+        with np.errstate(all='ignore'):
+            projection = robust_dlt(xyz, uv)
+            image = xyz @ projection[:, :3].T + projection[:, 3]
+            residual = np.linalg.norm(image[:, :2] / image[:, 2:] - uv, axis=1)
+            _, rotation, source = decompose(projection)
+    except (DataError, np.linalg.LinAlgError):
+        return None
+    depth = ((xyz - source) @ rotation.T)[:, 2]
+    if not np.isfinite(residual).all() or not np.isfinite(depth).all():
+        return None
+    distance = float(np.linalg.norm(source - xyz.mean(axis=0)))
+    return Fit(float(np.median(residual)), -1 if np.median(depth) < 0 else 1, distance)
+
+
+def _fit_of_plane(xyz: np.ndarray, uv: np.ndarray) -> Fit | None:
+    """Fit image points (n, 2) to targets (n, 3) in one plane."""
+    try:
+        with np.errstate(all='ignore'):
+            xy = plane_of(xyz).coordinates(xyz)
+            squared = squared_residuals(robust_homography(xy, uv), xy, uv)
+    except (DataError, np.linalg.LinAlgError):
+        return None
+    return Fit(float(np.sqrt(np.median(squared))), 1, None)
+
+
+def find_wrong_input(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> list[Finding]:
+    """Return a finding for every fluoroscope whose exposures cannot be of the phantom as given.
+
+    frames are exposures by fluoroscope, valid on their own. Those with the most targets are tested
+    first, and the others only where these raise suspicion; a cause is named where most of all
+    exposures have one. A few wrong exposures are left to the calibration, which excludes them.
+    """
+    out = []
+    for name, exposures in frames.items():
+        found = wrong_image_size(exposures) or _wrong_exposures(exposures, phantom)
+        if found is not None:
+            out.append(replace(found, place=Place((name,))))
+    return out
+
+
+def valid_frames(frames: Mapping[str, Sequence[Frame]]) -> dict[str, list[Frame]]:
+    """Return the frames that are valid on their own, by fluoroscope."""
+    out: dict[str, list[Frame]] = {}
+    for name, exposures in frames.items():
+        out[name] = []
+        for frame in exposures:
+            try:
+                validate_frame(frame)
+            except DataError:
+                continue
+            out[name].append(frame)
+    return out
+
+
+def require_phantom(frames: Mapping[str, Sequence[Frame]], phantom: Phantom) -> None:
+    """Raise DataError where exposures of a calibrated fluoroscope cannot be of the phantom.
+
+    Exposures with fewer than MIN_TESTED targets are not tested, nor those that are not valid.
+    """
+    found = []
+    for name, exposures in valid_frames(frames).items():
+        tested = [frame for frame in exposures if len(frame.target_id) >= MIN_TESTED]
+        wrong = _wrong_exposures(tested, phantom)
+        if wrong is not None:
+            found.append(replace(wrong, place=Place((name,))))
+    if found:
+        mixed = mixed_units(valid_frames(frames), phantom, is_suspicious=True)
+        raise DataError(*([mixed] if mixed else found))
+
+
+def find_wrong_orientation(
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    known: Mapping[str, KnownOrientation],
+) -> list[Finding]:
+    """Return a finding for every fluoroscope whose known orientation its exposures contradict."""
+    out = []
+    for name, orientation in known.items():
+        median = _median_residual(frames[name], phantom, orientation)
+        limit = WRONG_ORIENTATION * max(frames[name][0].image_size) if frames[name] else np.inf
+        fits = [
+            other
+            for other, theirs in known.items()
+            if other != name and _median_residual(frames[name], phantom, theirs) <= limit
+        ]
+        if median > limit and fits:
+            out.append(
+                Finding(
+                    Kind.FLUOROSCOPES_INTERCHANGED,
+                    f'its image points fit the known orientation of fluoroscope {fits[0]}, the '
+                    'fluoroscopes are interchanged',
+                    Place((name, fits[0]), name=f'fluoroscope {name}'),
+                )
+            )
+        elif median > limit:
+            behind = 'most targets would lie behind the source'
+            far = f'image points are {median:.0f} px off in the median'
+            out.append(
+                Finding(
+                    Kind.WRONG_KNOWN_ORIENTATION,
+                    f'the known orientation does not fit, '
+                    f'{far if np.isfinite(median) else behind}',
+                    Place((name,)),
+                    'check the unit and the frame of the lab, that R and t lead from the lab to '
+                    'the sensor, and that v runs down',
+                    numbers={'residual_px': median},
+                )
+            )
+    return out
+
+
+def _median_residual(frames: Sequence[Frame], phantom: Phantom, known: KnownOrientation) -> float:
+    """Median distance [px] of image points from their targets, 0 where there are none."""
+    distances = [
+        _residuals(frame, phantom, known)
+        for frame in frames
+        if (phantom.index(frame.target_id) >= 0).all()
+    ]
+    return float(np.median(np.concatenate(distances))) if distances else 0.0
+
+
+def _residuals(frame: Frame, phantom: Phantom, known: KnownOrientation) -> np.ndarray:
+    """Distances (n,) [px] of image points from their targets, infinite behind the source."""
+    xyz = phantom.xyz_mm[phantom.index(frame.target_id)]
+    n = len(xyz)
+    predicted = project(
+        np.broadcast_to(known.rotation, (n, 3, 3)),
+        np.broadcast_to(known.position_mm, (n, 3)),
+        xyz,
+        known.interior,
+    )
+    distance = np.linalg.norm(frame.uv - predicted, axis=1)
+    return np.where(np.isfinite(distance), distance, np.inf)
+
+
+def _wrong_exposures(exposures: Sequence[Frame], phantom: Phantom) -> Finding | None:
+    """Return the cause that most exposures have in common, None where most have none."""
+    ordered = sorted(exposures, key=lambda f: -len(f.target_id))
+    causes = [_cause(frame, phantom) for frame in ordered[:MAX_TESTED]]
+    if 2 * sum(cause is not None for cause in causes) <= len(causes):
+        return None
+    causes += [_cause(frame, phantom) for frame in ordered[MAX_TESTED:]]
+    named = [cause for cause in causes if cause is not None]
+    return max(named, key=named.count) if 2 * len(named) > len(causes) else None
+
+
+def wrong_image_size(exposures: Sequence[Frame]) -> Finding | None:
+    """Return a finding where the image points fill only the upper left part of the image."""
+    if not exposures:
+        return None
+    reach = np.max([np.max(frame.uv, axis=0) for frame in exposures], axis=0)
+    width, height = exposures[0].image_size
+    if not (reach < MIN_REACH * np.array([width, height])).all():
+        return None
+    return Finding(
+        Kind.WRONG_IMAGE_SIZE,
+        f'the image points reach only to u = {reach[0]:.0f}, v = {reach[1]:.0f} of an image of '
+        f'{width} x {height} px',
+        advice='the image size is wrong, or the phantom covers one corner only',
+        numbers={'largest_u': float(reach[0]), 'largest_v': float(reach[1])},
+    )
+
+
+def wrong_unit(distance_mm: float, phantom: Phantom) -> Finding | None:
+    """Return a finding where the source is so near or so far that the unit must be wrong.
+
+    A phantom larger than its distance is a wide-angle view in any unit.
+    """
+    low, high = DISTANCES_MM
+    if low <= distance_mm <= high:
+        return None
+    extent = float(np.linalg.norm(np.ptp(phantom.xyz_mm, axis=0)))
+    numbers = {'distance_mm': distance_mm, 'extent_mm': extent}
+    if distance_mm < min(low, extent):  # no unit changes their ratio
+        return Finding(
+            Kind.SOURCE_TOO_NEAR,
+            f'the source would be {distance_mm:.3g} mm from a phantom that is {extent:.3g} mm '
+            'large, nearer than that of a fluoroscope',
+            advice='the principal distance is wrong, or the images are those of a wide-angle '
+            'camera',
+            numbers=numbers,
+        )
+    units = [unit for unit, mm in UNITS_MM.items() if low <= distance_mm * mm <= high]
+    return Finding(
+        Kind.WRONG_UNIT,
+        f'the coordinates of the phantom are not in mm{_in(units)}: it would be {extent:.3g} mm '
+        f'large and {distance_mm:.3g} mm from the source',
+        numbers=numbers,
+    )
+
+
+def _in(units: Sequence[str]) -> str:
+    return f', but perhaps in {" or ".join(units)}' if units else ''
+
+
+def _cause(frame: Frame, phantom: Phantom) -> Finding | None:
+    """Return what is wrong with an exposure, None where nothing is known to be."""
+    ids = np.asarray(frame.target_id, dtype=np.int64)
+    side = max(frame.image_size)
+    given = fit_to_phantom(frame, phantom, ids)
+    if given is None:
+        return None
+    if given.misfit_px < FIT * side:
+        return _MIRRORED if given.depth < 0 else _unit_cause(phantom, given)
+    for confusion, relabel in CONFUSIONS:
+        other = fit_to_phantom(frame, phantom, relabel(ids, phantom))
+        if (
+            other is not None
+            and other.misfit_px < BETTER * given.misfit_px
+            and other.misfit_px < GOOD_MISFIT * side
+        ):
+            return confusion
+    if given.misfit_px > MISFIT * side:
+        return _OTHER_PHANTOM
+    if given.depth < 0:
+        return _MIRRORED
+    return _unit_cause(phantom, given)
+
+
+def _unit_cause(phantom: Phantom, fit: Fit) -> Finding | None:
+    """Return the finding on the unit, the same for all exposures: that of a rounded distance."""
+    if fit.distance_mm is None:
+        return None
+    digits = -int(np.floor(np.log10(max(fit.distance_mm, 1e-300))))
+    return wrong_unit(round(fit.distance_mm, digits), phantom)
+
+
+def copied_exposures(exposures: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
+    """Return the exposures of a fluoroscope that repeat an earlier one, each with that one.
+
+    Copies have the same image points to the last digit; exposures of a standing phantom differ by
+    their noise.
+    """
+    ordered = sorted(exposures, key=lambda f: f.number)
+    if not ordered:
+        return []
+    ids = np.unique(np.concatenate([frame.target_id for frame in ordered]))
+    uv = np.full((len(ordered), len(ids), 2), np.nan)
+    for own, frame in zip(uv, ordered):
+        own[np.searchsorted(ids, frame.target_id)] = frame.uv
+    out = []
+    kept: list[int] = []
+    for row, frame in enumerate(ordered):
+        originals = np.flatnonzero(_are_copied(uv[row], uv[kept]))
+        if len(originals):
+            out.append((frame, ordered[kept[originals[0]]]))
+        else:
+            kept.append(row)
+    return out
+
+
+def shared_exposures(one: Sequence[Frame], other: Sequence[Frame]) -> list[tuple[Frame, Frame]]:
+    """Return the exposures of two fluoroscopes that have the same image points, in pairs.
+
+    No two fluoroscopes have that: one recording was given for both.
+    """
+    both = [replace(f, number=2 * f.number) for f in one]
+    both += [replace(f, number=2 * f.number + 1) for f in other]
+    found = []
+    for copy, original in copied_exposures(both):
+        if copy.number % 2 != original.number % 2:
+            pair = sorted((copy, original), key=lambda f: f.number % 2)
+            first, second = (replace(f, number=f.number // 2) for f in pair)
+            found.append((first, second))
+    return found
+
+
+def _are_copied(uv: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Which (k,) of others (k, n, 2) have the image points uv (n, 2) [px]; NaN where unseen."""
+    u, v = np.moveaxis(np.abs(others - uv), 2, 0)
+    distance = np.maximum(u, v)  # max() along so short an axis takes ten times as long
+    common = np.sum(np.isfinite(distance), axis=1)
+    same = np.sum(distance <= SAME_PX, axis=1)
+    return (common >= MIN_COMMON) & (same >= COPIED * common)
+
+
+# Absolute tests of a calibration: what no calibration of a fluoroscope can look like.
+#
+# The verdict compares parts of the exposures with each other, and a fault that all of them share
+# passes. These tests compare with what is physically possible, whatever the input claims. Their
+# limits are far from every calibration that was right (docs/verdict.md).
+
+MAX_MISFIT = 0.0025  # RMSE after the correction over the longer side of the image
+MAX_MISFIT_SD = 4.0  # the same over the a-priori standard deviation of the image points
+MIN_INLIERS = 0.5  # share of the image points
+MAX_SD_DISTANCE = 0.05  # standard deviation of the principal distance over it
+MAX_DISTANCE_CHANGE = 0.2  # of one that is fixed, by the scale of the correction
+MAX_SD_POINT = 0.15  # of the principal point over the longer side of the image
+MAX_OFF_CENTRE = 1.0  # distance of the principal point from the middle over the longer side
+
+
+def implausible(request: CalibrationRequest, result: CalibrationResult) -> list[Finding]:
+    """Return a finding for everything that makes the result of a calibration impossible."""
+    out = []
+    for name, figures in result.fluoroscopes.items():
+        frames = request.frames[name]
+        tests = (
+            _large_residuals(figures, frames),
+            _few_inliers(figures),
+            _wrong_distance(figures, request),
+            _wrong_interior(figures, result.calibrations[name]),
+        )
+        out += [replace(found, place=Place((name,))) for found in tests if found is not None]
+    return out
+
+
+def _large_residuals(figures: FluoroscopeResult, frames: Sequence[Frame]) -> Finding | None:
+    """Residuals that are larger than distortion and noise leave."""
+    rmse = float(np.sqrt(np.mean(np.square(figures.rmse_after))))
+    given = [np.median(frame.sigma) for frame in frames if frame.sigma is not None]
+    limit = MAX_MISFIT * max(figures.image_size)
+    if given:
+        limit = max(limit, MAX_MISFIT_SD * float(np.median(given)))
+    if rmse <= limit:
+        return None
+    return Finding(
+        Kind.LARGE_RESIDUALS,
+        f'the residuals are too large: RMSE {rmse:.1f} px after the correction, at most '
+        f'{limit:.1f} px are plausible; false matches, another phantom, or the distortion changed '
+        'between the exposures',
+        numbers={'rmse_px': rmse, 'limit_px': limit},
+    )
+
+
+def _few_inliers(figures: FluoroscopeResult) -> Finding | None:
+    share = figures.inliers / figures.observations
+    if share >= MIN_INLIERS:
+        return None
+    return Finding(
+        Kind.FEW_INLIERS,
+        f'only {100 * share:.0f} % of the image points fit, at least {100 * MIN_INLIERS:.0f} % '
+        'are needed; the others are false matches',
+        numbers={'share': share},
+    )
+
+
+def _wrong_distance(figures: FluoroscopeResult, request: CalibrationRequest) -> Finding | None:
+    """A source so near or so far that the unit of the phantom must be wrong."""
+    centre = request.phantom.xyz_mm.mean(axis=0)
+    distances = [np.linalg.norm(e.position_mm - centre) for e in figures.exposures]
+    return wrong_unit(float(np.median(distances)), request.phantom)
+
+
+def _wrong_interior(
+    figures: FluoroscopeResult, calibration: FluoroscopeCalibration
+) -> Finding | None:
+    """An interior orientation that is not determined, or outside of anything built."""
+    xp, yp, c = figures.interior
+    sd = figures.interior_sd
+    side = max(figures.image_size)
+    if not np.any(sd) and (found := _wrong_given_distance(calibration)):
+        return found
+    if sd[2] > MAX_SD_DISTANCE * c or max(sd[:2]) > MAX_SD_POINT * side:
+        return Finding(
+            Kind.INTERIOR_UNDETERMINED,
+            f'the interior orientation is not determined: principal distance {c:.0f} px with a '
+            f'standard deviation of {sd[2]:.0f} px, principal point within {max(sd[:2]):.0f} px',
+            numbers={'sd_c_px': float(sd[2]), 'sd_point_px': float(max(sd[:2]))},
+        )
+    if _off_centre(figures.interior, figures.image_size) <= MAX_OFF_CENTRE * side:
+        return None
+    xp, yp, _ = _interior_about_middle(calibration)
+    offset = _off_centre(np.array([xp, yp]), figures.image_size)
+    if offset <= MAX_OFF_CENTRE * side:
+        return None
+    return Finding(
+        Kind.PRINCIPAL_POINT_OFF,
+        f'the principal point ({xp:.0f}, {yp:.0f}) is {offset:.0f} px from the middle of the '
+        'image',
+        advice='wrong target ids, a wrong image size, or another phantom',
+        numbers={'offset_px': offset},
+    )
+
+
+def _wrong_given_distance(calibration: FluoroscopeCalibration) -> Finding | None:
+    """A principal distance that is fixed, but far from the one that the correction makes of it."""
+    given = float(calibration.interior[2])
+    found = float(_interior_about_middle(calibration)[2])
+    if abs(found / given - 1) <= MAX_DISTANCE_CHANGE:
+        return None
+    return Finding(
+        Kind.WRONG_PRINCIPAL_DISTANCE,
+        f'the principal distance is fixed at {given:.0f} px, but the exposures show about '
+        f'{found:.0f} px',
+        advice='it has to be given in pixels',
+        numbers={'given_px': given, 'shown_px': found},
+    )
+
+
+def _off_centre(interior: np.ndarray, image_size: tuple[int, int]) -> float:
+    """Distance [px] of a principal point from the middle of the image."""
+    return float(np.linalg.norm(interior[:2] - (np.array(image_size) - 1) / 2))
+
+
+def _interior_about_middle(calibration: FluoroscopeCalibration) -> np.ndarray:
+    """Interior orientation (3,) [px] with a correction in the gauge about the middle of the image.
+
+    A strong affine distortion can move the principal point far away, and its correction with it.
+    """
+    pixels = sd_grid_pixels(calibration.image_size)
+    pixels = pixels[~calibration.model.outside(pixels)]
+    middle = (np.array(calibration.image_size) - 1) / 2
+    try:
+        return interior_about(
+            middle, pixels, calibration.model.predict(pixels), calibration.interior
+        )
+    except (ValueError, np.linalg.LinAlgError):
+        return calibration.interior

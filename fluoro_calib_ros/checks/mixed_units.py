@@ -1,0 +1,221 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Find targets of a phantom that are given in another unit than the others.
+
+Where most targets are right, the others are those that an exposure shows at the place of their
+multiple: a direct linear transformation of the others predicts it. Where they are about half,
+there is no majority, and the transformation is searched for with both versions of each target: of
+samples of six image points, each matched with the target or with its multiple, the one with the
+least median residual of the better versions is refined.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..errors import DataError
+from ..exposures.frame import Frame
+from ..exposures.phantom import Phantom
+from ..findings import Finding, Kind, Place
+from ..photogrammetry.resection import (
+    SAMPLE_SIZE,
+    decompose,
+    direct_linear_transformation,
+    least_vectors_with_last_one,
+    robust_dlt,
+    squared_residuals,
+)
+
+DISTANCES_MM = (200.0, 10_000.0)  # of the source from a phantom in mm
+UNITS = {10.0: 'cm', 25.4: 'inches', 1000.0: 'm'}  # that mm are mistaken for
+MAX_TESTED = 3  # exposures of a fluoroscope, those with the most targets
+MIN_TARGETS = 12  # of an exposure that is tested
+OFF = 0.03  # residual over the longer side of the image of a target that is not at its place
+AT = 0.01  # the same of one that is
+FIT = 0.004  # median of these residuals where all targets have their unit
+UNCLEAR = 0.6  # share of targets at their places below which there may be no majority
+MIN_GROUP = 3  # targets in either unit
+SAMPLES = 1500
+STEPS = 10
+MAX_LISTED = 5
+
+
+def mixed_units(
+    frames: Mapping[str, Sequence[Frame]],
+    phantom: Phantom,
+    is_suspicious: bool = False,
+) -> Finding | None:
+    """Return a finding where a part of the targets is in another unit than the others.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        Exposures by fluoroscope, valid on their own.
+    phantom : Phantom
+    is_suspicious : bool
+        Whether the exposures do not fit the phantom, so that there may be no majority.
+    """
+    every = [_on_phantom(frame, phantom) for of_one in frames.values() for frame in of_one]
+    every = [frame for frame in every if len(frame.target_id) >= MIN_TARGETS]
+    tested = [
+        frame
+        for name in frames
+        for frame in sorted(
+            (f for f in every if f.fluoroscope == name), key=lambda f: -len(f.target_id)
+        )[:MAX_TESTED]
+    ]
+    for frame in tested:
+        found = _factor_of(frame, phantom, is_suspicious)
+        if found is None:
+            continue
+        factor, group = found
+        scaled, distance = _whole_group(every, phantom, factor, group)
+        others = _seen(every, phantom) & ~scaled
+        if min(scaled.sum(), others.sum()) < MIN_GROUP:
+            continue
+        low, high = DISTANCES_MM
+        if not low <= distance <= high and low <= distance / factor <= high:
+            scaled, factor = others, 1 / factor  # these have the wrong unit
+        return _finding(phantom.target_id[scaled], factor)
+    return None
+
+
+def _on_phantom(frame: Frame, phantom: Phantom) -> Frame:
+    known = phantom.index(frame.target_id) >= 0
+    return replace(
+        frame,
+        target_id=np.asarray(frame.target_id)[known],
+        uv=np.asarray(frame.uv, dtype=float)[known],
+        sigma=None,
+    )
+
+
+def _seen(frames: Sequence[Frame], phantom: Phantom) -> np.ndarray:
+    """Return which (n,) targets of a phantom are seen."""
+    return np.isin(phantom.target_id, np.concatenate([frame.target_id for frame in frames]))
+
+
+def _factor_of(
+    frame: Frame, phantom: Phantom, is_suspicious: bool
+) -> tuple[float, np.ndarray] | None:
+    """Return the factor by which some targets fit, and which (n,) of the phantom, or None."""
+    rows = phantom.index(frame.target_id)
+    xyz = phantom.xyz_mm[rows]
+    limit = max(frame.image_size)
+    try:
+        with np.errstate(all='ignore'):
+            projection = robust_dlt(xyz, frame.uv)
+    except (DataError, np.linalg.LinAlgError):
+        return None
+    residual = np.sqrt(squared_residuals(projection, xyz, frame.uv))
+    off = residual > OFF * limit
+    for factor in (*UNITS, *(1 / factor for factor in UNITS)):
+        scaled = np.sqrt(squared_residuals(projection, factor * xyz, frame.uv))
+        there = off & (scaled < AT * limit)
+        if there.sum() >= MIN_GROUP and (residual < AT * limit).sum() > there.sum():
+            return factor, _chosen(phantom, rows[there])
+    if not is_suspicious and np.mean(~off) > UNCLEAR:
+        return None
+    return _factor_by_samples(frame, xyz, rows, phantom)
+
+
+def _factor_by_samples(
+    frame: Frame, xyz: np.ndarray, rows: np.ndarray, phantom: Phantom
+) -> tuple[float, np.ndarray] | None:
+    """Return the same as `_factor_of`, found without a majority of the targets (n, 3)."""
+    rng = np.random.default_rng(0)
+    limit = max(frame.image_size)
+    samples = np.argsort(rng.random((SAMPLES, len(xyz))), axis=1)[:, :SAMPLE_SIZE]
+    which = rng.integers(0, 2, samples.shape)
+    for factor in UNITS:
+        versions = np.stack([xyz, factor * xyz])
+        try:
+            with np.errstate(all='ignore'):
+                candidates = direct_linear_transformation(
+                    versions[which, samples],
+                    frame.uv[samples],
+                    least=least_vectors_with_last_one,
+                )
+                squared = [squared_residuals(candidates, each, frame.uv) for each in versions]
+                best = candidates[np.argmin(np.median(np.minimum(*squared), axis=1))]
+                scaled, median = _refined(best, versions, frame.uv)
+        except (DataError, np.linalg.LinAlgError):
+            continue
+        if median < FIT * limit and MIN_GROUP <= scaled.sum() <= len(xyz) - MIN_GROUP:
+            return factor, _chosen(phantom, rows[scaled])
+    return None
+
+
+def _refined(
+    projection: np.ndarray, versions: np.ndarray, uv: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return which (n,) targets of versions (2, n, 3) are multiples, and the median residual."""
+    every = np.arange(len(uv))
+    scaled = np.zeros(len(uv), dtype=int)
+    for _ in range(STEPS):
+        squared = np.stack([squared_residuals(projection, each, uv) for each in versions])
+        before, scaled = scaled, np.argmin(squared, axis=0)
+        projection = robust_dlt(versions[scaled, every], uv)
+        if np.array_equal(before, scaled):
+            break
+    squared = squared_residuals(projection, versions[scaled, every], uv)
+    return scaled == 1, float(np.sqrt(np.median(squared)))
+
+
+def _chosen(phantom: Phantom, rows: np.ndarray) -> np.ndarray:
+    out = np.zeros(len(phantom.target_id), dtype=bool)
+    out[rows] = True
+    return out
+
+
+def _whole_group(
+    frames: Sequence[Frame], phantom: Phantom, factor: float, group: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Return which (n,) targets fit by the factor in most exposures, and the source's distance.
+
+    group (n,) is a part of them; the distance [mm] is that with these targets multiplied.
+    """
+    votes = np.zeros(len(phantom.target_id))
+    distances: list[float] = []
+    for _ in range(STEPS):  # one exposure knows a part of the group only
+        xyz = np.where(group[:, None], factor * phantom.xyz_mm, phantom.xyz_mm)
+        votes[:] = 0
+        distances = []
+        for frame in frames:
+            rows = phantom.index(frame.target_id)
+            try:
+                with np.errstate(all='ignore'):
+                    projection = robust_dlt(xyz[rows], frame.uv)
+                    _, _, source = decompose(projection)
+            except (DataError, np.linalg.LinAlgError):
+                continue
+            limit = max(frame.image_size)
+            own, scaled = (
+                np.sqrt(squared_residuals(projection, f * phantom.xyz_mm[rows], frame.uv))
+                for f in (1.0, factor)
+            )
+            votes[rows] += (scaled < AT * limit) & (own > OFF * limit)
+            votes[rows] -= own < AT * limit
+            distances.append(float(np.linalg.norm(source - xyz[rows].mean(axis=0))))
+        before, group = group, votes > 0
+        if np.array_equal(before, group):
+            break
+    return group, float(np.median(distances)) if distances else np.nan
+
+
+def _finding(ids: np.ndarray, factor: float) -> Finding:
+    """Return the finding on targets that fit when they are multiplied by a factor."""
+    listed = ', '.join(map(str, ids[:MAX_LISTED])) + ' ...' * (len(ids) > MAX_LISTED)
+    unit = UNITS.get(factor)
+    meant = f' ({unit} in place of mm)' if unit else ''
+    return Finding(
+        Kind.MIXED_UNITS,
+        f'{len(ids)} targets, {listed}, are in another unit than the others',
+        Place(target_id=tuple(ids.tolist()), name='phantom'),
+        f'they fit when their coordinates are multiplied by {factor:.4g}{meant}',
+        numbers={'factor': factor},
+    )

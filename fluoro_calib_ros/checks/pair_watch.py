@@ -1,0 +1,217 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the epipolar residuals of one pair of views tell of a drift of both images."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .charts import MEMORY, ImageAreas
+from .drift_field import SystematicErrorField
+from .drift_observations import EpipolarObservations
+from .drift_options import DriftOptions
+
+LAGS = (1, 2, 4)  # frames over which the noise of a marker is compared
+MIN_CORRELATION = 0.05
+MAX_CORRELATION = 0.97  # of the noise of a marker in successive frames
+NUGGET = 0.35  # fraction of the systematic standard deviation that the nodes cannot represent
+
+
+@dataclass(frozen=True)
+class PairBlock:
+    """Statistics of a block of epipolar residuals.
+
+    The four series are: image a and image b against the calibration, image a and image b against
+    the start.
+
+    Attributes
+    ----------
+    score, information : ndarray
+        (4, A), of a drift of each area [1/px, 1/px^2].
+    systematic : ndarray
+        (4, A), systematic standard deviations [px].
+    enough : ndarray
+        (4, A), whether there are enough markers in the area.
+    normals : ndarray
+        (2, A, 2), sums of the normals of the epipolar lines in both images.
+    """
+
+    score: NDArray[np.float64]
+    information: NDArray[np.float64]
+    systematic: NDArray[np.float64]
+    enough: np.ndarray
+    normals: NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, areas: int) -> PairBlock:
+        """A block of zeros."""
+        score, information, systematic = np.zeros((3, 4, areas))
+        enough = np.zeros((4, areas), dtype=bool)
+        return cls(score, information, systematic, enough, np.zeros((2, areas, 2)))
+
+
+class PairWatch:
+    """Turns the epipolar residuals of one pair of views into statistics, block by block.
+
+    Parameters
+    ----------
+    sizes : sequence
+        (2, 2), width and height of both images [px].
+    areas : ImageAreas
+    options : DriftOptions
+    """
+
+    def __init__(
+        self, sizes: Sequence[Sequence[int]], areas: ImageAreas, options: DriftOptions
+    ) -> None:
+        self._sizes = sizes
+        self._areas = areas
+        self._options = options
+        self.field = SystematicErrorField(sizes)
+        self._squares = np.zeros(len(LAGS))  # sums of squared differences over the lags, halved
+        self._count = 0.0
+        self._frames = 0.0
+
+    def stretch(self) -> float:
+        """Variance of a long sum of blocks over that of the differences of two blocks.
+
+        The noise of a marker is modelled as a white part w and an autoregression of variance s
+        and correlation r in successive frames. Half the mean squares of differences over 1, 2 and
+        4 frames, in which a marker hardly moves, are V1 = w + s (1 - r), V2 = w + s (1 - r^2) and
+        V4 = w + s (1 - r^4), hence (V4 - V2)/(V2 - V1) = r (1 + r).
+        """
+        if not self._count:
+            return 1.0
+        v1, v2, v4 = self._squares / self._count
+        if v2 - v1 <= 6 * v1 / np.sqrt(self._count):  # three standard deviations: not significant
+            return 1.0
+        r = (np.sqrt(1 + 4 * max(v4 - v2, 0) / (v2 - v1)) - 1) / 2
+        r = float(np.clip(r, MIN_CORRELATION, MAX_CORRELATION))
+        s = min((v2 - v1) / (r * (1 - r)), v1 / (1 - r))
+        n = max(self._frames / self._count, 1.0)
+        long = (1 + r) / (1 - r)
+        # Variance of means of n values and covariance of two successive ones, times n.
+        own = long - 2 * r * (1 - r**n) / (n * (1 - r) ** 2)
+        shared = r * (1 - r**n) ** 2 / (n * (1 - r) ** 2)
+        white = v1 - s * (1 - r)
+        return max(1.0, (white + s * long) / (white + s * (own - shared)))
+
+    def _update_correlation(self, marker: np.ndarray, standardised: np.ndarray) -> None:
+        """Add the differences of standardised residuals (n,) of markers (n,), in frame order."""
+        order = np.argsort(marker, kind='stable')
+        marker = marker[order]
+        z = standardised[order]
+        first = np.flatnonzero(marker[LAGS[-1] :] == marker[: -LAGS[-1]])
+        if not len(first):
+            return
+        decay = 1 - 1 / MEMORY
+        self._squares = decay * self._squares + [
+            np.sum((z[first + lag] - z[first]) ** 2) / 2 for lag in LAGS
+        ]
+        self._frames = decay * self._frames + len(first) * len(marker) / (marker[-1] + 1)
+        self._count = decay * self._count + len(first)
+
+    def block(self, observations: EpipolarObservations) -> PairBlock:
+        """Statistics of the usable observations of a block; there must be at least one.
+
+        Until the field of systematic errors is estimated, the residuals go into it and the series
+        against the start are those against the calibration.
+        """
+        options = self._options
+        _, marker = np.unique(observations.target_id, return_inverse=True)
+        sd = observations.sd_noise
+        systematic = observations.sd_systematic
+        found = [self.field.interpolation(uv, side) for side, uv in enumerate(observations.uv)]
+        nodes = np.concatenate([nodes for nodes, _ in found], axis=1)
+        weights = np.concatenate([weights for _, weights in found], axis=1)
+        variance = sd * sd
+        limit = (
+            options.clip * sd
+            + options.band_calibration * systematic
+            + options.tolerance_px
+            + 2 * options.step_px
+        )
+        absolute = np.clip(observations.residual, -limit, limit)
+        self._update_correlation(marker, absolute / sd)
+        mean = self.field.mean
+        if mean is not None:
+            reference = np.sum(mean[nodes] * weights, axis=1)
+            relative = np.clip(observations.residual - reference, -limit, limit)
+        else:
+            self.field.add(marker, nodes, weights, absolute, variance, systematic)
+            relative = absolute
+        out = PairBlock.empty(len(self._areas))
+        residuals = np.stack([absolute, relative])
+        for side in (0, 1):
+            cell = self._areas.cell(observations.uv[side], self._sizes[side])
+            self._fill_side(
+                out, side, observations=observations, residuals=residuals, cell=cell, marker=marker
+            )
+            if mean is not None:
+                weight = observations.factor[side] / variance
+                unknown = self._unknown_variance(cell, nodes, weights * weight[:, None])
+                nugget = NUGGET * out.systematic[side]
+                with np.errstate(divide='ignore', invalid='ignore'):
+                    unknown = unknown / out.information[side] ** 2
+                out.systematic[2 + side] = np.sqrt(unknown + nugget**2)
+        return out
+
+    def _fill_side(
+        self,
+        out: PairBlock,
+        side: int,
+        observations: EpipolarObservations,
+        residuals: np.ndarray,
+        cell: np.ndarray,
+        marker: np.ndarray,
+    ) -> None:
+        """Fill in the series of one image.
+
+        residuals (2, n): against the calibration and against the start [px]; cell (n,) and
+        marker (n,) of each.
+        """
+        areas = self._areas
+        factor = observations.factor[side]
+        weight = factor / (observations.sd_noise * observations.sd_noise)
+        columns = [
+            weight * residuals[0],
+            weight * residuals[1],
+            weight * factor,
+            weight * observations.sd_systematic,
+            *observations.normal[side].T,
+        ]
+        sums = self._area_sums(cell, np.stack(columns))
+        both = [side, 2 + side]
+        out.score[both] = sums[:2]
+        out.information[both] = sums[2]
+        with np.errstate(divide='ignore', invalid='ignore'):
+            out.systematic[side] = sums[3] / sums[2]
+        out.normals[side] = sums[4:].T
+        present = np.zeros((areas.n**2, marker.max() + 1))
+        present[cell, marker] = 1
+        markers = ((areas.member @ present) > 0).sum(axis=1)
+        out.enough[both] = markers >= self._options.min_markers
+
+    def _area_sums(self, cell: np.ndarray, columns: np.ndarray) -> np.ndarray:
+        """Sums (k, A) of columns (k, n) over the areas, for rows in cells (n,)."""
+        size = self._areas.n**2
+        k = len(columns)
+        index = cell + size * np.arange(k)[:, None]
+        sums = np.bincount(index.ravel(), columns.ravel(), k * size).reshape(k, size)
+        return sums @ self._areas.member.T
+
+    def _unknown_variance(
+        self, cell: np.ndarray, nodes: np.ndarray, weights: np.ndarray
+    ) -> np.ndarray:
+        """Variance (A,) of the weighted sums of residuals by the uncertainty of the field."""
+        covariance = np.asarray(self.field.covariance)
+        size = len(covariance)
+        index = cell[:, None] * size + nodes
+        sums = np.bincount(index.ravel(), weights.ravel(), self._areas.n**2 * size)
+        sums = self._areas.member @ sums.reshape(-1, size)
+        return np.maximum(np.sum((sums @ covariance) * sums, axis=1), 0)

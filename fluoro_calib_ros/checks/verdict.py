@@ -1,0 +1,169 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The verdict on a calibration from the exposures it was made from: pass, fail or cannot tell.
+
+Every check is a number with a limit. How the limits were found, how often good calibrations exceed
+them and how large a fault must be to be found is in docs/verdict.md. `validate` recalibrates two
+halves and four folds of the exposures, which takes about twice as long as the calibration.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError
+from ..estimation.calibrate import adjust_with_calibrations
+from ..estimation.options import CalibrationRequest
+from ..estimation.result import CalibrationResult
+from ..exposures.frame import Frame
+from ..findings import Kind
+from .beads import BEADS
+from .calibration_evidence import Evidence
+from .check import Check, Validation, verdict_of
+from .exposure_variation import VARIATION
+from .given_interior import with_given_interior
+from .halves import HALVES
+from .held_out import HELD_OUT
+from .precision import PRECISION
+from .residual_trends import TRENDS
+
+Progress = Callable[[str, int, int], None]
+
+# A new check is a module with a Subject, and its entry here; docs/verdict.md describes it.
+SUBJECTS = (BEADS, HALVES, TRENDS, VARIATION, HELD_OUT, PRECISION)
+
+
+def validate(
+    request: CalibrationRequest,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    progress: Progress | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Validation:
+    """Validate calibrations with the exposures that they were made from.
+
+    Parameters
+    ----------
+    request : CalibrationRequest
+        What the calibrations were made from.
+    calibrations : mapping of str to FluoroscopeCalibration
+        By fluoroscope.
+    progress : callable, optional
+        Called with the name of a step, the number of steps done and their total before each step.
+    raise_if_cancelled : callable, optional
+        Called before every step of an adjustment; may raise to stop.
+
+    Returns
+    -------
+    Validation
+
+    Raises
+    ------
+    DataError
+        For frames that cannot be adjusted with the calibrations.
+    """
+    began = time.perf_counter()
+    result = adjust_with_calibrations(
+        request.frames,
+        request.phantom,
+        calibrations=calibrations,
+        loss=request.options.loss,
+        raise_if_cancelled=raise_if_cancelled,
+        known=request.known_orientations,
+    )
+    request = replace(request, frames=_used_frames(request.frames, result))
+    steps = _StepCounter(progress, 1 + _count_steps(len(request.groups)))
+    evidence = Evidence(request, calibrations, result, steps.report, raise_if_cancelled)
+    steps.report('residuals and beads')
+    checks = []
+    for subject in SUBJECTS:
+        if subject.of_rig:
+            checks += subject.run(evidence, tuple(request.frames))
+    for names in request.groups:
+        for subject in SUBJECTS:
+            if not subject.of_rig:
+                checks += subject.run(evidence, names)
+    checks = with_given_interior(evidence, checks)
+    checks = _by_fluoroscope(checks, [name for names in request.groups for name in names])
+    return Validation(
+        verdict_of(checks),
+        tuple(checks),
+        _identities(calibrations),
+        time.perf_counter() - began,
+        {name: _achieved_sd(evidence, name, checks) for name in request.frames},
+    )
+
+
+def _achieved_sd(evidence: Evidence, name: str, checks: Sequence[Check]) -> float:
+    """Standard deviation of a coordinate of the correction of a fluoroscope [px].
+
+    It is what the calibration claims, times the ratio of the difference of its halves to their
+    claims where that is above 1, together with the trend and the variation in the residuals.
+    """
+    values = {
+        check.kind: check.value
+        for check in checks
+        if check.place.fluoroscope == name and np.isfinite(check.value)
+    }
+    common = evidence.trends[name]
+    claimed = common.claimed_sd * max(1.0, values.get(Kind.HALVES, 1.0))
+    parts = (claimed, values.get(Kind.WHITENESS, 0.0), values.get(Kind.VARIATION, 0.0))
+    return float(np.linalg.norm(parts))
+
+
+def validate_or_report(
+    request: CalibrationRequest,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    progress: Progress | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> Validation:
+    """Validate; where that raises DataError, the verdict is 'cannot tell' with its message."""
+    try:
+        return validate(request, calibrations, progress, raise_if_cancelled)
+    except DataError as error:
+        check = Check(Kind.VALIDATION, f'the validation could not be made: {error}')
+        return Validation('cannot tell', (check,), _identities(calibrations), 0.0)
+
+
+class _StepCounter:
+    """Reports the steps of a validation with their number and total."""
+
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self._progress = progress
+        self._total = total
+        self._done = 0
+
+    def report(self, step: str) -> None:
+        """Report the step that begins."""
+        if self._progress is not None:
+            self._progress(step, self._done, self._total)
+        self._done += 1
+
+
+def _count_steps(groups: int) -> int:
+    return sum(subject.steps * (1 if subject.of_rig else groups) for subject in SUBJECTS)
+
+
+def _used_frames(
+    frames: Mapping[str, Sequence[Frame]], result: CalibrationResult
+) -> dict[str, list[Frame]]:
+    """Return the frames that an adjustment used, in the order of their numbers."""
+    out = {}
+    for name, of_fluoroscope in frames.items():
+        used = {e.exposure for e in result.fluoroscopes[name].exposures}
+        out[name] = sorted((f for f in of_fluoroscope if f.number in used), key=lambda f: f.number)
+    return out
+
+
+def _by_fluoroscope(checks: Sequence[Check], names: Sequence[str]) -> list[Check]:
+    """Return the checks of one fluoroscope after the other, then those of the rig."""
+    return [check for name in (*names, '') for check in checks if check.place.fluoroscope == name]
+
+
+def _identities(calibrations: Mapping[str, FluoroscopeCalibration]) -> dict[str, str]:
+    return {name: calibration.calibration_id for name, calibration in calibrations.items()}

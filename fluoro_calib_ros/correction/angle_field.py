@@ -1,0 +1,268 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Distortion that changes with the angle of a C-arm.
+
+The magnetic field along the axis of an image intensifier is that of the earth, turned with the
+C-arm: its components are cosines and sines of the angle; what the arm itself magnetises adds the
+second harmonic (Fahrig et al., "Three-dimensional computed tomographic reconstruction using a
+C-arm mounted XRII: correction of image intensifier distortion", Medical Physics 24, 1997).
+The correction is that of a calibration plus a sum of these harmonics, less their mean over the
+exposures, each with a field of its own (see `angle_fit`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import map_coordinates
+
+from .series import SD_GRID, Functions, Series, sd_grid_pixels
+from .terms import CUBIC
+
+ORDERS = 2  # harmonics of the angle
+HARMONICS = 2 * ORDERS
+PAIRS = [(j, k) for j in range(HARMONICS) for k in range(j, HARMONICS)]
+VARIANCES = HARMONICS + len(PAIRS)
+MAX_DISTANCE = np.deg2rad(15)  # of an angle from the next one that was calibrated
+TERMS = (CUBIC + 1) * (CUBIC + 2) // 2  # of a polynomial of two variables
+# Of the arrays that `packed_angles` gives; None: as many as there are exposures.
+PACKED_SHAPES = (None, (HARMONICS, 2, TERMS), (VARIANCES, SD_GRID, SD_GRID))
+
+
+def harmonics(angle: ArrayLike) -> np.ndarray:
+    """Cosines and sines (..., 4) of angles (...) [rad], by order."""
+    multiple = np.asarray(angle, dtype=float)[..., None] * np.arange(1, ORDERS + 1)
+    both = np.stack([np.cos(multiple), np.sin(multiple)], axis=-1)
+    return both.reshape(*both.shape[:-2], HARMONICS)
+
+
+@dataclass(frozen=True)
+class _Change:
+    """What an angle adds to a correction.
+
+    Attributes
+    ----------
+    coefficients : (4, k, 2, 4) ndarray
+        Of x^i y^j, in the order i, field, u or v, j: the change, then fields of what is unknown.
+    variance : (33, 33) ndarray
+        On the grid of the standard deviation [px^2].
+    scatters : bool
+        Whether there are fields of what is unknown.
+    """
+
+    coefficients: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    scatters: bool
+
+
+@dataclass(frozen=True)
+class AngleField:
+    """Change of a correction with the angle, relative to its mean over the exposures.
+
+    Attributes
+    ----------
+    image_size : (int, int)
+        Width and height [px].
+    angles : (e,) ndarray
+        Angles of the exposures [rad].
+    coefficients : (4, 2, 10) ndarray
+        Of each harmonic less its mean: those of cubic polynomials of the pixel for u and v, in
+        the order and coordinates of `series.Functions` [px].
+    variances : (14, 33, 33) ndarray
+        On the grid of the standard deviation of a series [px^2]: covariances of the correction
+        without angle and each harmonic, then those of pairs of harmonics.
+
+    Raises
+    ------
+    ValueError
+        For arrays of other shapes, or values that are not finite.
+    """
+
+    image_size: tuple[int, int]
+    angles: NDArray[np.float64]
+    coefficients: NDArray[np.float64]
+    variances: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        shapes = {
+            'angles': (len(self.angles),),
+            'coefficients': (HARMONICS, 2, len(self._functions)),
+            'variances': (VARIANCES, SD_GRID, SD_GRID),
+        }
+        for name, shape in shapes.items():
+            values = np.ascontiguousarray(getattr(self, name), dtype=float)
+            if values.shape != shape or not values.size:
+                raise ValueError(f'{name} of an angle field have shape {values.shape}')
+            if not np.isfinite(values).all():
+                raise ValueError(f'{name} of an angle field are not all finite')
+            object.__setattr__(self, name, values)
+
+    @cached_property
+    def _functions(self) -> Functions:
+        return Functions(self.image_size, CUBIC)
+
+    @cached_property
+    def _mean(self) -> np.ndarray:
+        return harmonics(self.angles).mean(axis=0)
+
+    @cached_property
+    def _spread(self) -> np.ndarray:
+        """Mean products (4, 4) of the harmonics over the exposures, less their mean."""
+        h = harmonics(self.angles) - self._mean
+        return h.T @ h / len(h)
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """Least and largest angle of the exposures [rad]."""
+        return float(self.angles.min()), float(self.angles.max())
+
+    @property
+    def size_px(self) -> float:
+        """RMS of a coordinate of the change, over the image and the exposures [px]."""
+        fields = self._functions(sd_grid_pixels(self.image_size)) @ self.coefficients.transpose(
+            0, 2, 1
+        )
+        square = np.einsum('jna,jk,kna->', fields, self._spread, fields)
+        return float(np.sqrt(square / (2 * fields.shape[1])))
+
+    def covers(self, angle: ArrayLike) -> np.ndarray:
+        """Whether angles (...) [rad] are near a calibrated one; True where unknown (NaN)."""
+        angle = np.asarray(angle, dtype=float)
+        distance = np.abs(np.angle(np.exp(1j * (angle[..., None] - self.angles))))
+        return ~(distance.min(axis=-1) > MAX_DISTANCE)
+
+    def nearest_common(self, other: AngleField) -> float:
+        """Angle [rad] of these exposures that is nearest to one of another field."""
+        turn = np.exp(1j * self.angles)[:, None] / np.exp(1j * other.angles)
+        return float(self.angles[np.argmin(np.abs(np.angle(turn)).min(axis=1))])
+
+    def change(self, uv: ArrayLike, angle: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Return what an angle adds to a correction and to its variance.
+
+        Parameters
+        ----------
+        uv : (n, 2) array_like
+            Observed pixels.
+        angle : float or (n,) array_like
+            Angle [rad]. NaN: it is unknown, the correction is the mean over the exposures, and
+            its variance holds what the angle changes.
+
+        Returns
+        -------
+        duv : (n, 2) ndarray
+            To be added to the correction [px].
+        variance : (n,) ndarray
+            To be added to the variance of each coordinate [px^2]; it can be negative.
+        """
+        uv = np.asarray(uv, dtype=float).reshape(-1, 2)
+        angles = np.asarray(angle, dtype=float)
+        if angles.ndim == 0:
+            return self._change_at(uv, float(angles))
+        duv = np.zeros_like(uv)
+        variance = np.zeros(len(uv))
+        for value in np.unique(angles[~np.isnan(angles)]):
+            rows = angles == value
+            duv[rows], variance[rows] = self._change_at(uv[rows], float(value))
+        rows = np.isnan(angles)
+        duv[rows], variance[rows] = self._change_at(uv[rows], np.nan)
+        return duv, variance
+
+    def duv(self, uv: np.ndarray, angle: float) -> NDArray[np.float64]:
+        """Return what a known angle [rad] adds to a correction (n, 2) at pixels uv (n, 2) [px]."""
+        return self._values(uv, self._known(angle).coefficients)[:, 0]
+
+    def added_to(self, series: Series, angle: float) -> Series:
+        """Return a series at an angle [rad], with its standard deviations there."""
+        weights = harmonics(angle) - self._mean
+        change = np.tensordot(weights, self.coefficients, axes=1)
+        functions = series.functions
+        _, variance = self._change_at(sd_grid_pixels(self.image_size), angle)
+        return Series(
+            functions,
+            series.coefficients
+            + functions.converted(self._functions, change.ravel()).reshape(2, -1),
+            np.sqrt(np.maximum(series.sd**2 + variance.reshape(series.sd.shape), 0)),
+        )
+
+    def _change_at(self, uv: np.ndarray, angle: float) -> tuple[np.ndarray, np.ndarray]:
+        found = self._unknown if np.isnan(angle) else self._known(angle)
+        values = self._values(uv, found.coefficients)
+        variance = self._at(uv, found.variance)
+        if found.scatters:
+            variance = variance + np.einsum('nka,nka->n', values[:, 1:], values[:, 1:]) / 2
+        return values[:, 0], variance
+
+    def _known(self, angle: float) -> _Change:
+        """Return the change at an angle; that of the last one is kept: arms stand still."""
+        last = self.__dict__.get('_last')
+        if last is None or last[0] != angle:
+            weights = harmonics(angle) - self._mean
+            last = angle, self._change(weights, np.outer(weights, weights), weights[None])
+            self.__dict__['_last'] = last  # as a whole, for other threads
+        found: _Change = last[1]
+        return found
+
+    @cached_property
+    def _unknown(self) -> _Change:
+        """The change at an unknown angle: none, and the scatter over all exposures."""
+        size, axes = np.linalg.eigh(self._spread)
+        roots = axes.T * np.sqrt(np.maximum(size, 0))[:, None]
+        weights = np.zeros(HARMONICS)
+        return self._change(weights, self._spread, np.vstack([weights, roots]))
+
+    def _change(self, weights: np.ndarray, products: np.ndarray, fields: np.ndarray) -> _Change:
+        """Return a change from weights of the harmonics, their products, and those of fields."""
+        j, k = np.transpose(PAIRS)
+        factors = np.concatenate([2 * weights, products[j, k] * np.where(j == k, 1, 2)])
+        coefficients = np.tensordot(fields, self.coefficients, axes=1)
+        square = np.zeros((CUBIC + 1, *coefficients.shape[:2], CUBIC + 1))
+        for term, (x, y) in enumerate(self._functions.powers):
+            square[x, :, :, y] = coefficients[:, :, term]
+        variance = np.tensordot(factors, self.variances, axes=1)
+        return _Change(square, variance, len(fields) > 1)
+
+    def _values(self, uv: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        """Values (n, k, 2) of k fields, from the coefficients of a `_Change`."""
+        side = max(self.image_size) / 2
+        powers = np.empty((CUBIC + 1, len(uv), 2))
+        powers[0] = 1
+        powers[1] = (uv - (np.asarray(self.image_size) - 1) / 2) / side
+        for order in range(2, CUBIC + 1):
+            np.multiply(powers[order - 1], powers[1], out=powers[order])
+        by_y = powers[:, :, 0].T @ coefficients.reshape(CUBIC + 1, -1)
+        by_y = by_y.reshape(len(uv), *coefficients.shape[1:])
+        return np.einsum('nkay,yn->nka', by_y, powers[:, :, 1])
+
+    def _at(self, uv: np.ndarray, grid: np.ndarray) -> np.ndarray:
+        """Values (n,) of a grid (33, 33) over the image at pixels uv (n, 2), interpolated."""
+        place = (uv + 0.5) / np.asarray(self.image_size) * (SD_GRID - 1)
+        return map_coordinates(grid, place[:, ::-1].T, order=1, mode='nearest')
+
+
+def packed_angles(field: AngleField | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return angles (e,), coefficients (4, 2, 10) and variances (14, 33, 33), as they are saved.
+
+    No field gives empty arrays.
+    """
+    if field is None:
+        return np.zeros(0), np.zeros((0, 2, 0)), np.zeros((0, 0, 0))
+    return field.angles, field.coefficients, field.variances
+
+
+def unpacked_angles(
+    image_size: tuple[int, int],
+    angles: np.ndarray,
+    coefficients: np.ndarray,
+    variances: np.ndarray,
+) -> AngleField | None:
+    """Return the AngleField, or None, from which `packed_angles` made the arguments.
+
+    Raises ValueError if the parts do not belong together.
+    """
+    if not (np.size(angles) or np.size(coefficients) or np.size(variances)):
+        return None
+    return AngleField(image_size, angles, coefficients, variances)

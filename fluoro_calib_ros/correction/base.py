@@ -1,0 +1,222 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The interface of the correction models.
+
+A model is a subclass of `CorrectionModel` and one line in `registry`. It says how it predicts
+(`predict` and `standard_deviation`), and what a user and the lookup grid need to know
+(`description`, `smoothness`, `min_k`). How a self-calibration obtains it is not its business but
+that of `estimators`, which a program that only corrects does not load.
+
+docs/models.md shows how to add one.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass, field
+from enum import Enum, IntEnum
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import ConvexHull, QhullError
+
+from ..limits import MAX_CORNERS
+from .series import Series, packed
+
+# Status of a corrected image point.
+
+
+class CorrectionStatus(IntEnum):
+    """Status of a corrected image point, as it is sent in messages and written to files."""
+
+    OK = 0
+    OUTSIDE = 1  # beyond the calibrated area
+    INVALID = 2  # off the image, or not a number
+
+
+BULK_CHUNK = 2048  # pixels evaluated in one call of `evaluate_in_bulk`: some milliseconds
+
+
+class Smoothness(Enum):
+    """How a correction varies over the image, which decides the cell size of its lookup grid."""
+
+    SMOOTH = 'smooth'  # differentiable
+    KINKED = 'kinked'  # continuous, its slope jumps
+    STEPPED = 'stepped'  # piecewise constant
+
+
+@dataclass(frozen=True)
+class Correction:
+    """A correction at n pixels.
+
+    Attributes
+    ----------
+    duv : (n, 2) ndarray
+        du, dv [px]; undistorted = observed - (du, dv).
+    sd : (n,) ndarray
+        Standard deviation of each coordinate [px].
+    outside : (n,) ndarray of bool
+        True beyond the calibrated area.
+    """
+
+    duv: NDArray[np.float64]
+    sd: NDArray[np.float64]
+    outside: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class CorrectionModel(ABC):
+    """Distortion (du, dv) as a function of the observed pixel.
+
+    The fields are the whole content of a model: calibration files and messages carry them and
+    nothing else, so a subclass derives everything it needs from them in `_prepare`.
+
+    Attributes
+    ----------
+    k : int
+        Number of neighbours; 0 for a model without.
+    train_uv : (N, 2) ndarray
+        Observed training pixels.
+    train_duv : (N, 2) ndarray
+        Corrections at the training pixels [px].
+    noise_px : float
+        Standard deviation of one training correction.
+    bias_px : float
+        Systematic error of a prediction, as a standard deviation.
+    series : Series or None
+        Terms that were estimated in the adjustment.
+
+    Raises
+    ------
+    ValueError
+        If the arrays differ in length or are not finite, if a series is missing or not expected,
+        or if the training points do not allow k.
+    """
+
+    kind: ClassVar[str]
+    description: ClassVar[str]
+    smoothness: ClassVar[Smoothness] = Smoothness.SMOOTH
+    min_k: ClassVar[int | None] = None  # smallest number of neighbours; None: it has no neighbours
+    has_series: ClassVar[bool] = False
+    selectable: ClassVar[bool] = True  # False: a user cannot ask for it by name
+    corrects: ClassVar[bool] = True  # False: it leaves every pixel as it is
+    keeps_training_points: ClassVar[bool] = True  # train_uv are image points of exposures
+
+    k: int
+    train_uv: NDArray[np.float64]
+    train_duv: NDArray[np.float64]
+    noise_px: float = 0.0
+    bias_px: float = 0.0
+    series: Series | None = None
+    _hull: np.ndarray = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        uv = np.ascontiguousarray(self.train_uv, dtype=float).reshape(-1, 2)
+        duv = np.ascontiguousarray(self.train_duv, dtype=float).reshape(-1, 2)
+        if len(uv) != len(duv):
+            raise ValueError(f'{len(uv)} training points, but {len(duv)} corrections')
+        if not (np.isfinite(uv).all() and np.isfinite(duv).all()):
+            raise ValueError('a training point or its correction is not a number')
+        if (self.series is not None) != self.has_series:
+            needs = 'needs a series' if self.has_series else 'has no series'
+            raise ValueError(f'the correction model {self.kind} {needs}')
+        if self.min_k is not None and not self.min_k <= self.k <= len(uv):
+            raise ValueError(
+                f'{self.kind} with k = {self.k} is not possible with {len(uv)} training points'
+            )
+        hull = _half_planes(self._calibrated_points(uv))
+        if len(hull) > MAX_CORNERS:
+            raise ValueError(
+                f'the calibrated area has {len(hull)} corners, more than the {MAX_CORNERS} that '
+                'are possible'
+            )
+        self._set(train_uv=uv, train_duv=duv, _hull=hull)
+        self._prepare()
+
+    def _set(self, **values: Any) -> None:
+        """Set attributes of the frozen instance while it is made."""
+        for name, value in values.items():
+            object.__setattr__(self, name, value)
+
+    def _prepare(self) -> None:  # noqa: B027
+        """Derive from the content what predictions need; called once, by the constructor."""
+
+    def _calibrated_points(self, uv: np.ndarray) -> np.ndarray:
+        """Points whose convex hull is the calibrated area."""
+        return uv
+
+    @abstractmethod
+    def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Corrections (n, 2) [px] at pixels uv (n, 2)."""
+
+    def standard_deviation(self, uv: np.ndarray) -> NDArray[np.float64]:
+        """Standard deviations (n,) [px] of the predictions at pixels uv (n, 2)."""
+        return self._sd(np.zeros(len(uv)), uv)
+
+    def _sd(self, norm2: np.ndarray, uv: np.ndarray) -> np.ndarray:
+        """Standard deviations (n,) [px] from the squared norms (n,) of the prediction weights."""
+        variance = self.noise_px**2 * norm2 + self.bias_px**2
+        return np.sqrt(variance if self.series is None else variance + self.series.sd_at(uv) ** 2)
+
+    def evaluate(self, uv: ArrayLike) -> Correction:
+        """Return the Correction at pixels uv (n, 2), with standard deviations."""
+        uv = np.asarray(uv, dtype=float).reshape(-1, 2)
+        return Correction(self.predict(uv), self.standard_deviation(uv), self.outside(uv))
+
+    def evaluate_in_bulk(self, uv: np.ndarray) -> NDArray[np.float64]:
+        """Return du, dv and standard deviation (3, n) [px] at many pixels uv (n, 2).
+
+        The lookup grid is built with it. A subclass overrides it where there is a faster way than
+        `predict` in chunks.
+        """
+        out = np.empty((3, len(uv)))
+        for start in range(0, len(uv), BULK_CHUNK):
+            part = slice(start, start + BULK_CHUNK)
+            out[:2, part] = self.predict(uv[part]).T
+            out[2, part] = self.standard_deviation(uv[part])
+        return out
+
+    def bulk_work(self, uv: np.ndarray, limit: float) -> float:
+        """Return the work of `evaluate_in_bulk` at pixels uv (n, 2), in some 50 ns.
+
+        By default the values of functions that are added up. A result above the limit may be too
+        small.
+        """
+        return float(len(uv)) * (1 if self.series is None else len(self.series.functions))
+
+    def outside(self, uv: ArrayLike) -> np.ndarray:
+        """True (n,) where a pixel uv (n, 2) is beyond the convex hull of the training points."""
+        uv = np.asarray(uv, dtype=float)
+        return (uv @ self._hull[:, :2].T + self._hull[:, 2] > 0).any(axis=1)
+
+    def to_values(self) -> dict[str, Any]:
+        """Values of the fields of a calibration's record that hold the model.
+
+        `registry.model_from_values` makes an equal model of them.
+        """
+        degree, modes, coefficients, sd = packed(self.series)
+        return {
+            'model_kind': self.kind,
+            'model_k': self.k,
+            'train_uv': self.train_uv,
+            'train_duv': self.train_duv,
+            'noise_px': self.noise_px,
+            'bias_px': self.bias_px,
+            'series_degree': degree,
+            'series_modes': modes,
+            'series_coefficients': coefficients,
+            'series_sd': sd,
+        }
+
+
+def _half_planes(uv: np.ndarray) -> np.ndarray:
+    """Half-planes (h, 3) whose intersection is the convex hull of uv (N, 2).
+
+    A pixel (u, v) is inside where a u + b v + c <= 0 for every row (a, b, c).
+    """
+    try:
+        return ConvexHull(uv).equations
+    except (QhullError, ValueError):
+        return np.array([[0.0, 0.0, 1.0]])  # no area: everything is outside

@@ -1,0 +1,335 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The record of a calibration: every value that its file, its message and its id hold.
+
+A new value is one line here and an attribute of `FluoroscopeCalibration`. Those that determine a
+correction come first, in the order in which the id depends on them.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from ..exposures.frame import MAX_ANGLE
+from ..limits import (
+    MAX_ANGLES,
+    MAX_IMAGE_SIDE,
+    MAX_NEIGHBOURS,
+    MAX_PRINCIPAL_DISTANCE_PX,
+    MAX_PX,
+)
+from ..records import Field
+from .angle_field import HARMONICS, TERMS, VARIANCES
+from .series import MAX_DEGREE, MAX_MODES, SD_GRID
+
+VERSION = 4  # of the file
+
+_correction = partial(Field, identity='correction')
+_detail = partial(Field, identity='detail')
+
+FIELDS = (
+    # What determines a correction.
+    _correction(
+        'fluoroscope',
+        'text',
+        meaning='name of the fluoroscope: letters, digits, `_` and `-`; part of the file name',
+    ),
+    _correction(
+        'interior',
+        'float',
+        (3,),
+        'px',
+        'interior orientation: xp, yp (principal point), c (principal distance)',
+        maximum=MAX_PRINCIPAL_DISTANCE_PX,
+        message=('xp', 'yp', 'c'),
+    ),
+    _correction(
+        'image_size',
+        'int',
+        (2,),
+        'px',
+        'width and height of the image',
+        minimum=1,
+        maximum=MAX_IMAGE_SIDE,
+        message=('image_width', 'image_height'),
+    ),
+    _correction(
+        'train_uv',
+        'float',
+        ('N', 2),
+        'px',
+        'observed u, v of each training point',
+        maximum=MAX_PX,
+        message=('train_u', 'train_v'),
+    ),
+    _correction(
+        'train_duv',
+        'float',
+        ('N', 2),
+        'px',
+        'correction du, dv at each training point',
+        maximum=MAX_PX,
+        message=('train_du', 'train_dv'),
+    ),
+    _correction(
+        'model_k',
+        'int',
+        (),
+        '1',
+        'number of neighbours of the model; 0 for a model without neighbours',
+        minimum=0,
+        maximum=MAX_NEIGHBOURS,
+        message=('k',),
+    ),
+    _correction(
+        'noise_px',
+        'float',
+        (),
+        'px',
+        'standard deviation of a single training correction',
+        minimum=0,
+        maximum=MAX_PX,
+        message=('model_noise',),
+    ),
+    _correction(
+        'bias_px',
+        'float',
+        (),
+        'px',
+        'systematic error of a predicted correction',
+        minimum=0,
+        maximum=MAX_PX,
+        message=('model_bias',),
+    ),
+    _correction(
+        'image_sd',
+        'float',
+        (),
+        'px',
+        "standard deviation of an inlier's image coordinate, with what the distortion of single "
+        'exposures differs; for points without sigma',
+        minimum=0,
+        maximum=MAX_PX,
+    ),
+    _correction(
+        'sigma0',
+        'float',
+        (),
+        'px, or 1',
+        'scale of the Student-t noise; a factor on sigma where sigma was given',
+        minimum=0,
+        maximum=MAX_PX,
+    ),
+    _correction(
+        'series_degree',
+        'int',
+        (),
+        '1',
+        'degree of the polynomials of the series; -1: the model has no series',
+        minimum=-1,
+        maximum=MAX_DEGREE,
+        since=2,
+        before=np.array(-1),
+    ),
+    _correction(
+        'series_modes',
+        'int',
+        (),
+        '1',
+        'number of sines along the longer side of the image; 0: polynomials only',
+        minimum=0,
+        maximum=MAX_MODES,
+        since=2,
+        before=np.array(0),
+    ),
+    _correction(
+        'series_coefficients',
+        'float',
+        (2, 'M'),
+        'px',
+        'coefficients in u and in v; M = 0 without a series',
+        maximum=MAX_PX,
+        since=2,
+        before=np.zeros((2, 0)),
+        message=('series_u', 'series_v'),
+    ),
+    _correction(
+        'series_sd',
+        'float',
+        ('S', 'S'),
+        'px',
+        f'standard deviation of the series on a grid from edge to edge of the image, row by row, '
+        f'S = {SD_GRID}; (0, 0) without a series',
+        minimum=0,
+        maximum=MAX_PX,
+        lengths={'S': SD_GRID},
+        since=2,
+        before=np.zeros((0, 0)),
+    ),
+    _correction(
+        'angles',
+        'float',
+        ('A',),
+        'rad',
+        'angles of the C-arm in the exposures; A = 0: the correction does not depend on the angle',
+        maximum=MAX_ANGLE,
+        longest=MAX_ANGLES,
+        since=3,
+        before=np.zeros(0),
+    ),
+    _correction(
+        'angle_coefficients',
+        'float',
+        ('H', 2, 'T'),
+        'px',
+        'coefficients in u and v of what each harmonic of the angle adds, '
+        f'H = {HARMONICS}, T = {TERMS}; (0, 2, 0) without angles',
+        maximum=MAX_PX,
+        lengths={'H': HARMONICS, 'T': TERMS},
+        since=3,
+        before=np.zeros((0, 2, 0)),
+    ),
+    _correction(
+        'angle_variances',
+        'float',
+        ('V', 'G', 'G'),
+        'px²',
+        'covariances of these fields on the grid of `series_sd`, '
+        f'V = {VARIANCES}, G = {SD_GRID}; (0, 0, 0) without angles',
+        maximum=MAX_PX**2,
+        lengths={'V': VARIANCES, 'G': SD_GRID},
+        since=3,
+        before=np.zeros((0, 0, 0)),
+    ),
+    _correction(
+        'noise_profile',
+        'float',
+        ('P',),
+        '-',
+        'factors f0, f1 of `image_sd` in the middle of the image, and at the border and beyond, '
+        'and the distance r of the border from the middle in halves of the longer side, P = 3; '
+        'P = 0: the same everywhere',
+        minimum=0,
+        maximum=MAX_PX,
+        longest=3,
+        since=4,
+        before=np.zeros(0),
+    ),
+    _correction(
+        'model_kind',
+        'text',
+        meaning='kind of correction model: `knn`, `local_linear`, `parametric`, `hybrid`, '
+        '`collocation`, `none`, `lookup`',
+    ),
+    _correction(
+        'source_digest',
+        'text',
+        meaning='SHA-256 of the observations and the phantom',
+    ),
+    # What does not change a correction.
+    _detail(
+        'interior_covariance',
+        'float',
+        (3, 3),
+        'px²',
+        'covariance of xp, yp, c; zeros if the interior orientation was fixed',
+        maximum=MAX_PRINCIPAL_DISTANCE_PX**2,
+    ),
+    _detail(
+        'train_exposure',
+        'int',
+        ('N',),
+        '1',
+        'number of the exposure of each training point',
+        minimum=0,
+    ),
+    _detail(
+        'rmse_before',
+        'float',
+        (2,),
+        'px',
+        'RMSE of the inlier residuals in u, v without correction; NaN: no inliers',
+        minimum=0,
+        allowed='nan',
+        message=('rmse_before_u', 'rmse_before_v'),
+    ),
+    _detail(
+        'rmse_after',
+        'float',
+        (2,),
+        'px',
+        'the same with the correction',
+        minimum=0,
+        allowed='nan',
+        message=('rmse_after_u', 'rmse_after_v'),
+    ),
+    _detail(
+        'nu',
+        'float',
+        (),
+        '1',
+        'degrees of freedom of that noise; `inf`: Gaussian',
+        minimum=0,
+        allowed='inf',
+    ),
+    _detail(
+        'cost_adjustment',
+        'float',
+        (),
+        '1',
+        'F, final negative log-likelihood of the image points; may be NaN',
+        allowed='nan',
+    ),
+    _detail(
+        'cost_regression',
+        'float',
+        (),
+        '1',
+        'G, final weighted sum of squares of the cross-validation; may be NaN',
+        allowed='nan',
+    ),
+    _detail(
+        'interior_estimated',
+        'bool',
+        meaning='true: estimated in the adjustment; false: fixed, the correction model learned it',
+    ),
+    _detail('exposures', 'int', (), '1', 'number of exposures used', minimum=0),
+    _detail('observations', 'int', (), '1', 'number of image points used', minimum=0),
+    _detail(
+        'inliers',
+        'int',
+        (),
+        '1',
+        'number of image points that the adjustment classified as inliers',
+        minimum=0,
+    ),
+    _detail(
+        'iterations', 'int', (), '1', 'number of rounds of adjustment and regression', minimum=0
+    ),
+    _detail('converged', 'bool', meaning='false: stopped at the maximum number of rounds'),
+    # What the id does not depend on: files of observations have neither stamps nor frames, and a
+    # calibration from files has the id of the same one by the node.
+    Field(
+        'calibration_id',
+        'text',
+        meaning='identifier of the calibration; derived from the content and verified on reading; '
+        'that of an earlier version, of what determines a correction only, is replaced by it',
+    ),
+    Field(
+        'stamp_ns',
+        'int',
+        (),
+        'ns',
+        'time of the last exposure used, since 1970',
+        message=('header.stamp',),
+    ),
+    Field(
+        'frame_id',
+        'text',
+        meaning='optical frame of the fluoroscope in ROS',
+        message=('header.frame_id',),
+    ),
+)

@@ -1,0 +1,356 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Calibration of one fluoroscope: what is published, saved and used for the correction."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import DataError
+from ..exposures.frame import Frame, points_on_image
+from ..exposures.phantom import Phantom
+from ..records import Field
+from .angle_field import AngleField, packed_angles, unpacked_angles
+from .base import Correction, CorrectionModel, CorrectionStatus
+from .calibration_record import FIELDS
+from .grid import CorrectionGrid
+from .noise_profile import NoiseProfile, packed_profile, unpacked_profile
+from .registry import MODEL_FIELDS, model_from_values
+
+_ANGLES = ('angles', 'angle_coefficients', 'angle_variances')
+_SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
+
+
+@dataclass(frozen=True)
+class CorrectedPoints:
+    """Corrected image points.
+
+    uv (n, 2) [px]; sigma (n,): standard deviation of each coordinate [px]; status (n,):
+    `CorrectionStatus`. uv and sigma are NaN where the status is INVALID.
+    """
+
+    uv: np.ndarray
+    sigma: np.ndarray
+    status: np.ndarray
+
+
+@dataclass(frozen=True)
+class FluoroscopeCalibration:
+    """Interior orientation and correction model of one fluoroscope, and their quality.
+
+    `calibration_record` says what the attributes mean and their units; those that are no fields of
+    the record follow.
+
+    Attributes
+    ----------
+    model : CorrectionModel
+    angle_field : AngleField or None
+        Change of the correction with the angle of the C-arm; None: there is none.
+    noise_profile : NoiseProfile or None
+        Factors of image_sd over the image; None: it is the same everywhere.
+    seconds : float
+        Time the calibration took; NaN where it was read from a file.
+    """
+
+    fluoroscope: str
+    image_size: tuple[int, int]
+    interior: np.ndarray
+    interior_covariance: np.ndarray
+    interior_estimated: bool
+    model: CorrectionModel
+    train_exposure: np.ndarray
+    image_sd: float
+    sigma0: float
+    nu: float
+    exposures: int
+    observations: int
+    inliers: int
+    rmse_before: np.ndarray
+    rmse_after: np.ndarray
+    cost_adjustment: float
+    cost_regression: float
+    iterations: int
+    converged: bool
+    stamp_ns: int
+    frame_id: str
+    source_digest: str
+    angle_field: AngleField | None = None
+    noise_profile: NoiseProfile | None = None
+    seconds: float = field(default=np.nan, compare=False)
+    calibration_id: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        digest = hashlib.sha256()
+        self._add_to(digest, 'correction')
+        self._add_to(digest, 'detail')
+        object.__setattr__(self, 'calibration_id', self._identity(digest))
+
+    @property
+    def earlier_id(self) -> str:
+        """Id of this calibration in earlier versions: of what determines a correction only."""
+        digest = hashlib.sha256()
+        self._add_to(digest, 'correction')
+        return self._identity(digest)
+
+    def _identity(self, digest: hashlib._Hash) -> str:
+        return f'{self.fluoroscope}-{digest.hexdigest()[:16]}'
+
+    def _add_to(self, digest: hashlib._Hash, identity: str) -> None:
+        """Add the fields with this identity to a digest: numbers, then words.
+
+        The words of a correction are texts, those of its details numbers without a dimension that
+        are whole.
+        """
+        fields = [field for field in FIELDS if field.identity == identity]
+        values = self.to_values(fields)
+        words = []
+        for entry in fields:
+            value = values[entry.name]
+            if entry.name in _SERIES and self.model.series is None:
+                continue
+            if entry.dtype == 'text':
+                words.append(value)
+            elif identity == 'detail' and entry.dtype != 'float' and not entry.shape:
+                words.append(str(int(value)))
+            else:
+                numbers = np.ascontiguousarray(value, dtype=float)
+                digest.update(np.where(np.isnan(numbers), np.nan, numbers).tobytes())
+        digest.update('/'.join(words).encode())
+
+    def to_values(self, fields: Sequence[Field] = FIELDS) -> dict[str, Any]:
+        """Return the values of the fields of its record, for files and messages."""
+        values = self.model.to_values()
+        values |= zip(_ANGLES, packed_angles(self.angle_field))
+        values['noise_profile'] = packed_profile(self.noise_profile)
+        # An empty list would be one of floats.
+        values['train_exposure'] = np.asarray(
+            self.train_exposure, dtype=None if len(self.train_exposure) else np.int64
+        )
+        return {
+            field.name: values[field.name] if field.name in values else getattr(self, field.name)
+            for field in fields
+        }
+
+    @classmethod
+    def from_values(
+        cls, values: Mapping[str, Any], seconds: float = np.nan
+    ) -> FluoroscopeCalibration:
+        """Return the calibration from which `to_values` made the values, with an id of its own.
+
+        Raises ValueError for values that do not belong together.
+        """
+        width, height = (int(side) for side in values['image_size'])
+        size = (width, height)
+        packed = {'calibration_id', 'image_size', 'noise_profile', *_ANGLES, *MODEL_FIELDS}
+        return cls(
+            image_size=size,
+            model=model_from_values(values, size),
+            angle_field=unpacked_angles(size, *(values[name] for name in _ANGLES)),
+            noise_profile=unpacked_profile(values['noise_profile']),
+            seconds=seconds,
+            **{field.name: values[field.name] for field in FIELDS if field.name not in packed},
+        )
+
+    def noise_factors(self, uv: np.ndarray) -> np.ndarray:
+        """Return the factors (n,) of image_sd at pixels uv (n, 2)."""
+        if self.noise_profile is None:
+            return np.ones(len(uv))
+        return self.noise_profile.factors(uv[:, 0], uv[:, 1], self.image_size)
+
+    def image_sd_at(self, uv: np.ndarray) -> np.ndarray:
+        """Return the standard deviations (n,) [px] of image coordinates at pixels uv (n, 2)."""
+        return self.image_sd * self.noise_factors(uv)
+
+    @cached_property
+    def grid(self) -> CorrectionGrid:
+        """Lookup grid of the model, built at its first use."""
+        return CorrectionGrid(self.model, self.image_size)
+
+    def prepare(self) -> None:
+        """Build what the first correction needs, so that no frame waits for it."""
+        _ = self.grid
+
+    def correction(self, uv: ArrayLike, angle: ArrayLike | None = None) -> Correction:
+        """Return the Correction of the model at pixels uv (n, 2).
+
+        angle: of the C-arm [rad], a number or (n,); None or NaN where it is unknown.
+        """
+        found = self.model.evaluate(uv)
+        if self.angle_field is None:
+            return found
+        angle = np.nan if angle is None else angle
+        duv, variance = self.angle_field.change(uv, angle)
+        return Correction(
+            found.duv + duv,
+            np.sqrt(np.maximum(found.sd**2 + variance, 0)),
+            found.outside | ~self.angle_field.covers(angle),
+        )
+
+    def at_angle(self, angle: float | None) -> FluoroscopeCalibration:
+        """Return the calibration at an angle [rad] of the C-arm, which does not change with it.
+
+        None, or a calibration that does not depend on the angle: the calibration as it is. Raises
+        DataError for an angle that is not calibrated.
+        """
+        field = self.angle_field
+        series = self.model.series
+        if field is None or angle is None or series is None:
+            return self
+        if not field.covers(angle):
+            low, high = np.degrees(field.range)
+            raise DataError(
+                f'fluoroscope {self.fluoroscope}: {np.degrees(angle):g} degrees is too far from '
+                f'the angles of the calibration, {low:.0f} to {high:.0f} degrees'
+            )
+        model = replace(
+            self.model,
+            train_duv=self.model.train_duv + field.change(self.model.train_uv, angle)[0],
+            series=field.added_to(series, angle),
+        )
+        return replace(self, model=model, angle_field=None)
+
+    def correct(
+        self,
+        uv: ArrayLike,
+        sigma: ArrayLike | None = None,
+        exact: bool = False,
+        angle: ArrayLike | None = None,
+    ) -> CorrectedPoints:
+        """Return the corrected image points of observed pixels.
+
+        Parameters
+        ----------
+        uv : (n, 2) array_like
+            Observed pixels.
+        sigma : (n,) array_like, optional
+            Their standard deviations [px]; by default that of the calibration.
+        exact : bool
+            True for the model itself instead of its grid, which differs by grid.error_px and is
+            OUTSIDE up to a cell before the calibrated area ends.
+        angle : float or (n,) array_like, optional
+            Of the C-arm [rad], for a correction that changes with it; None or NaN: it is unknown.
+
+        Returns
+        -------
+        CorrectedPoints
+            With standard deviations of observation and correction together.
+        """
+        uv = np.asarray(uv, dtype=float).reshape(-1, 2)
+        sigma = None if sigma is None else np.asarray(sigma, dtype=float)
+        if exact:
+            return self._correct_exactly(
+                uv, self.image_sd_at(uv) if sigma is None else sigma, angle
+            )
+        u, v, total, _, status = self.correct_arrays(uv[:, 0], uv[:, 1], sigma, angle)
+        return CorrectedPoints(np.stack([u, v], axis=1), total, status)
+
+    def correct_arrays(
+        self,
+        u: np.ndarray,
+        v: np.ndarray,
+        sigma: np.ndarray | None = None,
+        angle: ArrayLike | None = None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Correct arrays u, v and sigma (n,) of floats, with the least overhead.
+
+        angle: of the C-arm [rad], a number or (n,); None or NaN where it is unknown. Returns
+        corrected u and v, their standard deviation, that of the correction alone [px], and status,
+        each (n,). The numbers are those of `correct`.
+        """
+        (du, dv, sd), status = self.grid.look_up(u, v)
+        if self.angle_field is not None:
+            self._add_angle(self.angle_field, (u, v), (du, dv, sd), status, angle)
+        np.subtract(u, du, out=du)
+        np.subtract(v, dv, out=dv)
+        total = sd * sd
+        if sigma is not None:
+            total += sigma * sigma
+        elif self.noise_profile is None:
+            total += self.image_sd**2
+        else:
+            noise = self.image_sd * self.noise_profile.factors(u, v, self.image_size)
+            noise *= noise
+            total += noise
+        return du, dv, np.sqrt(total, out=total), sd, status
+
+    @staticmethod
+    def _add_angle(
+        field: AngleField,
+        uv: tuple[np.ndarray, np.ndarray],
+        correction: tuple[np.ndarray, np.ndarray, np.ndarray],
+        status: np.ndarray,
+        angle: ArrayLike | None,
+    ) -> None:
+        """Add to a correction and its status, in place, what an angle changes."""
+        valid = status != int(CorrectionStatus.INVALID)
+        on = slice(None) if valid.all() else np.flatnonzero(valid)
+        angle = np.asarray(np.nan if angle is None else angle, dtype=float)
+        angle = angle[on] if angle.ndim else angle
+        duv, variance = field.change(np.column_stack([uv[0][on], uv[1][on]]), angle)
+        du, dv, sd = correction
+        du[on] += duv[:, 0]
+        dv[on] += duv[:, 1]
+        sd[on] = np.sqrt(np.maximum(sd[on] ** 2 + variance, 0))
+        beyond = ~field.covers(angle)
+        if beyond.any():
+            status[on] = np.where(beyond, CorrectionStatus.OUTSIDE, status[on])
+
+    def _correct_exactly(
+        self, uv: np.ndarray, sigma: np.ndarray | float, angle: ArrayLike | None
+    ) -> CorrectedPoints:
+        """Correct by the model itself."""
+        good = points_on_image(uv, self.image_size)
+        out = CorrectedPoints(
+            np.full(uv.shape, np.nan),
+            np.full(len(uv), np.nan),
+            np.full(len(uv), CorrectionStatus.INVALID, dtype=np.uint8),
+        )
+        if angle is not None and np.ndim(angle):
+            angle = np.asarray(angle)[good]
+        correction = self.correction(uv[good], angle)
+        out.uv[good] = uv[good] - correction.duv
+        out.sigma[good] = np.sqrt(np.broadcast_to(sigma, len(uv))[good] ** 2 + correction.sd**2)
+        out.status[good] = np.where(
+            correction.outside, CorrectionStatus.OUTSIDE, CorrectionStatus.OK
+        )
+        return out
+
+
+def at_common_angle(
+    uv: ArrayLike, one: FluoroscopeCalibration, other: FluoroscopeCalibration
+) -> tuple[Correction, Correction]:
+    """Return two corrections at pixels uv (n, 2), which can be compared.
+
+    Corrections that change with the angle of a C-arm are those at the same angle, the one of the
+    exposures of one that the other has come nearest to.
+    """
+    fields = (one.angle_field, other.angle_field)
+    angle = None
+    if fields[0] is not None and fields[1] is not None:
+        angle = fields[0].nearest_common(fields[1])
+    return one.correction(uv, angle), other.correction(uv, angle)
+
+
+def digest_of_sources(frames: Iterable[Frame], phantom: Phantom) -> str:
+    """SHA-256 (hex) of the frames of one fluoroscope and of the phantom."""
+    digest = hashlib.sha256()
+    for frame in sorted(frames, key=lambda f: f.number):
+        frame = frame.sorted()
+        digest.update(np.array([frame.number, *frame.image_size], dtype=np.int64).tobytes())
+        digest.update(frame.target_id.astype(np.int64).tobytes() + frame.uv.tobytes())
+        digest.update(b'' if frame.sigma is None else frame.sigma.tobytes())
+        digest.update(b'' if frame.angle is None else np.array([frame.angle]).tobytes())
+    digest.update(
+        phantom.target_id.astype(np.int64).tobytes()
+        + phantom.xyz_mm.tobytes()
+        + phantom.sd_mm.tobytes()
+    )
+    return digest.hexdigest()

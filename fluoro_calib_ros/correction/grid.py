@@ -1,0 +1,328 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The correction at the rate of a stream: a lookup grid that is made of a model once.
+
+A frame of 30 points leaves no time for neighbour searches or series of sines, and millions of
+points even less. So the image is divided into cells, and in each the correction and its standard
+deviation are bilinear between their exact values at the corners. A cell is one row of a table,
+with everything that a point in it needs: a random access to memory for each point, and the calls
+of numpy for a small frame, are what a lookup costs.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .base import CorrectionModel, CorrectionStatus, Smoothness
+from .grid_cells import (
+    COEFFICIENTS,
+    Cells,
+    DividedCells,
+    aligned_array,
+    build_cells,
+    divide_cells,
+    write_coefficients,
+)
+
+# The arrays in which the points of a frame are looked up, kept from frame to frame.
+
+# Part of a cell by which the image ends later, so that rounding leaves its edge on it.
+EDGE = 1e-11
+
+
+class LookupWorkspace:
+    """Arrays, and views of them, for the lookup of up to n points in a table of cells.
+
+    One thread uses it at a time. All calls of numpy are between whole arrays of one shape that
+    exist already: the number of calls is what a frame of 30 points costs.
+
+    Parameters
+    ----------
+    n : int
+        Largest number of points.
+    shape : (int, int)
+        Numbers of rows and columns of cells on the image.
+    image_size : (int, int)
+        Width and height of the image [px].
+
+    Attributes
+    ----------
+    uv : (2, n) ndarray
+        Pixels.
+    place : (2, n) ndarray
+        Pixels in units of cells.
+    row : (n,) ndarray of int
+        Rows of their cells in the table.
+    result : (3, n) ndarray
+        du, dv and standard deviation [px].
+    status : (n,) ndarray of uint8
+        Status of their cells.
+    """
+
+    __slots__ = (
+        '_cell',
+        '_cells_per_px',
+        '_coefficients',
+        '_column',
+        '_columns_of_table',
+        '_constant',
+        '_found',
+        '_highest',
+        '_linear',
+        '_lowest',
+        '_of_one',
+        '_of_u',
+        '_shift',
+        '_slopes',
+        '_u',
+        '_v',
+        'place',
+        'result',
+        'row',
+        'status',
+        'uv',
+    )
+
+    def __init__(self, n: int, shape: tuple[int, int], image_size: tuple[int, int]) -> None:
+        rows, columns = shape
+        number = np.array([columns, rows])
+        cells_per_px = (number - 2 * EDGE) / np.array(image_size)
+        whole = np.ones((2, n))
+        self._cells_per_px = whole * cells_per_px[:, None]
+        self._shift = whole * (0.5 * cells_per_px + 1 + EDGE)[:, None]
+        self._lowest = whole * 0.5
+        self._highest = whole * (number[:, None] + 1.5)
+        self._columns_of_table = np.full(n, columns + 2)
+        pixels = np.zeros((9, n))  # u three times, v six times
+        self._u = pixels[:3]
+        self._v = pixels[3:]
+        self.uv = pixels[2:4]
+        self.place = np.empty((2, n))
+        self._cell = np.empty((2, n), dtype=np.intp)
+        self._column = self._cell[0]
+        self.row = self._cell[1]
+        self._coefficients = np.empty((n, COEFFICIENTS))
+        self._found = np.empty((COEFFICIENTS, n))
+        self._constant = self._found[:6]
+        self._slopes = self._found[6:]
+        self._linear = np.empty((6, n))
+        self._of_one = self._linear[:3]
+        self._of_u = self._linear[3:]
+        self.result = np.empty((3, n))
+        self.status = np.empty(n, dtype=np.uint8)
+
+    def locate(self, u: np.ndarray, v: np.ndarray) -> None:
+        """Find the cells of points u, v (m,) with m <= n: sets `uv`, `place` and `row`."""
+        place = self.place
+        row = self.row
+        count = len(u)
+        self._u[:, :count] = u
+        self._v[:, :count] = v
+        np.multiply(self.uv, self._cells_per_px, place)
+        np.add(place, self._shift, place)
+        np.fmax(place, self._lowest, place)  # replaces NaN, too
+        np.fmin(place, self._highest, place)
+        self._cell[...] = place  # rounds down: it is positive
+        np.multiply(row, self._columns_of_table, row)
+        np.add(row, self._column, row)
+
+    def interpolate(self, table: np.ndarray, status: np.ndarray) -> None:
+        """Evaluate the cells of the located points: sets `result` and `status`.
+
+        table (cells, COEFFICIENTS) and status (cells,) have a row for each cell.
+        """
+        linear = self._linear
+        result = self.result
+        # The rows are in range; other modes than 'clip' copy once more.
+        table.take(self.row, 0, self._coefficients, 'clip')
+        status.take(self.row, 0, self.status, 'clip')
+        self._found[...] = self._coefficients.T
+        np.multiply(self._slopes, self._v, linear)  # constant + slopes v, of 1 and of u
+        np.add(linear, self._constant, linear)
+        np.multiply(self._of_u, self._u, result)
+        np.add(result, self._of_one, result)
+
+
+DIVIDED = 4  # added to the status of a cell that is divided
+CHUNK = 8192  # points that are looked up at once, so that their workspace fits the cache
+# Numbers of points for which workspaces are made: steps of 32 for frames, then powers of two.
+WORKSPACE_STEP = 32
+MAX_STEPPED = 512
+WORKSPACE_SIZES = (*range(0, MAX_STEPPED + 1, WORKSPACE_STEP), 1024, 2048, 4096, CHUNK)
+CHECKS_OF_DIVIDED = 20  # random points in each divided cell at which its error is measured
+
+
+class CorrectionGrid:
+    """Correction, standard deviation and status of the pixels of an image, from a table.
+
+    A grid is not changed by its use: any number of threads may share it. A piecewise constant
+    model (knn) has the smallest cells; its lookups are between the values at the corners of the
+    cell.
+
+    Parameters
+    ----------
+    model : CorrectionModel
+    image_size : (int, int)
+        Width and height [px].
+
+    Attributes
+    ----------
+    nodes : (w,) ndarray, (h,) ndarray
+        Columns and rows [px] of the corners of cells.
+    cell_px : float
+        Longer side of a cell.
+    divided : int
+        Number of cells that are divided further.
+    error_px : float
+        Largest difference of a coordinate from the exact model in the calibrated area, measured at
+        the centres of cells and of their edges. A kink between them may do half more.
+    error_outside_px : float
+        The same in the other cells.
+    sd_error_px : float
+        Largest difference of the standard deviation, everywhere.
+    """
+
+    def __init__(self, model: CorrectionModel, image_size: tuple[int, int]) -> None:
+        width, height = image_size
+        self.image_size = (int(width), int(height))
+        cells = build_cells(model, self.image_size)
+        self.nodes = cells.nodes
+        self.cell_px = float(max(np.diff(axis).max() for axis in cells.nodes))
+        self._set_tables(cells)
+        self._workspaces: list[list[LookupWorkspace]] = _no_workspaces()
+        self.divided = 0
+        errors = cells.errors
+        if model.smoothness is not Smoothness.STEPPED:
+            divided = divide_cells(model, cells)
+            if divided is not None:
+                self._set_divided(divided)
+                errors[:, divided.row, divided.column] = self._errors_of_divided(model, divided)
+        self.error_px = float(np.nanmax(errors[0][~cells.outside], initial=0.0))
+        self.error_outside_px = float(np.nanmax(errors[0][cells.outside], initial=0.0))
+        self.sd_error_px = float(np.nanmax(errors[1]))
+
+    def _set_tables(self, cells: Cells) -> None:
+        """Make the tables of coefficients and status, one row for each cell."""
+        rows, columns = cells.outside.shape
+        self._shape = (rows, columns)
+        # A frame of cells around the image answers for what is off it, with NaN and INVALID.
+        table = aligned_array((rows + 2, columns + 2, COEFFICIENTS))
+        table[:] = np.nan
+        write_coefficients(cells.nodes, cells.values, table[1:-1, 1:-1])
+        self._table = table.reshape(-1, COEFFICIENTS)
+        status = np.where(cells.outside, CorrectionStatus.OUTSIDE, CorrectionStatus.OK)
+        self._status = np.pad(
+            status.astype(np.uint8), 1, constant_values=int(CorrectionStatus.INVALID)
+        ).ravel()
+
+    def _set_divided(self, divided: DividedCells) -> None:
+        """Let lookups in divided cells use the table of their parts."""
+        self._first = divided.first
+        self._parts = divided.parts
+        self._parts_table = divided.table
+        columns = self._shape[1] + 2
+        self._divided_cells = (divided.row + 1) * columns + divided.column + 1
+        self._status[self._divided_cells] += DIVIDED
+        self.divided = len(divided.row)
+
+    def _errors_of_divided(self, model: CorrectionModel, divided: DividedCells) -> np.ndarray:
+        """Errors (2, d) [px] of correction and standard deviation left in divided cells."""
+        place = np.random.default_rng(0).random((2, CHECKS_OF_DIVIDED, self.divided))
+        u, v = (
+            axis[k] + part * (axis[k + 1] - axis[k])
+            for axis, k, part in zip(self.nodes, (divided.column, divided.row), place)
+        )
+        found = self.look_up(u.ravel(), v.ravel())[0]
+        exact = model.evaluate_in_bulk(np.stack([u.ravel(), v.ravel()], axis=1))
+        error = np.abs(found - exact).reshape(3, *u.shape).max(axis=1)
+        return np.stack([error[:2].max(axis=0), error[2]])
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Copies of views would be arrays of their own.
+        return {**self.__dict__, '_workspaces': _no_workspaces()}
+
+    def look_up(
+        self,
+        u: NDArray[np.float64],
+        v: NDArray[np.float64],
+        values: NDArray[np.float64] | None = None,
+        status: NDArray[np.uint8] | None = None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return correction, standard deviation and status at pixels.
+
+        Parameters
+        ----------
+        u, v : (n,) ndarray
+            Columns and rows [px].
+        values, status : (3, n) ndarray of float and (n,) ndarray of uint8, optional
+            Arrays for the results, both or none.
+
+        Returns
+        -------
+        values : (3, n) ndarray
+            du, dv and standard deviation [px]; NaN where the status is INVALID.
+        status : (n,) ndarray of uint8
+            `CorrectionStatus`; INVALID off the image and for what is not a number.
+        """
+        n = len(u)
+        if n <= CHUNK:
+            return self._look_up(u, v, values, status)
+        if values is None or status is None:
+            values = np.empty((3, n))
+            status = np.empty(n, dtype=np.uint8)
+        for start in range(0, n, CHUNK):
+            part = slice(start, start + CHUNK)
+            self._look_up(u[part], v[part], values[:, part], status[part])
+        return values, status
+
+    def _look_up(
+        self,
+        u: np.ndarray,
+        v: np.ndarray,
+        values: np.ndarray | None,
+        status: np.ndarray | None,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Look up at most CHUNK points; see `look_up`."""
+        n = len(u)
+        number = (n + 31) // 32 if n <= MAX_STEPPED else 16 + (n - 1 >> 9).bit_length()
+        workspaces = self._workspaces[number]
+        try:
+            workspace = workspaces.pop()  # a thread that pops one has it alone, and puts it back
+        except IndexError:
+            workspace = LookupWorkspace(WORKSPACE_SIZES[number], self._shape, self.image_size)
+        workspace.locate(u, v)
+        workspace.interpolate(self._table, self._status)
+        if self.divided:
+            self._look_up_parts(workspace)
+        if values is None or status is None:
+            values = workspace.result[:, :n].copy()
+            status = workspace.status[:n].copy()
+        else:
+            values[...] = workspace.result[:, :n]
+            status[...] = workspace.status[:n]
+        workspaces.append(workspace)
+        return values, status
+
+    def _look_up_parts(self, workspace: LookupWorkspace) -> None:
+        """Replace the results of points in divided cells, whose status is DIVIDED or more."""
+        which = np.flatnonzero(workspace.status >= DIVIDED)
+        if not len(which):
+            return
+        cell = np.searchsorted(self._divided_cells, workspace.row[which])
+        parts = self._parts[cell]
+        place = workspace.place[:, which]
+        column, row = np.minimum(((place - np.floor(place)) * parts).astype(np.intp), parts - 1)
+        columns = self._parts_table[self._first[cell] + row * parts + column].T
+        u, v = workspace.uv[:, which]
+        half = columns[6:] * v + columns[:6]
+        workspace.result[:, which] = half[3:] * u + half[:3]
+        workspace.status[which] -= DIVIDED
+
+
+def _no_workspaces() -> list[list[LookupWorkspace]]:
+    """Empty lists of free workspaces, by WORKSPACE_SIZES."""
+    return [[] for _ in WORKSPACE_SIZES]

@@ -1,0 +1,350 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The cells of a lookup grid: their size, the exact values at their corners, their coefficients.
+
+The cells are as large as LIMIT_PX of `grid_errors` allows. The few in which that is not accurate
+enough, as neighbour models have kinks, are divided once more and have rows in a second table. What
+the values cost is counted beforehand: where it is too much, the cells are larger.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+from .base import BULK_CHUNK, CorrectionModel, Smoothness
+
+# Errors of bilinear interpolation between the corners of the cells of a lookup grid.
+
+LIMIT_PX = 0.01  # largest difference of a looked-up correction from that of the exact model
+# The difference is measured at centres of cells and of their edges; a kink between centre and
+# corner has its largest error elsewhere.
+TARGET_PX = 0.6 * LIMIT_PX
+# Cells of the smallest size in which the difference is measured: those with the largest second
+# differences.
+MIN_MEASURED = 500
+MAX_MEASURED = 25_000
+PLACES = ((0.5, 0.5), (0.5, 0.0), (0.0, 0.5), (0.5, 1.0), (1.0, 0.5))  # in a cell, where it is
+
+
+def errors_of_finer_grid(values: np.ndarray) -> NDArray[np.float64]:
+    """Errors (2, h, w) [px] of correction and standard deviation in cells.
+
+    values (3, 2h + 1, 2w + 1): du, dv and standard deviation at the corners of the cells, the
+    middles of their edges, and their centres.
+    """
+    corner = values[:, ::2, ::2]
+    along_u = (corner[:, :, :-1] + corner[:, :, 1:]) / 2
+    along_v = (corner[:, :-1] + corner[:, 1:]) / 2
+    of_u = np.abs(values[:, ::2, 1::2] - along_u)
+    of_v = np.abs(values[:, 1::2, ::2] - along_v)
+    error = np.abs(values[:, 1::2, 1::2] - (along_u[:, :-1] + along_u[:, 1:]) / 2)
+    for other in (of_u[:, :-1], of_u[:, 1:], of_v[:, :, :-1], of_v[:, :, 1:]):
+        np.maximum(error, other, out=error)
+    return np.stack([error[:2].max(axis=0), error[2]])
+
+
+def errors_where_curved(
+    model: CorrectionModel,
+    nodes: tuple[NDArray[np.float64], NDArray[np.float64]],
+    values: NDArray[np.float64],
+    affordable: int,
+) -> np.ndarray:
+    """Errors of cells, measured where second differences suggest that they may be too large.
+
+    Parameters
+    ----------
+    model : CorrectionModel
+    nodes : (w,) ndarray, (h,) ndarray
+        Columns and rows [px] of the corners of the cells.
+    values : (3, h, w) ndarray
+        du, dv and standard deviation there.
+    affordable : int
+        Number of exact values that do not take too long.
+
+    Returns
+    -------
+    (2, h - 1, w - 1) ndarray
+        Errors of correction and standard deviation [px]; NaN in cells that are not measured. At
+        least MIN_MEASURED cells are, if that is affordable.
+    """
+    columns, rows = nodes
+    curvature = _second_differences(values)
+    # At a kink the error is at most half the second difference, on a smooth bend an eighth.
+    count = MIN_MEASURED
+    if model.smoothness is not Smoothness.STEPPED:
+        curved = np.count_nonzero(curvature > 1.5 * TARGET_PX)
+        count = int(np.clip(curved, MIN_MEASURED, MAX_MEASURED))
+    count = max(1, min(count, affordable // len(PLACES)))
+    j, i = np.unravel_index(np.argsort(-curvature, axis=None)[:count], curvature.shape)
+    errors = np.full((2, *curvature.shape), np.nan)
+    errors[:, j, i] = 0.0
+    for x, y in PLACES:
+        u = columns[i] + x * (columns[i + 1] - columns[i])
+        v = rows[j] + y * (rows[j + 1] - rows[j])
+        upper = (1 - x) * values[:, j, i] + x * values[:, j, i + 1]
+        lower = (1 - x) * values[:, j + 1, i] + x * values[:, j + 1, i + 1]
+        exact = model.evaluate_in_bulk(np.stack([u, v], axis=1))
+        error = np.abs((1 - y) * upper + y * lower - exact)
+        errors[:, j, i] = np.maximum(errors[:, j, i], [error[:2].max(axis=0), error[2]])
+    return errors
+
+
+def _second_differences(values: np.ndarray) -> np.ndarray:
+    """Largest second difference (h - 1, w - 1) [px] of the correction at the corners of a cell."""
+    at_node = np.zeros(values.shape[1:])
+    at_node[:, 1:-1] = np.abs(np.diff(values[:2], 2, axis=2)).max(axis=0)
+    at_node[1:-1] += np.abs(np.diff(values[:2], 2, axis=1)).max(axis=0)
+    of_cell = np.maximum(at_node[:-1], at_node[1:])
+    return np.maximum(of_cell[:, :-1], of_cell[:, 1:])
+
+
+CELL_PX = (8, 4, 2)  # sizes of cells that are tried
+MAX_SHARE_DIVIDED = 0.01  # of cells, so that not all of them have to be smaller
+MAX_DIVIDED = 2500
+MAX_PARTS = 16  # of a divided cell along a side
+MAX_TABLE_BYTES = 128_000_000
+MAX_CELL_PX = 64  # larger ones would not resemble the model
+# Work of the values at the corners of cells (`CorrectionModel.bulk_work`): some six seconds. That
+# of the errors may be a quarter of it, that of the divided cells half.
+MAX_WORK = 1.2e8
+COEFFICIENTS = 12  # of a cell: 1, u, v, u v, each for du, dv and the standard deviation
+
+Nodes = tuple[np.ndarray, np.ndarray]  # columns (w,) and rows (h,) [px] of the corners of cells
+
+
+@dataclass(frozen=True)
+class Cells:
+    """Cells of a lookup grid.
+
+    Attributes
+    ----------
+    nodes : (w,) ndarray, (h,) ndarray
+        Columns and rows [px] of their corners.
+    values : (3, h, w) ndarray
+        du, dv and standard deviation [px] there.
+    errors : (2, h - 1, w - 1) ndarray
+        Errors [px] of correction and standard deviation in the cells; NaN where not measured.
+    outside : (h - 1, w - 1) ndarray of bool
+        True for cells with a corner beyond the calibrated area.
+    work : float
+        Of a value, on average.
+    """
+
+    nodes: Nodes
+    values: NDArray[np.float64]
+    errors: NDArray[np.float64]
+    outside: NDArray[np.bool_]
+    work: float
+
+
+@dataclass(frozen=True)
+class DividedCells:
+    """Cells that are divided further, as they are not accurate enough.
+
+    Attributes
+    ----------
+    row, column : (d,) ndarray of int
+        Their place among the cells.
+    parts : (d,) ndarray of int
+        Number of parts along a side.
+    first : (d,) ndarray of int
+        Row of the first part in the table.
+    table : (p, 12) ndarray
+        Coefficients of all parts.
+    """
+
+    row: NDArray[np.int64]
+    column: NDArray[np.int64]
+    parts: NDArray[np.int64]
+    first: NDArray[np.int64]
+    table: np.ndarray
+
+
+def build_cells(model: CorrectionModel, image_size: tuple[int, int]) -> Cells:
+    """Return the cells of an image (width, height) [px] for a model.
+
+    Raises DataError for a model whose values take too long, even at the corners of large cells.
+    """
+    sizes, work = _affordable_sizes(model, image_size)
+    nodes, values, errors = _nodes_and_values(model, image_size, sizes, work)
+    return Cells(nodes, values, errors, _outside(model, nodes), work)
+
+
+def divide_cells(model: CorrectionModel, cells: Cells) -> DividedCells | None:
+    """Divide the cells with the largest errors; None where all are accurate enough."""
+    error = cells.errors[0]
+    inaccurate = np.flatnonzero(error > TARGET_PX)
+    worst_first = np.argsort(-error.ravel()[inaccurate], kind='stable')
+    inaccurate = np.sort(inaccurate[worst_first[:MAX_DIVIDED]])
+    if not len(inaccurate):
+        return None
+    j, i = np.unravel_index(inaccurate, error.shape)
+    columns, rows = cells.nodes
+    # At a kink the error is proportional to the side of a cell; one more halving for what the
+    # measured points do not show.
+    halvings = 1 + np.ceil(np.log2(error[j, i] / TARGET_PX))
+    parts = np.minimum(2 ** halvings.astype(np.intp), MAX_PARTS)
+    kept = _affordable_cells(error[j, i], parts, cells.work)
+    if not len(kept):
+        return None
+    j = j[kept]
+    i = i[kept]
+    parts = parts[kept]
+    part_nodes = [
+        (
+            np.linspace(columns[x], columns[x + 1], n + 1),
+            np.linspace(rows[y], rows[y + 1], n + 1),
+        )
+        for x, y, n in zip(i, j, parts)
+    ]
+    exact = model.evaluate_in_bulk(np.concatenate([_pixels(nodes) for nodes in part_nodes]))
+    values = np.split(exact, np.cumsum((parts + 1) ** 2)[:-1], axis=1)
+    first = np.concatenate([[0], np.cumsum(parts**2)[:-1]])
+    table = aligned_array((int(np.sum(parts**2)), COEFFICIENTS))
+    for nodes, n, start, of_cell in zip(part_nodes, parts, first, values):
+        write_coefficients(
+            nodes,
+            of_cell.reshape(3, n + 1, n + 1),
+            table[start : start + n * n].reshape(n, n, COEFFICIENTS),
+        )
+    return DividedCells(j, i, parts, first, table)
+
+
+def _affordable_cells(error: np.ndarray, parts: np.ndarray, work: float) -> np.ndarray:
+    """Places, ascending, of the cells with the largest errors whose parts do not take too long."""
+    worst_first = np.argsort(-error, kind='stable')
+    values = np.cumsum((parts[worst_first] + 1) ** 2)
+    return np.sort(worst_first[: np.searchsorted(values * work, MAX_WORK / 2, side='right')])
+
+
+def write_coefficients(nodes: Nodes, values: np.ndarray, out: np.ndarray) -> None:
+    """Write the coefficients of bilinear interpolation in cells to out (h - 1, w - 1, 12).
+
+    nodes: columns (w,) and rows (h,) [px] of the corners; values (3, h, w) there. The coefficients
+    are those of 1, u, v and u v, each for du, dv and the standard deviation.
+    """
+    columns, rows = nodes
+    x = columns[:-1]
+    y = rows[:-1, None]
+    width = np.diff(columns)
+    height = np.diff(rows)[:, None]
+    corner = values[:, :-1, :-1]
+    of_x = (values[:, :-1, 1:] - corner) / width
+    of_y = (values[:, 1:, :-1] - corner) / height
+    of_xy = ((values[:, 1:, 1:] - values[:, 1:, :-1]) / width - of_x) / height
+    for k in range(3):
+        a = corner[k]
+        b = of_x[k]
+        c = of_y[k]
+        d = of_xy[k]
+        out[:, :, k] = a - b * x - (c - d * x) * y
+        out[:, :, 3 + k] = b - d * y
+        out[:, :, 6 + k] = c - d * x
+        out[:, :, 9 + k] = d
+
+
+def aligned_array(shape: tuple[int, ...]) -> np.ndarray:
+    """Uninitialised floats that begin with a cache line, so that a row is in few of them."""
+    size = int(np.prod(shape))
+    memory = np.empty(size + 8)
+    start = -memory.ctypes.data % 64 // 8
+    return memory[start : start + size].reshape(shape)
+
+
+def _nodes_and_values(
+    model: CorrectionModel, image_size: tuple[int, int], sizes: list[float], work: float
+) -> tuple[Nodes, np.ndarray, np.ndarray]:
+    """Nodes of the cell size that is chosen, values (3, h, w) there, and errors of the cells."""
+    nodes = _nodes(image_size, sizes[0], 1)
+    values = None
+    for number in range(len(sizes) - 1):
+        finer = _nodes(image_size, sizes[0], 2 ** (number + 1))
+        finer_values = _exact_values(model, finer)
+        values = finer_values[:, ::2, ::2]
+        errors = errors_of_finer_grid(finer_values)
+        if np.mean(errors[0] > TARGET_PX) <= MAX_SHARE_DIVIDED:
+            return nodes, values, errors
+        nodes = finer
+        values = finer_values
+    if values is None:
+        values = _exact_values(model, nodes)
+    affordable = int(MAX_WORK / 4 / work)
+    return nodes, values, errors_where_curved(model, nodes, values, affordable)
+
+
+def _affordable_sizes(
+    model: CorrectionModel, image_size: tuple[int, int]
+) -> tuple[list[float], float]:
+    """Sizes of cells to try whose values do not take too long, and the mean work of a value.
+
+    Raises DataError where there are none.
+    """
+    sizes = _cell_sizes(model.smoothness, image_size)
+    while True:
+        pixels = _pixels(_nodes(image_size, sizes[0], 2 ** (len(sizes) - 1)))
+        work = model.bulk_work(pixels, MAX_WORK)
+        if work <= MAX_WORK:
+            return sizes, work / len(pixels)
+        sizes = sizes[:-1] or [2 * sizes[0]]
+        if sizes[0] > MAX_CELL_PX:
+            raise DataError(
+                f'the correction takes too long: its {len(model.train_uv)} training points lie '
+                f'too close together for {model.k} neighbours'
+            )
+
+
+def _cell_sizes(smoothness: Smoothness, image_size: tuple[int, int]) -> list[float]:
+    """Sizes of cells [px] to try, each half the one before."""
+    area = image_size[0] * image_size[1]
+    bytes_of_cell = COEFFICIENTS * 8
+    sizes: list[float] = [
+        size for size in CELL_PX if area / size**2 * bytes_of_cell <= MAX_TABLE_BYTES
+    ]
+    if not sizes:
+        return [2 ** np.ceil(np.log2(area * bytes_of_cell / MAX_TABLE_BYTES) / 2)]
+    if smoothness is Smoothness.STEPPED:
+        return sizes[-1:]  # small cells blur the steps less
+    if smoothness is Smoothness.KINKED:
+        return sizes[-2:]  # larger cells are never accurate enough
+    return sizes
+
+
+def _nodes(image_size: tuple[int, int], size: float, parts: int) -> Nodes:
+    """Corners of cells from edge to edge of an image: 1/parts of cells of at most size [px]."""
+    width, height = image_size
+    return _axis_nodes(width, size, parts), _axis_nodes(height, size, parts)
+
+
+def _axis_nodes(length: int, size: float, parts: int) -> np.ndarray:
+    return np.linspace(-0.5, length - 0.5, parts * max(1, int(np.ceil(length / size))) + 1)
+
+
+def _pixels(nodes: Nodes) -> np.ndarray:
+    """Pixels (h * w, 2) of nodes, row by row."""
+    columns, rows = nodes
+    return np.stack([np.tile(columns, len(rows)), np.repeat(rows, len(columns))], axis=1)
+
+
+def _exact_values(model: CorrectionModel, nodes: Nodes) -> np.ndarray:
+    """du, dv and standard deviation (3, h, w) [px] of the model at nodes."""
+    columns, rows = nodes
+    return model.evaluate_in_bulk(_pixels(nodes)).reshape(3, len(rows), len(columns))
+
+
+def _outside(model: CorrectionModel, nodes: Nodes) -> np.ndarray:
+    """True (h - 1, w - 1) for cells with a corner beyond the calibrated area.
+
+    All other cells are wholly inside, as the area is convex.
+    """
+    columns, rows = nodes
+    step = max(1, BULK_CHUNK // len(columns))
+    parts = [
+        model.outside(_pixels((columns, rows[i : i + step]))) for i in range(0, len(rows), step)
+    ]
+    node = np.concatenate(parts).reshape(len(rows), len(columns))
+    return node[:-1, :-1] | node[:-1, 1:] | node[1:, :-1] | node[1:, 1:]

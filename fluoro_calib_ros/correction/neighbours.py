@@ -1,0 +1,510 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The model `knn`: the mean of the k nearest training corrections (Chow et al., section 3)."""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Iterator
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial import cKDTree
+
+from .base import BULK_CHUNK, Correction, CorrectionModel, Smoothness
+
+# Nearest training points of very many pixels, block by block.
+#
+# All pixels of a block have their k nearest training points among those within r + 2e of its
+# centre, where r is the distance of the k-th nearest from the centre and e half the diagonal
+# (triangle inequality). So one search serves some 200 pixels, and every call of numpy takes some
+# ten microseconds: a stream in the same process is not delayed.
+
+BLOCK = 200  # pixels of a block
+MIN_BLOCK = 9  # where training points are dense
+MAX_BLOCK_PX = 64.0  # its largest side, for pixels that are far apart
+BLOCKS_PER_QUERY = 32
+MAX_FOUND = 2_000_000  # candidates of a query, to bound the memory
+REACH_SAMPLES = 32
+# In candidates of a pixel: what a block costs, and each neighbour in the search from its centre.
+WORK_OF_BLOCK = 5000
+WORK_OF_NEIGHBOUR = 10
+
+
+def blocks_with_candidates(
+    tree: cKDTree, uv: np.ndarray, k: int, most: int
+) -> Iterator[tuple[np.ndarray, list[int] | None]]:
+    """Blocks of pixels uv (n, 2), and the training points among which their k nearest are.
+
+    tree holds the training points. Yields the rows of the pixels and of the training points; None
+    in place of more than most points, as where many coincide.
+    """
+    per_query = int(np.clip(MAX_FOUND // min(tree.n, most), 1, BLOCKS_PER_QUERY))
+    for some, centre, radius in _circles(tree, uv, k, per_query):
+        if tree.n <= most:
+            yield from zip(some, tree.query_ball_point(centre, radius))
+            continue
+        few = tree.query_ball_point(centre, radius, return_length=True) <= most
+        found = iter(tree.query_ball_point(centre[few], radius[few]) if few.any() else ())
+        for block, is_few in zip(some, few):
+            yield block, next(found) if is_few else None
+
+
+def work_of_blocks(tree: cKDTree, uv: np.ndarray, k: int, limit: float) -> int:
+    """Sum of the numbers of candidates over pixels uv (n, 2), and the work on blocks as such.
+
+    Counting ends above a limit.
+    """
+    total = 0
+    for some, centre, radius in _circles(tree, uv, k, BLOCKS_PER_QUERY):
+        counts = tree.query_ball_point(centre, radius, return_length=True)
+        total += sum(len(block) * int(count) for block, count in zip(some, counts))
+        total += len(some) * (WORK_OF_BLOCK + WORK_OF_NEIGHBOUR * k)
+        if total > limit:
+            break
+    return total
+
+
+def _circles(
+    tree: cKDTree, uv: np.ndarray, k: int, per_query: int
+) -> Iterator[tuple[list[np.ndarray], np.ndarray, np.ndarray]]:
+    """Yield per_query blocks at a time, with centres and radii of the circles of candidates."""
+    reach = np.median(tree.query(uv[:: len(uv) // REACH_SAMPLES + 1], k=[k])[0])
+    blocks = _blocks(uv, reach)
+    for start in range(0, len(blocks), per_query):
+        some = blocks[start : start + per_query]
+        low = np.array([np.min(uv[block], axis=0) for block in some])
+        high = np.array([np.max(uv[block], axis=0) for block in some])
+        centre = (low + high) / 2
+        diagonal = np.linalg.norm(high - low, axis=1)
+        kth = tree.query(centre, k=[k])[0][:, 0]
+        yield some, centre, (kth + diagonal) * (1 + 1e-9) + 1e-9
+
+
+def _blocks(uv: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Rows of pixels uv (n, 2) that are close together, about BLOCK of them each.
+
+    reach: distance of the k-th nearest training point [px]. Larger blocks would have many more
+    candidates than k, and are divided.
+    """
+    low = uv.min(axis=0)
+    high = uv.max(axis=0)
+    of_one = np.sqrt(np.prod(high - low + 1) / len(uv))
+    side = min(
+        np.sqrt(BLOCK) * of_one,
+        max(MAX_BLOCK_PX, reach / 2),
+        max(reach, np.sqrt(MIN_BLOCK) * of_one),
+    )
+    column, row = ((uv - low) / side).astype(np.intp).T
+    block = row * (column.max() + 1) + column
+    order = np.argsort(block, kind='stable')
+    border = np.flatnonzero(np.diff(block[order])) + 1
+    return [
+        part[i : i + 2 * BLOCK]
+        for part in np.split(order, border)
+        for i in range(0, len(part), 2 * BLOCK)
+    ]
+
+
+# Nearest neighbours of image points, and the weights of linear smoothers over them.
+
+RIDGE = 1e-6  # of the slopes, relative to the kernel weights: collinear neighbours stay harmless
+
+
+class Neighbourhoods:
+    """Offsets from n query points to their K nearest training points, ascending in distance.
+
+    neighbours (n, K, 2) and queries (n, 2) [px].
+    """
+
+    def __init__(self, neighbours: np.ndarray, queries: np.ndarray) -> None:
+        self.dx = neighbours[:, :, 0] - queries[:, :1]
+        self.dy = neighbours[:, :, 1] - queries[:, 1:]
+        square = self.dx * self.dx + self.dy * self.dy
+        self.cubed_distance = square * np.sqrt(square)
+
+    def __len__(self) -> int:
+        return len(self.dx)
+
+
+def tricube_plane_weights(near: Neighbourhoods, k: int) -> np.ndarray:
+    """Weights (n, k) of a plane fitted to the k nearest values with tricube weights.
+
+    The plane is evaluated at the query point (Cleveland, "Robust locally weighted regression",
+    Journal of the American Statistical Association 74, 1979).
+    """
+    # The k-th neighbour sets the bandwidth; among coincident points it stays positive.
+    bandwidth3 = np.maximum(near.cubed_distance[:, k - 1 : k], 1e-18)
+    kernel = 1 - near.cubed_distance[:, :k] / bandwidth3
+    kernel *= kernel * kernel
+    equidistant = np.einsum('nk->n', kernel) <= 1e-9  # then all neighbours have the same weight
+    if equidistant.any():
+        kernel[equidistant] = 1.0
+    return plane_weights(near.dx[:, :k], near.dy[:, :k], kernel, bandwidth3[:, 0] ** (2 / 3))
+
+
+def plane_weights(
+    dx: NDArray[np.float64],
+    dy: NDArray[np.float64],
+    kernel: NDArray[np.float64],
+    bandwidth2: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Weights that evaluate at the origin the plane fitted to values at (dx, dy).
+
+    The weights of a query sum to one and reproduce planes exactly but for the ridge.
+
+    Parameters
+    ----------
+    dx, dy : (n, k) ndarray
+        Offsets of the values from the origin.
+    kernel : (n, k) ndarray
+        Weights of the values in the fit; overwritten.
+    bandwidth2 : (n,) ndarray
+        Squared bandwidth, to which the ridge is relative.
+
+    Returns
+    -------
+    (n, k) ndarray
+    """
+    wx = kernel * dx
+    wy = kernel * dy
+    s0, sx, sy = (np.einsum('nk->n', w) for w in (kernel, wx, wy))
+    ridge = RIDGE * s0 * bandwidth2
+    sxx = np.einsum('nk,nk->n', wx, dx) + ridge
+    syy = np.einsum('nk,nk->n', wy, dy) + ridge
+    sxy = np.einsum('nk,nk->n', wx, dy)
+    # First column of the inverse of the moment matrix [[s0, sx, sy], [sx, sxx, sxy],
+    # [sy, sxy, syy]].
+    a = sxx * syy - sxy * sxy
+    b = sxy * sy - sx * syy
+    c = sx * sxy - sxx * sy
+    scale = 1 / (s0 * a + sx * b + sy * c)
+    wx *= (b * scale)[:, None]
+    wy *= (c * scale)[:, None]
+    kernel *= (a * scale)[:, None]
+    kernel += wx
+    kernel += wy
+    return kernel
+
+
+class NeighbourTable:
+    """The nearest neighbours of points (N, 2) among themselves, in order of distance.
+
+    It is built once and then answers for changing subsets of the points.
+
+    Parameters
+    ----------
+    uv : (N, 2) ndarray
+    count : int
+        Number of neighbours that will be asked for. Some more are looked up, so that excluded
+        points can be skipped.
+    rows : (T,) ndarray of int, optional
+        Points whose neighbours will be asked for; by default all.
+    """
+
+    def __init__(self, uv: np.ndarray, count: int, rows: np.ndarray | None = None) -> None:
+        self._uv = uv
+        numbers = np.arange(1, min(len(uv), int(1.3 * count) + 30) + 1)
+        if rows is None:
+            _, self._near = cKDTree(uv).query(uv, k=numbers)
+            return
+        self._near = np.empty((len(uv), len(numbers)), dtype=np.intp)
+        _, self._near[rows] = cKDTree(uv).query(uv[rows], k=numbers)
+
+    def nearest(self, rows: np.ndarray, allowed: NDArray[np.bool_], count: int) -> np.ndarray:
+        """Return the count nearest allowed points (n, count) of the points rows (n,), in order.
+
+        allowed : (N,) ndarray of bool
+        """
+        near = self._near[rows]
+        good = allowed[near]
+        rank = np.cumsum(good, axis=1)
+        out = np.empty((len(rows), count), dtype=np.intp)
+        selected = good & (rank <= count)
+        full = rank[:, -1] >= count
+        out[full] = near[full][selected[full]].reshape(-1, count)
+        if not full.all():
+            # Near a border of the image, or where a whole exposure is held out: search again.
+            points = np.flatnonzero(allowed)
+            _, found = cKDTree(self._uv[points]).query(
+                self._uv[rows[~full]], k=np.arange(1, count + 1)
+            )
+            out[~full] = points[found]
+        return out
+
+    def restricted(self, selected: np.ndarray) -> NeighbourTable:
+        """Return the table of the selected points (N, bool) alone, renumbered."""
+        other = NeighbourTable.__new__(NeighbourTable)
+        other._uv = self._uv[selected]
+        number = np.cumsum(selected) - 1
+        count = int(np.min(np.sum(selected[self._near[selected]], axis=1)))
+        other._near = number[self.nearest(np.flatnonzero(selected), selected, count)]
+        return other
+
+
+# Polynomial trend of a distortion, fitted to the training corrections.
+
+
+class Trend:
+    """Polynomials in two variables, centred and scaled by the training pixels.
+
+    degree: the highest, None: there are no polynomials; uv (N, 2): training pixels.
+    """
+
+    def __init__(self, degree: int | None, uv: np.ndarray) -> None:
+        self._powers = (
+            []
+            if degree is None
+            else [(i, j) for i in range(degree + 1) for j in range(degree + 1 - i)]
+        )
+        self._centre = uv.mean(axis=0) if len(uv) else np.zeros(2)
+        self._scale = max(float(np.max(np.abs(uv - self._centre), initial=0.0)), 1.0)
+
+    def __len__(self) -> int:
+        return len(self._powers)
+
+    def basis(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Values (n, p) of the polynomials at pixels uv (n, 2)."""
+        x, y = ((np.asarray(uv) - self._centre) / self._scale).T
+        out = np.empty((len(x), len(self._powers)))
+        for column, (i, j) in enumerate(self._powers):
+            # Each polynomial is an earlier one times x or y.
+            if i:
+                np.multiply(out[:, self._powers.index((i - 1, j))], x, out=out[:, column])
+            elif j:
+                np.multiply(out[:, self._powers.index((i, j - 1))], y, out=out[:, column])
+            else:
+                out[:, column] = 1.0
+        return out
+
+
+def least_squares_map(basis: np.ndarray) -> NDArray[np.float64]:
+    """Matrix (p, N) from values at N points to the least-squares coefficients of basis (N, p)."""
+    return np.linalg.pinv(basis) if basis.shape[1] else np.zeros((0, len(basis)))
+
+
+# Models that predict a weighted sum of the k nearest training corrections.
+
+WEIGHTS_CHUNK = 2_000_000  # weights computed at once, to bound the memory
+MAX_CANDIDATES = 50  # for each neighbour; more are never found among distinct points
+
+
+class NeighbourModel(CorrectionModel):
+    """A linear smoother: a global part plus weights times the k nearest values.
+
+    The global part is a polynomial trend fitted here, or a series that was estimated in the
+    adjustment; the neighbours smooth what it leaves of the training corrections. A subclass gives
+    the `weights`. Cross-validation, standard deviations and the lookup grid follow from them.
+    """
+
+    smoothness = Smoothness.KINKED
+    min_k: ClassVar[int]
+    trend_degree: ClassVar[int | None] = None  # of the polynomial trend; None: there is none
+    equal_weights: ClassVar[bool] = False  # weights are 1/k: a running mean gives all k at once
+    gauge_passes: ClassVar[int] = 3  # a smoother reproduces the gauge only approximately
+
+    tree: cKDTree
+    trend: Trend
+    trend_coefficients: np.ndarray
+    remainder: np.ndarray
+
+    def _prepare(self) -> None:
+        uv = self.train_uv
+        trend = Trend(self.trend_degree, uv)
+        basis = trend.basis(uv)
+        coefficients = least_squares_map(basis) @ self.train_duv
+        remainder = self.train_duv - basis @ coefficients
+        if self.series is not None:
+            remainder = remainder - self.series.predict(uv)
+        self._set(
+            tree=cKDTree(uv),
+            trend=trend,
+            trend_coefficients=coefficients,
+            remainder=remainder,
+        )
+
+    @classmethod
+    @abstractmethod
+    def weights(cls, near: Neighbourhoods, k: int) -> np.ndarray:
+        """Weights (n, k) of the k nearest training values in the predictions."""
+
+    @classmethod
+    def weights_of_candidates(cls, candidates: np.ndarray, uv: np.ndarray, k: int) -> np.ndarray:
+        """Weights (n, c) of candidates (c, 2) at pixels uv (n, 2); zero but for the k nearest.
+
+        The lookup grid is built with it. A subclass overrides it where it need not sort.
+        """
+        distance2 = np.sum((candidates - uv[:, None]) ** 2, axis=2)
+        index = np.argsort(distance2, axis=1, kind='stable')[:, :k]
+        out = np.zeros(distance2.shape)
+        weights = cls.weights(Neighbourhoods(candidates[index], uv), k)
+        np.put_along_axis(out, index, weights, axis=1)
+        return out
+
+    @classmethod
+    def candidate_k(cls, count: int) -> np.ndarray:
+        """Values of k that are tried for count training points, in steps of a quarter."""
+        largest = max(cls.min_k, min(int(count * 0.4), 400))
+        steps = np.round(10 * 1.25 ** np.arange(17)).astype(int)
+        steps = steps[steps <= largest]
+        return steps if len(steps) else np.array([largest])
+
+    def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Corrections (n, 2) [px] at pixels uv (n, 2)."""
+        return self._predict_with_norm(uv)[0]
+
+    def evaluate(self, uv: ArrayLike) -> Correction:
+        """Return the Correction at pixels uv (n, 2), with standard deviations."""
+        duv, norm2 = self._predict_with_norm(uv)
+        uv = np.asarray(uv, dtype=float).reshape(-1, 2)
+        return Correction(duv, self._sd(norm2, uv), self.outside(uv))
+
+    def standard_deviation(self, uv: np.ndarray) -> NDArray[np.float64]:
+        """Standard deviations (n,) [px] of the predictions at pixels uv (n, 2)."""
+        return self.evaluate(uv).sd
+
+    def evaluate_in_bulk(self, uv: np.ndarray) -> NDArray[np.float64]:
+        """Return du, dv and standard deviation (3, n) [px] at many pixels uv (n, 2)."""
+        out = np.zeros((3, len(uv)))
+        norm2 = np.zeros(len(uv))
+        most = MAX_CANDIDATES * (self.k + 1)
+        for block, near in blocks_with_candidates(self.tree, uv, self.k, most):
+            if near is None:
+                predicted, norm2[block] = self._local_part(uv[block])
+                out[:2, block] = predicted.T
+                continue
+            rows = max(1, WEIGHTS_CHUNK // len(near))
+            for start in range(0, len(block), rows):
+                some = block[start : start + rows]
+                weights = self.weights_of_candidates(self.train_uv[near], uv[some], self.k)
+                for axis, remainder in enumerate(self.remainder[near].T):
+                    out[axis, some] = np.einsum('nk,k->n', weights, remainder)
+                norm2[some] = np.einsum('nk,nk->n', weights, weights)
+        for start in range(0, len(uv), BULK_CHUNK):
+            part = slice(start, start + BULK_CHUNK)
+            out[:2, part] += self._global_part(uv[part]).T
+            out[2, part] = self._sd(norm2[part], uv[part])
+        return out
+
+    def bulk_work(self, uv: np.ndarray, limit: float) -> float:
+        """Return the work of `evaluate_in_bulk`: candidates of neighbours, and functions."""
+        return super().bulk_work(uv, limit) + work_of_blocks(self.tree, uv, self.k, limit)
+
+    def _global_part(self, uv: np.ndarray) -> np.ndarray:
+        """Trend or series (n, 2) [px] at pixels uv (n, 2)."""
+        if self.series is None:
+            return self.trend.basis(uv) @ self.trend_coefficients
+        return self.series.predict_in_chunks(uv)
+
+    def _predict_with_norm(self, uv: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+        """Corrections (n, 2) [px] and the squared norms (n,) of their weights."""
+        uv = np.asarray(uv, dtype=float).reshape(-1, 2)
+        duv, norm2 = self._local_part(uv)
+        return duv + self._global_part(uv), norm2
+
+    def _local_part(self, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the neighbours add to the global part (n, 2) [px], and the norms as above."""
+        duv = np.zeros_like(uv)
+        norm2 = np.zeros(len(uv))
+        size = max(1, WEIGHTS_CHUNK // self.k)
+        for start in range(0, len(uv), size):
+            part = slice(start, start + size)
+            _, index = self.tree.query(uv[part], k=np.arange(1, self.k + 1))
+            weights = self.weights(Neighbourhoods(self.tree.data[index], uv[part]), self.k)
+            duv[part] = np.einsum('nk,nkc->nc', weights, self.remainder[index])
+            norm2[part] = np.einsum('nk,nk->n', weights, weights)
+        return duv, norm2
+
+
+# The model `local_linear`: a cubic trend, and local planes fitted to what it leaves.
+#
+# A local plane has no bias where all neighbours are on one side, as at the border of an image,
+# where the mean of them has. It flattens what bends within its reach, though, and in the
+# alternation with the adjustment the flattened part is lost: orientations and object points absorb
+# it. Pincushion, S-shape and spiral bend over the whole image and are cubic polynomials to first
+# order (Gronenschild, Medical Physics 24, 1997), so that polynomial is fitted first.
+
+
+class LocalLinearModel(NeighbourModel):
+    """Cubic trend plus a plane fitted to the k nearest remainders with tricube weights."""
+
+    kind = 'local_linear'
+    description = 'cubic trend, and planes fitted to the k nearest residuals'
+    min_k = 6
+    trend_degree: ClassVar[int | None] = 3
+    gauge_passes = 1  # the trend reproduces the gauge
+
+    @classmethod
+    def weights(cls, near: Neighbourhoods, k: int) -> NDArray[np.float64]:
+        """Weights (n, k) of the plane fitted with tricube weights."""
+        return tricube_plane_weights(near, k)
+
+    @classmethod
+    def weights_of_candidates(cls, candidates: np.ndarray, uv: np.ndarray, k: int) -> np.ndarray:
+        """Weights (n, c); a candidate as far as the k-th nearest or farther has the weight 0."""
+        dx = candidates[:, 0] - uv[:, :1]
+        dy = candidates[:, 1] - uv[:, 1:]
+        distance2 = dx * dx
+        distance2 += dy * dy
+        kth = np.partition(distance2, k - 1, axis=1)[:, k - 1]
+        ratio = distance2 / np.maximum(kth, 1e-12)[:, None]
+        np.minimum(ratio, 1, out=ratio)
+        kernel = np.sqrt(ratio)
+        kernel *= ratio
+        np.subtract(1, kernel, out=kernel)
+        kernel *= kernel * kernel
+        equidistant = np.einsum('nk->n', kernel) <= 1e-9  # then all have the same weight
+        if equidistant.any():
+            kernel[equidistant] = distance2[equidistant] <= kth[equidistant, None]
+        return plane_weights(dx, dy, kernel, kth)
+
+
+# The model `hybrid`: a cubic trend in the adjustment, local planes on what it leaves.
+
+
+class HybridModel(LocalLinearModel):
+    """Series of polynomials from the adjustment plus local planes."""
+
+    kind = 'hybrid'
+    description = 'cubic trend in the adjustment, and planes fitted to the k nearest residuals'
+    has_series = True
+    trend_degree = None
+    gauge_passes = 3
+
+
+MIN_CANDIDATE = 3
+MAX_CANDIDATE = 100
+
+
+class KnnModel(NeighbourModel):
+    """Mean of the k nearest training corrections, as scikit-learn's KNeighborsRegressor."""
+
+    kind = 'knn'
+    description = 'mean of the k nearest residuals'
+    smoothness = Smoothness.STEPPED
+    min_k = 1
+    equal_weights = True
+
+    @classmethod
+    def weights(cls, near: Neighbourhoods, k: int) -> NDArray[np.float64]:
+        """Weights (n, k): 1/k each."""
+        return np.full((len(near), k), 1.0 / k)
+
+    @classmethod
+    def weights_of_candidates(cls, candidates: np.ndarray, uv: np.ndarray, k: int) -> np.ndarray:
+        """Weights (n, c); candidates at the distance of the k-th nearest share its weight."""
+        dx = candidates[:, 0] - uv[:, :1]
+        dy = candidates[:, 1] - uv[:, 1:]
+        distance2 = dx * dx
+        distance2 += dy * dy
+        kth = np.partition(distance2, k - 1, axis=1)[:, k - 1]
+        nearest = (distance2 <= kth[:, None]).astype(float)
+        return nearest / nearest.sum(axis=1, keepdims=True)
+
+    @classmethod
+    def candidate_k(cls, count: int) -> np.ndarray:
+        """Return all k from 3 to 100, or to 40 % of count training points."""
+        largest = max(cls.min_k, min(int(count * 0.4), MAX_CANDIDATE))
+        return np.arange(min(MIN_CANDIDATE, largest), largest + 1)

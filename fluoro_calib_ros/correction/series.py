@@ -1,0 +1,345 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Corrections as a series of functions of the observed pixel: polynomials and products of sines.
+
+Polynomials describe what bends over the whole image. What they leave is a signal with a covariance
+function. On a rectangle somewhat larger than the image such a signal is a series of sines with
+independent coefficients, whose variance is the spectral density of the covariance function (Solin
+and Saerkkae, "Hilbert space methods for reduced-rank Gaussian process regression", Statistics and
+Computing 30, 2020).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import comb
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import map_coordinates
+
+from .terms import CUBIC, ring_coefficients
+
+MARGIN = 1.3  # size of the rectangle of the sines, which vanish at its border, over the image
+RING_DEGREE = CUBIC + 2  # of the first radial polynomial beyond a cubic trend
+MAX_DEGREE = 15  # of a series that is read
+MAX_MODES = 100
+SD_GRID = 33  # nodes of the standard deviation along each side of the image
+PREDICTION_CHUNK = 20_000  # pixels for which a series is evaluated at once
+PREDICTION_VALUES = 20_000_000  # of functions at these pixels, to bound the memory
+
+
+@dataclass(frozen=True)
+class Functions:
+    """The functions of a series for an image.
+
+    Their coordinates are relative to the centre of the image, in units of half its longer side.
+
+    Attributes
+    ----------
+    image_size : (int, int)
+        Width and height [px].
+    degree : int
+        Highest degree of the polynomials; -1: there are none.
+    modes : int
+        Number of sines along the longer side of the image; 0: there are none.
+    rings : int
+        Number of radial polynomials R of the degrees 5, 7, ... (see `terms.ring_coefficients`),
+        each with the functions x R(r) / r and y R(r) / r; r is 1 at the corners of the image.
+    absent : tuple of int
+        Bands whose sines are left out. The band of a sine is its frequency over that of one half
+        wave along the longer side, rounded.
+    """
+
+    image_size: tuple[int, int]
+    degree: int
+    modes: int = 0
+    rings: int = 0
+    absent: tuple[int, ...] = ()
+
+    @cached_property
+    def powers(self) -> list[tuple[int, int]]:
+        """Exponents (i, j) of the polynomials x^i y^j."""
+        return [(i, j) for i in range(self.degree + 1) for j in range(self.degree + 1 - i)]
+
+    @cached_property
+    def _sines(self) -> np.ndarray:
+        """Numbers (s, 2) of the half waves along u and v."""
+        extent = MARGIN * np.asarray(self.image_size) / max(self.image_size)
+        i, j = np.meshgrid(
+            np.arange(1, self.modes + 1), np.arange(1, self.modes + 1), indexing='ij'
+        )
+        number = MARGIN * np.hypot(i / extent[0], j / extent[1])
+        keep = number <= self.modes + 0.5
+        if self.absent:
+            keep &= ~np.isin(np.rint(number), self.absent)
+        return np.stack([i[keep], j[keep]], axis=1)
+
+    @cached_property
+    def frequency(self) -> NDArray[np.float64]:
+        """Angular frequencies (s,) [1/px] of the sines."""
+        return np.linalg.norm(np.pi * self._sines / (MARGIN * np.asarray(self.image_size)), axis=1)
+
+    @property
+    def frequency_of_mode(self) -> float:
+        """Angular frequency [1/px] of one half wave along the longer side."""
+        return np.pi / (MARGIN * max(self.image_size))
+
+    @cached_property
+    def band(self) -> NDArray[np.float64]:
+        """Band (s,) of each sine."""
+        return np.rint(self.frequency / self.frequency_of_mode).astype(int)
+
+    @property
+    def complete(self) -> int:
+        """Number of the bands below the first that is left out."""
+        return min((self.modes, *(band - 1 for band in self.absent)))
+
+    @property
+    def highest(self) -> float:
+        """Angular frequency [1/px] up to which no sine is left out."""
+        return (self.complete + 0.5) * self.frequency_of_mode
+
+    def __len__(self) -> int:
+        return self.trend + len(self._sines)
+
+    @property
+    def trend(self) -> int:
+        """Number of functions of the trend: all but the sines."""
+        return len(self.powers) + 2 * self.rings
+
+    @property
+    def _ring_polynomials(self) -> np.ndarray:
+        """Coefficients (rings, k) of r^0, r^2, r^4, ... in R(r) / r, coordinates as elsewhere."""
+        corner = np.hypot(*self.image_size) / max(self.image_size)
+        out = np.zeros((self.rings, RING_DEGREE // 2 + self.rings))
+        for row, values in enumerate(out):
+            found = ring_coefficients(RING_DEGREE + 2 * row)
+            values[: len(found)] = found / corner ** (2 * np.arange(len(found)) + 1)
+        return out
+
+    def as_polynomials(self, coefficients: np.ndarray) -> tuple[Functions, np.ndarray]:
+        """Functions without rings, and their coefficients (2, m) for the same series.
+
+        The rings are written as polynomials of their degree.
+        """
+        if not self.rings:
+            return self, coefficients
+        degree = RING_DEGREE + 2 * (self.rings - 1)
+        out = Functions(self.image_size, degree, self.modes)
+        matrix = out.converted(self, coefficients.ravel()).reshape(2, -1)
+        number = {power: k for k, power in enumerate(out.powers)}
+        for k, polynomial in enumerate(self._ring_polynomials):
+            own = coefficients[:, len(self.powers) + 2 * k :][:, :2]
+            for order, factor in enumerate(polynomial):
+                for i in range(order + 1):
+                    part = factor * comb(order, i)
+                    matrix[:, number[2 * i + 1, 2 * (order - i)]] += part * own[:, 0]
+                    matrix[:, number[2 * i, 2 * (order - i) + 1]] += part * own[:, 1]
+        return out, matrix
+
+    def converted(self, other: Functions, coefficients: np.ndarray) -> NDArray[np.float64]:
+        """Coefficients (2m,) for these functions from those for others.
+
+        A function that the others lack gets the coefficient 0.
+        """
+        number = {key: column for column, key in enumerate(other._keys())}
+        mine = np.asarray([number.get(key, -1) for key in self._keys()])
+        return np.where(mine >= 0, coefficients.reshape(2, -1)[:, mine], 0.0).ravel()
+
+    def as_rings(
+        self, coefficients: np.ndarray, degree: int, rings: int
+    ) -> tuple[Functions, np.ndarray]:
+        """Functions with rings, and their coefficients (2, m) for the same series.
+
+        It is the inverse of `as_polynomials`, and the nearest series where these functions cannot
+        express it. coefficients (2, n): for these functions, which have no rings.
+        """
+        out = Functions(self.image_size, degree, self.modes, rings)
+        matrix = out.converted(self, coefficients.ravel()).reshape(2, -1)
+        if self.degree <= degree:
+            return out, matrix
+        trend = replace(out, modes=0)
+        units = np.eye(out.trend)
+        columns = [trend.as_polynomials(unit.reshape(1, -1).repeat(2, axis=0)) for unit in units]
+        highest = columns[0][0]
+        mine = highest.converted(replace(self, modes=0), coefficients[:, : self.trend].ravel())
+        design = np.stack([values[0] for _, values in columns], axis=1)
+        found = np.linalg.lstsq(design, mine.reshape(2, -1).T, rcond=None)[0]
+        matrix[:, : out.trend] = found.T
+        return out, matrix
+
+    def _keys(self) -> list[tuple[Any, ...]]:
+        """What tells each function from the others, in their order."""
+        rings = [('ring', k, axis) for k in range(self.rings) for axis in 'xy']
+        return [*self.powers, *rings, *(('sine', int(i), int(j)) for i, j in self._sines)]
+
+    def _coordinates(self, uv: ArrayLike) -> np.ndarray:
+        return (
+            (np.asarray(uv, dtype=float) - (np.asarray(self.image_size) - 1) / 2)
+            / (max(self.image_size) / 2)
+        ).T
+
+    def __call__(self, uv: ArrayLike) -> np.ndarray:
+        """Values (n, m) at pixels uv (n, 2): the polynomials, the rings, then the sines."""
+        x, y = self._coordinates(uv)
+        out = np.empty((len(x), len(self)))
+        of_x, of_y = (np.vander(a, self.degree + 1, increasing=True) for a in (x, y))
+        for column, (i, j) in enumerate(self.powers):
+            np.multiply(of_x[:, i], of_y[:, j], out=out[:, column])
+        if self.rings:
+            squares = np.vander(x * x + y * y, self._ring_polynomials.shape[1], increasing=True)
+            rings = squares @ self._ring_polynomials.T
+            out[:, len(self.powers) : self.trend : 2] = rings * x[:, None]
+            out[:, len(self.powers) + 1 : self.trend : 2] = rings * y[:, None]
+        if self.modes:
+            of_x, of_y = self._waves_of_both(x, y)
+            i, j = self._sines.T - 1
+            np.multiply(of_x[:, i], of_y[:, j], out=out[:, self.trend :])
+        return out
+
+    def sums_of_sines(self, uv: ArrayLike, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sums (s, k) of values (n, k) at pixels uv (n, 2) times the sines; (s,) of their squares.
+
+        A sine is a product of one along u and one along v: it takes no value at every pixel.
+        """
+        of_x, of_y = self._waves_of_both(*self._coordinates(uv))
+        i, j = self._sines.T - 1
+        sums = [(of_x.T @ (column[:, None] * of_y))[i, j] for column in values.T]
+        return np.stack(sums, axis=1), (np.square(of_x).T @ np.square(of_y))[i, j]
+
+    def _waves_of_both(self, x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Sines (n, modes) along u and along v."""
+        extent = MARGIN * np.asarray(self.image_size) / 2
+        return self._waves(x, extent[0]), self._waves(y, extent[1])
+
+    def _waves(self, coordinate: np.ndarray, extent: float) -> np.ndarray:
+        """Sines (n, modes) along one axis; extent: half the side of their rectangle [px]."""
+        place = coordinate[:, None] * max(self.image_size) / 2 + extent
+        return np.sin(np.arange(1, self.modes + 1) * (np.pi / 2 / extent * place)) / np.sqrt(
+            extent
+        )
+
+
+@dataclass(frozen=True)
+class Series:
+    """A correction that is a sum of functions.
+
+    functions; coefficients (2, m) [px] for u and v; sd (33, 33): standard deviation of the
+    correction [px], on a regular grid from edge to edge of the image.
+    """
+
+    functions: Functions
+    coefficients: np.ndarray
+    sd: np.ndarray
+
+    def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Corrections (n, 2) [px] at pixels uv (n, 2)."""
+        return self.functions(uv) @ self.coefficients.T
+
+    def predict_in_chunks(self, uv: np.ndarray) -> NDArray[np.float64]:
+        """Corrections (n, 2) [px] at many pixels uv (n, 2), with bounded memory."""
+        size = min(PREDICTION_CHUNK, max(1, PREDICTION_VALUES // max(1, len(self.functions))))
+        starts = range(0, len(uv), size)
+        return np.concatenate(
+            [self.predict(uv[i : i + size]) for i in starts] or [np.zeros((0, 2))]
+        )
+
+    def sd_at(self, uv: ArrayLike) -> NDArray[np.float64]:
+        """Standard deviations (n,) [px] of the corrections at pixels uv (n, 2), interpolated."""
+        place = (
+            (np.asarray(uv, dtype=float) + 0.5)
+            / np.asarray(self.functions.image_size)
+            * (SD_GRID - 1)
+        )
+        return map_coordinates(self.sd, place[:, ::-1].T, order=1, mode='nearest')
+
+
+def without_absent_bands(
+    functions: Functions, coefficients: np.ndarray
+) -> tuple[Functions, np.ndarray]:
+    """Leave out the bands of sines whose coefficients are all zero.
+
+    Returns the functions that remain, and their coefficients (2, m).
+    """
+    sizes = np.abs(coefficients[:, functions.trend :]).sum(axis=0)
+    present = np.unique(functions.band[sizes > 0])
+    absent = tuple(int(band) for band in np.setdiff1d(functions.band, present))
+    if not absent or not len(present):
+        return functions, coefficients
+    out = replace(functions, absent=absent)
+    return out, out.converted(functions, coefficients.ravel()).reshape(2, -1)
+
+
+def packed(series: Series | None) -> tuple[int, int, np.ndarray, np.ndarray]:
+    """Return degree, modes, coefficients (2, m) and sd (33, 33), as they are sent and saved.
+
+    No series gives -1, 0 and empty arrays.
+    """
+    if series is None:
+        return -1, 0, np.zeros((2, 0)), np.zeros((0, 0))
+    return series.functions.degree, series.functions.modes, series.coefficients, series.sd
+
+
+def unpacked(
+    image_size: tuple[int, int],
+    degree: int,
+    modes: int,
+    coefficients: ArrayLike,
+    sd: ArrayLike,
+) -> Series | None:
+    """Return the Series, or None, from which `packed` made the arguments.
+
+    Raises ValueError if the parts do not belong together.
+    """
+    coefficients = np.ascontiguousarray(coefficients, dtype=float)
+    sd = np.ascontiguousarray(sd, dtype=float)
+    if degree == -1 and not modes and not coefficients.size:
+        return None
+    if not (0 <= degree <= MAX_DEGREE and 0 <= modes <= MAX_MODES):
+        raise ValueError(f'a series of degree {degree} with {modes} modes is unknown')
+    width, height = image_size
+    functions = Functions((int(width), int(height)), int(degree), int(modes))
+    if coefficients.shape != (2, len(functions)) or sd.shape != (SD_GRID, SD_GRID):
+        raise ValueError(
+            f'a series of degree {degree} with {modes} modes has 2 x {len(functions)} '
+            f'coefficients and {SD_GRID} x {SD_GRID} standard deviations, '
+            f'not {coefficients.shape} and {sd.shape}'
+        )
+    if not (np.isfinite(coefficients).all() and np.isfinite(sd).all()):
+        raise ValueError('a coefficient or a standard deviation of the series is not a number')
+    return Series(functions, coefficients, sd)
+
+
+def series_from_values(image_size: tuple[int, int], content: Mapping[str, Any]) -> Series | None:
+    """Return the Series, or None, of `CorrectionModel.to_values`. Raises ValueError."""
+    return unpacked(
+        image_size,
+        content['series_degree'],
+        content['series_modes'],
+        content['series_coefficients'],
+        content['series_sd'],
+    )
+
+
+def sd_grid_pixels(image_size: tuple[int, int]) -> np.ndarray:
+    """Pixels (33 * 33, 2) of the standard deviations of a series, row by row, edge to edge."""
+    u, v = (np.linspace(-0.5, size - 0.5, SD_GRID) for size in image_size)
+    return np.stack([a.ravel() for a in np.meshgrid(u, v)], axis=1)
+
+
+def sd_over_image(functions: Functions, covariance: np.ndarray) -> NDArray[np.float64]:
+    """Standard deviations (33, 33) [px] of a series.
+
+    covariance (2m, 2m) of its coefficients, those of u first.
+    """
+    values = functions(sd_grid_pixels(functions.image_size))
+    m = len(functions)
+    variance = (
+        np.einsum('np,np->n', values @ (covariance[:m, :m] + covariance[m:, m:]), values) / 2
+    )
+    return np.sqrt(np.maximum(variance, 0)).reshape(SD_GRID, SD_GRID)

@@ -1,0 +1,336 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Self-calibration by adjustment and regression in turn (section 3.1 of Chow et al.).
+
+One round: a correction model is fitted to (residual + present correction) of the inliers, its k
+chosen by cross-validation; then the network is adjusted with that correction held. The rounds are
+a fixed-point iteration of the values the model is fitted to, and Anderson acceleration shortens
+it. Model and adjustment of a round belong together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.base import CorrectionModel
+from ..errors import DataError
+from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.elimination import factorize
+from ..photogrammetry.network import Network
+from ..photogrammetry.noise import Noise
+from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
+from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.precision import Precision, covariance_blocks, residual_covariance
+from .estimator import AdjustedTerms, RegressionStep
+from .initial_network import SINGULAR, Measured, adjusted_with_precision, with_additional
+from .options import CalibrationOptions
+from .rounds import History, Round, SelfCalibration
+
+# Anderson acceleration of a fixed-point iteration.
+#
+# Walker and Ni, "Anderson acceleration for fixed-point iterations", SIAM Journal on Numerical
+# Analysis 49, 2011.
+
+RELATIVE_RANK = 1e-6  # singular values of the differences below that part of the largest are zero
+
+
+class Anderson:
+    """Mixes the last iterates of x -> f(x) so that the residual f(x) - x becomes smallest.
+
+    depth: number of earlier iterates used. The iterates are arrays of one shape.
+    """
+
+    def __init__(self, depth: int = 8) -> None:
+        self._depth = depth
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget the earlier iterates: the map has changed."""
+        self._x: list[np.ndarray] = []
+        self._f: list[np.ndarray] = []
+
+    def next(
+        self, x: np.ndarray, f: np.ndarray, counted: np.ndarray | slice = slice(None)
+    ) -> np.ndarray:
+        """Return the next iterate from the present one x and its image f.
+
+        counted: entries whose residual is minimised.
+        """
+        self._x = (self._x + [x])[-self._depth - 1 :]
+        self._f = (self._f + [f])[-self._depth - 1 :]
+        if len(self._x) == 1:
+            return f
+        residual = [(b - a)[counted].ravel() for a, b in zip(self._x, self._f)]
+        d_residual = np.stack([b - a for a, b in pairwise(residual)], axis=1)
+        # Columns are scaled and small singular values dropped: late differences are nearly
+        # parallel.
+        scale = np.maximum(np.linalg.norm(d_residual, axis=0), 1e-300)
+        gamma, *_ = np.linalg.lstsq(d_residual / scale, residual[-1], rcond=RELATIVE_RANK)
+        return f - sum(g * (b - a) for g, a, b in zip(gamma / scale, self._f, self._f[1:]))
+
+
+ROUND_TOLERANCE = 1e-4  # decrease of F that a round may leave to the next: a hundredth of a sigma
+
+
+class Regressions:
+    """The regression steps of all fluoroscopes of a network, as one smoother of values (N, 2).
+
+    steps {fluoroscope: RegressionStep}, in the order of the network.
+    """
+
+    def __init__(
+        self, measured: Measured, steps: Mapping[str, RegressionStep[CorrectionModel]]
+    ) -> None:
+        self.steps = dict(steps)
+        self._rows = {name: measured.network.rows(f) for f, name in enumerate(self.steps)}
+
+    @property
+    def iterate(self) -> bool:
+        """Whether more than one round can make a difference."""
+        return any(step.iterates for step in self.steps.values())
+
+    @property
+    def k(self) -> dict[str, int]:
+        """Number of neighbours by fluoroscope."""
+        return {name: step.k for name, step in self.steps.items()}
+
+    def choose(
+        self, values: np.ndarray, q: np.ndarray, information: np.ndarray
+    ) -> tuple[float, bool]:
+        """Update inliers and k of all fluoroscopes; return G and whether any of them changed.
+
+        Raises DataError where a fluoroscope has too few inliers.
+        """
+        for name, rows in self._rows.items():
+            try:
+                self.steps[name].choose(values[rows], q[rows], information[rows])
+            except ValueError as error:
+                raise DataError(f'fluoroscope {name}: {error}') from None
+        score = sum(step.score for step in self.steps.values())
+        return score, any(step.changed for step in self.steps.values())
+
+    def inliers(self) -> np.ndarray:
+        """True (N,) for the image points to which the models are fitted."""
+        out = np.zeros(sum(len(rows) for rows in self._rows.values()), dtype=bool)
+        for name, rows in self._rows.items():
+            out[rows] = self.steps[name].inliers
+        return out
+
+    def without_gauge(self, values: np.ndarray, interior: np.ndarray) -> NDArray[np.float64]:
+        """Values (N, 2) with a fitted correction that is orthogonal to the gauge."""
+        out = values.copy()
+        for f, (name, rows) in enumerate(self._rows.items()):
+            out[rows] = self.steps[name].without_gauge(values[rows], interior[f])
+        return out
+
+    def smooth(self, values: np.ndarray) -> NDArray[np.float64]:
+        """Fitted corrections (N, 2) of values (N, 2)."""
+        out = np.zeros_like(values)
+        for name, rows in self._rows.items():
+            out[rows] = self.steps[name].smooth(values[rows])
+        return out
+
+    def models(
+        self,
+        values: np.ndarray,
+        terms: AdjustedTerms | None,
+        after: Adjustment,
+        precise: Precision,
+    ) -> dict[str, CorrectionModel]:
+        """Models of values (N, 2) by fluoroscope, with their terms from the last adjustment."""
+        out = {}
+        for f, (name, rows) in enumerate(self._rows.items()):
+            series = None if terms is None else terms.fitted_series(f, after, precise)
+            out[name] = self.steps[name].model(values[rows], series)
+        return out
+
+
+@dataclass(frozen=True)
+class _Iterate:
+    """State of the iteration after a round.
+
+    Attributes
+    ----------
+    values : (N, 2) ndarray
+        Values to which the models are fitted [px].
+    information : (N, 2, 2) ndarray
+        Inverse covariance of the residuals [1/px^2].
+    after : Adjustment
+        Adjustment of the round.
+    noise : Noise
+        Noise model that its residuals show.
+    """
+
+    values: NDArray[np.float64]
+    information: NDArray[np.float64]
+    after: Adjustment
+    noise: Noise
+
+
+class _Alternation:
+    """Rounds of regression and adjustment of one network.
+
+    Attributes
+    ----------
+    state : _Iterate
+        After the last round.
+    correction : (N, 2) ndarray
+        Held correction of the last round [px].
+    changed : bool
+        Whether inliers or k changed in the last round.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        start: Adjustment,
+        regressions: Regressions,
+        history: History,
+        raise_if_cancelled: Callable[[], None] | None,
+    ) -> None:
+        self.correction = np.zeros_like(network.uv)
+        self.changed = False
+        self._network = network
+        self._regressions = regressions
+        self._history = history
+        self._raise_if_cancelled = raise_if_cancelled
+        self._acceleration = Anderson()
+        self._image = start.residuals
+        information, _ = _information(network, start, self.correction)
+        self.state = _Iterate(start.residuals, information, start, start.noise)
+
+    def advance(self) -> None:
+        """Make one round: fit the models, adjust with their correction held, and record it."""
+        regressions = self._regressions
+        state = self.state
+        score, self.changed = regressions.choose(state.values, state.after.q, state.information)
+        if self.changed:
+            self._acceleration.restart()
+        values = regressions.without_gauge(state.values, state.after.parameters.interior)
+        correction = regressions.smooth(values)
+        after = adjust(
+            self._network,
+            state.after.parameters,
+            correction=correction,
+            noise=state.noise,
+            options=SolverOptions(ROUND_TOLERANCE),
+            raise_if_cancelled=self._raise_if_cancelled,
+        )
+        information, noise = _information(self._network, after, correction)
+        image = regressions.without_gauge(after.residuals + correction, after.parameters.interior)
+        core = regressions.inliers()
+        change = float(np.sqrt(np.mean((regressions.smooth(image) - correction)[core] ** 2)))
+        self._history.add(after, score, regressions.k, change)
+        self.correction = correction
+        self._image = image
+        self.state = _Iterate(values, information, after, noise)
+
+    def has_settled(self, tolerance: float) -> bool:
+        """Whether another round would give the same."""
+        scale = self.state.noise.scale
+        steady = abs(scale - self.state.after.noise.scale) <= SETTLED * scale
+        return not self.changed and steady and self._history.has_settled(tolerance)
+
+    def accelerate(self) -> None:
+        """Replace the values of the next round by those of Anderson acceleration."""
+        # Outliers follow the acceleration, but do not steer it.
+        values = self._acceleration.next(
+            self.state.values, self._image, self._regressions.inliers()
+        )
+        self.state = replace(self.state, values=values)
+
+
+def calibrate_by_regression(
+    measured: Measured,
+    before: Adjustment,
+    options: CalibrationOptions,
+    terms: AdjustedTerms | None,
+    regressions: Regressions,
+    progress: Callable[[Round], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> SelfCalibration:
+    """Self-calibrate by adjustment and regression in turn.
+
+    Parameters
+    ----------
+    measured : Measured
+    before : Adjustment
+        Adjustment without correction.
+    options : CalibrationOptions
+    terms : AdjustedTerms or None
+        Terms of the correction that are estimated in the adjustments.
+    regressions : Regressions
+        What fits the rest of the correction.
+    progress : callable, optional
+        Called with the Round after every round.
+    raise_if_cancelled : callable, optional
+        Called before every step of an adjustment; may raise to stop.
+
+    Returns
+    -------
+    SelfCalibration
+
+    Raises
+    ------
+    DataError
+        If there are too few inliers, or the exposures do not determine the unknowns.
+    """
+    network = measured.network
+    after = before
+    if terms is not None:
+        network = terms.with_additional(network)
+        after = with_additional(before, terms.zeros())
+    history = History(measured, progress)
+    rounds = _Alternation(network, after, regressions, history, raise_if_cancelled)
+    converged = False
+    for iteration in range(1, options.max_iterations + 1):
+        rounds.advance()
+        if rounds.has_settled(options.tolerance) or not regressions.iterate:
+            converged = rounds.state.after.converged
+            break
+        if iteration < options.max_iterations:
+            rounds.accelerate()
+    # The correction of the last round stays; its adjustment is completed here.
+    after, precise = adjusted_with_precision(
+        network,
+        rounds.state.after.parameters,
+        rounds.correction,
+        rounds.state.noise,
+        raise_if_cancelled=raise_if_cancelled,
+        noise_fixed=True,
+    )
+    return SelfCalibration(
+        measured=replace(measured, network=network),
+        before=before,
+        after=after,
+        precision=precise,
+        correction=rounds.correction + network.additional_correction(after.parameters),
+        trained=regressions.inliers(),
+        models=regressions.models(rounds.state.values, terms, after, precise),
+        history=tuple(history.rounds),
+        converged=converged,
+    )
+
+
+def _information(
+    network: Network, adjustment: Adjustment, correction: np.ndarray
+) -> tuple[np.ndarray, Noise]:
+    """C_r^-1 (N, 2, 2) [1/px^2] of the residuals, and the noise model that they show.
+
+    Raises DataError where the normal matrix is singular.
+    """
+    try:
+        matrix = factorize(
+            network, normal_equations(network, adjustment.parameters, correction, adjustment.noise)
+        )
+    except np.linalg.LinAlgError:
+        raise DataError(SINGULAR) from None
+    blocks = covariance_blocks(matrix)
+    information = np.linalg.inv(residual_covariance(network, adjustment, blocks))
+    return information, estimate_noise(network, adjustment, blocks)

@@ -1,0 +1,554 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A whole calibration or adjustment: from frames to what is published and saved."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime, timezone
+from typing import Any
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from ..correction.base import CorrectionModel
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration, digest_of_sources
+from ..correction.noise_profile import NoiseProfile
+from ..exposures.frame import validate_frame
+from ..exposures.phantom import Phantom
+from ..findings import Finding
+from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.known_orientation import KnownOrientation
+from ..photogrammetry.precision import (
+    Precision,
+    geometric_redundancy,
+    precision_with_fixed_interiors,
+)
+from ..photogrammetry.rotations import quaternion_from_matrix
+from .constraints import relative_orientations
+from .diagnostics import (
+    ResidualTable,
+    correlations_of,
+    exposures_that_do_not_fit,
+    outliers_of,
+    residuals_of_adjustment,
+    statistics_of,
+)
+from .fixed_calibration import (
+    SolvedNetwork,
+    fixed_corrections,
+    network_of_calibrations,
+    noise_of_calibrations,
+    too_few_rays_for_noise,
+)
+from .initial_network import (
+    MIN_EXPOSURES,
+    Frames,
+    Measured,
+    StartValues,
+    adjusted_with_precision,
+    measured_network,
+)
+from .noise_profile_fit import fitted_profile
+from .options import CalibrationOptions, CalibrationRequest
+from .result import (
+    CalibrationResult,
+    ExposureResult,
+    FluoroscopeResult,
+    Targets,
+    combined_targets,
+)
+from .rounds import Round, SelfCalibration, rmse_of_inliers
+from .self_calibration import self_calibrate
+
+MAX_REPEATS = 3  # of a calibration, to exclude exposures that do not fit
+MIN_REDUNDANCY = 0.05  # of a coordinate, for the square of its residual to be divided by
+EQUAL_WEIGHTS_NU = 100.0  # degrees of freedom from which weights of inliers hardly differ
+TOLERANCE_WITHOUT_CORRECTION = 1e-4  # its residuals are only reported
+
+
+def calibrate(
+    frames: Frames,
+    phantom: Phantom,
+    options: CalibrationOptions | None = None,
+    joint: bool = False,
+    principal_distance: float | None = None,
+    progress: Callable[[str, Round], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> CalibrationResult:
+    """Self-calibrate fluoroscopes, one after the other or in one adjustment.
+
+    The result is the same to the last bit for the same observations, whatever their order.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        By fluoroscope.
+    phantom : Phantom
+    options : CalibrationOptions, optional
+    joint : bool
+        True for one adjustment of all fluoroscopes.
+    principal_distance : float, optional
+        Start value [px]; by default it is taken from the observations.
+    progress : callable, optional
+        Called with the name of the fluoroscope and the Round after every round.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop.
+
+    Returns
+    -------
+    CalibrationResult
+
+    Raises
+    ------
+    DataError
+        If the observations do not suffice.
+    ValueError
+        If the relative orientation is to be constrained in separate adjustments.
+    """
+    request = CalibrationRequest(
+        frames, phantom, options or CalibrationOptions(), joint, principal_distance
+    )
+    return calibrate_request(request, progress, raise_if_cancelled)
+
+
+def calibrate_request(
+    request: CalibrationRequest,
+    progress: Callable[[str, Round], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+    starts: StartValues | None = None,
+) -> CalibrationResult:
+    """Self-calibrate the fluoroscopes of a request; see `calibrate` for the other arguments.
+
+    starts: of an earlier calibration with these exposures.
+
+    Raises DataError and ValueError as `calibrate`, ValueError also for options that exclude known
+    orientations.
+    """
+    _require_compatible(request)
+    options = request.options
+    began = time.perf_counter()
+    figures: dict[str, FluoroscopeResult] = {}
+    calibrations: dict[str, FluoroscopeCalibration] = {}
+    runs: dict[str, SelfCalibration] = {}
+    # One thread: faster than two for these sizes, and sums are always made in the same order.
+    with threadpool_limits(1):
+        for group in request.groups:
+            start = time.perf_counter()
+            label = '+'.join(group)
+            of_group = {name: request.frames[name] for name in group}
+            run = _calibrated_group(
+                request, of_group, _progress_of(label, progress), raise_if_cancelled, starts
+            )
+            seconds = time.perf_counter() - start
+            runs[label] = run
+            figures |= _figures_of_run(run)
+            calibrations |= _calibrations_of_run(run, of_group, request.phantom, seconds)
+        relative = [
+            relative_orientations(run, options.relative_orientation) for run in runs.values()
+        ]
+    targets = [_targets(run.measured, run.after, run.claims) for run in runs.values()]
+    return CalibrationResult(
+        figures,
+        calibrations,
+        targets=combined_targets(targets, request.phantom, options.datum == 'survey'),
+        history={label: run.history for label, run in runs.items()},
+        runs=runs,
+        findings=tuple(found for run in runs.values() for found in run.measured.excluded),
+        converged=all(run.converged for run in runs.values()),
+        seconds=time.perf_counter() - began,
+        relative=tuple(one for of_run in relative for one in of_run),
+        outliers=_outliers_of_all(runs.values()),
+        correlations=tuple(one for run in runs.values() for one in correlations_of(run)),
+        statistics=tuple(
+            statistics_of(run.measured, run.after, run.precision) for run in runs.values()
+        ),
+        residuals=ResidualTable.joined(
+            [
+                residuals_of_adjustment(run.measured, run.after, run.precision, run.correction)
+                for run in runs.values()
+            ]
+        ),
+        created=_now(),
+        solved={label: _solved(run) for label, run in runs.items()},
+    )
+
+
+def calibrate_part(
+    request: CalibrationRequest,
+    starts: StartValues,
+    whole: Mapping[str, FluoroscopeCalibration],
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> dict[str, FluoroscopeCalibration]:
+    """Self-calibrate with a part of the exposures of an earlier calibration.
+
+    Parameters
+    ----------
+    request : CalibrationRequest
+        With the frames of the part.
+    starts : StartValues
+        Of the earlier calibration.
+    whole : mapping of str to FluoroscopeCalibration
+        The earlier calibration, of all exposures, whose noise of image coordinates is taken over.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop.
+
+    Returns
+    -------
+    dict of str to FluoroscopeCalibration
+
+    Raises
+    ------
+    DataError
+        If the exposures do not suffice.
+    """
+    out: dict[str, FluoroscopeCalibration] = {}
+    with threadpool_limits(1):
+        for group in request.groups:
+            start = time.perf_counter()
+            frames = {name: request.frames[name] for name in group}
+            run = _calibrated_group(request, frames, None, raise_if_cancelled, starts)
+            seconds = time.perf_counter() - start
+            for f, name in enumerate(run.measured.fluoroscopes):
+                digest = digest_of_sources(frames[name], request.phantom)
+                noise = _ImageNoise(whole[name].image_sd, whole[name].noise_profile)
+                out[name] = _calibration(
+                    run, f, name=name, digest=digest, seconds=seconds, noise=noise
+                )
+    return out
+
+
+def _solved(run: SelfCalibration) -> SolvedNetwork:
+    """Network and adjustment of a self-calibration."""
+    estimated = run.measured.network.additional_correction(run.after.parameters)
+    return SolvedNetwork(run.measured, run.after, run.correction - estimated, stated=run.stated)
+
+
+def _now() -> str:
+    """Date and time (UTC, ISO 8601)."""
+    return datetime.now(timezone.utc).isoformat(timespec='seconds')
+
+
+def _figures_of_run(run: SelfCalibration) -> dict[str, FluoroscopeResult]:
+    """Figures of the fluoroscopes of a self-calibration."""
+    return {
+        name: _figures(
+            run.measured,
+            run.before,
+            after=run.after,
+            precise=run.claims,
+            f=f,
+            model=run.models[name],
+        )
+        for f, name in enumerate(run.measured.fluoroscopes)
+    }
+
+
+def _calibrations_of_run(
+    run: SelfCalibration,
+    frames: Frames,
+    phantom: Phantom,
+    seconds: float,
+) -> dict[str, FluoroscopeCalibration]:
+    """Calibrations of the fluoroscopes of a self-calibration that took some seconds."""
+    return {
+        name: _calibration(
+            run,
+            f,
+            name=name,
+            digest=digest_of_sources(frames[name], phantom),
+            seconds=seconds,
+            noise=_image_noise(run, f, name),
+        )
+        for f, name in enumerate(run.measured.fluoroscopes)
+    }
+
+
+def _calibrated_group(
+    request: CalibrationRequest,
+    frames: Frames,
+    progress: Callable[[Round], None] | None,
+    raise_if_cancelled: Callable[[], None] | None,
+    starts: StartValues | None,
+) -> SelfCalibration:
+    """Calibrate fluoroscopes in one adjustment, without exposures of which too little fits."""
+    excluded: tuple[Finding, ...] = ()
+    for _ in range(MAX_REPEATS):
+        measured = measured_network(
+            frames,
+            request.phantom,
+            principal_distance=request.principal_distance,
+            raise_if_cancelled=raise_if_cancelled,
+            known=request.known_orientations,
+            starts=starts,
+        )
+        earlier = None if starts is None else starts.earlier
+        run = self_calibrate(measured, request.options, progress, raise_if_cancelled, earlier)
+        misfits = exposures_that_do_not_fit(run)
+        kept = {
+            name: [f for f in exposures if (name, f.number) not in misfits]
+            for name, exposures in frames.items()
+        }
+        if not misfits or any(len(exposures) < MIN_EXPOSURES for exposures in kept.values()):
+            break
+        excluded += tuple(misfits.values())
+        frames = kept
+    return replace(
+        run, measured=replace(run.measured, excluded=(*excluded, *run.measured.excluded))
+    )
+
+
+def _require_compatible(request: CalibrationRequest) -> None:
+    """Raise ValueError for options that exclude each other."""
+    options = request.options
+    if options.relative_orientation != 'none' and not request.joint:
+        raise ValueError('a relative orientation constraint needs the joint adjustment')
+    if request.known_orientations and (
+        options.relative_orientation != 'none' or options.datum != 'survey'
+    ):
+        raise ValueError(
+            'known orientations exclude a relative orientation constraint and a free network'
+        )
+
+
+def _progress_of(
+    label: str, progress: Callable[[str, Round], None] | None
+) -> Callable[[Round], None] | None:
+    """Report rounds with the name of what is calibrated."""
+    if progress is None:
+        return None
+    return lambda one: progress(label, one)
+
+
+def _outliers_of_all(runs: Iterable[SelfCalibration]) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """Outliers of all runs: image points, and targets."""
+    found = [outliers_of(run) for run in runs]
+    return (
+        tuple(point for points, _ in found for point in points),
+        tuple(target for _, targets in found for target in targets),
+    )
+
+
+def adjust_with_calibrations(
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    loss: str = 'student_t',
+    raise_if_cancelled: Callable[[], None] | None = None,
+    known: Mapping[str, KnownOrientation] | None = None,
+    starts: StartValues | None = None,
+) -> CalibrationResult:
+    """Adjust frames with calibrations held: interior orientations and corrections do not change.
+
+    Covariances hold the uncertainty of both: that of the interior orientation is common to all
+    exposures, that of the correction is part of the noise of every image point.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        By fluoroscope; all fluoroscopes share the object points.
+    phantom : Phantom
+    calibrations : mapping of str to FluoroscopeCalibration
+    loss : str
+        Noise model of the image points.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop.
+    known : mapping of str to KnownOrientation, optional
+        Orientations that are known beforehand, by fluoroscope.
+    starts : StartValues, optional
+        Of an earlier adjustment of the frames, for its residuals: the residuals without correction
+        are then not computed again, their RMSE is NaN, and covariances are without the
+        uncertainty of the interior orientations.
+
+    Returns
+    -------
+    CalibrationResult
+
+    Raises
+    ------
+    DataError
+        If a frame is invalid or has another image size than its calibration.
+    """
+    began = time.perf_counter()
+    for name, of_fluoroscope in frames.items():
+        for frame in of_fluoroscope:
+            validate_frame(frame, phantom, calibrations[name].image_size)
+    with threadpool_limits(1):
+        measured = network_of_calibrations(
+            frames,
+            phantom,
+            calibrations=calibrations,
+            raise_if_cancelled=raise_if_cancelled,
+            known=known,
+            starts=starts,
+        )
+        correction, network = fixed_corrections(measured, calibrations)
+        after, precise = adjusted_with_precision(
+            network,
+            measured.start,
+            correction,
+            noise_of_calibrations(loss, calibrations.values()),
+            raise_if_cancelled=raise_if_cancelled,
+            noise_fixed=too_few_rays_for_noise(network),
+        )
+        before = None
+        solved = replace(measured, network=network)
+        held = np.stack([calibrations[name].interior_covariance for name in frames])
+        if starts is None:
+            precise = precision_with_fixed_interiors(network, after, correction, precise, held)
+            before, _ = adjusted_with_precision(
+                network,
+                after.parameters,
+                correction=np.zeros_like(correction),
+                noise=after.noise,
+                tolerance=TOLERANCE_WITHOUT_CORRECTION,
+                raise_if_cancelled=raise_if_cancelled,
+            )
+    figures = {
+        name: _figures(
+            measured, before, after=after, precise=precise, f=f, model=calibrations[name].model
+        )
+        for f, name in enumerate(frames)
+    }
+    return CalibrationResult(
+        figures,
+        dict(calibrations),
+        targets=_targets(measured, after, precise),
+        history={},
+        runs={},
+        findings=measured.excluded,
+        converged=after.converged,
+        seconds=time.perf_counter() - began,
+        statistics=(statistics_of(solved, after, precise),),
+        residuals=residuals_of_adjustment(measured, after, precise, correction),
+        created=_now(),
+        solved={'+'.join(frames): SolvedNetwork(solved, after, correction, held)},
+    )
+
+
+def _targets(measured: Measured, adjustment: Adjustment, precise: Precision) -> Targets:
+    return Targets(
+        measured.target_id, adjustment.parameters.points_mm, precise.points, precise.joint_points
+    )
+
+
+def _rows_of(measured: Measured, f: int) -> np.ndarray:
+    """Image points of fluoroscope number f."""
+    return np.flatnonzero(measured.network.fluoroscope[measured.network.exposure] == f)
+
+
+def _figures(
+    measured: Measured,
+    before: Adjustment | None,
+    after: Adjustment,
+    precise: Precision,
+    f: int,
+    model: CorrectionModel,
+) -> FluoroscopeResult:
+    """Figures of fluoroscope number f of an adjustment; before: the one without correction."""
+    rows = _rows_of(measured, f)
+    exposures = []
+    for j in np.flatnonzero(measured.network.fluoroscope == f):
+        sd = np.sqrt(np.diagonal(precise.exterior[j]))
+        exposures.append(
+            ExposureResult(
+                measured.frames[j].number,
+                after.parameters.position_mm[j],
+                quaternion_from_matrix(after.parameters.rotation[j]),
+                sd[:3],
+                sd[3:],
+            )
+        )
+    return FluoroscopeResult(
+        after.parameters.interior[f],
+        np.sqrt(np.diagonal(precise.interior[f])),
+        image_size=measured.image_size[f],
+        model_kind=model.kind,
+        k=model.k,
+        rmse_before=np.full(2, np.nan) if before is None else rmse_of_inliers(before, rows),
+        rmse_after=rmse_of_inliers(after, rows),
+        observations=len(rows),
+        inliers=int(after.inliers[rows].sum()),
+        exposures=tuple(exposures),
+    )
+
+
+@dataclass(frozen=True)
+class _ImageNoise:
+    """Standard deviation of an image coordinate [px], and its factors over the image."""
+
+    sd: float
+    profile: NoiseProfile | None
+
+
+def _image_noise(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
+    """Noise of an image coordinate of fluoroscope number f.
+
+    It is that of the inlier residuals, which are smaller than the noise by the root of their
+    redundancy numbers, together with what the distortion of an exposure differs from the model.
+    The scale of a Student-t noise is no substitute: where the tails are heavy it is smaller than
+    the standard deviation of its core.
+    """
+    noise_model = run.after.noise
+    if noise_model.loss != 'huber' and noise_model.nu >= EQUAL_WEIGHTS_NU:
+        redundancy = run.precision.redundancy.mean(axis=1)
+    else:
+        redundancy = geometric_redundancy(run.measured.network, run.after.parameters, noise_model)
+    rows = _rows_of(run.measured, f)
+    rows = rows[run.after.inliers[rows]]
+    square = np.sum(run.after.residuals[rows] ** 2, axis=1) / 2
+    between = run.between_exposures.get(name, np.zeros(len(rows)))
+    variance = np.sum(square) / np.sum(redundancy[rows]) + np.mean(between)
+    squares = square / np.maximum(redundancy[rows], MIN_REDUNDANCY) + between
+    profile = fitted_profile(run.measured.network.uv[rows], squares, run.measured.image_size[f])
+    return _ImageNoise(float(np.sqrt(variance)), profile)
+
+
+def _calibration(
+    run: SelfCalibration,
+    f: int,
+    name: str,
+    digest: str,
+    seconds: float,
+    noise: _ImageNoise,
+) -> FluoroscopeCalibration:
+    """Calibration of fluoroscope number f of a self-calibration."""
+    rows = _rows_of(run.measured, f)
+    last = run.history[-1]
+    frames = [frame for frame in run.measured.frames if frame.fluoroscope == name]
+    numbers = np.array([frame.number for frame in run.measured.frames])
+    model = run.models[name]
+    if model.keeps_training_points:
+        train_exposure = numbers[run.measured.network.exposure[rows[run.trained[rows]]]]
+    else:
+        train_exposure = np.zeros(len(model.train_uv), dtype=numbers.dtype)
+    return FluoroscopeCalibration(
+        fluoroscope=name,
+        image_size=run.measured.image_size[f],
+        interior=run.after.parameters.interior[f],
+        interior_covariance=run.claims.interior[f],
+        interior_estimated=bool(run.measured.network.interior_free[f]),
+        model=model,
+        train_exposure=train_exposure,
+        image_sd=noise.sd,
+        sigma0=run.after.noise.scale,
+        nu=run.after.noise.nu,
+        exposures=len(frames),
+        observations=len(rows),
+        inliers=int(run.after.inliers[rows].sum()),
+        rmse_before=rmse_of_inliers(run.before, rows),
+        rmse_after=rmse_of_inliers(run.after, rows),
+        cost_adjustment=last.F,
+        cost_regression=last.G,
+        iterations=last.iteration,
+        converged=run.converged,
+        stamp_ns=max(frame.stamp_ns for frame in frames),
+        frame_id=frames[0].frame_id,
+        source_digest=digest,
+        angle_field=run.angle_fields.get(name),
+        noise_profile=noise.profile,
+        seconds=seconds,
+    )

@@ -1,0 +1,288 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The model `collocation`: trend and signal estimated in the adjustment.
+
+Least-squares collocation (Moritz, "Advanced Physical Geodesy", 1980): the distortion is a cubic
+trend plus a random field, both among the unknowns of the adjustment, with priors that are
+estimated from the observations (see `priors`). Radial terms of degree 5 and 7 and a spiral of
+degree 5 join the trend where the observations make them likely: beyond the image points a field
+returns to zero, and a trend goes on.
+
+After each adjustment:
+
+1. The variances of the terms of exposures, where there are such terms, are renewed.
+2. The prior of each fluoroscope is renewed by one step towards the largest marginal likelihood.
+   Where it hardly changes, a short field is searched that the last steps may have missed; where
+   the signal varies more in places, more of these.
+3. The number of sines becomes that which the image points can tell with this prior.
+4. Once the priors are steady, the residuals are searched for what the terms cannot follow yet, one
+   after the other: ripples; exposures that differ, or else a signal shorter than the sines; places
+   where the signal varies more.
+
+A change of 3 or 4 leads to another adjustment. After two renewals that change nothing, the priors
+stay as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..correction.angle_field import AngleField
+from ..correction.series import Functions, Series
+from ..photogrammetry.precision import solved_additional
+from .estimator import AdjustedTerms, AdjustmentProblem, coefficients_of
+from .exposure_terms import ExposureTerms, estimates_beside_free_points
+from .fluoroscope_terms import FluoroscopeTerms, SeriesEquations
+from .lack_of_fit import LeftOut
+from .priors import Prior
+from .refinements import (
+    SETTLED_PRIOR,
+    START_MODES,
+    Change,
+    MorePlaces,
+    NumberOfSines,
+    Once,
+    PriorRefinement,
+    Refinement,
+    ShortField,
+    Solution,
+    exposure_terms,
+    places,
+    renewed_prior,
+    ripples,
+    short_sines,
+)
+
+if TYPE_CHECKING:
+    from ..photogrammetry.adjustment import Adjustment
+    from ..photogrammetry.elimination import FactorizedNormalMatrix
+    from ..photogrammetry.network import Network
+    from ..photogrammetry.precision import Precision
+
+SETTLED_VARIATION = 0.05  # relative change of the size of what differs between exposures
+# Renewals without visible change after which the priors are held. Noise and signal would otherwise
+# swing about their solution for long where the signal is as short as the distance of the points.
+HELD_AFTER = 2
+# Decrease of F that terms which continue an earlier calibration may leave: a thirtieth of a sigma.
+CONTINUED_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class EarlierTerms:
+    """Terms of an earlier calibration with more exposures.
+
+    Attributes
+    ----------
+    series : sequence of Series
+        By fluoroscope.
+    priors : sequence of Prior or None
+        Priors by fluoroscope; None: to be estimated from the series.
+    is_varying : bool
+        Whether the distortion differs between exposures.
+    """
+
+    series: Sequence[Series]
+    priors: Sequence[Prior | None]
+    is_varying: bool
+
+
+class CollocationTerms(AdjustedTerms):
+    """Trend and signal of all fluoroscopes of a network, and their priors.
+
+    modes: number of sines along the image to start with; 0: there is no signal, and the trend has
+    no rings (see `series.Functions`). earlier: what to start with instead.
+
+    Attributes
+    ----------
+    parts : list of FluoroscopeTerms
+        By fluoroscope.
+    """
+
+    intermediate_tolerance = 1.0  # noise and prior still change
+    # A third of the standard deviation of the noise of 1000 image points; what is left is less.
+    noise_tolerance = 5e-3
+
+    def __init__(
+        self,
+        problem: AdjustmentProblem,
+        modes: int = START_MODES,
+        earlier: EarlierTerms | None = None,
+    ) -> None:
+        self.network = problem.network
+        self.gauge_kinds = problem.gauges
+        self.parts: list[FluoroscopeTerms] = []
+        self._of_priors: list[list[PriorRefinement]] = []
+        self._steady_renewals = 0
+        if earlier is not None:
+            self._continue(problem, earlier)
+            return
+        for f in range(len(problem.image_sizes)):
+            self.parts.append(FluoroscopeTerms.first(problem, f, modes))
+            self._of_priors.append([ShortField(), MorePlaces()])
+        self._start = self.zeros()
+        self._refinements: list[Refinement] = [
+            NumberOfSines(),
+            Once(ripples),  # they may pass for a change between exposures
+            Once(exposure_terms, short_sines),
+            Once(places),
+        ]
+
+    def _continue(self, problem: AdjustmentProblem, earlier: EarlierTerms) -> None:
+        """Start with earlier series, and with the priors that are most likely for them."""
+        self.final_tolerance = CONTINUED_TOLERANCE
+        start = []
+        for f, (series, prior) in enumerate(zip(earlier.series, earlier.priors)):
+            part, coefficients = FluoroscopeTerms.continued(problem, f, series, prior)
+            self.parts.append(part)
+            start.append(coefficients)
+            # A prior that is given was refined where it was estimated.
+            self._of_priors.append([ShortField(), MorePlaces()] if prior is None else [])
+        self._start = tuple(start)
+        # The ripples of the earlier series stay, and its number of sines is not the first.
+        self._refinements = [NumberOfSines(changes=1)]
+        if earlier.is_varying:
+            self._refinements.append(Once(exposure_terms, short_sines))
+        if any(prior is None for prior in earlier.priors):
+            self._refinements.append(Once(places))
+
+    @property
+    def functions(self) -> list[Functions]:
+        """Functions by fluoroscope."""
+        return [part.functions for part in self.parts]
+
+    @property
+    def values(self) -> list[np.ndarray]:
+        """See `AdjustedTerms`."""
+        return [part.values for part in self.parts]
+
+    @property
+    def priors(self) -> list[Prior]:
+        """Present priors by fluoroscope."""
+        return [part.prior for part in self.parts]
+
+    @property
+    def exposure_terms(self) -> list[ExposureTerms | None]:
+        """Terms of exposures by fluoroscope."""
+        return [part.own for part in self.parts]
+
+    def start(self) -> tuple[np.ndarray, ...]:
+        """Coefficients to start with, by fluoroscope."""
+        return self._start
+
+    def zeros(self) -> tuple[np.ndarray, ...]:
+        """Coefficients of no correction, by fluoroscope."""
+        return tuple(np.zeros(part.count) for part in self.parts)
+
+    def with_additional(self, network: Network) -> Network:
+        """Return the network with the terms under their present priors."""
+        return replace(network, additional=tuple(part.additional() for part in self.parts))
+
+    def renew(
+        self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
+    ) -> tuple[bool, tuple[np.ndarray, ...]]:
+        """Renew priors, gauges and functions at a solution.
+
+        Returns whether the priors have settled, and the coefficients with which to continue.
+        """
+        coefficients = coefficients_of(adjustment)
+        if self._steady_renewals == HELD_AFTER:
+            return True, coefficients
+        solution = self._renewed(network, matrix, adjustment)
+        for refinement in self._refinements:
+            change = refinement.propose(solution)
+            if change is not None:
+                self._steady_renewals = 0
+                return False, self._changed(change, coefficients)
+        self._steady_renewals = self._steady_renewals + 1 if solution.is_steady else 0
+        return solution.is_steady, coefficients
+
+    def _renewed(
+        self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
+    ) -> Solution:
+        """Renew what the priors assume; return the solution with what that shows."""
+        for part, interior in zip(self.parts, adjustment.parameters.interior):
+            part.interior = interior
+        solved = solved_additional(matrix, network, adjustment)
+        self._renew_exposure_terms(network, adjustment)
+        equations = [part.equations(network, matrix, own) for part, own in zip(self.parts, solved)]
+        steady = [
+            _renew_prior(part, own, refinements)
+            for part, own, refinements in zip(self.parts, equations, self._of_priors)
+        ]
+        return Solution(self.parts, adjustment, equations, all(steady))
+
+    def _renew_exposure_terms(self, network: Network, adjustment: Adjustment) -> None:
+        """Renew the variances of the terms of exposures."""
+        if all(part.own is None for part in self.parts):
+            return
+        estimates = estimates_beside_free_points(network, adjustment)
+        for part, (mean, variance) in zip(self.parts, estimates):
+            own = part.own
+            if own is not None:
+                first = part.of_series.stop
+                before = own.size_px
+                own.renew(mean[first:], variance[first:])
+                if abs(own.size_px - before) > SETTLED_VARIATION * before:
+                    self._steady_renewals = 0
+
+    def _changed(
+        self, change: Change, coefficients: Sequence[np.ndarray]
+    ) -> tuple[np.ndarray, ...]:
+        """Change the terms; return the coefficients with which to continue."""
+        out = []
+        for part, modes, present in zip(self.parts, change.modes, coefficients):
+            f = part.number
+            part.prior = change.priors.get(f, part.prior)
+            converted = part.use_modes(modes, present)
+            part.own = change.exposure_terms.get(f, part.own)
+            started = np.pad(converted, (0, part.count - len(converted)))
+            out.append(change.coefficients.get(f, started))
+        return tuple(out)
+
+    def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
+        """Return the series of fluoroscope f, without the terms of its exposures.
+
+        coefficients (p,), those of u first, and their covariance (p, p).
+        """
+        return self.parts[f].series(coefficients, covariance)
+
+    def fit_angles(self, f: int, adjustment: Adjustment, precise: Precision) -> AngleField | None:
+        """See `AdjustedTerms`."""
+        fit = self.parts[f].fit_angles(adjustment, precise)
+        return None if fit is None else fit.field
+
+    def fitted_series(self, f: int, adjustment: Adjustment, precise: Precision) -> Series:
+        """See `AdjustedTerms`; beside a field of the angle, that which belongs to it."""
+        return self.parts[f].fitted_series(adjustment, precise)
+
+    def left_out(self, f: int) -> LeftOut | None:
+        """The signal beyond the sines of fluoroscope f."""
+        return self.parts[f].left_out()
+
+    def variance_between_exposures(
+        self, f: int, network: Network, adjustment: Adjustment, precise: Precision
+    ) -> np.ndarray:
+        """See `AdjustedTerms`."""
+        found = self.parts[f].variance_between_exposures(network, adjustment, precise)
+        if found is None:
+            return super().variance_between_exposures(f, network, adjustment, precise)
+        return found
+
+
+def _renew_prior(
+    part: FluoroscopeTerms,
+    equations: SeriesEquations,
+    refinements: Sequence[PriorRefinement],
+) -> bool:
+    """Renew the prior of a fluoroscope; return whether it hardly changes."""
+    last = part.prior
+    prior = renewed_prior(part, equations)
+    for refinement in refinements:
+        prior = refinement.propose(part, equations, prior) or prior
+    part.use_prior(prior)
+    return not part.functions.modes or prior.change(last, part.functions) < SETTLED_PRIOR

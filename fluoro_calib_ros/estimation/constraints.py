@@ -1,0 +1,305 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Constraints of a self-calibration, and the relative orientations it gives.
+
+Constraints are relative orientations of the fluoroscopes, interior orientations that are known
+beforehand, and the datum.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+from ..findings import Finding, Kind, Place, Severity
+from ..photogrammetry.elimination import factorize
+from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.precision import covariance_blocks
+from ..photogrammetry.relative_orientation import (
+    discrepancies,
+    discrepancies_with_jacobian,
+    mean_pose,
+)
+from ..photogrammetry.relative_pose import (
+    RIGID_SD_MM,
+    RIGID_SD_RAD,
+    RelativeConstraint,
+    RelativePose,
+)
+from .gauge import GaugeKind
+from .initial_network import Measured
+from .options import CalibrationOptions
+from .rounds import SelfCalibration
+
+# Image points of a target without surveyed coordinates. Two would determine it, but a false match
+# among them could not be detected, and would move it anywhere.
+MIN_RAYS = 3
+MIN_PAIRS = 2  # of exposures for a constraint of the relative orientation
+MAX_LISTED = 10  # targets named in a sentence
+
+
+@dataclass(frozen=True)
+class RelativeOrientation:
+    """Relative orientation of two fluoroscopes.
+
+    Attributes
+    ----------
+    fluoroscopes : (str, str)
+        Names of fluoroscopes a and b.
+    pose : RelativePose
+        Q = R_b R_a^T and t = R_a (T_b - T_a) [mm].
+    covariance : (6, 6) ndarray
+        Of t [mm] and of Q [rad] about the axes of b's sensor.
+    scatter_mm, scatter_rad : (3,) ndarray
+        Standard deviations of the exposures about it.
+    exposures : int
+        Number of pairs of exposures.
+    constraint : str
+        'none', 'soft' or 'hard'.
+    """
+
+    fluoroscopes: tuple[str, str]
+    pose: RelativePose
+    covariance: NDArray[np.float64]
+    scatter_mm: NDArray[np.float64]
+    scatter_rad: NDArray[np.float64]
+    exposures: int
+    constraint: str
+
+    @property
+    def sd_mm(self) -> NDArray[np.float64]:
+        """Standard deviations (3,) of the translation [mm]."""
+        return np.sqrt(np.diagonal(self.covariance)[:3])
+
+    @property
+    def sd_rad(self) -> NDArray[np.float64]:
+        """Standard deviations (3,) of the rotation [rad]."""
+        return np.sqrt(np.diagonal(self.covariance)[3:])
+
+
+def paired_exposures(measured: Measured, b: int, a: int = 0) -> np.ndarray:
+    """Rows (k, 2) of the exposures of fluoroscopes a and b that have the same number."""
+    row = {
+        (int(f), frame.number): j
+        for j, (f, frame) in enumerate(zip(measured.network.fluoroscope, measured.frames))
+    }
+    pairs = [
+        (row[a, number], j) for (f, number), j in row.items() if f == b and (a, number) in row
+    ]
+    return np.array(pairs, dtype=int).reshape(-1, 2)
+
+
+def interiors_to_estimate(measured: Measured, options: CalibrationOptions) -> np.ndarray:
+    """Whether (F,) the interior orientation of each fluoroscope is estimated.
+
+    It is held where it is known and has no standard deviation, and where flat targets parallel to
+    the image cannot show it.
+    """
+    estimated = options.interior == 'estimated'
+    out = np.full(len(measured.fluoroscopes), estimated)
+    for f, name in enumerate(measured.fluoroscopes):
+        if name in measured.known:
+            out[f] = measured.known[name].interior_sd is not None
+        elif _is_untilted(measured, f):
+            out[f] = estimated and options.interior_sd is not None
+    return out
+
+
+def gauges_of(measured: Measured, options: CalibrationOptions) -> tuple[GaugeKind, ...]:
+    """What the orientation of each fluoroscope can express.
+
+    Targets parallel to the image show no shift or scale that the exterior orientations could not
+    take up, though the interior orientation is fixed.
+    """
+    held = GaugeKind.TURNS if options.interior == 'fixed' else GaugeKind.FULL
+    return tuple(
+        GaugeKind.NONE
+        if name in measured.known
+        else GaugeKind.TREND
+        if _is_untilted(measured, f)
+        else held
+        for f, name in enumerate(measured.fluoroscopes)
+    )
+
+
+def _is_untilted(measured: Measured, f: int) -> bool:
+    return bool(measured.untilted) and measured.untilted[f]
+
+
+def _interior_sd(measured: Measured, options: CalibrationOptions) -> np.ndarray | None:
+    """Standard deviations (F, 3) [px] of the start values of the interior orientations.
+
+    None where nothing is known of any.
+    """
+    sd = np.full((len(measured.fluoroscopes), 3), np.inf)
+    if options.interior_sd is not None:
+        sd[:] = options.interior_sd
+    for f, name in enumerate(measured.fluoroscopes):
+        known = measured.known.get(name)
+        if known is not None:
+            sd[f] = np.inf if known.interior_sd is None else known.interior_sd
+    return sd if np.isfinite(sd).any() else None
+
+
+def with_constraints(measured: Measured, options: CalibrationOptions) -> Measured:
+    """Return a network with the constraints and the datum of the options.
+
+    Raises DataError if no exposures can be paired.
+    """
+    if options.datum == 'inner':
+        measured = _without_targets_of_few_rays(measured)
+    network = replace(measured.network, datum=options.datum, relative=())
+    start = replace(measured.start, relative=())
+    sd = _interior_sd(measured, options)
+    if sd is not None:
+        network = replace(network, interior_mean=start.interior, interior_sd=sd)
+    if options.relative_orientation != 'none':
+        constraints = _relative_constraints(measured, options)
+        start = replace(start, relative=tuple(mean_pose(start, c.pairs) for c in constraints))
+        if options.datum == 'inner':
+            constraints = tuple(
+                replace(c, length_mm=float(np.linalg.norm(pose.translation_mm)))
+                for c, pose in zip(constraints, start.relative)
+            )
+        network = replace(network, relative=constraints)
+    return replace(measured, network=network, start=start)
+
+
+def _relative_constraints(
+    measured: Measured, options: CalibrationOptions
+) -> tuple[RelativeConstraint, ...]:
+    """Constraints of every further fluoroscope with the first. Raises DataError."""
+    first, *others = measured.fluoroscopes
+    if not others:
+        raise DataError(
+            'a relative orientation needs two fluoroscopes in one adjustment, there is only '
+            f'{first}'
+        )
+    soft = options.relative_orientation == 'soft'
+    sd_mm, sd_rad = options.relative_sd if soft else (RIGID_SD_MM, RIGID_SD_RAD)
+    out = []
+    for b, name in enumerate(others, 1):
+        pairs = paired_exposures(measured, b)
+        if len(pairs) < MIN_PAIRS:
+            raise DataError(
+                f'fluoroscopes {first} and {name}: {len(pairs)} exposures have the same number, '
+                f'{MIN_PAIRS} are needed for a relative orientation constraint'
+            )
+        out.append(RelativeConstraint((0, b), pairs, sd_mm, sd_rad))
+    return tuple(out)
+
+
+def _without_targets_of_few_rays(measured: Measured) -> Measured:
+    """Return the network without targets that fewer than MIN_RAYS image points show."""
+    network = measured.network
+    rays = np.bincount(network.point, minlength=network.n_points)
+    few = rays < MIN_RAYS
+    if not few.any():
+        return measured
+    selected = ~few[network.point]
+    row = np.cumsum(~few) - 1
+    if not selected.any():
+        raise DataError(
+            'no target is seen in three exposures: without surveyed coordinates none is determined'
+        )
+    network = replace(
+        network,
+        uv=network.uv[selected],
+        sigma=network.sigma[selected],
+        exposure=network.exposure[selected],
+        point=row[network.point[selected]],
+        survey_mm=network.survey_mm[~few],
+        survey_sd_mm=network.survey_sd_mm[~few],
+    )
+    names = ', '.join(str(i) for i in measured.target_id[few][:MAX_LISTED])
+    names += ' and more' if few.sum() > MAX_LISTED else ''
+    excluded = Finding(
+        Kind.FEW_RAYS,
+        f'{few.sum()} targets are seen in fewer than {MIN_RAYS} exposures, which do not determine '
+        f'them safely without surveyed coordinates: {names}',
+        Place(target_id=tuple(measured.target_id[few].tolist())),
+        severity=Severity.NOTE,
+    )
+    return replace(
+        measured,
+        network=network,
+        target_id=measured.target_id[~few],
+        start=replace(measured.start, points_mm=measured.start.points_mm[~few]),
+        excluded=(*measured.excluded, excluded),
+    )
+
+
+def relative_orientations(
+    run: SelfCalibration, constraint: str
+) -> tuple[RelativeOrientation, ...]:
+    """Relative orientation of every further fluoroscope with the first, where exposures pair.
+
+    constraint: that of the CalibrationOptions. Without one it is the weighted mean of the
+    exposures.
+    """
+    measured = run.measured
+    parameters = run.after.parameters
+    out = []
+    for b in range(1, len(measured.fluoroscopes)):
+        names = (measured.fluoroscopes[0], measured.fluoroscopes[b])
+        if constraint == 'none':
+            pairs = paired_exposures(measured, b)
+            if not len(pairs):
+                continue
+            pose, covariance = _mean_of_pairs(run, pairs)
+        else:
+            pairs = measured.network.relative[b - 1].pairs
+            pose = parameters.relative[b - 1]
+            covariance = run.precision.relative[b - 1]
+        off = discrepancies(RelativeConstraint((0, b), pairs, 1.0, 1.0), pose, parameters)
+        scatter = np.sqrt(np.sum(off**2, axis=0) / max(len(off) - 1, 1))
+        out.append(
+            RelativeOrientation(
+                names,
+                pose,
+                covariance=covariance,
+                scatter_mm=scatter[:3],
+                scatter_rad=scatter[3:],
+                exposures=len(pairs),
+                constraint=constraint,
+            )
+        )
+    return tuple(out)
+
+
+def _mean_of_pairs(run: SelfCalibration, pairs: np.ndarray) -> tuple[RelativePose, np.ndarray]:
+    """Weighted mean of the relative orientations of pairs (k, 2), and its covariance (6, 6).
+
+    The exposures are correlated through interior orientation and object points, so their mixed
+    covariances count.
+    """
+    network = run.measured.network
+    after = run.after
+    equations = normal_equations(
+        network,
+        after.parameters,
+        run.correction - network.additional_correction(after.parameters),
+        after.noise,
+        after.noise.information_factor(after.q),
+    )
+    blocks = covariance_blocks(factorize(network, equations))
+    pose = mean_pose(after.parameters, pairs)
+    _, d_a, d_b, _ = discrepancies_with_jacobian(
+        RelativeConstraint((0, 1), pairs, 1.0, 1.0), pose, after.parameters
+    )
+    count = len(pairs)
+    one, other = (a.ravel() for a in np.indices((count, count)))
+    mixed: np.ndarray = np.zeros(())
+    for p, d_p in zip(pairs.T, (d_a, d_b)):
+        for q, d_q in zip(pairs.T, (d_a, d_b)):
+            between = blocks.between(p[one], q[other])
+            mixed = mixed + d_p[one] @ between @ d_q[other].transpose(0, 2, 1)
+    mixed = mixed.reshape(count, count, 6, 6)
+    weights = np.linalg.inv(mixed[np.arange(count), np.arange(count)])
+    inverse = np.linalg.inv(weights.sum(axis=0))
+    middle = np.einsum('kab,klbc,lcd->ad', weights, mixed, weights)
+    return mean_pose(after.parameters, pairs, weights), inverse @ middle @ inverse

@@ -1,0 +1,324 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Distortion that differs between exposures: low-order terms of each exposure.
+
+The magnetic field about an image intensifier, and so its distortion, changes with the angle of a
+C-arm. The change is smooth: the 14 terms of the cubic trend, less what the orientation of an
+exposure absorbs, describe it (Gronenschild, Medical Physics 26, 1999). Their coefficients are
+random effects with mean zero (Robinson, "That BLUP is a good thing", Statistical Science 6, 1991);
+the variance of each term over the exposures has the largest marginal likelihood (MacKay, Neural
+Computation 4, 1992) and vanishes where nothing changes.
+
+A change of the principal distance is hardly different from one of the distance of the source: its
+variance over the exposures can be estimated many times too small, and its stated standard
+deviation with it. Terms of the interior orientation change about as much as the others do. This is
+the prior of their variances: inverse chi squared with a few degrees of freedom, about the mean
+variance of the others (Smyth, "Linear models and empirical Bayes methods", Statistical
+Applications in Genetics and Molecular Biology 3, 2004). Their variances are the means of the
+posterior (Gelman et al., "Bayesian Data Analysis", 2013, 2.6): what is not known of them enlarges
+the stated standard deviations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.series import Functions
+from ..correction.terms import ABSENT_VARIANCE, CUBIC, cubic_terms, trend_transformation
+from ..photogrammetry.additional_parameters import AdditionalParameters, GroupedFunctions
+from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.collinearity import project_with_jacobian
+from ..photogrammetry.elimination import factorize
+from ..photogrammetry.network import Network
+from ..photogrammetry.noise import Noise
+from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.precision import information_of_additional, solved_additional
+from ..photogrammetry.unknowns import EXTERIOR_SIZE, INTERIOR_SIZE
+from .gauge import GaugeKind, gauge_basis
+
+TERMS = len(cubic_terms())  # of the cubic trend without the gauge
+# Square sum of the terms over its expectation for independent residuals from which distortion is
+# taken to vary. Object points and the common distortion absorb a part of the residuals: constant
+# distortions have 0.4 to 0.8 (docs/how_good/pathologies.md).
+VARYING = 0.85
+# Exposures as many as which the other terms tell of the variances of a change of the interior
+# orientation. Variances of the terms of a smooth field scatter like this.
+LIKE_OTHERS = 4
+MIN_POINTS = 30  # of an exposure whose terms are tested
+
+
+@dataclass(frozen=True)
+class Variation:
+    """Change of a distortion between exposures.
+
+    Attributes
+    ----------
+    chi2_per_dof : float
+        Square sum of the terms of all exposures over its expectation for independent residuals.
+    size_px : float
+        RMS of a coordinate of the change [px], without what the noise contributes.
+    """
+
+    chi2_per_dof: float
+    size_px: float
+
+    @property
+    def is_varying(self) -> bool:
+        """Whether the residuals show a change."""
+        return self.chi2_per_dof > VARYING
+
+
+def exposure_functions(
+    uv: np.ndarray,
+    image_size: tuple[int, int],
+    interior: np.ndarray,
+    with_interior: bool = False,
+) -> NDArray[np.float64]:
+    """Values (N, 2, 14) of the terms at pixels uv (N, 2), orthogonal and with an RMS of one.
+
+    They are orthogonal to the gauge about interior (3,), which orientations absorb. with_interior:
+    three further terms are what a turn of the sensor does not absorb of the gauge, a change of the
+    interior orientation.
+    """
+    to_terms, count = trend_transformation(CUBIC)
+    as_polynomials = np.linalg.inv(to_terms)[:, :count].reshape(2, -1, count)
+    values = np.einsum('nm,amt->nat', Functions(image_size, CUBIC)(uv), as_polynomials)
+    gauge = gauge_basis(uv, interior)
+    both = np.concatenate([gauge, values], axis=2).reshape(2 * len(uv), -1)
+    q = np.linalg.qr(both)[0][:, gauge.shape[2] :]
+    if with_interior:
+        turns = gauge_basis(uv, interior, GaugeKind.TURNS).reshape(2 * len(uv), -1)
+        turns = np.linalg.qr(turns)[0]
+        flat = gauge.reshape(2 * len(uv), -1)
+        left = flat - turns @ (turns.T @ flat)
+        q = np.hstack([q, np.linalg.svd(left, full_matrices=False)[0][:, :INTERIOR_SIZE]])
+    return q.reshape(len(uv), 2, -1) * np.sqrt(2 * len(uv))
+
+
+def is_determined(exposure: np.ndarray, fewest: int) -> bool:
+    """Whether at least `fewest` exposures have enough of the image points of exposure (n,)."""
+    return int(np.sum(np.unique(exposure, return_counts=True)[1] >= MIN_POINTS)) >= fewest
+
+
+def variation(residuals: np.ndarray, exposure: np.ndarray, functions: np.ndarray) -> Variation:
+    """Return the change of the distortion that residuals show.
+
+    residuals (n, 2) [px] of inliers, their exposures (n,), and the values (n, 2, 14) of
+    `exposure_functions`. The variance of the noise is that which the terms leave.
+    """
+    explained = 0.0
+    left = 0.0
+    dof = 0
+    dof_left = 0
+    points = 0
+    for number in np.unique(exposure):
+        own = exposure == number
+        if own.sum() < MIN_POINTS:
+            continue
+        a = functions[own].reshape(-1, functions.shape[2])
+        q, _ = np.linalg.qr(a)
+        square = float(np.sum((q.T @ residuals[own].ravel()) ** 2))
+        explained += square
+        left += float(np.sum(residuals[own] ** 2)) - square
+        dof += a.shape[1]
+        dof_left += len(a) - a.shape[1] - EXTERIOR_SIZE
+        points += len(a)
+    if not dof or left <= 0:
+        return Variation(0.0, 0.0)
+    noise = left / dof_left
+    excess = max(explained - VARYING * dof * noise, 0.0)
+    return Variation(explained / (dof * noise), float(np.sqrt(excess / points)))
+
+
+class ExposureTerms:
+    """Terms of every exposure of a fluoroscope as additional parameters.
+
+    The coefficients of one exposure stand after those of the one before. size_px: RMS of a
+    coordinate of the change to start with [px].
+
+    Attributes
+    ----------
+    functions : GroupedFunctions
+        At the image points; the groups are the exposures.
+    variance : (t,) ndarray
+        Variance of the coefficients of each term over the exposures [px^2]; t: 14, or 17 with a
+        change of the interior orientation.
+    """
+
+    def __init__(self, functions: np.ndarray, exposure: np.ndarray, size_px: float) -> None:
+        numbers, place = np.unique(exposure, return_inverse=True)
+        self.exposures = len(numbers)
+        self.functions = GroupedFunctions(functions, place)
+        count = functions.shape[2]
+        self.variance = np.full(count, max(size_px**2 / count, ABSENT_VARIANCE))
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients."""
+        return self.functions.count
+
+    @property
+    def values(self) -> np.ndarray:
+        """Functions (N, 2, t e) at the image points; zero but for those of the own exposure."""
+        own = self.functions
+        out = np.zeros((len(own.group), 2, self.exposures, own.values.shape[2]))
+        out[np.arange(len(own.group)), :, own.group] = own.values
+        return out.reshape(len(own.group), 2, -1)
+
+    @property
+    def precision(self) -> NDArray[np.float64]:
+        """Prior precisions (t e,) of the coefficients."""
+        return np.tile(1 / self.variance, self.exposures)
+
+    @property
+    def size_px(self) -> float:
+        """RMS of a coordinate of the change [px]."""
+        return float(np.sqrt(np.sum(self.variance)))
+
+    def renew(self, mean: np.ndarray, posterior: np.ndarray) -> None:
+        """Renew the variances from coefficients (t e,) and their posterior variances (t e,)."""
+        mean = mean.reshape(self.exposures, -1)
+        posterior = posterior.reshape(self.exposures, -1)
+        determined = np.clip(1 - posterior / self.variance, 1e-6, 1).sum(axis=0)
+        squares = np.sum(mean**2, axis=0)
+        others = np.sum(squares[:TERMS]) / np.sum(determined[:TERMS])
+        of_interior = np.arange(len(squares)) >= TERMS
+        squares = squares + LIKE_OTHERS * others * of_interior
+        # The mean of inverse chi squared has two degrees of freedom less.
+        exposures = determined + (LIKE_OTHERS - 2) * of_interior
+        self.variance = np.maximum(squares / exposures, ABSENT_VARIANCE)
+
+
+def without_exposure_terms(
+    information: np.ndarray, right: np.ndarray, precision: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information (c, c) and right side (c,) of the first coefficients, the others eliminated.
+
+    precision (p - c,): prior of the coefficients that are eliminated.
+    """
+    rest = information[count:, count:] + np.diag(precision)
+    mixed = information[count:, :count]
+    solved = np.linalg.solve(rest, np.column_stack([mixed, right[count:]]))
+    reduced = information[:count, :count] - mixed.T @ solved[:, :-1]
+    return reduced, right[:count] - mixed.T @ solved[:, -1]
+
+
+# What the terms of exposures (see `exposure_terms`) are if the survey has errors in common.
+#
+# Errors of the survey are taken to be independent. Errors that it has in common, such as a sheet
+# that is bent or has shrunk in one direction, look like terms that change as the phantom is
+# turned: such terms are more likely than errors of so many points. Object points must not lend
+# the terms their likelihood. The variances of the terms are therefore estimated with object
+# points that are nearly free, by restricted likelihood (Patterson and Thompson, "Recovery of
+# inter-block information when block sizes are unequal", Biometrika 58, 1971). How far the
+# distortion of a later exposure differs is the size of the part which neither orientations nor
+# object points absorb, a variance component by the method of moments (Searle, Casella and
+# McCulloch, "Variance Components", Wiley 1992, chapter 5).
+
+UNUSED = 1e6  # factor of the standard deviation of an outlier
+NEARLY_FREE = 10.0  # factor of the standard deviations of the survey
+
+
+def estimates_beside_free_points(
+    network: Network, adjustment: Adjustment
+) -> tuple[tuple[np.ndarray, np.ndarray], ...]:
+    """Coefficients (p,) and their variances (p,) by fluoroscope, with points that are nearly free.
+
+    network has additional parameters for each fluoroscope; it is linearised at the adjustment.
+    Raises numpy.linalg.LinAlgError where it does not determine them.
+    """
+    free = replace(network, survey_sd_mm=NEARLY_FREE * network.survey_sd_mm)
+    factor = adjustment.noise.information_factor(adjustment.q)
+    equations = normal_equations(free, adjustment.parameters, 0.0, adjustment.noise, factor)
+    matrix = factorize(free, equations)
+    means = solved_additional(matrix, free, adjustment)
+    informations = (information_of_additional(matrix, f) for f in range(len(means)))
+    return tuple((mean, np.diagonal(np.linalg.inv(one))) for mean, one in zip(means, informations))
+
+
+def variance_between_exposures(
+    network: Network,
+    adjustment: Adjustment,
+    f: int,
+    terms: ExposureTerms,
+    coefficients: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> np.ndarray:
+    """Variances [px^2] of image coordinates by terms of exposures, less what orientations absorb.
+
+    Parameters
+    ----------
+    network : Network
+    adjustment : Adjustment
+        Of the network.
+    f : int
+        Number of the fluoroscope.
+    terms : ExposureTerms
+        Of its exposures.
+    coefficients : (p,) ndarray
+        Estimated coefficients of the terms [px].
+    covariance : (p, p) ndarray
+        Their covariance.
+
+    Returns
+    -------
+    (i,) ndarray
+        Of the inliers among the image points of the fluoroscope.
+
+    Raises
+    ------
+    numpy.linalg.LinAlgError
+        Where the network does not determine orientations and object points.
+    """
+    variance = np.tile(terms.variance, terms.exposures)
+    information = _information(network, adjustment, f, terms)
+    expected = float(variance @ np.diagonal(information))
+    if not expected > 0:
+        return np.zeros(int(adjustment.inliers[network.rows(f)].sum()))
+    found = float(coefficients @ information @ coefficients + np.sum(information * covariance))
+    return found / expected * _variances_left(network, adjustment, f, terms)
+
+
+def _information(
+    network: Network, adjustment: Adjustment, f: int, terms: ExposureTerms
+) -> np.ndarray:
+    """Information (p, p) of the terms where only orientations and object points are unknown."""
+    additional: list[AdditionalParameters | None] = [None] * network.n_fluoroscopes
+    start: list[np.ndarray | None] = [None] * network.n_fluoroscopes
+    none = np.zeros((len(network.rows(f)), 0))
+    additional[f] = AdditionalParameters(none, np.diag(terms.precision), terms.functions)
+    start[f] = np.zeros(terms.count)
+    plain = replace(
+        network,
+        sigma=np.where(adjustment.inliers, network.sigma, UNUSED * network.sigma),
+        interior_free=np.zeros(network.n_fluoroscopes, dtype=bool),
+        additional=tuple(additional),
+    )
+    parameters = replace(adjustment.parameters, additional=tuple(start))
+    equations = normal_equations(plain, parameters, 0.0, Noise('gaussian', adjustment.noise.scale))
+    matrix = factorize(plain, equations)
+    return information_of_additional(matrix, f) - np.diag(terms.precision)
+
+
+def _variances_left(
+    network: Network, adjustment: Adjustment, f: int, terms: ExposureTerms
+) -> np.ndarray:
+    """Expected squares (i,) [px^2] of the terms, without what orientations absorb, of inliers."""
+    rows = network.rows(f)
+    inliers = adjustment.inliers[rows]
+    _, by_exterior, _, _ = project_with_jacobian(*network.per_image_point(adjustment.parameters))
+    exposure = network.exposure[rows]
+    squares = np.zeros(len(rows))
+    for number in np.unique(exposure):
+        at = inliers & (exposure == number)
+        own = terms.functions.values[at].reshape(2 * int(at.sum()), -1)
+        # In units in which the six unknowns matter alike.
+        absorbed = by_exterior[rows[at]].reshape(len(own), -1)
+        absorbed = absorbed / np.linalg.norm(absorbed, axis=0)
+        left = own - absorbed @ np.linalg.lstsq(absorbed, own, rcond=None)[0]
+        squares[at] = (left**2 @ terms.variance).reshape(-1, 2).mean(axis=1)
+    return squares[inliers]

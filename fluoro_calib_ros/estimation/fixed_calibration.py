@@ -1,0 +1,234 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Networks whose interior orientations and corrections are held at their calibrations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..exposures.frame import Frame, angles_of
+from ..exposures.phantom import Phantom
+from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.diagnosis import global_names
+from ..photogrammetry.elimination import factorize
+from ..photogrammetry.network import Network
+from ..photogrammetry.noise import Noise
+from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.precision import (
+    Precision,
+    covariance_blocks,
+    equations_with_fixed_interiors,
+    joint_covariance,
+)
+from .initial_network import (
+    Frames,
+    Known,
+    KnownSensor,
+    Measured,
+    StartValues,
+    network_of_known_sensors,
+    start_noise,
+)
+
+# Covariance matrix of all unknowns of an adjustment, computed on request.
+
+# Position of the source in the frame of the phantom, rotation about the axes of the sensor.
+EXTERIOR = ('x', 'y', 'z', 'turn x', 'turn y', 'turn z')
+
+
+@dataclass(frozen=True)
+class JointPrecision:
+    """Covariance matrix of all unknowns of an adjustment.
+
+    Attributes
+    ----------
+    names : tuple of str
+        Of the unknowns: x, y, z of the source [mm] and its turns about the axes of the sensor
+        [rad] of each exposure; x, y, z [mm] of each target; xp, yp, c [px] of each fluoroscope;
+        relative orientations and coefficients of the correction, where they were estimated.
+    values : (u,) ndarray
+        NaN for rotations, which have no value.
+    covariance : (u, u) ndarray
+        Zeros for what was held.
+    """
+
+    names: tuple[str, ...]
+    values: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SolvedNetwork:
+    """A network and its adjustment.
+
+    Attributes
+    ----------
+    measured : Measured
+    adjustment : Adjustment
+    correction : (N, 2) ndarray
+        Correction that was held [px].
+    held : (F, 3, 3) ndarray or None
+        Covariances of interior orientations that were held [px^2].
+    stated : Precision or None
+        What the unknowns claim where that is not the precision of the network: the matrix then
+        has these standard deviations, and the correlations of the network.
+    """
+
+    measured: Measured
+    adjustment: Adjustment
+    correction: NDArray[np.float64]
+    held: NDArray[np.float64] | None = None
+    stated: Precision | None = None
+
+    def joint_precision(self) -> JointPrecision:
+        """Covariance matrix of all unknowns.
+
+        Raises numpy.linalg.LinAlgError where the network does not determine them.
+        """
+        network = self.measured.network
+        parameters = self.adjustment.parameters
+        noise = self.adjustment.noise
+        if self.held is not None:
+            network, equations = equations_with_fixed_interiors(
+                network, self.adjustment, self.correction, self.held
+            )
+        else:
+            factor = noise.information_factor(self.adjustment.q)
+            equations = normal_equations(network, parameters, self.correction, noise, factor)
+        blocks = covariance_blocks(factorize(network, equations))
+        angles = np.full((network.n_exposures, 3), np.nan)
+        others = [p.ravel() for p in parameters.additional if p is not None]
+        relative = [np.append(p.translation_mm, angles[0]) for p in parameters.relative]
+        return JointPrecision(
+            (*self._exterior_names(), *self._target_names(), *self._global_names()),
+            np.concatenate(
+                [
+                    np.hstack([parameters.position_mm, angles]).ravel(),
+                    parameters.points_mm.ravel(),
+                    parameters.interior.ravel(),
+                    *relative,
+                    *others,
+                ]
+            ),
+            self._as_stated(joint_covariance(blocks).matrix),
+        )
+
+    def _as_stated(self, covariance: np.ndarray) -> np.ndarray:
+        """Scale a covariance matrix to the standard deviations that the unknowns claim."""
+        if self.stated is None:
+            return covariance
+        claimed = np.concatenate(
+            [
+                np.diagonal(blocks, axis1=1, axis2=2).ravel()
+                for blocks in (self.stated.exterior, self.stated.points, self.stated.interior)
+            ]
+        )
+        variance = np.diagonal(covariance)[: len(claimed)]
+        scale = np.ones(len(covariance))
+        free = variance > 0  # not of what was held
+        scale[: len(claimed)][free] = np.sqrt(claimed[free] / variance[free])
+        return scale[:, None] * covariance * scale
+
+    def _exterior_names(self) -> list[str]:
+        return [
+            f'exposure {frame.number} of {frame.fluoroscope}: {part}'
+            for frame in self.measured.frames
+            for part in EXTERIOR
+        ]
+
+    def _target_names(self) -> list[str]:
+        return [f'target {number}: {part}' for number in self.measured.target_id for part in 'xyz']
+
+    def _global_names(self) -> list[str]:
+        return global_names(self.measured.network, self.measured.fluoroscopes)
+
+
+# Mean number of image points of a target from which the noise can be estimated: with fewer the
+# noise cannot be told from errors of the survey.
+MIN_RAYS_FOR_NOISE = 3
+
+
+def network_of_calibrations(
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    raise_if_cancelled: Callable[[], None] | None = None,
+    known: Known | None = None,
+    starts: StartValues | None = None,
+) -> Measured:
+    """Return network and start values of frames {fluoroscope: [Frame, ...]}.
+
+    calibrations {fluoroscope: FluoroscopeCalibration} are held, as are exterior orientations that
+    are known {fluoroscope: KnownOrientation}. starts: of an earlier adjustment of the frames.
+    Raises DataError as `measured_network`.
+    """
+    sensors = {name: _sensor(calibrations[name]) for name in frames}
+    return network_of_known_sensors(
+        frames,
+        phantom,
+        sensors=sensors,
+        raise_if_cancelled=raise_if_cancelled,
+        known=known,
+        starts=starts,
+    )
+
+
+def _sensor(calibration: FluoroscopeCalibration) -> KnownSensor:
+    """Return interior orientation and correction of a calibration."""
+
+    def correction(frame: Frame) -> np.ndarray:
+        if calibration.angle_field is None:
+            return calibration.model.predict(frame.uv)
+        return calibration.correction(frame.uv, frame.angle).duv
+
+    return KnownSensor(calibration.interior, correction)
+
+
+def _angles(measured: Measured, rows: np.ndarray) -> np.ndarray:
+    """Angle [rad] of the C-arm for image points (r,), NaN where it is unknown."""
+    return angles_of(measured.frames)[measured.network.exposure[rows]]
+
+
+def fixed_corrections(
+    measured: Measured, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> tuple[np.ndarray, Network]:
+    """Corrections (N, 2) [px] by calibrations, and the network with their uncertainty in sigma.
+
+    Where a correction is uncertain, at the border and beyond the calibrated area, an image point
+    has less weight, and where the noise of the calibration is larger, unless it has a sigma
+    itself.
+    """
+    network = measured.network
+    correction = np.zeros_like(network.uv)
+    sigma = network.sigma.copy()
+    has_sigma = np.array([frame.sigma is not None for frame in measured.frames])
+    for f, name in enumerate(measured.fluoroscopes):
+        rows = network.rows(f)
+        calibration = calibrations[name]
+        found = calibration.correction(network.uv[rows], _angles(measured, rows))
+        correction[rows] = found.duv
+        without = rows[~has_sigma[network.exposure[rows]]]
+        sigma[without] *= calibration.noise_factors(network.uv[without])
+        sigma[rows] = np.hypot(sigma[rows], found.sd / calibration.sigma0)
+    return correction, replace(network, sigma=sigma)
+
+
+def noise_of_calibrations(loss: str, calibrations: Iterable[FluoroscopeCalibration]) -> Noise:
+    """Return the noise model of calibrations: medians of their scales and degrees of freedom."""
+    used = list(calibrations)
+    return replace(
+        start_noise(loss),
+        scale=float(np.median([c.sigma0 for c in used])),
+        nu=float(np.median([c.nu for c in used])),
+    )
+
+
+def too_few_rays_for_noise(network: Network) -> bool:
+    """Whether the noise of a network cannot be estimated and is that of the calibrations."""
+    return len(network.uv) < MIN_RAYS_FOR_NOISE * len(network.survey_mm)

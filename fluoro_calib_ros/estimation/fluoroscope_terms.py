@@ -1,0 +1,307 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""The terms of one fluoroscope in a collocation: functions, prior, gauge, terms of exposures."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from ..correction.series import Functions, Series, sd_over_image, without_absent_bands
+from ..correction.terms import CUBIC
+from ..photogrammetry.additional_parameters import AdditionalParameters
+from ..photogrammetry.precision import information_of_additional
+from .angle_fit import AngleFit, SeriesWithExposures, can_be_fitted, fit_angles
+from .estimator import AdjustmentProblem, coefficients_of, prior_of_additional
+from .exposure_terms import ExposureTerms, variance_between_exposures, without_exposure_terms
+from .lack_of_fit import FittedPoints, LeftOut, LeftOutInPlaces
+from .local_signal import correlation_beyond
+from .priors import (
+    Prior,
+    covariance_of_series,
+    gauge_precision,
+    has_rings,
+    most_likely_prior,
+    prior_precision,
+    starting_prior,
+)
+from .signal import ripples_of
+
+if TYPE_CHECKING:
+    from ..photogrammetry.adjustment import Adjustment
+    from ..photogrammetry.elimination import FactorizedNormalMatrix
+    from ..photogrammetry.network import Network
+    from ..photogrammetry.precision import Precision
+
+RINGS = 2  # radial polynomials of degree 5 and 7: what a curved screen adds at the border
+# Least standard deviation [px] to start with: a detector without distortion leaves only noise.
+MIN_START_SD_PX = 0.1
+
+
+@dataclass(frozen=True)
+class SeriesEquations:
+    """Normal equations of the coefficients of a series, all other unknowns eliminated.
+
+    Attributes
+    ----------
+    information : (2m, 2m) ndarray
+        Without a prior.
+    right : (2m,) ndarray
+    """
+
+    information: NDArray[np.float64]
+    right: NDArray[np.float64]
+
+
+class FluoroscopeTerms:
+    """Trend and signal of one fluoroscope, and the terms of its exposures.
+
+    Attributes
+    ----------
+    number : int
+        Of the fluoroscope in the network.
+    uv : (n, 2) ndarray
+        Image points [px].
+    image_size : (int, int)
+        Width and height [px].
+    gauge_kind : GaugeKind
+    angles : (e,) ndarray
+        Angles of the C-arm [rad]; empty where unknown.
+    interior : (3,) ndarray
+        xp, yp, c [px] at the last solution.
+    functions : Functions
+    values : (n, m) ndarray
+        Functions at the image points.
+    prior : Prior
+    gauge : (2m, 2m) ndarray
+        Precision matrix of the gauge.
+    own : ExposureTerms or None
+        Terms of the exposures; None: the distortion does not vary.
+    """
+
+    prior: Prior
+
+    def __init__(self, problem: AdjustmentProblem, number: int, functions: Functions) -> None:
+        network = problem.network
+        self.number = number
+        self.rows = network.rows(number)
+        self.uv = network.uv[self.rows]
+        self.sigma = network.sigma[self.rows]
+        self.exposure = network.exposure[self.rows]
+        self.point = network.point[self.rows]
+        self.image_size = problem.image_sizes[number]
+        self.gauge_kind = problem.gauges[number]
+        self.angles = np.zeros(0) if problem.angles is None else problem.angles[number]
+        self.interior = problem.before.parameters.interior[number]
+        self.own: ExposureTerms | None = None
+        self._angle_fit: AngleFit | None = None
+        self._use(functions)
+
+    @classmethod
+    def first(cls, problem: AdjustmentProblem, number: int, modes: int) -> FluoroscopeTerms:
+        """Return terms to start with; modes: of the sines, 0: trend without rings or signal."""
+        functions = Functions(
+            problem.image_sizes[number], CUBIC, modes, rings=RINGS if modes else 0
+        )
+        out = cls(problem, number, functions)
+        core = problem.before.residuals[out.rows][problem.before.inliers[out.rows]]
+        sd = max(float(np.sqrt(np.mean(core**2))), MIN_START_SD_PX)
+        out.prior = starting_prior(functions, sd)
+        return out
+
+    @classmethod
+    def continued(
+        cls, problem: AdjustmentProblem, number: int, series: Series, prior: Prior | None
+    ) -> tuple[FluoroscopeTerms, np.ndarray]:
+        """Return terms with the functions of an earlier series, and its coefficients (2m,).
+
+        prior: None, it is to be estimated from the series.
+        """
+        functions = series.functions
+        rings = RINGS if functions.modes else 0
+        functions, matrix = functions.as_rings(series.coefficients, CUBIC, rings)
+        functions, matrix = without_absent_bands(functions, matrix)
+        out = cls(problem, number, functions)
+        out.prior = prior or out._prior_of(matrix, problem.before.noise.scale)
+        return out, matrix.ravel()
+
+    def _prior_of(self, matrix: np.ndarray, scale: float) -> Prior:
+        """Prior that is most likely for coefficients (2, m); scale: of the noise.
+
+        Orientations are taken to be known, which is near enough to start with.
+        """
+        weighted = self.weighted(self.values, scale)
+        information = block_diag(*[weighted.T @ weighted] * 2)
+        sd = max(float(np.std(self.values @ matrix.T)), MIN_START_SD_PX)
+        start = starting_prior(self.functions, sd)
+        ripples = ripples_of(self.functions, matrix)
+        start = replace(start, signal=replace(start.signal, ripples=ripples))
+        right = information @ matrix.ravel()
+        return most_likely_prior(self.functions, information, right, self.gauge, prior=start)
+
+    def weighted(self, values: np.ndarray, scale: float) -> np.ndarray:
+        """Values (n, k) at image points over the sd of their noise, of a scale."""
+        return values / (scale * self.sigma)[:, None]
+
+    def _use(self, functions: Functions) -> None:
+        """Use these functions."""
+        self.functions = functions
+        self.values = functions(self.uv)
+        self.gauge = self.gauge_of(self.values)
+
+    def gauge_of(self, values: np.ndarray) -> NDArray[np.float64]:
+        """Precision matrix (2m, 2m) of the gauge for values (n, m) of functions."""
+        return gauge_precision(values, self.uv, self.interior, self.gauge_kind)
+
+    def use_prior(self, prior: Prior) -> None:
+        """Use this prior, and the gauge about the present interior orientation."""
+        self.prior = prior
+        self.gauge = self.gauge_of(self.values)
+
+    @property
+    def count(self) -> int:
+        """Number of coefficients, with those of the exposures."""
+        return 2 * len(self.functions) + (0 if self.own is None else self.own.count)
+
+    @property
+    def of_series(self) -> slice:
+        """Coefficients of the series; those of the exposures follow."""
+        return slice(2 * len(self.functions))
+
+    def additional(self) -> AdditionalParameters:
+        """Additional parameters: the series, then the terms of the exposures."""
+        prior = prior_precision(self.functions, self.prior) + self.gauge
+        if self.own is None:
+            return AdditionalParameters(self.values, prior)
+        prior = block_diag(prior, np.diag(self.own.precision))
+        return AdditionalParameters(self.values, prior, self.own.functions)
+
+    def correction(self, coefficients: np.ndarray) -> np.ndarray:
+        """Corrections (n, 2) [px] of the image points by the series."""
+        return self.values @ coefficients[self.of_series].reshape(2, -1).T
+
+    def inliers(self, adjustment: Adjustment) -> FittedPoints:
+        """Inliers of an adjustment."""
+        core = adjustment.inliers[self.rows]
+        return FittedPoints(
+            self.uv[core], adjustment.residuals[self.rows][core], self.exposure[core]
+        )
+
+    def functions_with(self, modes: int, prior: Prior) -> Functions:
+        """Functions with all sines up to a number of modes, and those of ripples of a prior."""
+        ripples = prior.signal.ripples
+        bands = ripples.bands if ripples is not None else ()
+        highest = max((modes, *bands))
+        absent = tuple(b for b in range(modes + 1, highest) if b not in bands)
+        return Functions(self.image_size, CUBIC, highest, self.functions.rings, absent)
+
+    def use_modes(self, modes: int, coefficients: np.ndarray) -> np.ndarray:
+        """Use all sines up to a number of modes, and those of the ripples of the prior.
+
+        Returns the coefficients for them.
+        """
+        end = self.of_series.stop
+        before = self.functions
+        self._use(self.functions_with(modes, self.prior))
+        series = self.functions.converted(before, coefficients[:end])
+        return np.concatenate([series, coefficients[end:]])
+
+    def equations(
+        self, network: Network, matrix: FactorizedNormalMatrix, solved: np.ndarray
+    ) -> SeriesEquations:
+        """Normal equations of the series at a solution.
+
+        network: with the terms under their last priors; solved (p,): estimates with these.
+        """
+        present = prior_of_additional(network, self.number)
+        information = information_of_additional(matrix, self.number) - present
+        information *= matrix.information_factor
+        right = (information + present) @ solved
+        if self.own is not None:
+            information, right = without_exposure_terms(
+                information, right, self.own.precision, self.of_series.stop
+            )
+        return SeriesEquations(information, right)
+
+    def series(self, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
+        """Return the series, without the terms of the exposures.
+
+        coefficients (p,), those of u first, and their covariance (p, p).
+        """
+        functions = self.functions
+        sd = sd_over_image(functions, covariance[self.of_series, self.of_series])
+        values = coefficients[self.of_series].reshape(2, -1)
+        if has_rings(functions, self.prior):
+            return Series(*functions.as_polynomials(values), sd)
+        plain = replace(functions, rings=0, absent=())
+        return Series(plain, plain.converted(functions, values.ravel()).reshape(2, -1), sd)
+
+    def fitted_series(self, adjustment: Adjustment, precise: Precision) -> Series:
+        """See `AdjustedTerms`; beside a field of the angle, that which belongs to it."""
+        fit = self._angle_fit
+        if fit is not None:
+            return self.series(fit.coefficients, fit.covariance)
+        covariance = precise.additional[self.number]
+        if covariance is None:
+            raise ValueError(f'no terms were estimated for fluoroscope number {self.number}')
+        of_series = self.of_series
+        coefficients = coefficients_of(adjustment)[self.number][of_series]
+        covariance = covariance_of_series(
+            self.functions, self.prior, coefficients, covariance[of_series, of_series]
+        )
+        return self.series(coefficients, covariance)
+
+    def fit_angles(self, adjustment: Adjustment, precise: Precision) -> AngleFit | None:
+        """Fit the terms of the exposures to the angles of the C-arm; None: they do not follow."""
+        covariance = precise.additional[self.number]
+        if self.own is None or covariance is None or not can_be_fitted(self.angles):
+            return None
+        coefficients = coefficients_of(adjustment)[self.number]
+        estimated = SeriesWithExposures(
+            self.functions, self.uv, self.own, coefficients, covariance
+        )
+        self._angle_fit = fit_angles(estimated, self.angles)
+        return self._angle_fit
+
+    def left_out(self) -> LeftOut | None:
+        """The signal beyond the sines; None: there is no signal."""
+        functions = self.functions
+        if not functions.modes:
+            return None
+        signal = self.prior.signal
+        local = self.prior.local
+        places = None
+        if local is not None:
+            places = LeftOutInPlaces(
+                partial(local.variance_beyond, functions), partial(correlation_beyond, functions)
+            )
+        highest = functions.highest
+        correlation = partial(signal.correlation_beyond, highest)
+        return LeftOut(signal.sd_beyond(highest), correlation, places)
+
+    def variance_between_exposures(
+        self, network: Network, adjustment: Adjustment, precise: Precision
+    ) -> np.ndarray | None:
+        """See `AdjustedTerms`; None: there are no terms of exposures."""
+        covariance = precise.additional[self.number]
+        if self.own is None or covariance is None:
+            return None
+        coefficients = coefficients_of(adjustment)[self.number]
+        last = slice(-self.own.count, None)
+        remaining = 1.0 if self._angle_fit is None else self._angle_fit.remaining
+        return remaining * variance_between_exposures(
+            network,
+            adjustment,
+            self.number,
+            terms=self.own,
+            coefficients=coefficients[last],
+            covariance=covariance[last, last],
+        )

@@ -1,0 +1,668 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""From frames to a network: validation, start values and what has to be excluded."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.series import Series
+from ..errors import DataError
+from ..exposures.frame import Frame, angles_of, validate_frame
+from ..exposures.phantom import Phantom
+from ..findings import Finding, Kind, Place, Severity
+from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.known_orientation import (
+    HELD_SD_MM,
+    HELD_SD_RAD,
+    ExteriorPrior,
+    KnownOrientation,
+)
+from ..photogrammetry.network import Network
+from ..photogrammetry.noise import Noise
+from ..photogrammetry.noise_estimation import adjust_and_estimate_noise
+from ..photogrammetry.plane_resection import flatness, plane_of, tilt_of
+from ..photogrammetry.precision import Precision, precision
+from ..photogrammetry.resection import MIN_FLATNESS, Resection, refine_resection, resection_at
+from ..photogrammetry.rotations import rotation_angle
+from ..photogrammetry.unknowns import EXTERIOR_SIZE, Parameters
+from .priors import Prior
+from .start_orientation import (
+    UNTILTED,
+    View,
+    orient_view,
+    principal_distance_of_views,
+    settle_planes,
+    view_of,
+)
+
+# Adjustment of a network with its precision, as every step of a calibration needs it.
+
+START_GROSS = 0.01  # share of gross errors with which the estimation of the noise begins
+ADVICE = 'add exposures with the phantom turned and moved'
+SINGULAR = f'the exposures do not determine the unknowns: the normal matrix is singular; {ADVICE}'
+
+
+def start_noise(loss: str) -> Noise:
+    """Return the noise model with which an estimation begins.
+
+    A Student-t noise comes with a share of gross errors.
+    """
+    return Noise(loss, gross=START_GROSS if loss == 'student_t' else 0.0)
+
+
+def adjusted_with_precision(
+    network: Network,
+    start: Parameters,
+    correction: NDArray[np.float64],
+    noise: Noise,
+    tolerance: float = 1e-8,
+    raise_if_cancelled: Callable[[], None] | None = None,
+    noise_fixed: bool = False,
+) -> tuple[Adjustment, Precision]:
+    """Adjust a network and compute its precision.
+
+    Parameters
+    ----------
+    network : Network
+    start : Parameters
+        Start values of the unknowns.
+    correction : (N, 2) ndarray
+        Corrections of the image points [px], held.
+    noise : Noise
+        Start values of the noise model, or the noise model where noise_fixed.
+    tolerance : float
+        Decrease of the cost at which the adjustment stops.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop.
+    noise_fixed : bool
+        True where the noise model is not to be estimated.
+
+    Returns
+    -------
+    Adjustment, Precision
+
+    Raises
+    ------
+    DataError
+        If the network does not determine the unknowns.
+    """
+    try:
+        if noise_fixed:
+            result = adjust(
+                network,
+                start,
+                correction=correction,
+                noise=noise,
+                options=SolverOptions(tolerance),
+                raise_if_cancelled=raise_if_cancelled,
+            )
+        else:
+            result = adjust_and_estimate_noise(
+                network,
+                start,
+                correction=correction,
+                noise=noise,
+                options=SolverOptions(tolerance),
+                raise_if_cancelled=raise_if_cancelled,
+            )
+        return result, precision(network, result, correction)
+    except np.linalg.LinAlgError:
+        raise DataError(SINGULAR) from None
+
+
+def with_additional(adjustment: Adjustment, values: tuple[np.ndarray, ...]) -> Adjustment:
+    """Return an adjustment whose parameters have additional parameters of these values."""
+    return replace(adjustment, parameters=replace(adjustment.parameters, additional=values))
+
+
+MIN_EXPOSURES = 3
+MIN_TARGETS_OF_EXPOSURE = 12
+# Of an exposure whose orientation is known.
+MIN_TARGETS_OF_KNOWN = 1
+# Flat targets that are tilted less in all exposures do not show the principal distance.
+UNTILTED_RAD = np.deg2rad(5.0)
+# Smaller differences of rotation and distance make two exposures show one pose of the phantom.
+MIN_POSE_RAD = np.deg2rad(2.0)
+MIN_POSE_MM = 20.0
+# A distance along the optical axis is determined this many times worse than one across it.
+AXIAL_FACTOR = 10.0
+MAX_MISFIT = 8.0  # residuals of a resection relative to the median of the exposures
+
+Frames = Mapping[str, Sequence[Frame]]  # by fluoroscope
+Known = Mapping[str, KnownOrientation]  # by fluoroscope
+
+
+@dataclass(frozen=True)
+class Measured:
+    """A network and what it was made from.
+
+    Attributes
+    ----------
+    network : Network
+    start : Parameters
+        Start values.
+    fluoroscopes : tuple of str
+        Names, in the order of the network.
+    image_size : tuple of (int, int)
+        Width and height [px] by fluoroscope.
+    frames : tuple of Frame
+        The frame of every exposure of the network.
+    target_id : (n,) ndarray of int
+        Of the object points.
+    excluded : tuple of Finding
+        One for every frame that is not used.
+    untilted : tuple of bool
+        By fluoroscope, whether all exposures show flat targets parallel to the image.
+    known : mapping of str to KnownOrientation
+        Orientations that are known beforehand, by fluoroscope.
+    """
+
+    network: Network
+    start: Parameters
+    fluoroscopes: tuple[str, ...]
+    image_size: tuple[tuple[int, int], ...]
+    frames: tuple[Frame, ...]
+    target_id: NDArray[np.int64]
+    excluded: tuple[Finding, ...]
+    untilted: tuple[bool, ...] = ()
+    known: Known = field(default_factory=dict)
+
+    @property
+    def angles(self) -> list[np.ndarray]:
+        """Angles (e,) of the C-arm [rad] in the exposures of each fluoroscope; NaN: unknown."""
+        network = self.network
+        exposures = [
+            np.unique(network.exposure[network.rows(f)]) for f in range(len(self.fluoroscopes))
+        ]
+        return [angles_of(self.frames[j] for j in own) for own in exposures]
+
+
+@dataclass(frozen=True)
+class KnownSensor:
+    """A fluoroscope whose interior orientation (3,) [px] and correction are known.
+
+    correction: of the n image points of a frame, (n, 2) [px].
+    """
+
+    interior: np.ndarray
+    correction: Callable[[Frame], np.ndarray]
+
+
+@dataclass(frozen=True)
+class EarlierCalibration:
+    """What a calibration with some exposures can take over from one with more of them.
+
+    Attributes
+    ----------
+    series : mapping of str to Series
+        Corrections by fluoroscope.
+    varying : frozenset of str
+        Fluoroscopes whose distortion differs between exposures.
+    noise : Noise
+    target_id : (n,) ndarray of int
+        Targets with object points, ascending.
+    points_mm : (n, 3) ndarray
+    priors : dict of str to Prior
+        Of the corrections by fluoroscope: those that the last of several such calibrations has
+        found, with which the next one starts.
+    """
+
+    series: Mapping[str, Series]
+    varying: frozenset[str]
+    noise: Noise
+    target_id: NDArray[np.int64]
+    points_mm: NDArray[np.float64]
+    priors: dict[str, Prior] = field(default_factory=dict)
+
+    def points(self, target_id: np.ndarray) -> NDArray[np.float64]:
+        """Object points (k, 3) [mm] of targets (k,)."""
+        return self.points_mm[np.searchsorted(self.target_id, target_id)]
+
+
+@dataclass(frozen=True)
+class StartValues:
+    """Start values from an earlier adjustment of the same exposures, instead of resections.
+
+    Attributes
+    ----------
+    interior : mapping of str to (3,) ndarray
+        xp, yp, c [px] by fluoroscope.
+    exterior : mapping of (str, int) to ((3, 3) ndarray, (3,) ndarray)
+        Rotation and position [mm] by fluoroscope and exposure.
+    earlier : EarlierCalibration, optional
+        That of the same exposures and others; the orientations are those with its corrections.
+    """
+
+    interior: Mapping[str, NDArray[np.float64]]
+    exterior: Mapping[tuple[str, int], tuple[NDArray[np.float64], NDArray[np.float64]]]
+    earlier: EarlierCalibration | None = None
+
+
+@dataclass(frozen=True)
+class _Task:
+    """What start values are made from; sensors None: the fluoroscopes are to be calibrated."""
+
+    phantom: Phantom
+    sensors: Mapping[str, KnownSensor] | None
+    principal_distance: float | None
+    known: Known
+    raise_if_cancelled: Callable[[], None] | None
+    starts: StartValues | None = None
+
+    def has_starts(self, name: str, frames: Sequence[Frame]) -> bool:
+        """Whether there are start values of all these exposures of a fluoroscope."""
+        starts = self.starts
+        return (
+            starts is not None
+            and name in starts.interior
+            and all((name, frame.number) in starts.exterior for frame in frames)
+        )
+
+    def min_exposures(self, name: str, untilted: bool = True) -> int:
+        """Number of exposures that a fluoroscope needs; untilted: of flat targets at rest."""
+        if self.sensors is not None or name in self.known:
+            return 1
+        return 1 if untilted and self.principal_distance is not None else MIN_EXPOSURES
+
+    def min_targets(self, name: str) -> int:
+        """Number of targets that an exposure needs."""
+        return MIN_TARGETS_OF_KNOWN if name in self.known else MIN_TARGETS_OF_EXPOSURE
+
+
+@dataclass(frozen=True)
+class _Resected:
+    """Exposures of one fluoroscope that fit the phantom, and findings on those that do not."""
+
+    frames: list[Frame]
+    resections: list[Resection]
+    interior: np.ndarray
+    excluded: list[Finding]
+    untilted: bool = False
+
+
+def nominal_interior(image_size: tuple[int, int], principal_distance: float) -> np.ndarray:
+    """Interior orientation (3,) [px] with the principal point at the centre of the image."""
+    return np.array([(image_size[0] - 1) / 2, (image_size[1] - 1) / 2, principal_distance])
+
+
+def measured_network(
+    frames: Frames,
+    phantom: Phantom,
+    principal_distance: float | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+    known: Known | None = None,
+    starts: StartValues | None = None,
+) -> Measured:
+    """Return network and start values of the frames of fluoroscopes that are to be calibrated.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+    phantom : Phantom
+    principal_distance : float, optional
+        Start value [px]; by default it is taken from the observations.
+    raise_if_cancelled : callable, optional
+        Called for every exposure; may raise to stop.
+    known : mapping of str to KnownOrientation, optional
+        Orientations that are known beforehand, by fluoroscope.
+    starts : StartValues, optional
+        Used for a fluoroscope with start values of all its exposures.
+
+    Returns
+    -------
+    Measured
+
+    Raises
+    ------
+    DataError
+        If a frame is invalid, if exposures or targets are too few, or if all exposures show one
+        pose.
+    """
+    task = _Task(
+        phantom,
+        None,
+        principal_distance=principal_distance,
+        known=known or {},
+        raise_if_cancelled=raise_if_cancelled,
+        starts=starts,
+    )
+    return _measured(
+        task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
+    )
+
+
+def network_of_known_sensors(
+    frames: Frames,
+    phantom: Phantom,
+    sensors: Mapping[str, KnownSensor],
+    raise_if_cancelled: Callable[[], None] | None = None,
+    known: Known | None = None,
+    starts: StartValues | None = None,
+) -> Measured:
+    """Return network and start values with interior orientations and corrections fixed.
+
+    One exposure of a fluoroscope is enough. The arguments and errors are those of
+    `measured_network`; sensors {fluoroscope: KnownSensor}.
+    """
+    task = _Task(
+        phantom,
+        sensors,
+        principal_distance=None,
+        known=known or {},
+        raise_if_cancelled=raise_if_cancelled,
+        starts=starts,
+    )
+    return _measured(
+        task, {name: _resected(task, name, of_one) for name, of_one in frames.items()}
+    )
+
+
+def _measured(task: _Task, found: Mapping[str, _Resected]) -> Measured:
+    """Return the network of resected exposures {fluoroscope: _Resected}."""
+    frames = [frame for one in found.values() for frame in one.frames]
+    resections = [resection for one in found.values() for resection in one.resections]
+    fluoroscope = np.repeat(np.arange(len(found)), [len(one.frames) for one in found.values()])
+    network, target_id = _index(frames, fluoroscope, task, len(found))
+    if task.known:
+        network = replace(network, exterior=_exterior_prior(task, frames))
+    earlier = None if task.starts is None or task.sensors is not None else task.starts.earlier
+    start = Parameters(
+        np.array([one.interior for one in found.values()]),
+        np.array([resection.rotation for resection in resections]),
+        np.array([resection.position_mm for resection in resections]),
+        network.survey_mm.copy() if earlier is None else earlier.points(target_id),
+    )
+    sizes = tuple(one.frames[0].image_size for one in found.values())
+    excluded = tuple(one for resected in found.values() for one in resected.excluded)
+    untilted = tuple(one.untilted for one in found.values())
+    known = {name: task.known[name] for name in found if name in task.known}
+    return Measured(
+        network=network,
+        start=start,
+        fluoroscopes=tuple(found),
+        image_size=sizes,
+        frames=tuple(frames),
+        target_id=target_id,
+        excluded=excluded,
+        untilted=untilted,
+        known=known,
+    )
+
+
+def _exterior_prior(task: _Task, frames: Sequence[Frame]) -> ExteriorPrior:
+    """What is known of the exterior orientations of exposures."""
+    rotation = np.tile(np.eye(3), (len(frames), 1, 1))
+    position = np.zeros((len(frames), 3))
+    sd = np.full((len(frames), EXTERIOR_SIZE), np.inf)
+    for row, frame in enumerate(frames):
+        known = task.known.get(frame.fluoroscope)
+        if known is not None:
+            rotation[row] = known.rotation
+            position[row] = known.position_mm
+            sd[row] = np.repeat(known.exterior_sd or (HELD_SD_MM, HELD_SD_RAD), 3)
+    return ExteriorPrior(rotation, position, sd)
+
+
+def _resected(task: _Task, name: str, frames: Sequence[Frame]) -> _Resected:
+    """Resect the exposures of one fluoroscope. Raises DataError."""
+    ordered, excluded = _usable_frames(task, name, frames)
+    untilted = False
+    if name in task.known:
+        found, interior, misfits = _place_all(task, name, ordered)
+    elif task.has_starts(name, ordered):
+        found, interior, misfits = _start_all(task, name, ordered)
+    else:
+        found, interior, misfits = _resect_all(task, name, ordered)
+    if task.sensors is None and name not in task.known:
+        untilted = _are_untilted(task, ordered, found)
+        _require_determined(task, name, found, untilted)
+    excluded += misfits
+    fitting = [(frame, one) for frame, one in zip(ordered, found) if one is not None]
+    needed = task.min_exposures(name, untilted)
+    if len(fitting) < needed:
+        if not misfits:
+            raise DataError(_too_few(name, len(fitting), needed, excluded))
+        raise DataError(
+            f'only {len(fitting)} of {len(found)} exposures fit the phantom, '
+            f'{needed} are needed; the first that does not: {excluded[0]}',
+            kind=excluded[0].kind,
+            place=Place((name,), excluded[0].place.exposures, name=f'fluoroscope {name}'),
+            numbers={'fitting': len(fitting), 'needed': needed},
+        )
+    return _Resected(
+        [frame for frame, _ in fitting],
+        [one for _, one in fitting],
+        interior,
+        excluded,
+        untilted,
+    )
+
+
+def _no_correction(frame: Frame) -> np.ndarray:
+    return np.zeros_like(frame.uv)
+
+
+def _place_all(
+    task: _Task, name: str, frames: Sequence[Frame]
+) -> tuple[list[Resection | None], np.ndarray, list[Finding]]:
+    """Known orientations of the frames of one fluoroscope; returns as _resect_all."""
+    known = task.known[name]
+    sensor = None if task.sensors is None else task.sensors[name]
+    correction = _no_correction if sensor is None else sensor.correction
+    interior = known.interior if sensor is None else np.asarray(sensor.interior)
+    found: list[Resection | None] = []
+    for frame in frames:
+        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        found.append(
+            resection_at(
+                known.rotation, known.position_mm, xyz, frame.uv - correction(frame), interior
+            )
+        )
+    return found, interior, _reject_poor_fits(frames, found)
+
+
+def _start_all(
+    task: _Task, name: str, frames: Sequence[Frame]
+) -> tuple[list[Resection | None], np.ndarray, list[Finding]]:
+    """Start values that are given for the frames of one fluoroscope; returns as _resect_all."""
+    assert task.starts is not None
+    sensor = None if task.sensors is None else task.sensors[name]
+    earlier = task.starts.earlier
+    correction = _no_correction if sensor is None else sensor.correction
+    interior = task.starts.interior[name] if sensor is None else np.asarray(sensor.interior)
+    found: list[Resection | None] = []
+    for frame in frames:
+        rotation, position = task.starts.exterior[name, frame.number]
+        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        if sensor is None and earlier is not None:
+            uv = frame.uv - earlier.series[name].predict(frame.uv)
+            found.append(resection_at(rotation, position, xyz, uv, interior))
+            continue
+        # The sensor may have another gauge than that of the earlier adjustment.
+        found.append(
+            refine_resection(xyz, frame.uv - correction(frame), interior, rotation, position)
+        )
+    return found, interior, _reject_poor_fits(frames, found)
+
+
+def _are_untilted(task: _Task, frames: Sequence[Frame], found: Sequence[Resection | None]) -> bool:
+    """Whether all exposures show flat targets that are parallel to the image."""
+    for frame, one in zip(frames, found):
+        if one is None:
+            continue
+        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        if flatness(xyz) >= MIN_FLATNESS or tilt_of(one.rotation, plane_of(xyz)) > UNTILTED_RAD:
+            return False
+    return any(one is not None for one in found)
+
+
+def _require_determined(
+    task: _Task, name: str, found: Sequence[Resection | None], untilted: bool
+) -> None:
+    """Raise DataError where poses determine no principal distance."""
+    if not untilted:
+        _require_different_poses(name, found)
+    elif task.principal_distance is None:
+        raise DataError(replace(UNTILTED, place=Place((name,))))
+
+
+def _usable_frames(
+    task: _Task, name: str, frames: Sequence[Frame]
+) -> tuple[list[Frame], list[Finding]]:
+    """Frames with enough targets, ordered by number, and a finding for each of the others."""
+    ordered: list[Frame] = []
+    excluded: list[Finding] = []
+    needed_targets = task.min_targets(name)
+    for frame in sorted((f.sorted() for f in frames), key=lambda f: f.number):
+        validate_frame(frame, task.phantom, frames[0].image_size)
+        if ordered and ordered[-1].number == frame.number:
+            raise DataError(f'fluoroscope {name}: exposure {frame.number} appears twice')
+        count = len(frame.target_id)
+        if count < needed_targets:
+            excluded.append(
+                Finding(
+                    Kind.FEW_TARGETS,
+                    f'{count} targets are too few, {needed_targets} are needed',
+                    frame.place,
+                    severity=Severity.NOTE,
+                    numbers={'targets': count, 'needed': needed_targets},
+                )
+            )
+        else:
+            ordered.append(frame)
+    needed = task.min_exposures(name)
+    if len(ordered) < needed:
+        raise DataError(_too_few(name, len(ordered), needed, excluded))
+    return ordered, excluded
+
+
+def _too_few(name: str, count: int, needed: int, excluded: Sequence[Finding]) -> Finding:
+    """Return the finding that the exposures of a fluoroscope are too few."""
+    few = f', {len(excluded)} more have too few targets' if excluded else ''
+    return Finding(
+        Kind.FEW_EXPOSURES,
+        f'{count} exposures are too few, {needed} are needed{few}',
+        Place((name,)),
+        numbers={'exposures': count, 'needed': needed, 'few_targets': len(excluded)},
+    )
+
+
+def _resect_all(
+    task: _Task, name: str, frames: Sequence[Frame]
+) -> tuple[list[Resection | None], np.ndarray, list[Finding]]:
+    """Resections of the frames of one fluoroscope.
+
+    Returns them, None where one fails; the interior orientation (3,); and a finding for every
+    failure.
+    """
+    sensor = None if task.sensors is None else task.sensors[name]
+    correction = _no_correction if sensor is None else sensor.correction
+    views = []
+    for frame in frames:
+        if task.raise_if_cancelled is not None:
+            task.raise_if_cancelled()
+        xyz = task.phantom.xyz_mm[task.phantom.index(frame.target_id)]
+        views.append(view_of(frame, xyz, frame.uv - correction(frame)))
+    excluded = [_not_oriented(view.frame, view.error) for view in views if view.error]
+    if len(excluded) == len(views):
+        raise DataError(excluded[0])
+    if sensor is None:
+        interior = _start_interior(task, name, [view for view in views if not view.error])
+    else:
+        interior = np.asarray(sensor.interior)
+    found: list[Resection | None] = []
+    for view in views:
+        try:
+            found.append(None if view.error else orient_view(view, interior))
+        except DataError as error:
+            found.append(None)
+            excluded.append(_not_oriented(view.frame, error.finding))
+    if sensor is None:
+        found = settle_planes(views, found, interior)
+    excluded += _reject_poor_fits(frames, found)
+    return found, interior, excluded
+
+
+def _start_interior(task: _Task, name: str, views: Sequence[View]) -> np.ndarray:
+    """Start values (3,) [px] of the interior orientation. Raises DataError."""
+    size = views[0].frame.image_size
+    middle = nominal_interior(size, 1.0)[:2]
+    try:
+        distance = task.principal_distance or principal_distance_of_views(views, middle, size)
+    except DataError as error:
+        raise DataError(replace(error.finding, place=Place((name,)))) from None
+    return nominal_interior(size, distance)
+
+
+def _reject_poor_fits(frames: Sequence[Frame], found: list[Resection | None]) -> list[Finding]:
+    """Set resections to None whose residuals are too large; return a finding for each."""
+    scales = [one.scale for one in found if one is not None]
+    typical = np.median(scales) if scales else np.inf
+    out = []
+    for row, (frame, one) in enumerate(zip(frames, found)):
+        if one is not None and one.scale > MAX_MISFIT * typical:
+            out.append(
+                Finding(
+                    Kind.POOR_FIT,
+                    'the image points do not fit the phantom, their residuals are about '
+                    f'{one.scale:.0f} px',
+                    frame.place,
+                    severity=Severity.NOTE,
+                    numbers={'residual_px': float(one.scale)},
+                )
+            )
+            found[row] = None
+    return out
+
+
+def _not_oriented(frame: Frame, why: Finding) -> Finding:
+    """Return why an exposure is excluded that has no orientation."""
+    kind = Kind.NOT_ORIENTED if why.kind is Kind.DATA else why.kind
+    return replace(why, kind=kind, place=frame.place, severity=Severity.NOTE)
+
+
+def _require_different_poses(name: str, resections: Sequence[Resection | None]) -> None:
+    """Raise DataError where all exposures show the phantom in one pose."""
+    found = [one for one in resections if one is not None]
+    if len(found) < 2:
+        return
+    turn = max(rotation_angle(one.rotation @ found[0].rotation.T) for one in found)
+    places = np.array([-one.rotation @ one.position_mm for one in found])
+    shift = np.max(np.abs(places - places[0]) / (1, 1, AXIAL_FACTOR))
+    if turn < MIN_POSE_RAD and shift < MIN_POSE_MM:
+        raise DataError(
+            f'all {len(found)} exposures show the phantom in one pose (turned by at most '
+            f'{np.rad2deg(turn):.1f} degrees); turn and move it between the exposures',
+            kind=Kind.ONE_POSE,
+            place=Place((name,)),
+            numbers={'exposures': len(found), 'turn_deg': float(np.rad2deg(turn))},
+        )
+
+
+def _index(
+    frames: Sequence[Frame], fluoroscope: np.ndarray, task: _Task, n_fluoroscopes: int
+) -> tuple[Network, np.ndarray]:
+    """The network of frames, and the target ids (n,) of its object points."""
+    counts = [len(frame.target_id) for frame in frames]
+    rows = task.phantom.index(np.concatenate([frame.target_id for frame in frames]))
+    used, point = np.unique(rows, return_inverse=True)
+    sigma = [
+        np.ones(len(frame.target_id)) if frame.sigma is None else frame.sigma for frame in frames
+    ]
+    network = Network(
+        uv=np.concatenate([frame.uv for frame in frames]),
+        sigma=np.concatenate(sigma),
+        exposure=np.repeat(np.arange(len(frames)), counts),
+        point=point,
+        fluoroscope=fluoroscope,
+        survey_mm=task.phantom.xyz_mm[used],
+        survey_sd_mm=task.phantom.sd_mm[used],
+        interior_free=np.full(n_fluoroscopes, task.sensors is None),
+    )
+    return network, task.phantom.target_id[used]

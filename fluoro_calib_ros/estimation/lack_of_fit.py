@@ -1,0 +1,391 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a correction model cannot follow, seen in its residuals.
+
+Residuals of neighbouring image points of different exposures have independent noise (joins in the
+sense of Moran, Biometrika 37, 1950). Their mean product is therefore the square of the error that
+all exposures have in common, less the variance of the correction, which makes residuals of
+neighbours opposite. Of both, a residual shows the part that its redundancy number says (Foerstner
+and Wrobel, "Photogrammetric Computer Vision", Springer 2016, 4.6): orientations and object points
+absorb the rest. The square is part of the variance of the correction.
+
+Where the error is large, its image points are rejected like gross errors. False matches differ
+from each other, but these agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import log_ndtr
+from scipy.stats import binom
+
+from ..correction.series import SD_GRID, Series, sd_grid_pixels
+
+NEIGHBOURS = 5  # of an image point, those of its own exposure not counted
+POINTS = 60  # image points about a node of the grid
+# Standard errors above which a mean product is not chance: of all image points, of those about one
+# of the nodes.
+SIGNIFICANT = 4.0
+SIGNIFICANT_LOCAL = 4.5
+MAX_GROWTH = 4.0  # of a mean product that is extrapolated to no distance
+PLACE = 0.1  # of the largest variance of a place, up to which image points are in it
+MIN_CORRELATION = 0.05  # with which products show what a series leaves out
+FAR = 30.0  # standard deviations below zero
+# Rejected image points agree within so many standard deviations of an inlier, over so many times
+# the typical distance of an inlier from the next, with so many others; larger residuals than so
+# many standard deviations are no error of a correction.
+AGREE_SD = 5.0
+AGREE_REACH = 3.0
+AGREE_WITH = 2
+# Where only one exposure has image points: part of the larger residual that the difference of two
+# residuals that agree does not exceed.
+ALONE_AGREE = 0.6
+ALONE_REACH = 3.0  # of such neighbours, relative to that of others
+AGREE_SIGNIFICANT = 1.5  # standard errors by which more pairs agree than are opposite
+LARGEST_SD = 40.0
+# Areas in which they are looked at together: cells that overlap by half, so many side by side,
+# with image points of so many targets that agree in so many exposures.
+CELLS = 8
+MIN_TARGETS = 6
+FALSE_ALARM = 2e-3  # chance that false matches agree in any of the areas
+# The same where so many of the image points of an area are rejected that this is no chance, and
+# the limit of that.
+CLUSTERED_FALSE_ALARM = 0.05
+CLUSTERED = 1e-3
+# Exposures whose scatter is the standard error of a mean product, and that may agree.
+MIN_EXPOSURES = 3
+
+
+@dataclass(frozen=True)
+class FittedPoints:
+    """Inliers of one fluoroscope.
+
+    uv (n, 2) [px], residuals (n, 2) [px] with the correction, exposure (n,), redundancy (n,):
+    redundancy number of a coordinate, 1 where they do not matter.
+    """
+
+    uv: np.ndarray
+    residuals: np.ndarray
+    exposure: np.ndarray
+    redundancy: np.ndarray | float = 1.0
+
+
+@dataclass(frozen=True)
+class RejectedArea:
+    """Rejected image points of an area.
+
+    size_px: length of their mean residual; limit_px: that which false matches hardly exceed in any
+    of the areas; rows: the image points.
+    """
+
+    size_px: float
+    limit_px: float
+    rows: np.ndarray
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """What a series leaves out by design, as its covariance function expects it.
+
+    sd_px: standard deviation [px]; correlation: callable, of distances (n,) [px]; places: the same
+    for what is left out in places, None: nowhere.
+    """
+
+    sd_px: float
+    correlation: Callable[[np.ndarray], np.ndarray]
+    places: LeftOutInPlaces | None = None
+
+
+@dataclass(frozen=True)
+class LeftOutInPlaces:
+    """What a series leaves out where the signal varies more.
+
+    variance: callable, variances [px^2] at pixels (n, 2); correlation: as in `LeftOut`.
+    """
+
+    variance: Callable[[np.ndarray], np.ndarray]
+    correlation: Callable[[np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class _Products:
+    """Products of the residuals of n image points with those of their neighbours.
+
+    uv (n, 2) [px]; value (n,): mean product of a coordinate [px^2]; shown (n,): mean product of
+    the redundancy numbers, the part of a common error that the products show; exposure (n,);
+    distance (n,): mean distance of the neighbours [px]; growth: mean product at no distance over
+    that at the distance of the neighbours, 1 where there is none.
+    """
+
+    uv: np.ndarray
+    value: np.ndarray
+    shown: np.ndarray
+    exposure: np.ndarray
+    distance: np.ndarray
+    growth: float
+
+    def mean_of_all(self) -> tuple[float, float]:
+        """Mean product, and its standard error from the scatter between exposures."""
+        _, place = np.unique(self.exposure, return_inverse=True)
+        number = np.bincount(place)
+        if len(number) < MIN_EXPOSURES:
+            return 0.0, np.inf
+        means = np.bincount(place, self.value) / number
+        mean = np.average(means, weights=number)
+        variance = np.average((means - mean) ** 2, weights=number) / (len(means) - 1)
+        return float(mean), float(np.sqrt(variance))
+
+    def is_significant(self) -> bool:
+        """Whether the mean product is above zero."""
+        mean, error = self.mean_of_all()
+        return mean > SIGNIFICANT * error
+
+
+def _products(points: FittedPoints) -> _Products:
+    """Products of the image points that have neighbours of other exposures."""
+    count = min(NEIGHBOURS + 1, len(points.uv))
+    distance, near = cKDTree(points.uv).query(points.uv, k=np.arange(2, count + 1))
+    other = points.exposure[near] != points.exposure[:, None]
+    r = points.residuals
+    redundancy = np.broadcast_to(points.redundancy, len(r))
+    number = other.sum(axis=1)
+    usable = number > 0
+
+    def mean(of_pairs: np.ndarray) -> np.ndarray:
+        return np.where(other, of_pairs, 0.0).sum(axis=1)[usable] / number[usable]
+
+    product = np.einsum('na,nka->nk', r, r[near]) / 2
+    return _Products(
+        points.uv[usable],
+        mean(product),
+        shown=mean(redundancy[:, None] * redundancy[near]),
+        exposure=points.exposure[usable],
+        distance=mean(distance),
+        growth=_growth(product, distance, other),
+    )
+
+
+def _growth(product: np.ndarray, distance: np.ndarray, other: np.ndarray) -> float:
+    """Mean product at no distance over the mean of products (n, k) at distances (n, k) [px].
+
+    The covariance of a smooth error falls with the square of the distance: it is extrapolated
+    from nearer and farther neighbours. other (n, k): pairs that count.
+    """
+    nearer = other & (distance < np.median(distance))
+    farther = other & ~nearer
+    if not nearer.any() or not farther.any():
+        return 1.0
+    square = distance**2
+    slope = (product[nearer].mean() - product[farther].mean()) / (
+        square[farther].mean() - square[nearer].mean()
+    )
+    at_zero = product[nearer].mean() + slope * square[nearer].mean()
+    mean = product[other].mean()
+    return float(np.clip(at_zero / mean, 1.0, MAX_GROWTH)) if mean > 0 else 1.0
+
+
+def has_common_error(points: FittedPoints) -> bool:
+    """Whether residuals show an error that all exposures have in common."""
+    return _products(points).is_significant()
+
+
+def sd_with_lack_of_fit(
+    points: FittedPoints, series: Series, left_out: LeftOut | None = None
+) -> NDArray[np.float64]:
+    """Standard deviations (33, 33) [px] of a series with what it cannot follow, on its grid.
+
+    Parameters
+    ----------
+    points : FittedPoints
+    series : Series
+        With the standard deviations of its coefficients alone.
+    left_out : LeftOut, optional
+
+    Returns
+    -------
+    (33, 33) ndarray
+    """
+    products = _products(points)
+    variance = series.sd**2
+    if len(products.uv) < 2 * POINTS:
+        return variance**0.5 if left_out is None else np.hypot(series.sd, left_out.sd_px)
+    pixels = sd_grid_pixels(series.functions.image_size)
+    beyond = np.zeros(len(pixels))
+    if left_out is not None:
+        beyond += _variance_beyond(products, series, left_out)
+        if left_out.places is not None:
+            beyond += _variance_in_places(products, series, left_out.places, pixels)
+    _, near = cKDTree(products.uv).query(pixels, k=POINTS)
+    mean = products.value[near].mean(axis=1)
+    # Each product occurs twice among the points about a node.
+    error = products.value[near].std(axis=1) * np.sqrt(2 / POINTS)
+    everywhere = products.is_significant()
+    shown = (mean > SIGNIFICANT_LOCAL * error) | everywhere
+    if everywhere:
+        mean = mean * products.growth
+    common = mean / products.shown[near].mean(axis=1) + variance.ravel()
+    found = np.where(shown, np.maximum(common, beyond), beyond)
+    return np.sqrt(variance + found.reshape(variance.shape))
+
+
+def sd_of_rejected(
+    inliers: FittedPoints, rejected: FittedPoints, series: Series
+) -> NDArray[np.float64]:
+    """Standard deviations (33, 33) [px] on the grid of a series where rejected points agree.
+
+    They are the largest RMS residual of those nearby, and zero where there are none, or where
+    chance explains that they agree. Inliers beside them count as image points without that error.
+    Points of one exposure count where no other exposure has inliers: at a border that a single one
+    shows, nothing contradicts them.
+    """
+    out = np.zeros(series.sd.size)
+    noise = float(np.sqrt(np.mean(inliers.residuals**2)))
+    distance, _ = cKDTree(inliers.uv).query(inliers.uv, k=[2])
+    reach = AGREE_REACH * float(np.median(distance))
+    size = np.linalg.norm(rejected.residuals, axis=1)
+    possible = np.flatnonzero(size < LARGEST_SD * noise)
+    if len(possible) <= AGREE_WITH:
+        return out.reshape(series.sd.shape)
+    there = FittedPoints(
+        rejected.uv[possible], rejected.residuals[possible], rejected.exposure[possible]
+    )
+    uv = there.uv
+    i, j, agree, opposite = _pairs_of_rejected(inliers, there, reach, AGREE_SD * noise)
+    pairs = np.count_nonzero(agree), np.count_nonzero(opposite)
+    if pairs[0] - pairs[1] <= AGREE_SIGNIFICANT * np.sqrt(sum(pairs)):
+        return out.reshape(series.sd.shape)
+    number = np.bincount(np.concatenate([i[agree], j[agree]]), minlength=len(possible))
+    found = np.flatnonzero(number >= AGREE_WITH)
+    beside = cKDTree(inliers.uv).query_ball_point(uv, reach, return_length=True)
+    share = (number + 1) / (number + 1 + beside)
+    pixels = sd_grid_pixels(series.functions.image_size)
+    # Every one of them reaches the nodes about it.
+    cell = np.linalg.norm(np.asarray(series.functions.image_size) / (SD_GRID - 1))
+    for row in found:
+        near = np.linalg.norm(pixels - uv[row], axis=1) < max(reach, cell)
+        out[near] = np.maximum(out[near], size[possible[row]] * np.sqrt(share[row] / 2))
+    return out.reshape(series.sd.shape)
+
+
+def _pairs_of_rejected(
+    inliers: FittedPoints, rejected: FittedPoints, reach: float, limit: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Pairs (k,), (k,) of neighbouring rejected points; which (k,) agree, and which are opposite.
+
+    reach [px]: of neighbours of different exposures; limit [px]: difference of residuals that
+    agree. Chance makes as many pairs opposite as it makes agree.
+    """
+    near = cKDTree(inliers.uv).query_ball_point(rejected.uv, reach)
+    exposure = rejected.exposure
+    alone = np.flatnonzero(
+        [np.all(inliers.exposure[rows] == own) for rows, own in zip(near, exposure)]
+    )
+    apart = cKDTree(rejected.uv).query_pairs(reach, output_type='ndarray')
+    apart = apart[exposure[apart[:, 0]] != exposure[apart[:, 1]]]
+    same = alone[
+        cKDTree(rejected.uv[alone]).query_pairs(ALONE_REACH * reach, output_type='ndarray')
+    ]
+    same = same[exposure[same[:, 0]] == exposure[same[:, 1]]]
+    i, j = np.concatenate([apart, same]).T
+    r = rejected.residuals
+    limits = np.full(len(i), limit)
+    # Beyond the last inliers, the error of a correction grows fast.
+    larger = np.linalg.norm(r[same], axis=2).max(axis=1, initial=0.0)
+    limits[len(apart) :] = np.maximum(limit, ALONE_AGREE * larger)
+    agree = np.linalg.norm(r[i] - r[j], axis=1) < limits
+    opposite = np.linalg.norm(r[i] + r[j], axis=1) < limits
+    return i, j, agree, opposite
+
+
+def areas_of_rejected(
+    rejected: FittedPoints, target: np.ndarray, inliers: np.ndarray, image_size: tuple[int, int]
+) -> list[RejectedArea]:
+    """Return the areas with enough rejected image points, of targets (n,), to see what they share.
+
+    inliers (k, 2): the other image points [px]. False matches are as frequent in an area as in the
+    whole image, and have residuals of any direction (Rayleigh's test; Mardia and Jupp,
+    "Directional Statistics", 2000, 6.3, here with the lengths). What a correction does not follow
+    gives those of one place the same. The image points of one target count once: its survey may be
+    wrong.
+    """
+    cell = np.asarray(image_size) / CELLS
+    found = []
+    if len(target) < MIN_TARGETS:
+        return []
+    rate = len(target) / (len(target) + len(inliers))
+    for corner in np.ndindex(2 * CELLS - 1, 2 * CELLS - 1):
+        at = (rejected.uv + 0.5) / cell - np.array(corner) / 2
+        rows = np.flatnonzero(((at >= 0) & (at < 1)).all(axis=1))
+        _, place = np.unique(target[rows], return_inverse=True)
+        number = np.bincount(place)
+        if len(number) < MIN_TARGETS:
+            continue
+        r = rejected.residuals[rows]
+        of_target = np.stack([np.bincount(place, r[:, i]) / number for i in (0, 1)], axis=1)
+        mean = of_target.mean(axis=0)
+        along = np.bincount(rejected.exposure[rows], r @ mean)
+        agree = np.count_nonzero(along > 0) >= MIN_EXPOSURES
+        chance = np.sqrt(np.sum(of_target**2)) / len(of_target)
+        others = (inliers + 0.5) / cell - np.array(corner) / 2
+        total = len(rows) + int(((others >= 0) & (others < 1)).all(axis=1).sum())
+        by_chance = (2 * CELLS - 1) ** 2 * binom.sf(len(number) - 1, total, rate)
+        alarm = CLUSTERED_FALSE_ALARM if by_chance < CLUSTERED else FALSE_ALARM
+        size = float(np.linalg.norm(mean)) if agree else 0.0
+        found.append((size, float(chance), alarm, rows))
+    return [
+        RejectedArea(size, chance * float(np.sqrt(np.log(len(found) / alarm))), rows)  # Bonferroni
+        for size, chance, alarm, rows in found
+    ]
+
+
+def _variance_in_places(
+    products: _Products, series: Series, places: LeftOutInPlaces, pixels: np.ndarray
+) -> np.ndarray:
+    """Variances (n,) [px^2] at pixels (n, 2) of what a series leaves out in places.
+
+    The share of what is expected there is that which the products of these places show.
+    """
+    expected = places.variance(products.uv)
+    inside = expected > PLACE * np.max(expected, initial=0.0)
+    if not inside.any():
+        return places.variance(pixels)
+    within = replace(
+        products,
+        **{
+            name: getattr(products, name)[inside]
+            for name in ('uv', 'value', 'shown', 'exposure', 'distance')
+        },
+    )
+    mean = float(np.mean(expected[inside]))
+    found = _variance_beyond(within, series, LeftOut(mean**0.5, places.correlation))
+    return found / mean * places.variance(pixels)
+
+
+def _variance_beyond(products: _Products, series: Series, left_out: LeftOut) -> float:
+    """Variance [px^2] of what a series leaves out, by its covariance function and the residuals.
+
+    The covariance function was estimated from the functions that the series has; beyond them it
+    is an extrapolation. As the variance that it expects is uncertain and positive, it is given an
+    exponential prior; that which the residuals show has a Gaussian error. The posterior is a
+    truncated Gaussian, of which this is the mean; what exceeds the expectation may also be what
+    exposures differ, and is left to the test of significance.
+    """
+    mean, error = products.mean_of_all()
+    expected = left_out.sd_px**2
+    part = float(products.shown.mean())
+    correlation = float(np.mean(left_out.correlation(products.distance)))
+    if not expected > 0 or not 0 < error < np.inf or correlation < MIN_CORRELATION:
+        return expected
+    error /= part * correlation
+    found = (mean / part + float(np.mean(series.sd_at(products.uv) ** 2))) / correlation
+    at = found / error - error / expected
+    if at < -FAR:  # the tail is exponential
+        return float(-error / at)
+    density = np.exp(-(at**2) / 2 - log_ndtr(at)) / np.sqrt(2 * np.pi)
+    return min(float(error * (at + density)), expected)

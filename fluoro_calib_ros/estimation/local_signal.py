@@ -1,0 +1,323 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Places where the signal of a distortion varies more than elsewhere.
+
+A dent of the input screen or the seam of two fibre plates is no stationary field: one covariance
+function for the whole image follows it too little there, and follows noise elsewhere. Places are
+square windows, or bands along straight lines, with Gaussian bumps whose heights have a variance of
+their own. The bumps are written as sums of the sines of the series, so that a place changes only
+the prior of their coefficients.
+
+Windows are added where they raise the marginal likelihood clearly, and then those beside them
+where they raise it at all: an edge goes on. A low edge, which no window shows alone, is shown by
+the band along it. For one more component of a covariance the gain is known exactly without a new
+solution (Tipping and Faul, "Fast marginal likelihood maximisation for sparse Bayesian models",
+2003; here for the bumps of a place together). Variances are renewed as in MacKay, "Bayesian
+interpolation", Neural Computation 4, 1992.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import j0
+
+from ..correction.series import Functions
+from .signal import MIN_DETERMINED
+
+NODES = 32  # bumps along the longer side of the image
+WIDTH = 0.75 / NODES  # of a bump (one standard deviation), relative to that side
+WINDOWS = 8  # windows along that side; they overlap by half
+# Bands: directions of their lines, half their width and the distance of the next [bumps], and
+# number of those that are looked at more closely. They have as many bumps as a side or more.
+DIRECTIONS = 32
+BAND = 1.5
+LIKELY_BANDS = 8
+# Gain of the logarithm of the likelihood from which a place is added: anywhere, which chance does
+# in one of twenty images, and for windows beside those that there are.
+MIN_GAIN = 6.0
+MIN_GAIN_BESIDE = 1.5
+VARIANCES = np.geomspace(1e-3, 30.0, 40)  # of the heights [px^2] that are tried
+MIN_VARIANCE = 2e-4  # [px^2] below which a window is left out again
+# Frequencies of a quadrature, from the lowest to so many times it.
+QUADRATURE = 60
+SHORTEST = 6.0
+MIN_LEVEL = 1e-30  # of the evidence of a bump that no image point shows
+
+
+@dataclass(frozen=True)
+class LocalSignal:
+    """Bumps of the windows and bands where the signal varies more.
+
+    Attributes
+    ----------
+    nodes : (n, 2) ndarray
+        Middles of the bumps [px].
+    window : (n,) ndarray of int
+        Window or band of each bump.
+    variances : (w,) ndarray
+        Variances of the heights of the bumps of each of them [px^2], the same for u and v.
+    """
+
+    nodes: NDArray[np.float64]
+    window: NDArray[np.int64]
+    variances: NDArray[np.float64]
+
+    @property
+    def of_bumps(self) -> NDArray[np.float64]:
+        """Variances (n,) of the heights of the bumps [px^2]."""
+        return self.variances[self.window]
+
+    def variance_beyond(self, functions: Functions, uv: np.ndarray) -> NDArray[np.float64]:
+        """Variances (n,) [px^2] at pixels uv (n, 2) of what the sines of a series leave out."""
+        width = WIDTH * max(functions.image_size)
+        squares = np.sum((uv[:, None] - self.nodes[None]) ** 2, axis=2)
+        whole = np.exp(-squares / width**2) @ self.of_bumps
+        return whole * np.exp(-((functions.highest * width) ** 2))
+
+    def change(self, other: LocalSignal | None) -> float:
+        """Mean change of the logarithms of the variances; infinite where windows differ."""
+        if other is None or len(other.variances) != len(self.variances):
+            return np.inf
+        return float(np.mean(np.abs(np.log(self.variances / other.variances))))
+
+    def renewed(self, mean: np.ndarray, variance: np.ndarray) -> LocalSignal | None:
+        """Return the windows with more likely variances, without those that have vanished.
+
+        mean, variance (2, n): of the heights [px], [px^2]. None: no window is left.
+        """
+        count = len(self.variances)
+        squares = np.bincount(self.window, np.sum(mean**2, axis=0), count)
+        determined = np.sum(1 - variance / self.of_bumps, axis=0)
+        determined = np.bincount(self.window, determined, count)
+        variances = squares / np.maximum(determined, MIN_DETERMINED)
+        kept = variances > MIN_VARIANCE
+        if not kept.any():
+            return None
+        own = kept[self.window]
+        number = np.cumsum(kept) - 1
+        return LocalSignal(self.nodes[own], number[self.window[own]], variances[kept])
+
+
+@dataclass(frozen=True)
+class SineEstimates:
+    """What the image points say about the coefficients of the sines of u and of v.
+
+    Both times (s, 2) and (2, s, s), with K the prior covariance matrix of the coefficients of one
+    coordinate.
+
+    Attributes
+    ----------
+    pull : (s, 2) ndarray
+        Inverse of K times their estimates.
+    evidence : (k, s, s) ndarray
+        Inverse of K less that of K times their covariance times that of K: for u and v, or one
+        for both.
+    """
+
+    pull: NDArray[np.float64]
+    evidence: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, precision: np.ndarray, mean: np.ndarray, covariances: np.ndarray) -> SineEstimates:
+        """Return them from the inverse of K (s, s), estimates (s, 2) and covariances (k, s, s)."""
+        evidence = [precision - precision @ one @ precision for one in covariances]
+        return cls(precision @ mean, np.stack(evidence))
+
+
+def bumps(functions: Functions, nodes: np.ndarray) -> NDArray[np.float64]:
+    """Coefficients (s, n) of the sines for bumps of height one about nodes (n, 2) [px].
+
+    A sine is an eigenfunction of the convolution with a Gaussian.
+    """
+    width = WIDTH * max(functions.image_size)
+    damped = 2 * np.pi * width**2 * np.exp(-((functions.frequency * width) ** 2) / 2)
+    return functions(nodes)[:, functions.trend :].T * damped[:, None]
+
+
+def correlation_beyond(functions: Functions, distance: np.ndarray) -> NDArray[np.float64]:
+    """Correlation (n,), at distances (n,) [px], of what the sines leave out of the bumps."""
+    f = functions.highest * np.geomspace(1, SHORTEST, QUADRATURE)
+    # f df on a geometric grid
+    weight = np.exp(-((f * WIDTH * max(functions.image_size)) ** 2)) * f**2
+    return j0(np.outer(distance, f)) @ weight / np.sum(weight)
+
+
+def with_likely_places(
+    functions: Functions, estimates: SineEstimates, local: LocalSignal | None
+) -> LocalSignal | None:
+    """Return the windows and bands with those that raise the marginal likelihood.
+
+    Parameters
+    ----------
+    functions : Functions
+    estimates : SineEstimates
+        With the present places.
+    local : LocalSignal or None
+        Present places.
+
+    Returns
+    -------
+    LocalSignal or None
+        The present places where there are no more.
+    """
+    shown = _ShownBumps.of(functions, estimates)
+    taken = np.zeros(len(shown.nodes), dtype=bool)
+    if local is not None:
+        taken = (np.abs(shown.nodes[:, None] - local.nodes[None]).max(axis=2) < 1).any(axis=1)
+    windows = shown.windows()
+    band = shown.most_likely_band(taken)
+    if band is not None and band.gain > max(MIN_GAIN, *(place.gain for place in windows)):
+        # What windows gain is known again when this band is in the prior.
+        return _joined(local, shown.nodes[band.rows], band.variance)
+    out = local
+    reach = 1.01 * max(functions.image_size) / NODES
+    for place in sorted(windows, key=lambda window: -window.gain):
+        if place.gain < MIN_GAIN_BESIDE:
+            break
+        nodes = shown.nodes[place.rows]
+        if taken[place.rows].any():
+            continue
+        if place.gain < MIN_GAIN and not _is_beside(nodes, shown.nodes[taken], reach):
+            continue
+        taken[place.rows] = True
+        out = _joined(out, nodes, place.variance)
+    return out
+
+
+def largest_gain(functions: Functions, estimates: SineEstimates) -> float:
+    """Largest gain of the logarithm of the likelihood by one more window or band."""
+    shown = _ShownBumps.of(functions, estimates)
+    places = shown.windows()
+    band = shown.most_likely_band(np.zeros(len(shown.nodes), dtype=bool))
+    return max(place.gain for place in (*places, *([] if band is None else [band])))
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Bumps that have a variance in common.
+
+    rows (b,); gain: of the logarithm of the likelihood; variance: the most likely one [px^2].
+    """
+
+    rows: np.ndarray
+    gain: float
+    variance: float
+
+
+@dataclass(frozen=True)
+class _ShownBumps:
+    """What the image points say about all bumps that an image may have.
+
+    nodes (n, 2) [px]; pulls (n, 2) and products (k, n, n), for u and v or one for both: q and s of
+    Tipping and Faul 2003.
+    """
+
+    image_size: tuple[int, int]
+    nodes: np.ndarray
+    pulls: np.ndarray
+    products: np.ndarray
+
+    @classmethod
+    def of(cls, functions: Functions, estimates: SineEstimates) -> _ShownBumps:
+        """Return it for what the image points say about the sines."""
+        nodes = _all_nodes(functions.image_size)
+        base = bumps(functions, nodes)
+        products = np.stack([base.T @ (one @ base) for one in estimates.evidence])
+        return cls(functions.image_size, nodes, base.T @ estimates.pull, products)
+
+    def windows(self) -> list[_Place]:
+        """Return all windows."""
+        return [self._place(rows) for rows in _windows(self.image_size, self.nodes)]
+
+    def most_likely_band(self, taken: np.ndarray) -> _Place | None:
+        """Return the band that gains most, without the bumps that are taken (n,).
+
+        Those whose bumps, each alone, are the least likely to be zero are looked at.
+        """
+        level = np.diagonal(self.products, axis1=1, axis2=2).T
+        excess = np.sum(self.pulls**2 / np.maximum(level, MIN_LEVEL) - 1, axis=1)
+        bands = _bands(self.image_size)
+        number = bands @ ~taken
+        score = (bands @ np.where(taken, 0.0, excess)) / np.sqrt(np.maximum(number, 1))
+        score[number < NODES] = -np.inf
+        best = np.argsort(score)[-LIKELY_BANDS:]
+        likely = [
+            self._place(np.flatnonzero((bands[i] > 0) & ~taken))
+            for i in best[score[best] > -np.inf]
+        ]
+        return max(likely, key=lambda band: band.gain, default=None)
+
+    def _place(self, rows: np.ndarray) -> _Place:
+        """Return the place of some bumps (b,)."""
+        products = [product[np.ix_(rows, rows)] for product in self.products]
+        return _Place(rows, *_largest_gain(self.pulls[rows], products))
+
+
+def _all_nodes(image_size: tuple[int, int]) -> np.ndarray:
+    """Middles (n, 2) [px] of the bumps that an image may have."""
+    spacing = max(image_size) / NODES
+    u, v = ((np.arange(max(1, round(size / spacing))) + 0.5) * spacing for size in image_size)
+    return np.stack(np.meshgrid(u, v, indexing='ij'), axis=-1).reshape(-1, 2)
+
+
+def _windows(image_size: tuple[int, int], nodes: np.ndarray) -> list[np.ndarray]:
+    """Rows of the nodes (n, 2) [px] of each window."""
+    size = max(image_size) / WINDOWS
+    count = [max(1, int(np.ceil(2 * side / size)) - 1) for side in image_size]
+    corners = np.array(list(np.ndindex(*count))) * size / 2
+    inside = ((nodes >= corners[:, None]) & (nodes < corners[:, None] + size)).all(axis=2)
+    return [np.flatnonzero(one) for one in np.asarray(inside) if np.any(one)]
+
+
+@lru_cache(maxsize=4)
+def _bands(image_size: tuple[int, int]) -> np.ndarray:
+    """Ones (b, n) for the bumps within a distance of each of many lines across the image."""
+    nodes = _all_nodes(image_size)
+    half = BAND * max(image_size) / NODES
+    out = []
+    for angle in np.arange(DIRECTIONS) * np.pi / DIRECTIONS:
+        across = nodes @ [np.cos(angle), np.sin(angle)]
+        lines = np.arange(across.min(), across.max() + half, half)
+        out.append(np.abs(across - lines[:, None]) <= half)
+    return np.concatenate(out).astype(float)
+
+
+def _largest_gain(pulls: np.ndarray, products: list[np.ndarray]) -> tuple[float, float]:
+    """Largest gain of the logarithm of the likelihood by one more place, and its variance.
+
+    pulls (b, 2) and products (b, b), for u and v or one for both: q and s of Tipping and Faul 2003
+    for b bumps.
+    """
+    gain = np.zeros(len(VARIANCES))
+    solved = [np.linalg.eigh(product) for product in products]
+    for axis in (0, 1):
+        values, vectors = solved[min(axis, len(solved) - 1)]
+        values = VARIANCES[:, None] * np.maximum(values, 0)
+        squares = VARIANCES[:, None] * (vectors.T @ pulls[:, axis]) ** 2
+        gain += np.sum(squares / (1 + values) - np.log1p(values), axis=1) / 2
+    best = int(np.argmax(gain))
+    return float(gain[best]), float(VARIANCES[best])
+
+
+def _is_beside(nodes: np.ndarray, others: np.ndarray, reach: float) -> bool:
+    """Whether some of the nodes (b, 2) are within reach [px] of others (n, 2)."""
+    distance = np.abs(nodes[:, None] - others[None]).max(axis=2)
+    return bool(np.min(distance, initial=np.inf) < reach)
+
+
+def _joined(local: LocalSignal | None, nodes: np.ndarray, variance: float) -> LocalSignal:
+    """Return the places with one more, of nodes (b, 2)."""
+    if local is None:
+        return LocalSignal(nodes, np.zeros(len(nodes), dtype=int), np.array([variance]))
+    window = np.full(len(nodes), len(local.variances))
+    return replace(
+        local,
+        nodes=np.concatenate([local.nodes, nodes]),
+        window=np.concatenate([local.window, window]),
+        variances=np.append(local.variances, variance),
+    )

@@ -1,0 +1,313 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Automatic choice of the model by cross-validation, whole exposures held out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import cho_factor, cho_solve
+
+from ..correction.base import CorrectionModel
+from ..correction.models import SeriesModel
+from ..correction.neighbours import KnnModel, LocalLinearModel, NeighbourModel, NeighbourTable
+from ..correction.series import sd_grid_pixels
+from ..photogrammetry.precision import Precision
+from ..photogrammetry.rotations import vector_from_matrix
+from .collocation import CollocationTerms
+from .estimator import AdjustedTerms, AdjustmentProblem, exposure_folds
+from .gauge import GaugeKind, gauge_basis, gauge_rows
+from .neighbour_regression import CrossValidation
+from .parametric import StepwiseTerms
+from .priors import GAUGE_SD_PX, prior_precision
+from .rounds import SelfCalibration
+
+# Errors of models that cannot follow a distortion, from their difference to one that can.
+#
+# The residuals of a forced model show only a part of its errors: orientations and object points
+# absorb the rest, in every round. Collocation of the same exposures gives the distortion as the
+# posterior of a random field, with its covariance. The expected squared error of any other
+# correction is then its squared difference from the posterior mean plus the posterior variance
+# (Rasmussen and Williams, "Gaussian Processes for Machine Learning", 2006, 2.4). The same holds
+# for object points and orientations, which take up what the correction leaves.
+
+MIN_PIXELS = 20  # of the grid that are within both calibrated areas
+
+
+def with_errors_by(
+    reference: SelfCalibration, run: SelfCalibration, gauges: Sequence[GaugeKind]
+) -> SelfCalibration:
+    """Return a self-calibration whose models and unknowns state their errors by a reference.
+
+    reference: self-calibration of the same exposures by collocation; gauges: what the orientation
+    of each fluoroscope can express.
+    """
+    models = {}
+    for f, (name, model) in enumerate(run.models.items()):
+        rows = run.measured.network.rows(f)
+        uv = run.measured.network.uv[rows[run.trained[rows]]]
+        interior = run.after.parameters.interior[f]
+        other = reference.models[name]
+        size = run.measured.image_size[f]
+        pixels = sd_grid_pixels(size)
+        inside = ~(model.outside(pixels) | other.outside(pixels))
+        if inside.sum() < MIN_PIXELS:
+            models[name] = model
+            continue
+        # What the gauges differ is no error.
+        basis = gauge_basis(uv, interior, gauges[f])
+        flat = (model.predict(uv) - other.predict(uv)).ravel()
+        shared = np.linalg.lstsq(basis.reshape(len(flat), -1), flat, rcond=None)[0]
+        found = other.evaluate(pixels)
+        difference = model.predict(pixels) - found.duv
+        difference = difference - gauge_basis(pixels, interior, gauges[f]) @ shared
+        square = np.mean(difference**2, axis=1) + found.sd**2
+        models[name] = _with_variance(model, pixels, square, inside)
+    return replace(run, models=models, stated=_precision_by(reference, run))
+
+
+def _precision_by(reference: SelfCalibration, run: SelfCalibration) -> Precision:
+    """Precision of a run: covariances of a reference, and the products of the differences.
+
+    Its covariances with additional parameters and other global unknowns are those of the network.
+    """
+    found = run.after.parameters
+    other = reference.after.parameters
+    points = found.points_mm - other.points_mm
+    turn = vector_from_matrix(found.rotation @ other.rotation.transpose(0, 2, 1))
+    exterior = np.concatenate([found.position_mm - other.position_mm, turn], axis=1)
+    interior = found.interior - other.interior
+    precise = reference.precision
+    joint = precise.joint_points
+    return replace(
+        run.precision,
+        interior=precise.interior + _squares(interior),
+        exterior=precise.exterior + _squares(exterior),
+        points=precise.points + _squares(points),
+        joint_points=None if joint is None else joint + np.outer(points, points),
+    )
+
+
+def _squares(differences: np.ndarray) -> np.ndarray:
+    """Products (n, s, s) of the components of differences (n, s)."""
+    return differences[:, :, None] * differences[:, None, :]
+
+
+def _with_variance(
+    model: CorrectionModel, pixels: np.ndarray, square: np.ndarray, inside: np.ndarray
+) -> CorrectionModel:
+    """Return a model with variances (n,) [px^2] at the pixels (n, 2) of the grid of a series.
+
+    A series has them as they are; of any other model the mean over the calibrated area, where
+    inside (n,), is that of the variances.
+    """
+    if isinstance(model, SeriesModel):
+        sd = np.sqrt(square).reshape(model.series.sd.shape)
+        return replace(model, series=replace(model.series, sd=sd))
+    random = model.standard_deviation(pixels[inside]) ** 2 - model.bias_px**2
+    bias2 = float(np.mean(square[inside] - random))
+    return replace(model, bias_px=float(np.sqrt(max(bias2, 0.0))))
+
+
+START_MODEL = 'collocation'
+# Another model is preferred where its squared errors are smaller by more than 1 %.
+MAX_RATIO = 0.99
+ALTERNATIVES = ('local_linear', 'knn', 'parametric')
+# Neighbour models with the largest k that is tried: more neighbours follow a distortion no closer
+# than collocation does.
+MAX_NEIGHBOURS: dict[type[NeighbourModel], int] = {LocalLinearModel: 100, KnnModel: 40}
+# Image points of a fluoroscope whose predictions are compared: more tell the models no better.
+MAX_TESTED = 5_000
+# With more image points of a fluoroscope no other model was better than collocation.
+MAX_IMAGE_POINTS = 40_000
+
+
+def better_model(run: SelfCalibration, terms: AdjustedTerms) -> str | None:
+    """Return the model that predicts held-out exposures clearly better than collocation, or None.
+
+    The criterion is the square sum of the errors of predictions of (residual + correction) of the
+    inliers with their robust weights: Eq. 2 of Chow et al. with one variance for all image points,
+    summed over the fluoroscopes.
+
+    run: self-calibration by collocation; terms: its terms.
+    """
+    assert isinstance(terms, CollocationTerms)
+    if any(own is not None for own in terms.exposure_terms):
+        return None  # no other model knows what differs between exposures
+    network = run.measured.network
+    after = run.after
+    inside = after.inliers
+    parametric = StepwiseTerms(
+        AdjustmentProblem(terms.network, run.measured.image_size, run.before, terms.gauge_kinds)
+    )
+    scores = dict.fromkeys((START_MODEL, *ALTERNATIVES), 0.0)
+    for f in range(len(run.measured.fluoroscopes)):
+        rows = network.rows(f)
+        rows = rows[inside[rows]]
+        if len(rows) > MAX_IMAGE_POINTS:
+            return None
+        uv = network.uv[rows]
+        values = (after.residuals + run.correction)[rows]
+        weight = after.noise.weight(after.q[rows])
+        weight = weight / (after.noise.scale * network.sigma[rows]) ** 2
+        fold = exposure_folds(network.exposure[rows])
+        tested = np.unique(np.linspace(0, len(uv) - 1, MAX_TESTED).astype(int))
+        near = NeighbourTable(uv, min(max(MAX_NEIGHBOURS.values()), len(uv)), tested)
+        information = weight[:, None, None] * np.eye(2)
+        for model_type, max_k in MAX_NEIGHBOURS.items():
+            candidates = model_type.candidate_k(len(uv))
+            candidates = candidates[candidates <= max_k]
+            validation = CrossValidation(
+                model_type, uv, fold=fold, candidates=candidates, near=near, tested=tested
+            )
+            scores[model_type.kind] += float(np.min(validation.scores(values, information)))
+        held_out = {
+            START_MODEL: _held_out(
+                _prior_of(terms, f), terms.functions[f](uv), values, weight, fold
+            ),
+            'parametric': _held_out_of_terms(
+                parametric.values[f][inside[network.rows(f)]], values, weight, fold
+            ),
+        }
+        for kind, predicted in held_out.items():
+            errors = (weight[:, None] * (values - predicted) ** 2)[tested]
+            scores[kind] += float(np.sum(errors))
+    best = min(ALTERNATIVES, key=lambda kind: scores[kind])
+    return best if scores[best] < MAX_RATIO * scores[START_MODEL] else None
+
+
+@dataclass(frozen=True)
+class _SeriesPrior:
+    """Prior precisions of the coefficients of a series, in parts.
+
+    Attributes
+    ----------
+    trend : (2t, 2t) ndarray
+        Of the trend, u first.
+    signal : (s, s) ndarray
+        Of the sines, the same for u and v.
+    gauge : (2, g, t + s) ndarray
+        Products with the coefficients of u and of v whose sums have the precision of one.
+    """
+
+    trend: NDArray[np.float64]
+    signal: NDArray[np.float64]
+    gauge: NDArray[np.float64]
+
+
+def _prior_of(terms: CollocationTerms, f: int) -> _SeriesPrior:
+    """Prior of the series of fluoroscope f."""
+    part = terms.parts[f]
+    functions = part.functions
+    m = len(functions)
+    t = functions.trend
+    precision = prior_precision(functions, part.prior)
+    at = np.concatenate([np.arange(t), m + np.arange(t)])
+    rows = gauge_rows(part.values, part.uv, part.interior, part.gauge_kind)
+    return _SeriesPrior(
+        precision[np.ix_(at, at)],
+        precision[t:m, t:m],
+        rows.reshape(-1, 2, m).transpose(1, 0, 2) / GAUGE_SD_PX,
+    )
+
+
+def _held_out(
+    prior: _SeriesPrior,
+    functions: np.ndarray,
+    values: np.ndarray,
+    weight: np.ndarray,
+    fold: np.ndarray,
+) -> np.ndarray:
+    """Predictions (N, 2) of values (N, 2) by functions fitted without the own fold.
+
+    Parameters
+    ----------
+    prior : _SeriesPrior
+    functions : (N, m) ndarray
+        Trend, then sines.
+    values : (N, 2) ndarray
+    weight, fold : (N,) ndarray
+
+    Returns
+    -------
+    (N, 2) ndarray
+    """
+    out = np.empty_like(values)
+    root = np.sqrt(weight)[:, None]
+    scaled = root * functions
+    goal = root * values
+    folds = [np.flatnonzero(fold == number) for number in np.unique(fold)]
+    grams = [scaled[rows].T @ scaled[rows] for rows in folds]
+    rights = [scaled[rows].T @ goal[rows] for rows in folds]
+    gram = np.sum(grams, axis=0)
+    right = np.sum(rights, axis=0)
+    for rows, own_gram, own_right in zip(folds, grams, rights):
+        out[rows] = functions[rows] @ _solved(prior, gram - own_gram, right - own_right)
+    return out
+
+
+def _solved(prior: _SeriesPrior, gram: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Coefficients (m, 2) of u and v from their normal equations (m, m) and (m, 2).
+
+    The sines, whose matrix u and v have in common, are eliminated first; what remains are trend
+    and gauge, whose products are unknowns of their own.
+    """
+    t = len(gram) - len(prior.signal)
+    g = prior.gauge.shape[1]
+    of_trend = gram[t:, :t]
+    of_gauge = prior.gauge[:, :, t:]
+    columns = np.column_stack([of_trend, *of_gauge.transpose(0, 2, 1), right[t:]])
+    factor = cho_factor(gram[t:, t:] + prior.signal, lower=True)
+    solved = cho_solve(factor, columns)
+    by_trend = solved[:, :t]
+    by_gauge = [solved[:, t : t + g], solved[:, t + g : t + 2 * g]]
+    by_right = solved[:, t + 2 * g :]
+    size = 2 * t + g
+    rest = np.zeros((size, size))
+    rest_right = np.zeros(size)
+    rest[: 2 * t, : 2 * t] = prior.trend
+    rest[2 * t :, 2 * t :] = -np.eye(g)
+    for axis in (0, 1):
+        own = slice(axis * t, (axis + 1) * t)
+        rest[own, own] += gram[:t, :t] - of_trend.T @ by_trend
+        mixed = prior.gauge[axis, :, :t].T - of_trend.T @ by_gauge[axis]
+        rest[own, 2 * t :] = mixed
+        rest[2 * t :, own] = mixed.T
+        rest[2 * t :, 2 * t :] -= of_gauge[axis] @ by_gauge[axis]
+        rest_right[own] = right[:t, axis] - of_trend.T @ by_right[:, axis]
+        rest_right[2 * t :] -= of_gauge[axis] @ by_right[:, axis]
+    found = np.linalg.solve(rest, rest_right)
+    out = np.empty((len(gram), 2))
+    for axis in (0, 1):
+        out[:t, axis] = found[axis * t : (axis + 1) * t]
+        eliminated = by_trend @ out[:t, axis] + by_gauge[axis] @ found[2 * t :]
+        out[t:, axis] = by_right[:, axis] - eliminated
+    return out
+
+
+def _held_out_of_terms(
+    terms: np.ndarray, values: np.ndarray, weight: np.ndarray, fold: np.ndarray
+) -> np.ndarray:
+    """Predictions (N, 2) of values (N, 2) by terms (N, 2, t) fitted without the own fold.
+
+    weight, fold (N,).
+    """
+    out = np.empty_like(values)
+    root = np.sqrt(weight)[:, None]
+    scaled = terms * root[:, :, None]
+    scaled = scaled / np.sqrt(np.sum(scaled**2, axis=(0, 1)))
+    right = values * root
+    folds = [np.flatnonzero(fold == number) for number in np.unique(fold)]
+    parts = [scaled[rows].reshape(-1, terms.shape[2]) for rows in folds]
+    grams = [part.T @ part for part in parts]
+    rights = [part.T @ right[rows].ravel() for part, rows in zip(parts, folds)]
+    gram = np.sum(grams, axis=0)
+    everything = np.sum(rights, axis=0)
+    for rows, part, own, own_right in zip(folds, parts, grams, rights):
+        found = np.linalg.lstsq(gram - own, everything - own_right, rcond=1e-12)[0]
+        out[rows] = (part @ found).reshape(-1, 2) / root[rows]
+    return out

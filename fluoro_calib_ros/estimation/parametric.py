@@ -1,0 +1,289 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The model `parametric`: terms of the expert, selected stepwise without the expert.
+
+Section 3 of Chow et al.: additional parameters are added one at a time. One stays if it reduces
+the RMSE of the residuals, is significant by Student's t-test, and reduces the trend that is left
+in the residuals. Where the last two disagree the expert decides; here a significant term stays if
+one of the other two criteria holds.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+from scipy.special import stdtrit
+
+from ..correction.series import Functions, Series, sd_over_image
+from ..correction.terms import HIGHEST, expert_terms
+from ..photogrammetry.additional_parameters import AdditionalParameters
+from ..photogrammetry.noise_estimation import LOOSE
+from ..photogrammetry.precision import information_of_additional
+from .estimator import AdjustedTerms, AdjustmentProblem, coefficients_of, prior_of_additional
+from .gauge import GaugeKind, gauge_basis
+
+if TYPE_CHECKING:
+    from ..photogrammetry.adjustment import Adjustment
+    from ..photogrammetry.elimination import FactorizedNormalMatrix
+    from ..photogrammetry.network import Network
+
+# Uncertainty of which terms of a trend exist, and with which variance.
+#
+# The prior variances of the trend terms are those of the largest marginal likelihood (see
+# `priors`), and the posterior takes them as known. A term that hardly exceeds its noise may then
+# be left out, or kept with too small a standard deviation: its mean squared error is up to three
+# times its variance. Here each term is averaged over its prior: with equal odds it does not exist
+# (Mitchell and Beauchamp, "Bayesian variable selection in linear regression", JASA 83, 1988), or
+# it has a variance with the uniform shrinkage prior (Daniels, "A prior for the variance in
+# hierarchical models", Canadian Journal of Statistics 27, 1999).
+
+NODES = 64  # of a quadrature
+FAR = 8.0  # standard deviations of a Gaussian beyond which nothing is left
+
+
+def squared_error_of_kept(
+    ratio: NDArray[np.float64], kept: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Expected squared errors (t,) of terms, in units of the variances of their estimates.
+
+    Parameters
+    ----------
+    ratio : (t,) ndarray
+        Estimates without a prior, over their standard deviations.
+    kept : (t,) ndarray
+        Parts of these estimates that are kept, 0 to 1.
+
+    Returns
+    -------
+    (t,) ndarray
+        Posterior variances about the kept values.
+    """
+    half = np.square(ratio) / 2
+    x, weight = np.polynomial.legendre.leggauss(NODES)
+    # Shrinkage k = x^2 is uniform on 0..1; the likelihood is sqrt(k) exp(-k half).
+    end = np.minimum(1.0, FAR / np.sqrt(np.maximum(2 * half, 1e-300)))[:, None]
+    x = (x + 1) / 2 * end
+    k = np.square(x)
+    density = weight / 2 * end * 2 * k * np.exp(-k * half[:, None])
+    evidence = density.sum(axis=1)
+    exists = evidence / (evidence + np.exp(-half))
+    density /= evidence[:, None]
+    of_kept = 1 - k
+    variance = np.sum(density * of_kept, axis=1)
+    square = np.sum(density * np.square(of_kept - kept[:, None]), axis=1)
+    return exists * (variance + 2 * half * square) + (1 - exists) * 2 * half * np.square(kept)
+
+
+def covariance_with_uncertain_terms(
+    to_terms: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    mean: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the covariance (p, p) of coefficients with that of which terms exist.
+
+    Each term in turn, the prior variances of the others taken as known.
+
+    Parameters
+    ----------
+    to_terms : (t, p) ndarray
+        From coefficients to terms.
+    variance : (t,) ndarray
+        Prior variances of the terms.
+    mean, covariance : (p,) and (p, p) ndarray
+        Posterior of the coefficients with these variances.
+
+    Returns
+    -------
+    (p, p) ndarray
+    """
+    mixed = covariance @ to_terms.T
+    of_terms = np.einsum('tp,pt->t', to_terms, mixed)
+    kept = np.clip(1 - of_terms / variance, 1e-12, 1.0)
+    alone = of_terms / kept  # variances of the estimates without their priors
+    ratio = to_terms @ mean / kept / np.sqrt(alone)
+    more = np.maximum(squared_error_of_kept(ratio, kept) * alone - of_terms, 0.0)
+    along = mixed * (np.sqrt(more) / of_terms)
+    return covariance + along @ along.T
+
+
+SIGNIFICANCE = 0.01  # of all terms together that are tested for one fluoroscope
+ZERO_PRECISION = 1e12  # prior that holds a term at zero
+MIN_DROP = 1e-3  # relative decrease of the RMSE that counts as one
+NEIGHBOURS = 8  # of an image point, whose mean residual shows the trend
+
+
+class StepwiseTerms(AdjustedTerms):
+    """The 31 terms of every fluoroscope of a network, and which of them are in the model.
+
+    Attributes
+    ----------
+    names : list of str
+        Names of the terms.
+    selected : list of (31,) ndarray of bool
+        Terms in the model, by fluoroscope.
+    """
+
+    intermediate_tolerance = LOOSE  # the tests of significance need a solution
+    needs_solution = True
+
+    def __init__(self, problem: AdjustmentProblem) -> None:
+        self.network = problem.network
+        # What no orientation can take up is left to the terms.
+        self.names, terms = expert_terms(GaugeKind.NONE in problem.gauges)
+        self.functions: list[Functions] = []
+        self._values: list[np.ndarray] = []
+        self._maps: list[np.ndarray] = []
+        self._near: list[np.ndarray] = []
+        for f, size in enumerate(problem.image_sizes):
+            uv = self.network.uv[self.network.rows(f)]
+            functions = Functions(size, HIGHEST)
+            values = functions(uv)
+            interior = problem.before.parameters.interior[f]
+            # The terms themselves have no shift, scale or tilt.
+            kind = problem.gauges[f]
+            kind = GaugeKind.NONE if kind is GaugeKind.TREND else kind
+            terms_f = _without_gauge(terms, values, gauge_basis(uv, interior, kind))
+            self.functions.append(functions)
+            self._maps.append(terms_f.reshape(len(terms), -1))
+            self._values.append(np.einsum('nm,tam->nat', values, terms_f))
+            count = min(NEIGHBOURS + 1, len(uv))
+            self._near.append(cKDTree(uv).query(uv, k=np.arange(2, count + 1))[1])
+        self.selected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
+        self._rejected = [np.zeros(len(terms), dtype=bool) for _ in self.functions]
+
+    @property
+    def values(self) -> list[np.ndarray]:
+        """See `AdjustedTerms`."""
+        return self._values
+
+    def with_additional(self, network: Network) -> Network:
+        """Return the network with the terms; those that are not selected are held at zero."""
+        additional = tuple(
+            AdditionalParameters(values, np.diag(np.where(selected, 0.0, ZERO_PRECISION)))
+            for values, selected in zip(self._values, self.selected)
+        )
+        return replace(network, additional=additional)
+
+    def zeros(self) -> tuple[np.ndarray, ...]:
+        """Coefficients of no correction, by fluoroscope."""
+        return tuple(np.zeros(len(self.names)) for _ in self.functions)
+
+    def series(self, f: int, coefficients: np.ndarray, covariance: np.ndarray) -> Series:
+        """Return the series of fluoroscope f from its coefficients (31,) and their covariance."""
+        functions = self.functions[f]
+        to_polynomials = self._maps[f]
+        return Series(
+            functions,
+            (coefficients @ to_polynomials).reshape(2, -1),
+            sd_over_image(functions, to_polynomials.T @ covariance @ to_polynomials),
+        )
+
+    def renew(
+        self, network: Network, matrix: FactorizedNormalMatrix, adjustment: Adjustment
+    ) -> tuple[bool, tuple[np.ndarray, ...]]:
+        """Add or remove a term of every fluoroscope.
+
+        Returns whether no term was, and the coefficients with which to continue.
+        """
+        changed = [self._step(f, network, matrix, adjustment) for f in range(len(self.functions))]
+        return not any(changed), coefficients_of(adjustment)
+
+    def _step(
+        self, f: int, network: Network, matrix: FactorizedNormalMatrix, result: Adjustment
+    ) -> bool:
+        """Add the best term of fluoroscope f, or remove one that is not significant any more."""
+        present = prior_of_additional(network, f)
+        information = information_of_additional(matrix, f) - present
+        information *= matrix.information_factor
+        coefficients = coefficients_of(result)[f]
+        selected = self.selected[f]
+        rows = network.rows(f)
+        dof = 2 * len(rows) - network.n_unknowns + len(self.names) * len(self.selected)
+        if network.exterior is not None:
+            # Most unknowns are known beforehand.
+            dof += network.n_observations - 2 * network.n_image_points
+        limit = stdtrit(max(dof, 1), 1 - SIGNIFICANCE / (2 * len(self.names)))  # quantile of t
+        if self._remove_insignificant(f, information, coefficients, limit):
+            return True
+        score = present @ coefficients  # gradient of the likelihood by terms held at zero
+        mixed = np.linalg.solve(information[np.ix_(selected, selected)], information[selected])
+        own = np.diagonal(information) - np.einsum('ij,ij->j', information[selected], mixed)
+        dependent = own <= 1e-9 * np.diagonal(information)
+        with np.errstate(divide='ignore', invalid='ignore'):
+            excluded = selected | self._rejected[f] | dependent
+            t = np.where(excluded, 0, score / np.sqrt(own))
+        for best in np.argsort(-np.abs(t)):
+            if abs(t[best]) < limit:
+                return False
+            direction = -mixed[:, best] if selected.any() else np.zeros(0)
+            change = self._values[f][:, :, best] + self._values[f][:, :, selected] @ direction
+            if self._improves(f, result, rows, change * score[best] / own[best], t[best]):
+                selected[best] = True
+                return True
+            self._rejected[f][best] = True
+        return False
+
+    def _remove_insignificant(
+        self, f: int, information: np.ndarray, coefficients: np.ndarray, limit: float
+    ) -> bool:
+        """Reject the least significant selected term for good if it is below the limit of t."""
+        selected = np.flatnonzero(self.selected[f])
+        if not len(selected):
+            return False
+        sd = np.sqrt(np.diagonal(np.linalg.inv(information[np.ix_(selected, selected)])))
+        t = np.abs(coefficients[selected]) / sd
+        worst = int(np.argmin(t))
+        if t[worst] >= limit:
+            return False
+        self.selected[f][selected[worst]] = False
+        self._rejected[f][selected[worst]] = True
+        return True
+
+    def _improves(
+        self, f: int, result: Adjustment, rows: np.ndarray, change: np.ndarray, t: float
+    ) -> bool:
+        """Whether a significant change (n, 2) of the correction reduces the RMSE or the trend."""
+        core = result.inliers[rows]
+        residuals = result.residuals[rows]
+        square = np.sum(result.q[rows][core])
+        drop = 1 - np.sqrt(max(square - t * t, 0.0) / square)
+        if drop >= MIN_DROP:
+            return True
+        return self._trend(f, residuals - change, core) < self._trend(f, residuals, core)
+
+    def _trend(self, f: int, residuals: np.ndarray, core: np.ndarray) -> float:
+        """Mean product of the residuals with the mean residual of their neighbours [px^2]."""
+        inside = np.where(core[:, None], residuals, 0.0)
+        return float(np.mean(np.sum(inside * inside[self._near[f]].mean(axis=1), axis=1)))
+
+
+def _without_gauge(terms: np.ndarray, values: np.ndarray, gauge: np.ndarray) -> np.ndarray:
+    """Terms (t, 2, m) less their part in the gauge.
+
+    Parameters
+    ----------
+    terms : (t, 2, m) ndarray
+        Coefficients of the polynomials in u and v.
+    values : (n, m) ndarray
+        Polynomials at the image points.
+    gauge : (n, 2, g) ndarray
+        Gauge at the image points.
+
+    Returns
+    -------
+    (t, 2, m) ndarray
+    """
+    if not gauge.shape[2]:
+        return terms
+    flat = gauge.reshape(-1, gauge.shape[2])
+    as_polynomials = np.linalg.lstsq(values, gauge.reshape(len(values), -1), rcond=None)[0]
+    as_polynomials = as_polynomials.reshape(values.shape[1], 2, -1).transpose(2, 1, 0)
+    own = np.einsum('nm,tam->nat', values, terms).reshape(-1, len(terms))
+    share = np.linalg.lstsq(flat, own, rcond=None)[0]
+    return terms - np.einsum('gt,gam->tam', share, as_polynomials)

@@ -1,0 +1,373 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Prior distributions of the coefficients of a distortion's trend and signal.
+
+Least-squares collocation (Moritz, "Advanced Physical Geodesy", 1980): the signal is a random field
+with a covariance function (see `signal`). That, and for each term of the trend whether it exists,
+is estimated from the observations themselves by their marginal likelihood (Rasmussen and Williams,
+"Gaussian Processes for Machine Learning", 2006, 5.4; for the trend Tipping and Faul, "Fast
+marginal likelihood maximisation for sparse Bayesian models", 2003).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag, cho_factor, cho_solve
+
+from ..correction.series import Functions
+from ..correction.terms import ABSENT_VARIANCE, trend_transformation
+from .gauge import GaugeKind, gauge_rows
+from .local_signal import LocalSignal, SineEstimates, bumps, largest_gain, with_likely_places
+from .parametric import covariance_with_uncertain_terms
+from .signal import Signal, SignalEquations, most_likely_signal, starting_signal
+
+# Standard deviation to which the gauge is held; a much smaller one would damp the steps of the
+# adjustment.
+GAUGE_SD_PX = 3e-5
+# Prior variance of a trend term that does not exist, relative to that with which it is determined.
+MIN_RELATIVE_VARIANCE = 1e-3
+MAX_VARIANCE = 1e8  # of a trend term that exists
+# Terms of the rings that can exist: the radial one and the spiral of degree 5, the radial of 7.
+RING_TERMS = (0, 1, 4)
+# Square of such a term over its variance from which it exists. It costs errors beyond the
+# calibrated area, where it grows fast; at 1, chance alone would make one of three exist.
+RING_EXISTS = 9.0
+# Gain of the logarithm of the likelihood by a place, with the signal of fewer sines, from which
+# the signal is estimated with more; renewals of it then.
+SUSPECTED_GAIN = 2.0
+SIGNAL_ROUNDS = 3
+RIDGE = 1e-9  # increase of a diagonal relative to its largest value
+SWEEPS = 3  # over the terms of the trend
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior of a distortion.
+
+    signal: covariance function of the signal; trend (t,): variances of the trend terms [px^2];
+    local: where the signal varies more, None: nowhere.
+    """
+
+    signal: Signal
+    trend: np.ndarray
+    local: LocalSignal | None = None
+
+    def change(self, other: Prior, functions: Functions) -> float:
+        """Mean change of the logarithms of the variances of the signal from another prior."""
+        change = self.signal.change(other.signal, functions.frequency)
+        if self.local is None:
+            return change if other.local is None else np.inf
+        return max(change, self.local.change(other.local))
+
+
+def starting_prior(functions: Functions, sd: float) -> Prior:
+    """Return a prior to start with; sd: RMS residual without correction [px]."""
+    _, count = trend_transformation(functions.degree, functions.rings)
+    signal = starting_signal(0.3 * sd, max(functions.image_size))
+    trend = np.full(count, MAX_VARIANCE)
+    trend[count - 4 * functions.rings :] = ABSENT_VARIANCE
+    return Prior(signal, trend)
+
+
+def has_rings(functions: Functions, prior: Prior) -> bool:
+    """Whether a term of the rings exists."""
+    return bool(np.any(prior.trend[len(prior.trend) - 4 * functions.rings :] > ABSENT_VARIANCE))
+
+
+def prior_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
+    """Precision matrix (2m, 2m) of the coefficients of a series."""
+    m = len(functions)
+    t = functions.trend
+    out = np.zeros((2 * m, 2 * m))
+    if functions.modes:
+        signal = signal_precision(functions, prior)
+        for axis in (0, 1):
+            own = slice(axis * m + t, (axis + 1) * m)
+            out[own, own] = signal
+    at = _trend_columns(functions)
+    out[np.ix_(at, at)] = _trend_precision(functions, prior)
+    return out
+
+
+def signal_precision(functions: Functions, prior: Prior) -> NDArray[np.float64]:
+    """Precision matrix (s, s) of the coefficients of the sines of u, or of v."""
+    variance = prior.signal.variance(functions.frequency)
+    if prior.local is None:
+        return np.diag(1 / variance)
+    base = bumps(functions, prior.local.nodes)
+    covariance = (base * prior.local.of_bumps) @ base.T
+    covariance[np.diag_indices(len(variance))] += variance
+    return cho_solve(cho_factor(covariance, lower=True), np.eye(len(variance)))
+
+
+def _trend_columns(functions: Functions) -> np.ndarray:
+    """Places of the coefficients of polynomials and rings, those of u first."""
+    m = len(functions)
+    t = functions.trend
+    return np.concatenate([np.arange(t), m + np.arange(t)])
+
+
+def _trend_precision(functions: Functions, prior: Prior) -> np.ndarray:
+    """Precision matrix of the coefficients of the trend; zero for what the gauge holds."""
+    to_terms, count = trend_transformation(functions.degree, functions.rings)
+    return to_terms[:count].T @ (to_terms[:count] / prior.trend[:, None])
+
+
+def covariance_of_series(
+    functions: Functions,
+    prior: Prior,
+    coefficients: NDArray[np.float64],
+    covariance: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Return the covariance (2m, 2m) of a series with that of which trend terms exist.
+
+    Whether a ring exists is the result of a test, and taken as known.
+
+    Parameters
+    ----------
+    functions : Functions
+    prior : Prior
+    coefficients, covariance : (2m,) and (2m, 2m) ndarray
+        Posterior with this prior.
+
+    Returns
+    -------
+    (2m, 2m) ndarray
+    """
+    to_terms, count = trend_transformation(functions.degree, functions.rings)
+    rows = np.arange(count - 4 * functions.rings)
+    whole = np.zeros((len(rows), 2 * len(functions)))
+    whole[:, _trend_columns(functions)] = to_terms[rows]
+    return covariance_with_uncertain_terms(whole, prior.trend[rows], coefficients, covariance)
+
+
+def gauge_precision(
+    values: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    interior: NDArray[np.float64],
+    kind: GaugeKind = GaugeKind.FULL,
+) -> np.ndarray:
+    """Precision matrix that keeps a series orthogonal to the gauge at image points.
+
+    Parameters
+    ----------
+    values : (n, m) ndarray
+        Functions of the series at the image points.
+    uv : (n, 2) ndarray
+        Image points [px].
+    interior : (3,) ndarray
+        xp, yp, c [px].
+    kind : GaugeKind
+
+    Returns
+    -------
+    (2m, 2m) ndarray
+    """
+    rows = gauge_rows(values, uv, interior, kind)
+    return rows.T @ rows / GAUGE_SD_PX**2
+
+
+def most_likely_prior(
+    functions: Functions,
+    information: NDArray[np.float64],
+    right: NDArray[np.float64],
+    gauge: NDArray[np.float64],
+    prior: Prior,
+    search: bool = False,
+) -> Prior:
+    """Return a prior with a larger marginal likelihood: signal first, then trend.
+
+    It is to be repeated until the prior does not change.
+
+    Parameters
+    ----------
+    functions : Functions
+    information, right : (2m, 2m) and (2m,) ndarray
+        Normal equations of the coefficients without a prior, all other unknowns eliminated.
+    gauge : (2m, 2m) ndarray
+        Precision matrix of the gauge.
+    prior : Prior
+        Present prior.
+    search : bool
+        Whether to look for a short field that may have been missed.
+
+    Returns
+    -------
+    Prior
+    """
+    if functions.modes:
+        prior = _most_likely_signal(functions, information + gauge, right, prior, search)
+    return _most_likely_trend(functions, information + gauge, right, prior)
+
+
+def _most_likely_signal(
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior, search: bool
+) -> Prior:
+    """Return the prior with a renewed signal."""
+    at = _trend_columns(functions)
+    base = information.copy(order='F')
+    base[np.ix_(at, at)] += _trend_precision(functions, prior)
+    columns = np.setdiff1d(np.arange(len(right)), at)
+    side = max(functions.image_size)
+    local = prior.local
+    if local is not None:
+        base, right = _with_bumps(functions, base, right, local)
+    equations = SignalEquations(functions.frequency, base, right, columns)
+    found = most_likely_signal(prior.signal, equations, side, search)
+    if local is not None:
+        local = _renewed(local, equations, found.variance(functions.frequency))
+    return replace(prior, signal=found, local=local)
+
+
+def _with_bumps(
+    functions: Functions, matrix: np.ndarray, right: np.ndarray, local: LocalSignal
+) -> tuple[np.ndarray, np.ndarray]:
+    """Normal equations with the heights of the bumps as further unknowns, those of u first.
+
+    matrix (2m, 2m), right (2m,): of the coefficients. The coefficients of the sines are then what
+    the bumps leave.
+    """
+    m = len(functions)
+    base = bumps(functions, local.nodes)
+    sines = [slice(axis * m + functions.trend, (axis + 1) * m) for axis in (0, 1)]
+    mixed = np.concatenate([matrix[:, own] @ base for own in sines], axis=1)
+    corner = np.concatenate([base.T @ mixed[own] for own in sines])
+    size = corner.shape[0]
+    corner[np.diag_indices(size)] += 1 / np.tile(local.of_bumps, 2)
+    out = np.asfortranarray(np.block([[matrix, mixed], [mixed.T, corner]]))
+    return out, np.concatenate([right, *(base.T @ right[own] for own in sines)])
+
+
+def _renewed(
+    local: LocalSignal, equations: SignalEquations, variance: np.ndarray
+) -> LocalSignal | None:
+    """Return the places with more likely variances; variance (s,): of the sines."""
+    matrix = equations.information.copy(order='F')
+    columns = equations.columns
+    matrix[columns, columns] += 1 / np.tile(variance, 2)
+    size = 2 * len(local.nodes)
+    units = np.eye(len(matrix))[:, -size:]
+    factor = cho_factor(matrix, lower=True)
+    solved = cho_solve(factor, np.column_stack([equations.right, units]))[-size:]
+    mean, heights = solved[:, 0], np.diagonal(solved[:, 1:])
+    return local.renewed(mean.reshape(2, -1), heights.reshape(2, -1))
+
+
+def with_shown_places(
+    functions: Functions, values: NDArray[np.float64], observed: NDArray[np.float64], prior: Prior
+) -> Prior:
+    """Return the prior with places where the signal varies more, as image points show them.
+
+    Orientations are taken to be known, and the trend to have no prior, so that u and v have the
+    same matrices. The signal is estimated anew only where a place may be found.
+
+    Parameters
+    ----------
+    functions : Functions
+    values : (n, m) ndarray
+        Functions at the image points, divided by the standard deviation of their noise.
+    observed : (n, 2) ndarray
+        Corrections that they show, divided likewise.
+    prior : Prior
+
+    Returns
+    -------
+    Prior
+    """
+    t = functions.trend
+    matrix = values.T @ values
+    right = values.T @ observed
+    # Terms that the image points do not tell apart.
+    matrix[np.arange(t), np.arange(t)] += RIDGE * np.max(np.diagonal(matrix))
+
+    def estimates(given: Prior) -> SineEstimates:
+        precision = signal_precision(functions, given)
+        whole = matrix.copy()
+        whole[t:, t:] += precision
+        factor = cho_factor(whole, lower=True)
+        covariance = cho_solve(factor, np.eye(len(whole))[:, t:])[t:]
+        return SineEstimates.of(precision, cho_solve(factor, right)[t:], covariance[None])
+
+    if largest_gain(functions, estimates(prior)) < SUSPECTED_GAIN:
+        return prior
+    columns = np.concatenate([axis * len(matrix) + np.arange(t, len(matrix)) for axis in (0, 1)])
+    both = np.asfortranarray(block_diag(matrix, matrix))
+    equations = SignalEquations(functions.frequency, both, right.T.ravel(), columns)
+    side = max(functions.image_size)
+    for _ in range(SIGNAL_ROUNDS):
+        prior = replace(prior, signal=most_likely_signal(prior.signal, equations, side))
+    return replace(prior, local=with_likely_places(functions, estimates(prior), prior.local))
+
+
+def with_more_places(
+    functions: Functions,
+    information: np.ndarray,
+    right: np.ndarray,
+    gauge: np.ndarray,
+    prior: Prior,
+) -> Prior:
+    """Return the prior with more places where the signal varies more, if there are any.
+
+    The arguments are those of `most_likely_prior`.
+    """
+    m = len(functions)
+    t = functions.trend
+    precision = information + gauge + prior_precision(functions, prior)
+    covariance = cho_solve(cho_factor(precision, lower=True), np.eye(2 * m))
+    mean = (covariance @ right).reshape(2, m).T[t:]
+    sines = [slice(axis * m + t, (axis + 1) * m) for axis in (0, 1)]
+    covariances = np.stack([covariance[own, own] for own in sines])
+    estimates = SineEstimates.of(signal_precision(functions, prior), mean, covariances)
+    return replace(prior, local=with_likely_places(functions, estimates, prior.local))
+
+
+def _most_likely_trend(
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+) -> Prior:
+    """Return the prior with renewed variances of the trend terms, one after the other."""
+    to_terms, count = trend_transformation(functions.degree, functions.rings)
+    if not count:
+        return prior
+    matrix, right = _trend_alone(functions, information, right, prior)
+    back = np.linalg.inv(to_terms)
+    matrix = back.T @ matrix @ back
+    right = back.T @ right
+    variance = prior.trend.copy()
+    rings = count - 4 * functions.rings
+    for _ in range(SWEEPS):
+        for j in (*range(rings), *(rings + k for k in RING_TERMS if rings + k < count)):
+            precision = np.concatenate([1 / variance, np.zeros(len(to_terms) - count)])
+            precision[j] = 0
+            # The term is estimated without its prior; its square exceeds its own variance by that
+            # of the prior.
+            c = np.linalg.solve(
+                matrix + np.diag(precision), np.stack([right, np.eye(len(right))[j]], axis=1)
+            )
+            variance[j] = np.clip(
+                c[j, 0] ** 2 - c[j, 1], MIN_RELATIVE_VARIANCE * c[j, 1], MAX_VARIANCE
+            )
+            if j >= rings and c[j, 0] ** 2 < RING_EXISTS * c[j, 1]:
+                variance[j] = ABSENT_VARIANCE
+    return replace(prior, trend=variance)
+
+
+def _trend_alone(
+    functions: Functions, information: np.ndarray, right: np.ndarray, prior: Prior
+) -> tuple[np.ndarray, np.ndarray]:
+    """Information and right side of the coefficients of the trend, the signal eliminated."""
+    at = _trend_columns(functions)
+    rest = np.setdiff1d(np.arange(len(right)), at)
+    if not len(rest):
+        return information, right
+    signal = information[np.ix_(rest, rest)].copy()
+    own = signal_precision(functions, prior)
+    signal[: len(own), : len(own)] += own
+    signal[len(own) :, len(own) :] += own
+    mixed = information[np.ix_(rest, at)]
+    solved = cho_solve(cho_factor(signal, lower=True), np.column_stack([mixed, right[rest]]))
+    reduced = information[np.ix_(at, at)] - mixed.T @ solved[:, :-1]
+    return reduced, right[at] - mixed.T @ solved[:, -1]

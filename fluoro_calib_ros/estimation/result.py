@@ -1,0 +1,255 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a calibration or an adjustment found, and the object points of several of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import block_diag
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..exposures.phantom import Phantom
+from ..findings import Finding
+from ..photogrammetry.rotations import matrix_from_quaternion
+from .constraints import RelativeOrientation
+from .diagnostics import (
+    AdjustmentStatistics,
+    ResidualTable,
+)
+from .fixed_calibration import (
+    SolvedNetwork,
+)
+from .initial_network import (
+    StartValues,
+)
+from .rounds import Round, SelfCalibration
+
+ROUNDING = 1e-6  # of the information of object points, relative to that of the survey
+
+
+@dataclass(frozen=True)
+class ExposureResult:
+    """Exterior orientation of an exposure.
+
+    Attributes
+    ----------
+    exposure : int
+        Its number.
+    position_mm : (3,) ndarray
+        Position of the source.
+    quaternion_wxyz : (4,) ndarray
+        Rotation phantom -> sensor.
+    sd_mm, sd_rad : (3,) ndarray
+        Standard deviations of the position, and of the rotation about the axes of the sensor.
+    """
+
+    exposure: int
+    position_mm: NDArray[np.float64]
+    quaternion_wxyz: NDArray[np.float64]
+    sd_mm: NDArray[np.float64]
+    sd_rad: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class FluoroscopeResult:
+    """Figures of one fluoroscope.
+
+    Attributes
+    ----------
+    interior, interior_sd : (3,) ndarray
+        xp, yp, c and their standard deviations [px].
+    image_size : (int, int)
+        Width and height [px].
+    model_kind : str
+    k : int
+        Number of neighbours of the model.
+    rmse_before, rmse_after : (2,) ndarray
+        RMSE of the inlier residuals in u and v [px], without and with the correction.
+    observations, inliers : int
+        Numbers of image points.
+    exposures : tuple of ExposureResult
+    """
+
+    interior: NDArray[np.float64]
+    interior_sd: NDArray[np.float64]
+    image_size: tuple[int, int]
+    model_kind: str
+    k: int
+    rmse_before: NDArray[np.float64]
+    rmse_after: NDArray[np.float64]
+    observations: int
+    inliers: int
+    exposures: tuple[ExposureResult, ...]
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Object points.
+
+    Attributes
+    ----------
+    target_id : (n,) ndarray
+    xyz_mm : (n, 3) ndarray
+    covariance : (n, 3, 3) ndarray
+        [mm^2]
+    joint_covariance : (3n, 3n) ndarray or None
+        Of all object points with each other [mm^2]; None where they are too many.
+    """
+
+    target_id: NDArray[np.int64]
+    xyz_mm: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    joint_covariance: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
+class CalibrationResult:
+    """Result of a calibration, or of an adjustment with calibrations held.
+
+    Attributes
+    ----------
+    fluoroscopes : dict of str to FluoroscopeResult
+    calibrations : dict of str to FluoroscopeCalibration
+    targets : Targets
+        Object points of all fluoroscopes together.
+    history : dict of str to tuple of Round
+        By fluoroscope, or by '+'.join(fluoroscopes) where they were adjusted together.
+    runs : dict of str to SelfCalibration
+        By the same names; for the report.
+    findings : tuple of Finding
+        NOTE: an exposure or image points that are excluded; WARNING: what is doubtful about the
+        orientation of the rig; ERROR: why the calibration cannot be right, though it was forced.
+    converged : bool
+    seconds : float
+    relative : tuple of RelativeOrientation
+        Of every further fluoroscope with the first, where they were adjusted together.
+    outliers : (tuple, tuple)
+        Dicts of the image points and of the targets that fail their tests.
+    correlations : tuple of (str, str, float)
+        Correlations above 0.95 between unknowns.
+    statistics : tuple of AdjustmentStatistics
+        Of each adjustment.
+    residuals : ResidualTable or None
+        Of all image points; None where they were not kept.
+    created : str
+        Date and time of the end (UTC, ISO 8601).
+    solved : dict of str to SolvedNetwork
+        What the covariance matrix of all unknowns is computed from, by the names of the history.
+    """
+
+    fluoroscopes: dict[str, FluoroscopeResult]
+    calibrations: dict[str, FluoroscopeCalibration]
+    targets: Targets
+    history: dict[str, tuple[Round, ...]]
+    runs: dict[str, SelfCalibration]
+    findings: tuple[Finding, ...]
+    converged: bool
+    seconds: float
+    relative: tuple[RelativeOrientation, ...] = ()
+    outliers: tuple[tuple[Any, ...], tuple[Any, ...]] = ((), ())
+    correlations: tuple[tuple[str, str, float], ...] = ()
+    statistics: tuple[AdjustmentStatistics, ...] = ()
+    residuals: ResidualTable | None = None
+    created: str = ''
+    solved: dict[str, SolvedNetwork] = field(default_factory=dict)
+
+    @property
+    def starts(self) -> StartValues:
+        """Start values of other adjustments of the same exposures."""
+        return StartValues(
+            {name: figures.interior for name, figures in self.fluoroscopes.items()},
+            {
+                (name, e.exposure): (matrix_from_quaternion(e.quaternion_wxyz), e.position_mm)
+                for name, figures in self.fluoroscopes.items()
+                for e in figures.exposures
+            },
+        )
+
+
+def combined_targets(parts: Sequence[Targets], phantom: Phantom, weighted: bool = True) -> Targets:
+    """Return one set of object points from separate adjustments of the same phantom.
+
+    Every adjustment holds the survey. In the sum of their information it counts once, so the
+    information of the survey is subtracted for every further adjustment; weighted False: none of
+    them holds the survey. Where the errors of a model make the points of an adjustment worse than
+    the survey, they add nothing to it.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    target_id = np.unique(np.concatenate([p.target_id for p in parts]))
+    row = phantom.index(target_id)
+    survey = np.eye(3) / phantom.sd_mm[row, None, None] ** 2
+    seen = np.zeros(len(row))
+    for part in parts:
+        seen[np.searchsorted(target_id, part.target_id)] += 1
+    further = ((seen - 1) * weighted)[:, None, None] * survey
+    joint = [part.joint_covariance for part in parts if part.joint_covariance is not None]
+    if weighted and len(joint) == len(parts):
+        together = _combined_jointly(parts, joint, further, phantom)
+        if together is not None:
+            return together
+    surveyed = weighted * survey
+    information = surveyed.copy()
+    right = (surveyed @ phantom.xyz_mm[row, :, None])[..., 0]
+    for part in parts:
+        at = np.searchsorted(target_id, part.target_id)
+        own = np.linalg.inv(part.covariance)
+        value, vector = np.linalg.eigh(own - surveyed[at])
+        is_better = value > 0
+        better = (vector * (value * is_better)[:, None, :]) @ vector.transpose(0, 2, 1)
+        information[at] += better
+        # The point that the adjustment would find without the survey.
+        added = own @ part.xyz_mm[..., None] - (surveyed @ phantom.xyz_mm[row, :, None])[at]
+        inside = (vector * is_better[:, None, :]) @ vector.transpose(0, 2, 1)
+        right[at] += (inside @ added)[..., 0]
+    covariance = np.linalg.inv(information)
+    return Targets(target_id, (covariance @ right[..., None])[..., 0], covariance)
+
+
+def _combined_jointly(
+    parts: Sequence[Targets],
+    joint: Sequence[np.ndarray],
+    further: np.ndarray,
+    phantom: Phantom,
+) -> Targets | None:
+    """Return one set of object points from their joint covariances.
+
+    None where the points of an adjustment are worse than the survey. The errors of few beads have
+    much in common: the datum, which is the same survey in every part. Information of single beads
+    would count it once a part.
+
+    Parameters
+    ----------
+    parts : sequence of Targets
+    joint : sequence of ndarray
+        Their joint covariances [mm^2].
+    further : (n, 3, 3) ndarray
+        Information of the survey that is subtracted.
+    phantom : Phantom
+
+    Returns
+    -------
+    Targets
+    """
+    target_id = np.unique(np.concatenate([p.target_id for p in parts]))
+    n = len(target_id)
+    information = -block_diag(*further)
+    right = information @ phantom.xyz_mm[phantom.index(target_id)].ravel()
+    for part, covariance in zip(parts, joint):
+        at = 3 * np.searchsorted(target_id, part.target_id)[:, None] + np.arange(3)
+        own = np.linalg.inv(covariance)
+        information[np.ix_(at.ravel(), at.ravel())] += own
+        right[at.ravel()] += own @ part.xyz_mm.ravel()
+    survey = np.repeat(1 / phantom.sd_mm[phantom.index(target_id)] ** 2, 3)
+    relative = information / np.sqrt(np.outer(survey, survey))
+    if np.linalg.eigvalsh(relative)[0] < 1 - ROUNDING:
+        return None
+    found = np.linalg.inv(information)
+    blocks = found.reshape(n, 3, n, 3)[np.arange(n), :, np.arange(n), :]
+    return Targets(target_id, (found @ right).reshape(n, 3), blocks, found)

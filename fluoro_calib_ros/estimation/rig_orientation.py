@@ -1,0 +1,657 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Orientation of the fluoroscopes of a rig, from a capture of the phantom or from the exposures.
+
+Interior orientations and corrections are held at their calibrations, so that rays and corrected
+image points are consistent. The uncertainty of the interior orientation is propagated, not
+estimated again. With N the normal matrix of the adjustment of exteriors e and object points, with
+the interiors i as further unknowns,
+
+    de/di = -N_ee^-1 N_ei (object points eliminated),
+    C_e = N_ee^-1 + de/di C_i (de/di)^T,   C_ei = de/di C_i,
+
+the covariance of an estimate with parameters that are held, but not known (consider parameters of
+Schmidt: Bierman, "Factorization Methods for Discrete Sequential Estimation", Academic Press 1977,
+ch. VIII). An error of the principal distance moves the source, but hardly the points that are
+intersected afterwards: C_ei describes that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError
+from ..exposures.collector import displacement
+from ..exposures.frame import Frame, angles_of, validate_frame
+from ..exposures.phantom import Phantom
+from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.collinearity import to_sensor
+from ..photogrammetry.elimination import CovarianceBlocks, factorize
+from ..photogrammetry.known_orientation import HELD_SD_MM, HELD_SD_RAD
+from ..photogrammetry.network import Network
+from ..photogrammetry.normal_equations import normal_equations
+from ..photogrammetry.precision import covariance_blocks
+from ..photogrammetry.relative_orientation import (
+    discrepancies_with_jacobian,
+    mean_pose,
+    relative_poses,
+)
+from ..photogrammetry.relative_pose import RelativeConstraint, RelativePose
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation, with_datum_of_points
+from ..photogrammetry.rotations import matrix_from_quaternion
+from .constraints import paired_exposures
+from .fixed_calibration import (
+    fixed_corrections,
+    network_of_calibrations,
+    noise_of_calibrations,
+    too_few_rays_for_noise,
+)
+from .initial_network import (
+    MIN_TARGETS_OF_EXPOSURE,
+    Frames,
+    Known,
+    Measured,
+    StartValues,
+    adjusted_with_precision,
+)
+from .pair_scatter import PairScatter, agreeing, displacements, functions_of_angles
+from .result import FluoroscopeResult, Targets
+
+# Orientation of a rig whose fluoroscopes were calibrated with known orientations.
+
+FRAME_ID = 'lab'
+
+
+def orientation_of_known(
+    known: Known,
+    figures: Mapping[str, FluoroscopeResult],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+) -> RigOrientation:
+    """Return the orientation of the rig in the frame in which its fluoroscopes are known.
+
+    It is the mean of those of the exposures: the known one where it is held, else the weighted
+    one. Its standard deviations are the given ones: an error of a known orientation is the same in
+    all exposures.
+    """
+    names = tuple(figures)
+    rotations = np.array([_mean_rotation(figures[name]) for name in names])
+    positions = np.array(
+        [np.mean([e.position_mm for e in figures[name].exposures], axis=0) for name in names]
+    )
+    size = ORIENTATION_SIZE * len(names)
+    covariance = np.zeros((size, size))
+    for f, name in enumerate(names):
+        sd_mm, sd_rad = known[name].exterior_sd or (HELD_SD_MM, HELD_SD_RAD)
+        at = slice(ORIENTATION_SIZE * f, ORIENTATION_SIZE * (f + 1))
+        own = np.diag(np.repeat([sd_mm**2, sd_rad**2, 0.0], 3))
+        own[6:, 6:] = calibrations[name].interior_covariance
+        covariance[at, at] = own
+    used = [calibrations[name] for name in names]
+    return RigOrientation(
+        fluoroscopes=names,
+        interior=np.array([calibration.interior for calibration in used]),
+        rotation=rotations,
+        position_mm=positions,
+        covariance=covariance,
+        frame_id=FRAME_ID,
+        source='capture',
+        calibration_ids=tuple(calibration.calibration_id for calibration in used),
+        stamp_ns=max(calibration.stamp_ns for calibration in used),
+        exposures=min(calibration.exposures for calibration in used),
+        optical_frame_ids=tuple(c.frame_id or f'{name}_optical' for name, c in zip(names, used)),
+    ).rounded()
+
+
+def _mean_rotation(figures: FluoroscopeResult) -> np.ndarray:
+    """Mean rotation (3, 3) of exposures: the nearest to the sum of their matrices."""
+    total = matrix_from_quaternion([e.quaternion_wxyz for e in figures.exposures]).sum(axis=0)
+    u, _, vt = np.linalg.svd(total)
+    return u @ vt
+
+
+Calibrations = Mapping[str, FluoroscopeCalibration]
+
+# Exposures that are used: with more of them the interior orientations remain the uncertainty.
+MAX_PAIRS = 30
+# The phantom moves where the median displacement between two frames of a capture exceeds both
+# limits, in pixels and in standard deviations of the noise.
+MAX_STILL_PX = 1.0
+MAX_STILL_SD = 4.0
+MAX_MATCH_SD = 5.0  # distance from the median of a target above which a match is false
+# Of interior orientations that are added as unknowns: their normal matrix can then be inverted
+# also where one pose of the phantom does not determine them. The derivative de/di does not depend
+# on it.
+ASSUMED_SD_PX = 1.0
+
+
+@dataclass(frozen=True)
+class _HeldAdjustment:
+    """An adjustment of m exposures with the calibrations of F fluoroscopes held.
+
+    Attributes
+    ----------
+    measured : Measured
+    after : Adjustment
+    by_interior : (m, 6, 3F) ndarray
+        Derivatives de/di of the exteriors by the interiors.
+    blocks : CovarianceBlocks
+        Of the adjustment with the interiors among the unknowns.
+    interiors : (3F, 3F) ndarray
+        Covariance of the interiors.
+    """
+
+    measured: Measured
+    after: Adjustment
+    by_interior: NDArray[np.float64]
+    blocks: CovarianceBlocks
+    interiors: NDArray[np.float64]
+
+    def covariance(self, e: np.ndarray, f: np.ndarray) -> NDArray[np.float64]:
+        """Covariances (k, 6, 6) of exposures e (k,) with others f (k,), the interiors known."""
+        derivative = self.by_interior
+        of_interiors = derivative[e] @ self.blocks.gg @ derivative[f].transpose(0, 2, 1)
+        return self.blocks.between(e, f) - of_interiors
+
+    def covariance_of_all(self) -> NDArray[np.float64]:
+        """Covariance (6m, 6m) of all exposures, the interiors known."""
+        count = len(self.measured.frames)
+        every = np.arange(count)
+        rows = [
+            self.covariance(np.full(count, e), every).transpose(1, 0, 2).reshape(6, 6 * count)
+            for e in every
+        ]
+        return np.concatenate(rows)
+
+
+@dataclass(frozen=True)
+class _Exteriors:
+    """Exterior orientations of F fluoroscopes in the frame of a rig.
+
+    Attributes
+    ----------
+    rotation : (F, 3, 3) ndarray
+    position_mm : (F, 3) ndarray
+    covariance : (6F, 6F) ndarray
+        With the interiors known.
+    by_interior : (6F, 3F) ndarray
+        Derivatives by the interiors.
+    """
+
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    by_interior: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Origin:
+    """Where an orientation comes from; see `RigOrientation`."""
+
+    frame_id: str
+    source: str
+    stamp_ns: int
+    exposures: int
+
+
+def orientation_of_capture(
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Calibrations,
+    frame_id: str = 'rig',
+    loss: str = 'student_t',
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> RigOrientation:
+    """Orientation from a capture of the phantom at rest, whose frame is that of the rig.
+
+    The object points are estimated, too, with their survey as weighted observations.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        One or more of every fluoroscope; they need not be paired.
+    phantom : Phantom
+        Survey of its targets, or the better known object points of a calibration (`phantom_of`).
+    calibrations : mapping of str to FluoroscopeCalibration
+        Held.
+    frame_id : str
+        Name of the rig frame.
+    loss : str
+        Noise model of the image points.
+    raise_if_cancelled : callable, optional
+        Called during the adjustment; may raise to stop it.
+
+    Returns
+    -------
+    RigOrientation
+
+    Raises
+    ------
+    DataError
+        If there are fewer than two fluoroscopes, calibrations are missing, frames are invalid or
+        of another image size, targets are too few, or the phantom moves.
+    """
+    _validate(frames, phantom, calibrations)
+    still = {name: [frame] for name, frame in standing_frames(frames, calibrations).items()}
+    for name, (frame,) in still.items():
+        if len(frame.target_id) < MIN_TARGETS_OF_EXPOSURE:
+            raise DataError(
+                f'fluoroscope {name}: the capture shows {len(frame.target_id)} targets of the '
+                f'phantom, {MIN_TARGETS_OF_EXPOSURE} are needed'
+            )
+    with threadpool_limits(1):
+        measured = network_of_calibrations(still, phantom, calibrations, raise_if_cancelled)
+        held = _adjusted(measured, calibrations, loss, True, raise_if_cancelled)
+        known = held.covariance_of_all()
+    parameters = held.after.parameters
+    count = len(frames)
+    exteriors = _Exteriors(
+        parameters.rotation,
+        parameters.position_mm,
+        known,
+        held.by_interior.reshape(6 * count, -1),
+    )
+    exposures = min(len(of_one) for of_one in frames.values())
+    origin = _Origin(frame_id, 'capture', _last_stamp(frames), exposures)
+    return _orientation(held, exteriors, calibrations, origin)
+
+
+def orientation_of_exposures(
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Calibrations,
+    loss: str = 'student_t',
+    raise_if_cancelled: Callable[[], None] | None = None,
+    starts: StartValues | None = None,
+) -> RigOrientation:
+    """Orientation in the optical frame of the first fluoroscope, from exposures of the phantom.
+
+    The relative orientation is the weighted mean of those of the exposures, a few of which are
+    left out where they contradict the others. Where these scatter more than their standard
+    deviations, its covariance is enlarged accordingly. The frame is the estimated one of the
+    sensor, and its covariance is given a datum where the phantom was (`with_datum_of_points`).
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        Those of the same number belong together.
+    phantom : Phantom
+    calibrations : mapping of str to FluoroscopeCalibration
+        Held.
+    loss : str
+        Noise model of the image points.
+    raise_if_cancelled : callable, optional
+        Called during the adjustment; may raise to stop it.
+    starts : StartValues, optional
+        Of an earlier adjustment of the frames.
+
+    Returns
+    -------
+    RigOrientation
+
+    Raises
+    ------
+    DataError
+        As `orientation_of_capture`, and if no exposures can be paired.
+    """
+    return orientation_and_scatter(
+        frames,
+        phantom,
+        calibrations=calibrations,
+        loss=loss,
+        raise_if_cancelled=raise_if_cancelled,
+        starts=starts,
+    )[0]
+
+
+def orientation_and_scatter(
+    frames: Frames,
+    phantom: Phantom,
+    calibrations: Calibrations,
+    loss: str = 'student_t',
+    raise_if_cancelled: Callable[[], None] | None = None,
+    starts: StartValues | None = None,
+) -> tuple[RigOrientation, tuple[PairScatter, ...]]:
+    """Return `orientation_of_exposures`, and how the exposures scatter about it.
+
+    There is one PairScatter for every fluoroscope but the first. Raises DataError.
+    """
+    _validate(frames, phantom, calibrations)
+    paired = _paired(frames)
+    with threadpool_limits(1):
+        measured = network_of_calibrations(
+            paired, phantom, calibrations, raise_if_cancelled, starts=starts
+        )
+        held = _adjusted(measured, calibrations, loss, False, raise_if_cancelled)
+        turning = {name for name, each in calibrations.items() if each.angle_field is not None}
+        exteriors, scatter = _relative_to_first(held, turning)
+    first = held.measured.fluoroscopes[0]
+    frame_id = calibrations[first].frame_id or f'{first}_optical'
+    exposures = min(int(of_one.used.sum()) for of_one in scatter)
+    origin = _Origin(frame_id, 'joint calibration', _last_stamp(paired), exposures)
+    found = _orientation(held, exteriors, calibrations, origin)
+    try:
+        return with_datum_of_points(found, _seen_by_first(held)), scatter
+    except np.linalg.LinAlgError:
+        raise DataError(
+            'the fluoroscopes see the phantom from one place, so that their rays do not intersect'
+        ) from None
+
+
+def _relative_to_first(
+    held: _HeldAdjustment, turning: Collection[str]
+) -> tuple[_Exteriors, tuple[PairScatter, ...]]:
+    """Exteriors relative to the first fluoroscope, and the scatter of the paired exposures.
+
+    turning: names of those whose corrections change with the angle of a C-arm.
+    Raises DataError where no exposures can be paired.
+    """
+    names = held.measured.fluoroscopes
+    count = len(names)
+    rotation = np.tile(np.eye(3), (count, 1, 1))
+    position = np.zeros((count, 3))
+    operator = np.zeros((6 * count, 6 * len(held.measured.frames)))
+    growth = np.ones(6 * count)
+    scatter = []
+    for b in range(1, count):
+        pairs = paired_exposures(held.measured, b)
+        if not len(pairs):
+            raise DataError(_unpaired(names, b))
+        rows = slice(6 * b, 6 * b + 6)
+        corrected = names[0] in turning or names[b] in turning
+        pose, operator[rows], of_pairs = _mean_of_pairs(held, pairs, corrected)
+        growth[rows] = of_pairs.growth
+        rotation[b] = pose.rotation
+        position[b] = pose.translation_mm
+        scatter.append(of_pairs)
+    known = growth[:, None] * (operator @ held.covariance_of_all() @ operator.T) * growth
+    by_interior = operator @ held.by_interior.reshape(operator.shape[1], -1)
+    return _Exteriors(rotation, position, known, by_interior), tuple(scatter)
+
+
+def _seen_by_first(held: _HeldAdjustment) -> np.ndarray:
+    """Object points (n, 3) [mm] that the first fluoroscope sees, in its sensor frame."""
+    network = held.measured.network
+    parameters = held.after.parameters
+    rows = network.rows(0)
+    exposure = network.exposure[rows]
+    points = parameters.points_mm[network.point[rows]]
+    return to_sensor(parameters.rotation[exposure], parameters.position_mm[exposure], points)
+
+
+def phantom_of(targets: Targets) -> Phantom:
+    """Phantom of the object points of a calibration, better known than by their survey.
+
+    The standard deviation of a target is the root mean square of those of its coordinates.
+    """
+    variance = np.trace(targets.covariance, axis1=1, axis2=2) / 3
+    return Phantom(targets.target_id, targets.xyz_mm, np.sqrt(variance))
+
+
+def _validate(frames: Frames, phantom: Phantom, calibrations: Calibrations) -> None:
+    """Raise DataError for frames and calibrations that do not belong together."""
+    if len(frames) < 2:
+        raise DataError(
+            'a rig has two fluoroscopes or more, there are frames of '
+            f'{", ".join(frames) or "none"} only'
+        )
+    for name, of_one in frames.items():
+        if name not in calibrations:
+            raise DataError(
+                f'there is no calibration of fluoroscope {name}, only of {", ".join(calibrations)}'
+            )
+        if not of_one:
+            raise DataError(f'fluoroscope {name}: there is no frame of the phantom')
+        for frame in of_one:
+            validate_frame(frame, phantom, calibrations[name].image_size)
+
+
+def _last_stamp(frames: Frames) -> int:
+    return max(frame.stamp_ns for of_one in frames.values() for frame in of_one)
+
+
+def standing_frames(frames: Frames, calibrations: Calibrations) -> dict[str, Frame]:
+    """One frame by fluoroscope of a capture of the phantom at rest.
+
+    Its image points are the weighted means of those of every target. An image point that is far
+    from the median of its target is a false match and left out. Raises DataError where the phantom
+    moves.
+    """
+    return {
+        name: _mean_frame(of_one, calibrations[name].image_sd) for name, of_one in frames.items()
+    }
+
+
+def _mean_frame(frames: Sequence[Frame], image_sd: float) -> Frame:
+    """Mean of the frames of a fluoroscope; image_sd: noise of an image coordinate [px]."""
+    if len(frames) == 1:
+        return frames[0]
+    _require_still(frames, max(MAX_STILL_PX, MAX_STILL_SD * image_sd))
+    ids, row = np.unique(np.concatenate([f.target_id for f in frames]), return_inverse=True)
+    uv = np.concatenate([f.uv for f in frames])
+    sigma = np.concatenate(
+        [np.ones(len(f.target_id)) if f.sigma is None else f.sigma for f in frames]
+    )
+    order = np.argsort(row, kind='stable')
+    ends = np.cumsum(np.bincount(row))[:-1]
+    middle = np.array([np.median(uv[part], axis=0) for part in np.split(order, ends)])
+    off = uv - middle[row]
+    limit = max(MAX_STILL_PX, MAX_MATCH_SD * image_sd)
+    weight = np.where(np.linalg.norm(off, axis=1) <= limit, sigma**-2.0, 0.0)
+    total = np.bincount(row, weight, len(ids))
+    matched = total > 0
+    sums = np.column_stack([np.bincount(row, weight * off[:, i], len(ids)) for i in (0, 1)])
+    mean = sums[matched] / total[matched, None]
+    last = max(frames, key=lambda f: (f.stamp_ns, f.number))
+    return Frame(
+        fluoroscope=last.fluoroscope,
+        number=last.number,
+        target_id=ids[matched],
+        uv=middle[matched] + mean,
+        image_size=last.image_size,
+        sigma=np.asarray(total[matched] ** -0.5, dtype=np.float64),
+        stamp_ns=last.stamp_ns,
+        frame_id=last.frame_id,
+        angle=last.angle,
+    )
+
+
+def _require_still(frames: Sequence[Frame], still_px: float) -> None:
+    """Raise DataError where a frame shows the phantom displaced by more than still_px.
+
+    Every frame is compared with the one before, and with the first.
+    """
+    to_first = ((frames[0], frame) for frame in frames[2:])
+    for before, frame in [*pairwise(frames), *to_first]:
+        moved = displacement(before, frame)
+        if np.isfinite(moved) and moved > still_px:
+            raise DataError(
+                f'fluoroscope {frame.fluoroscope}: the phantom does not stand still, between '
+                f'frames {before.number} and {frame.number} it moves by {moved:.1f} px'
+            )
+
+
+def _paired(frames: Frames) -> dict[str, list[Frame]]:
+    """Frames that the first fluoroscope and another have in common, at most MAX_PAIRS each.
+
+    Raises DataError where a fluoroscope has none in common with the first.
+    """
+    first, *others = frames
+    numbers = {name: {frame.number for frame in of_one} for name, of_one in frames.items()}
+    for b, name in enumerate(others, 1):
+        if not numbers[name] & numbers[first]:
+            raise DataError(_unpaired(tuple(frames), b))
+    # Exposures that all fluoroscopes took are preferred; they are spread evenly over the numbers.
+    common = sorted(numbers[first].intersection(n for name in others for n in numbers[name]))
+    complete = [n for n in common if all(n in numbers[name] for name in others)]
+    usable = complete if len(complete) >= MAX_PAIRS else common
+    selected = np.unique(np.linspace(0, len(usable) - 1, MAX_PAIRS).astype(int))
+    used = {usable[i] for i in selected}
+    return {
+        name: [frame for frame in of_one if frame.number in used]
+        for name, of_one in frames.items()
+    }
+
+
+def _unpaired(names: Sequence[str], b: int) -> str:
+    """Return the sentence on fluoroscopes without paired exposures."""
+    return (
+        f'fluoroscopes {names[0]} and {names[b]}: no exposures have the same number, so that '
+        'their relative orientation is not known'
+    )
+
+
+def _adjusted(
+    measured: Measured,
+    calibrations: Calibrations,
+    loss: str,
+    noise_fixed: bool,
+    raise_if_cancelled: Callable[[], None] | None,
+) -> _HeldAdjustment:
+    """Adjust a network with the calibrations fixed.
+
+    noise_fixed: the noise is that of the calibrations; else only where the exposures are too few
+    to estimate it. Raises DataError.
+    """
+    used = [calibrations[name] for name in measured.fluoroscopes]
+    correction, network = fixed_corrections(measured, calibrations)
+    after, _ = adjusted_with_precision(
+        network,
+        measured.start,
+        correction,
+        noise_of_calibrations(loss, used),
+        raise_if_cancelled=raise_if_cancelled,
+        noise_fixed=noise_fixed or too_few_rays_for_noise(network),
+    )
+    if not np.isfinite(after.parameters.position_mm).all():
+        raise DataError('the exposures do not determine the orientation of the fluoroscopes')
+    blocks = _with_free_interiors(network, after, correction)
+    by_interior = blocks.eg @ np.linalg.inv(blocks.gg)
+    return _HeldAdjustment(measured, after, by_interior, blocks, _covariance_of_interiors(used))
+
+
+def _with_free_interiors(
+    network: Network, after: Adjustment, correction: np.ndarray
+) -> CovarianceBlocks:
+    """Covariances of an adjustment with the interiors as further unknowns."""
+    count = network.n_fluoroscopes
+    free = replace(
+        network,
+        interior_free=np.ones(count, dtype=bool),
+        interior_mean=after.parameters.interior,
+        interior_sd=np.full((count, 3), ASSUMED_SD_PX),
+    )
+    factor = after.noise.information_factor(after.q)
+    equations = normal_equations(free, after.parameters, correction, after.noise, factor)
+    return covariance_blocks(factorize(free, equations))
+
+
+def _covariance_of_interiors(calibrations: Iterable[FluoroscopeCalibration]) -> np.ndarray:
+    """Covariance (3F, 3F) of the interior orientations of calibrations."""
+    used = list(calibrations)
+    out = np.zeros((3 * len(used), 3 * len(used)))
+    for f, calibration in enumerate(used):
+        rows = slice(3 * f, 3 * f + 3)
+        out[rows, rows] = calibration.interior_covariance
+    return out
+
+
+def _mean_of_pairs(
+    held: _HeldAdjustment, pairs: np.ndarray, corrected: bool
+) -> tuple[RelativePose, np.ndarray, PairScatter]:
+    """Weighted mean of the relative orientations of pairs (k, 2) of exposures.
+
+    corrected: whether a correction changes with the angle of a C-arm. Returns the mean, its
+    derivatives (6, 6m) by the exposures, and how the pairs scatter about it.
+    """
+    parameters = held.after.parameters
+    frames = held.measured.frames
+    pairs = pairs[np.argsort([frames[row].number for row in pairs[:, 0]], kind='stable')]
+    angles = [angles_of(frames[row] for row in rows) for rows in pairs.T]
+    constraint = RelativeConstraint((0, 1), pairs, 1.0, 1.0)
+    start = mean_pose(parameters, pairs)
+    _, d_a, d_b, _ = discrepancies_with_jacobian(constraint, start, parameters)
+    weights = np.linalg.inv(_covariance_of_pairs(held, pairs, d_a, d_b))
+    columns = functions_of_angles(angles)
+    found = agreeing(parameters, constraint, weights, columns)
+    used = found.used
+    pose = mean_pose(parameters, pairs[used], weights[used])
+    operator = np.zeros((6, len(held.measured.frames), 6))
+    share = np.linalg.solve(
+        weights[used].sum(axis=0), weights[used].transpose(1, 0, 2).reshape(6, -1)
+    ).reshape(6, -1, 6)
+    for rows, derivative in zip(pairs[used].T, (d_a[used], d_b[used])):
+        operator[:, rows] += np.einsum('ika,kab->ikb', share, derivative)
+    poses = [pose.updated(step) for step in found.trend]
+    network = held.measured.network
+    by_angle = displacements(network, parameters, pairs, poses, [pose] * len(poses))
+    turn, shift = relative_poses(parameters, pairs)
+    scatter = PairScatter(
+        fluoroscopes=(frames[pairs[0, 0]].fluoroscope, frames[pairs[0, 1]].fluoroscope),
+        exposures=np.array([frames[row].number for row in pairs[:, 0]]),
+        off_px=displacements(network, parameters, pairs, poses),
+        off_sd=found.off_sd,
+        used=used,
+        growth=found.growth,
+        unexplained=found.unexplained,
+        angle_px=float(np.sqrt(np.mean(by_angle**2))),
+        columns=columns,
+        corrected=corrected,
+        turn=turn,
+        shift_mm=shift,
+    )
+    return pose, operator.reshape(6, -1), scatter
+
+
+def _covariance_of_pairs(
+    held: _HeldAdjustment, pairs: np.ndarray, d_a: np.ndarray, d_b: np.ndarray
+) -> np.ndarray:
+    """Covariances (k, 6, 6) of the relative orientations of pairs (k, 2) of exposures.
+
+    d_a, d_b (k, 6, 6) are their derivatives by the exposures.
+    """
+    a, b = pairs.T
+    mixed = d_a @ held.covariance(a, b) @ d_b.transpose(0, 2, 1)
+    return (
+        d_a @ held.covariance(a, a) @ d_a.transpose(0, 2, 1)
+        + d_b @ held.covariance(b, b) @ d_b.transpose(0, 2, 1)
+        + mixed
+        + mixed.transpose(0, 2, 1)
+    )
+
+
+def _orientation(
+    held: _HeldAdjustment, exteriors: _Exteriors, calibrations: Calibrations, origin: _Origin
+) -> RigOrientation:
+    """Rig orientation of exteriors, with the uncertainty of the interiors."""
+    names = held.measured.fluoroscopes
+    used = [calibrations[name] for name in names]
+    by_interior = exteriors.by_interior
+    mixed = by_interior @ held.interiors
+    total = exteriors.covariance + mixed @ by_interior.T
+    every = np.block([[total, mixed], [mixed.T, held.interiors]])
+    count = len(names)
+    order = np.concatenate(
+        [np.r_[6 * f : 6 * f + 6, 6 * count + 3 * f : 6 * count + 3 * f + 3] for f in range(count)]
+    )
+    covariance = every[np.ix_(order, order)].reshape(ORIENTATION_SIZE * count, -1)
+    return RigOrientation(
+        fluoroscopes=names,
+        interior=np.array([calibration.interior for calibration in used]),
+        rotation=exteriors.rotation,
+        position_mm=exteriors.position_mm,
+        covariance=(covariance + covariance.T) / 2,
+        frame_id=origin.frame_id,
+        source=origin.source,
+        calibration_ids=tuple(calibration.calibration_id for calibration in used),
+        stamp_ns=origin.stamp_ns,
+        exposures=origin.exposures,
+        optical_frame_ids=tuple(c.frame_id or f'{name}_optical' for name, c in zip(names, used)),
+    ).rounded()

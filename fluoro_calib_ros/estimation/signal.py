@@ -1,0 +1,550 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Covariance function of the signal of a distortion, and its estimation.
+
+The signal is the sum of two random fields with covariance functions of Matern's family, the same
+for u and v: a long one for what bends over the image, a short one for the local ripples that the
+first, with one correlation length for all, would smooth away. Their standard deviations,
+correlation lengths and common smoothness are those of the largest marginal likelihood (Rasmussen
+and Williams, "Gaussian Processes for Machine Learning", 2006, 5.4) with weak priors, found by
+Fisher scoring: the slopes and the expected curvature of the likelihood follow from the posterior
+means and variances of the coefficients (MacKay, "Bayesian interpolation", Neural Computation 4,
+1992).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import lapack, solve_triangular
+from scipy.special import j0
+from scipy.stats import t as student
+
+from ..correction.series import MARGIN, Functions
+from ..correction.terms import ABSENT_VARIANCE
+from .lack_of_fit import MIN_EXPOSURES
+
+# Ripples: a part of the signal within a few bands of spatial frequency.
+#
+# A weave, a moire pattern or the seams of fibre plates repeat with a wavelength. A covariance
+# function of Matern's family has to hold all longer waves, too, to hold such ripples; a series
+# for it has as many sines. The periodogram of the residuals (Scargle, "Studies in astronomical
+# time series analysis II", ApJ 263, 1982) shows which few bands of frequencies there are.
+
+# Sines along the image that are looked at: ripples shorter than 53 px on 1024 px.
+SEARCHED_BANDS = 50
+# Standard deviations by which the mean power of a band with ripples exceeds that of noise.
+SIGNIFICANT = 5.0
+INDEPENDENT = 1 / MARGIN**2  # part of the sines, over their rectangle, that the image can tell
+# Chance that ripples which differ between exposures agree in a band.
+FALSE_ALARM = 1e-5
+BESIDE = 1  # bands next to one with ripples that are used, too: the image ends, and waves do not
+BESIDE_PEAK = 0.2  # part of the power of the strongest band, up to which others belong to it
+LEAST_EXCESS = 0.1  # power that a band starts with, over that of noise
+
+
+@dataclass(frozen=True)
+class Ripples:
+    """Prior variances of the sines of bands of frequencies.
+
+    width: of a band [1/px]; variances: [px^2] of the bands 0, 1, ..., zero where there are none.
+    """
+
+    width: float
+    variances: tuple[float, ...]
+
+    @property
+    def bands(self) -> tuple[int, ...]:
+        """Bands in which there are ripples."""
+        return tuple(band for band, variance in enumerate(self.variances) if variance > 0)
+
+    def band(self, frequency: np.ndarray) -> NDArray[np.float64]:
+        """Band (s,) of frequency (s,) [1/px]."""
+        return np.rint(frequency / self.width).astype(int)
+
+    def variance(self, frequency: np.ndarray) -> NDArray[np.float64]:
+        """Variances (s,) of sines of frequency (s,) [1/px]."""
+        band = self.band(frequency)
+        inside = band < len(self.variances)
+        return np.where(inside, np.asarray(self.variances)[np.where(inside, band, 0)], 0.0)
+
+    def with_variances(self, variances: np.ndarray) -> Ripples:
+        """Return ripples in the same bands with these variances (n,), of all bands."""
+        own = np.where(np.asarray(self.variances) > 0, variances, 0.0)
+        return replace(self, variances=tuple(float(value) for value in own))
+
+    def alone(self) -> Ripples | None:
+        """Return the ripples in the bands about the strongest; None: longer waves are as strong.
+
+        A field without ripples grows weaker from band to band.
+        """
+        variances = np.asarray(self.variances)
+        largest = float(variances.max())
+        if variances[self.bands[0]] > BESIDE_PEAK * largest:
+            return None
+        used = np.convolve(variances > BESIDE_PEAK * largest, np.ones(2 * BESIDE + 1), 'same') > 0
+        return replace(self, variances=tuple(float(v) for v in np.where(used, variances, 0.0)))
+
+    def joined(self, other: Ripples | None) -> Ripples:
+        """Return ripples with the bands of another, too; the variances of both add."""
+        if other is None:
+            return self
+        count = max(len(self.variances), len(other.variances))
+        both = [np.pad(r.variances, (0, count - len(r.variances))) for r in (self, other)]
+        return replace(self, variances=tuple(float(value) for value in np.sum(both, axis=0)))
+
+
+def ripples_of(functions: Functions, coefficients: np.ndarray) -> Ripples | None:
+    """Ripples of a series that has them, as its coefficients (2, m) show them, or None."""
+    if not functions.absent:
+        return None
+    count = functions.modes + 1
+    squares = np.mean(coefficients[:, functions.trend :] ** 2, axis=0)
+    number = np.maximum(np.bincount(functions.band, minlength=count), 1)
+    variances = np.bincount(functions.band, squares, count) / number
+    variances[: functions.complete + 1] = 0.0
+    return Ripples(functions.frequency_of_mode, tuple(float(value) for value in variances))
+
+
+def shown_ripples(
+    image_size: tuple[int, int],
+    uv: NDArray[np.float64],
+    residuals: NDArray[np.float64],
+    exposure: NDArray[np.int64],
+    complete: int,
+) -> Ripples | None:
+    """Return the ripples that residuals show beyond the sines of a series, or None.
+
+    Parameters
+    ----------
+    image_size : (int, int)
+        Width and height of the image [px].
+    uv, residuals : (n, 2) ndarray
+        Image points and their residuals [px].
+    exposure : (n,) ndarray
+        Exposures of the image points.
+    complete : int
+        Bands up to which the series has all sines.
+    """
+    functions = Functions(image_size, -1, SEARCHED_BANDS)
+    products, squares = functions.sums_of_sines(uv, residuals)
+    noise = float(np.mean(residuals**2))
+    power = np.mean(products**2, axis=1) / (squares * noise)
+    number = np.maximum(np.bincount(functions.band), 1)
+    excess = np.bincount(functions.band, power) / number - 1
+    bands = np.arange(len(number))
+    # The power of a sine has a standard deviation of one: it is a mean of two squares.
+    shown = (excess > SIGNIFICANT / np.sqrt(INDEPENDENT * number)) & (bands > complete)
+    if shown.any():
+        shown[shown] = _are_common(functions, uv, residuals, exposure, bands[shown])
+    if not shown.any():
+        return None
+    used = np.convolve(shown, np.ones(2 * BESIDE + 1), 'same') > 0
+    used &= (bands > complete) & (bands <= SEARCHED_BANDS)
+    variances = np.maximum(excess, LEAST_EXCESS) * noise / float(np.mean(squares))
+    return Ripples(
+        functions.frequency_of_mode, tuple(float(v) for v in np.where(used, variances, 0.0))
+    )
+
+
+def _are_common(
+    functions: Functions,
+    uv: np.ndarray,
+    residuals: np.ndarray,
+    exposure: np.ndarray,
+    bands: np.ndarray,
+) -> np.ndarray:
+    """Whether the ripples of residuals (n, 2) in bands (b,) are common to the exposures (n,).
+
+    The products of pairs of exposures are compared with zero by Student's t: those of different
+    pairs are uncorrelated where the ripples of an exposure have their own signs.
+    """
+    sums = np.stack(
+        [
+            functions.sums_of_sines(uv[exposure == e], residuals[exposure == e])[0]
+            for e in np.unique(exposure)
+        ]
+    )
+    first, second = np.triu_indices(len(sums), 1)
+    if len(sums) < MIN_EXPOSURES:
+        return np.zeros(len(bands), dtype=bool)
+    limit = student.isf(FALSE_ALARM, len(first) - 1)
+    out = []
+    for band in bands:
+        own = sums[:, functions.band == band].reshape(len(sums), -1)
+        product = (own @ own.T)[first, second]
+        error = np.std(product, ddof=1) / np.sqrt(len(product))
+        out.append(np.mean(product) > limit * error)
+    return np.array(out)
+
+
+# Smoothness nu of the long field: its range, and the median and the standard deviation of its
+# logarithm before it is estimated. It tells how much of the signal the sines leave out.
+SMOOTHNESS_RANGE = (1.0, 4.0)
+SMOOTHNESS = 3.0
+SMOOTHNESS_SD = 0.5
+FINE_SMOOTHNESS = 2.5
+MIN_SD_PX = 1e-3  # of a field
+# Ranges of the correlation lengths relative to the longer side of the image.
+REACH_RANGE = (0.02, 1.0)
+FINE_RANGE = (0.012, 0.2)
+# Prior of the short field: scales of the inverse of its correlation length, over the inverse of
+# the extent of the sines, and of its standard deviation [px]. Their densities are exponential
+# (Fuglstad et al., "Constructing priors that penalize the complexity of Gaussian random fields",
+# JASA 114, 2019), so that it only exists where the observations need it.
+FINE_PER_EXTENT = 15.0
+FINE_PX = 0.5
+# Short fields that may have been missed: their standard deviation [px], their correlation lengths
+# relative to the image, and the gain of the logarithm of the likelihood from which they exist.
+SEARCH_PX = 0.1
+SEARCH_REACH = (0.03, 0.06, 0.12)
+MIN_SEARCH_GAIN = 3.0
+START_REACH = 0.15
+START_FINE_SHARE = 0.1  # of the standard deviation of the long field
+SHOWN_PX = 0.2  # standard deviation of a short field that residuals show, to start with
+MAX_STEP = 0.8  # of the logarithm of a standard deviation or length
+STEPS = 4  # of the likelihood in one renewal
+RIPPLE_STEPS = 2  # of the variances of ripples in one renewal
+MIN_DETERMINED = 1e-3  # least number of coefficients that a sum counts as determined
+# Frequencies of a quadrature, from the lowest to so many times it.
+QUADRATURE = 120
+SHORTEST = 30.0
+MIN_GAIN = 0.1  # of the logarithm of the likelihood that is worth another step
+RIDGE = 0.05  # least damping: added to the expected curvature, it keeps what hardly matters
+
+
+@dataclass(frozen=True)
+class Signal:
+    """Standard deviations [px] and correlation lengths [px] of the long and the short field.
+
+    smoothness: nu of the long field. ripples: further variances of the sines of some bands; they
+    are no part of the fields.
+    """
+
+    sd: float
+    reach: float
+    fine_sd: float = 0.0
+    fine_reach: float = 1.0
+    smoothness: float = SMOOTHNESS
+    ripples: Ripples | None = None
+
+    @property
+    def fields(self) -> tuple[tuple[float, float, float], ...]:
+        """Standard deviation, correlation length and smoothness of each field."""
+        long = (self.sd, self.reach, self.smoothness)
+        fine = (self.fine_sd, self.fine_reach, FINE_SMOOTHNESS)
+        return (long, fine) if self.fine_sd else (long,)
+
+    def density(self, frequency: np.ndarray) -> NDArray[np.float64]:
+        """Variances (s,) of the coefficients by the fields alone."""
+        return np.sum([spectral_density(frequency, *field) for field in self.fields], axis=0)
+
+    def variance(self, frequency: np.ndarray) -> NDArray[np.float64]:
+        """Prior variances (s,) of the coefficients of sines of frequency (s,) [1/px]."""
+        return np.maximum(self.density(frequency) + self.of_ripples(frequency), ABSENT_VARIANCE)
+
+    def of_ripples(self, frequency: np.ndarray) -> NDArray[np.float64]:
+        """Parts (s,) of these variances that are those of the ripples."""
+        if self.ripples is None:
+            return np.zeros_like(frequency)
+        return self.ripples.variance(frequency)
+
+    def sd_beyond(self, frequency: float) -> float:
+        """Standard deviation [px] of the part of the signal with larger frequencies [1/px].
+
+        It is the integral of the spectral density of the fields over the plane outside of a
+        circle: the sines of ripples are all in the series.
+        """
+        variance = 0.0
+        for sd, reach, nu in self.fields:
+            a = 2 * nu / reach**2
+            variance += sd**2 * (a / (a + frequency**2)) ** nu
+        return float(np.sqrt(variance))
+
+    def correlation_beyond(self, frequency: float, distance: np.ndarray) -> NDArray[np.float64]:
+        """Correlation (n,) of that part at distances (n,) [px]: its Hankel transform.
+
+        Ripples shorter than the distance of image points hardly show in products of neighbours.
+        """
+        f = frequency * np.geomspace(1, SHORTEST, QUADRATURE)
+        weight = self.density(f) * f**2  # f df on a geometric grid
+        return j0(np.outer(distance, f)) @ weight / np.sum(weight)
+
+    def with_short_field(self, side: float) -> Signal:
+        """Return a signal with a short field to start with; side: of the image [px]."""
+        return replace(self, fine_sd=SHOWN_PX, fine_reach=min(SEARCH_REACH) * side)
+
+    def without_short_field(self, side: float) -> Signal:
+        """Return a signal whose short field starts anew, very small; side: of the image [px]."""
+        return replace(self, fine_sd=MIN_SD_PX, fine_reach=SEARCH_REACH[1] * side)
+
+    def change(self, other: Signal, frequency: np.ndarray) -> float:
+        """Mean change of the logarithms of the variances at frequency (s,) from another signal."""
+        ratio = self.variance(frequency) / other.variance(frequency)
+        return float(np.mean(np.abs(np.log(ratio))))
+
+
+def spectral_density(
+    frequency: np.ndarray, sd: float, reach: float, nu: float = SMOOTHNESS
+) -> NDArray[np.float64]:
+    """Variances (s,) of the coefficients of sines: Matern's covariance in two dimensions.
+
+    frequency (s,) [1/px]; sd, reach [px]; nu: smoothness (Rasmussen and Williams 2006, Eq. 4.15
+    for D = 2).
+    """
+    a = 2 * nu / reach**2
+    return sd**2 * 4 * np.pi * nu / a * (a / (a + frequency**2)) ** (nu + 1)
+
+
+def starting_signal(sd: float, side: float) -> Signal:
+    """Return a signal to start with; sd: standard deviation of the long field, side [px]."""
+    return Signal(sd, START_REACH * side, START_FINE_SHARE * sd, SEARCH_REACH[1] * side)
+
+
+def _parameters(signal: Signal) -> np.ndarray:
+    """Logarithms (5,) of the parameters of a signal."""
+    fine = [signal.fine_sd, signal.fine_reach]
+    return np.log([signal.sd, signal.reach, *fine, signal.smoothness])
+
+
+def _slopes(signal: Signal, frequency: np.ndarray) -> np.ndarray:
+    """Derivatives (s, 5) of the logarithms of the variances by those of the parameters."""
+    out = []
+    for sd, reach, nu in signal.fields:
+        a = 2 * nu / reach**2
+        density = spectral_density(frequency, sd, reach, nu)
+        part = a / (a + frequency**2)
+        by_reach = 2 * (nu + 1) * part - 2 * nu
+        by_smoothness = 1 + nu + nu * np.log(part) - (nu + 1) * part
+        out += [2 * density, by_reach * density, by_smoothness * density]
+    long, fine = out[:3], out[3:]
+    columns = [*long[:2], *fine[:2], long[2]]
+    return np.stack(columns, axis=1) / signal.variance(frequency)[:, None]
+
+
+@dataclass(frozen=True)
+class SignalEquations:
+    """Normal equations of all coefficients of a series, with every prior but that of the signal.
+
+    Attributes
+    ----------
+    frequency : (s,) ndarray
+        Frequencies of the sines [1/px].
+    information, right : (p, p) and (p,) ndarray
+    columns : (2 s,) ndarray of int
+        Places of the coefficients of the sines, those of u first.
+    """
+
+    frequency: NDArray[np.float64]
+    information: NDArray[np.float64]
+    right: NDArray[np.float64]
+    columns: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class _Likelihood:
+    """Marginal likelihood of a signal, with the priors of its parameters.
+
+    cost: its negative logarithm, without constants; slopes (5,) and curvature (5, 5) by the
+    logarithms of the parameters.
+    """
+
+    cost: float
+    slopes: np.ndarray
+    curvature: np.ndarray
+
+
+def most_likely_signal(
+    signal: Signal, coefficients: SignalEquations, side: float, search: bool = False
+) -> Signal:
+    """Return a signal with a larger marginal likelihood.
+
+    Parameters
+    ----------
+    signal : Signal
+        Present one.
+    coefficients : SignalEquations
+    side : float
+        Longer side of the image [px].
+    search : bool
+        Whether to start from several short fields too. One that has vanished cannot return by
+        itself, and a rough long field may have taken its place.
+
+    Returns
+    -------
+    Signal
+    """
+    cost, found = _more_likely(signal, coefficients, side)
+    if found.ripples is not None:
+        found = _with_likely_ripples(found, found.ripples, coefficients)
+    if not search:
+        return found
+    for reach in SEARCH_REACH:
+        for smoothness in (found.smoothness, SMOOTHNESS):
+            start = replace(
+                found, fine_sd=SEARCH_PX, fine_reach=reach * side, smoothness=smoothness
+            )
+            there, other = _more_likely(start, coefficients, side)
+            if there < cost - MIN_SEARCH_GAIN:
+                cost = there
+                found = other
+    return found
+
+
+def _more_likely(
+    signal: Signal, coefficients: SignalEquations, side: float
+) -> tuple[float, Signal]:
+    """Return cost and signal after some steps of Fisher scoring."""
+    low, high = _ranges(side)
+    at = np.clip(_parameters(signal), low, high)
+    here = _likelihood(at, coefficients, ripples=signal.ripples)
+    if here is None:
+        return np.inf, signal
+    damping = RIDGE
+    for _ in range(STEPS):
+        step = np.linalg.solve(here.curvature + damping * np.eye(len(at)), -here.slopes)
+        step = step / max(1.0, np.max(np.abs(step)) / MAX_STEP)
+        trial = np.clip(at + step, low, high)
+        there = _likelihood(trial, coefficients, here.cost, signal.ripples)
+        if there is None or there.cost > here.cost:
+            damping *= 30
+            continue
+        gain = here.cost - there.cost
+        at = trial
+        here = there
+        damping = max(RIDGE, damping / 10)
+        if gain < MIN_GAIN:
+            break
+    return here.cost, _signal(at, signal.ripples)
+
+
+def _signal(at: np.ndarray, ripples: Ripples | None) -> Signal:
+    """Signal with these logarithms (5,) of its parameters."""
+    sd, reach, fine_sd, fine_reach, smoothness = (float(value) for value in np.exp(at))
+    return Signal(
+        sd, reach, fine_sd=fine_sd, fine_reach=fine_reach, smoothness=smoothness, ripples=ripples
+    )
+
+
+def _with_likely_ripples(
+    signal: Signal, ripples: Ripples, coefficients: SignalEquations
+) -> Signal:
+    """Return the signal with ripples of a larger marginal likelihood (MacKay 1992).
+
+    The variance of a band is the square sum of its coefficients over the number of those that the
+    observations determine.
+    """
+    frequency = coefficients.frequency
+    band = ripples.band(frequency)
+    for _ in range(RIPPLE_STEPS):
+        variance = np.tile(signal.variance(frequency), 2)
+        found = _posterior(variance, coefficients)
+        if found is None:
+            return signal
+        mean, square = (np.sum(a.reshape(2, -1), axis=0) for a in (found.mean**2, found.variance))
+        determined = np.clip(2 - square / variance[: len(frequency)], MIN_DETERMINED, 2)
+        count = len(ripples.variances)
+        sums = [np.bincount(band, a, count)[:count] for a in (mean, determined)]
+        fields = signal.density(np.arange(count) * ripples.width)
+        values = np.maximum(
+            sums[0] / np.maximum(sums[1], MIN_DETERMINED) - fields, ABSENT_VARIANCE
+        )
+        ripples = ripples.with_variances(values)
+        signal = replace(signal, ripples=ripples)
+    return signal
+
+
+def _ranges(side: float) -> tuple[np.ndarray, np.ndarray]:
+    """Least and largest logarithms (5,) of the parameters; side: of the image [px]."""
+    return (
+        np.log(
+            [
+                MIN_SD_PX,
+                REACH_RANGE[0] * side,
+                MIN_SD_PX,
+                FINE_RANGE[0] * side,
+                SMOOTHNESS_RANGE[0],
+            ]
+        ),
+        np.log([side, REACH_RANGE[1] * side, side, FINE_RANGE[1] * side, SMOOTHNESS_RANGE[1]]),
+    )
+
+
+@dataclass(frozen=True)
+class _Posterior:
+    """Coefficients of the sines, with a prior.
+
+    cost: negative logarithm of the marginal likelihood, without constants; mean and variance
+    (2 s,): of the coefficients.
+    """
+
+    cost: float
+    mean: np.ndarray
+    variance: np.ndarray
+
+
+def _posterior(
+    variance: np.ndarray, coefficients: SignalEquations, limit: float = np.inf
+) -> _Posterior | None:
+    """Return the posterior for prior variances (2 s,).
+
+    None where there is none, or where its cost is found to be above a limit.
+    """
+    columns = coefficients.columns
+    matrix = coefficients.information.copy(order='F')
+    matrix[columns, columns] += 1 / variance
+    factor, failed = lapack.dpotrf(matrix, lower=1, overwrite_a=1)
+    if failed:
+        return None
+    z = solve_triangular(factor, coefficients.right, lower=True, check_finite=False)
+    cost = np.sum(np.log(np.diagonal(factor))) + np.sum(np.log(variance)) / 2 - z @ z / 2
+    if not np.isfinite(cost) or cost > limit:  # the priors only add to it
+        return None
+    mean = solve_triangular(factor, z, trans='T', lower=True, check_finite=False)[columns]
+    inverse, failed = lapack.dtrtri(factor, lower=1, overwrite_c=1)
+    if failed:
+        return None
+    # Columns are contiguous, and what is above the diagonal is zero.
+    return _Posterior(float(cost), mean, np.sum(np.square(inverse, out=inverse), axis=0)[columns])
+
+
+def _likelihood(
+    at: np.ndarray,
+    coefficients: SignalEquations,
+    limit: float = np.inf,
+    ripples: Ripples | None = None,
+) -> _Likelihood | None:
+    """Return the likelihood at logarithms (5,) of the parameters, with given ripples.
+
+    None where there is none, or where its cost is found to be above a limit.
+    """
+    signal = _signal(at, ripples)
+    frequency = coefficients.frequency
+    variance = np.tile(signal.variance(frequency), 2)
+    found = _posterior(variance, coefficients, limit)
+    if found is None:
+        return None
+    slopes = np.tile(_slopes(signal, frequency), (2, 1))
+    determined = np.clip(1 - found.variance / variance, 0, 1)
+    likelihood = _Likelihood(
+        found.cost,
+        slopes.T @ (1 - (found.mean**2 + found.variance) / variance) / 2,
+        (slopes * (determined**2)[:, None]).T @ slopes / 2,
+    )
+    return _with_priors(likelihood, at, np.pi / frequency.min())
+
+
+def _with_priors(likelihood: _Likelihood, at: np.ndarray, extent: float) -> _Likelihood:
+    """Return the posterior of logarithms (5,) of the parameters; extent: of the sines [px]."""
+    _, _, fine_sd, fine_reach, smoothness = at
+    large = np.exp(fine_sd) / FINE_PX
+    short = extent / np.exp(fine_reach) / FINE_PER_EXTENT
+    rough = (smoothness - np.log(SMOOTHNESS)) / SMOOTHNESS_SD
+    return _Likelihood(
+        likelihood.cost + float(large + short + rough**2 / 2),
+        likelihood.slopes + [0, 0, large, -short, rough / SMOOTHNESS_SD],
+        likelihood.curvature + np.diag([0, 0, large, short, SMOOTHNESS_SD**-2]),
+    )

@@ -1,0 +1,237 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Start values of the exterior orientations of one fluoroscope, and of its principal distance.
+
+An exposure of targets in space starts with a direct linear transformation, one of targets in a
+plane with a homography, in the better of its two poses. Where the targets are few or nearly in a
+plane, minimal samples with the interior orientation known (P3P) compete with both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.series import Functions
+from ..errors import DataError
+from ..exposures.frame import Frame
+from ..findings import Finding, Kind
+from ..photogrammetry.collinearity import project
+from ..photogrammetry.noise import Noise
+from ..photogrammetry.plane_resection import (
+    Plane,
+    flatness,
+    mirrored_pose,
+    plane_of,
+    poses_of_homography,
+    principal_distance_of_planes,
+    robust_homography,
+)
+from ..photogrammetry.resection import (
+    MIN_FLATNESS,
+    NU,
+    Resection,
+    principal_distance_of,
+    refine_resection,
+    resect,
+    robust_dlt,
+    robust_p3p,
+)
+
+# Below this flatness the plane of the targets is tried too.
+NEARLY_FLAT = 0.08
+START_TOLERANCE = 1e-2  # a tenth of a standard deviation: the adjustment goes on from there
+# With fewer targets a direct linear transformation may be far off.
+FEW_TARGETS = 20
+# Rounds in which poses of planes and a preliminary correction are estimated in turn, and the
+# degree of its polynomials.
+ROUNDS = 4
+DEGREE = 3
+# Principal distances over the longer side of the image that a fluoroscope can have.
+DISTANCES = (0.5, 30.0)
+
+UNTILTED = Finding(
+    Kind.UNTILTED_TARGETS,
+    'the targets are flat and not tilted, so that the principal distance cannot be found',
+    advice='tilt the target by 20 degrees and more, or give the principal distance',
+)
+
+
+@dataclass(frozen=True)
+class View:
+    """The targets of an exposure, and what is known of it before any orientation.
+
+    Attributes
+    ----------
+    frame : Frame
+    xyz : (n, 3) ndarray
+        Targets [mm].
+    uv : (n, 2) ndarray
+        Image points without distortion, as far as that is known [px].
+    projection : (3, 4) ndarray or None
+        Where the targets are not in a plane.
+    plane : Plane or None
+        Where the targets are nearly in a plane.
+    plane_image : (3, 3) ndarray or None
+        Homography of the plane.
+    error : Finding or None
+        Why neither is known.
+    """
+
+    frame: Frame
+    xyz: NDArray[np.float64]
+    uv: NDArray[np.float64]
+    projection: NDArray[np.float64] | None = None
+    plane: Plane | None = None
+    plane_image: np.ndarray | None = None
+    error: Finding | None = None
+
+    @property
+    def is_flat(self) -> bool:
+        """Whether the targets lie in one plane."""
+        return self.projection is None and self.plane_image is not None
+
+    @property
+    def needs_samples(self) -> bool:
+        """Whether a direct linear transformation may be far off."""
+        return len(self.xyz) < FEW_TARGETS or self.plane is not None
+
+
+def view_of(frame: Frame, xyz: np.ndarray, uv: np.ndarray) -> View:
+    """Return the view of an exposure."""
+    flat = flatness(xyz)
+    view = View(frame, xyz, uv)
+    try:
+        if flat >= MIN_FLATNESS:
+            view = replace(view, projection=robust_dlt(xyz, uv))
+        if flat < NEARLY_FLAT:
+            plane = plane_of(xyz)
+            image = robust_homography(plane.coordinates(xyz), uv)
+            view = replace(view, plane=plane, plane_image=image)
+    except DataError as error:
+        return replace(view, error=error.finding)
+    return view
+
+
+def principal_distance_of_views(
+    views: Sequence[View], principal_point: np.ndarray, image_size: tuple[int, int]
+) -> float:
+    """Return the principal distance [px] that views show, those in space before those of planes.
+
+    Raises DataError where there are only planes that are not tilted.
+    """
+    solid = [v.projection for v in views if v.projection is not None and not v.needs_samples]
+    in_space = solid or [v.projection for v in views if v.projection is not None]
+    distances = [principal_distance_of(projection) for projection in in_space]
+    if distances:
+        return float(np.median(distances))
+    planes = [v.plane_image for v in views if v.plane_image is not None]
+    found = principal_distance_of_planes(planes, principal_point) if planes else None
+    low, high = (factor * max(image_size) for factor in DISTANCES)
+    if found is None or not low <= found <= high:
+        raise DataError(UNTILTED)
+    return found
+
+
+def orient_view(view: View, interior: np.ndarray) -> Resection:
+    """Return the exterior orientation of a view with the smallest residuals. Raises DataError."""
+    if view.projection is not None and not view.needs_samples:
+        return resect(view.xyz, view.uv, interior, view.projection, tolerance=START_TOLERANCE)
+    found = []
+    errors: list[Finding] = []
+    for start in _starts(view, interior):
+        try:
+            found.append(start())
+        except DataError as error:
+            errors.append(error.finding)
+        except np.linalg.LinAlgError as error:
+            errors.append(Finding(Kind.NOT_ORIENTED, str(error)))
+    if not found:
+        raise DataError(errors[0] if errors else view.error)
+    return min(found, key=lambda one: one.scale)
+
+
+def _starts(view: View, interior: np.ndarray) -> list[Callable[[], Resection]]:
+    """Return the resections that compete."""
+    xyz = view.xyz
+    uv = view.uv
+    out: list[Callable[[], Resection]] = []
+    if view.projection is not None:
+        out.append(lambda: resect(xyz, uv, interior, view.projection))
+    if view.plane_image is not None and view.plane is not None:
+        for pose in poses_of_homography(view.plane_image, view.plane, interior):
+            out.append(partial(refine_resection, xyz, uv, interior, *pose))
+    if not view.is_flat:
+        out.append(lambda: refine_resection(xyz, uv, interior, *robust_p3p(xyz, uv, interior)))
+    return out
+
+
+def settle_planes(
+    views: Sequence[View], found: Sequence[Resection | None], interior: np.ndarray
+) -> list[Resection | None]:
+    """Return resections in which views of planes have the better of their two poses.
+
+    Distortion bends a plane as a tilt does. It is the same in all exposures: a preliminary
+    correction of all residuals, and the poses with it, are estimated in turn.
+    """
+    out = list(found)
+    if not any(view.is_flat and one is not None for view, one in zip(views, out)):
+        return out
+    for _ in range(ROUNDS):
+        correct = _preliminary_correction(views, out, interior)
+        for row, (view, present) in enumerate(zip(views, out)):
+            if present is not None:
+                corrected = replace(view, uv=view.uv - correct(view.uv))
+                out[row] = _better_pose(corrected, present, interior)
+    return out
+
+
+def _better_pose(view: View, present: Resection, interior: np.ndarray) -> Resection:
+    """Return the pose of a view refined; of a plane the better of its two."""
+    starts = [(present.rotation, present.position_mm)]
+    if view.is_flat and view.plane is not None:
+        starts.append(mirrored_pose(*starts[0], view.plane))
+    refined = []
+    for start in starts:
+        try:
+            refined.append(refine_resection(view.xyz, view.uv, interior, *start))
+        except (DataError, np.linalg.LinAlgError):
+            continue
+    return min(refined, key=lambda one: one.scale, default=present)
+
+
+def _preliminary_correction(
+    views: Sequence[View], found: Sequence[Resection | None], interior: np.ndarray
+) -> Callable[[np.ndarray], np.ndarray]:
+    """Return a polynomial correction fitted robustly to the residuals of all views."""
+    functions = Functions(views[0].frame.image_size, DEGREE)
+    pixels = []
+    residuals = []
+    for view, one in zip(views, found):
+        if one is None:
+            continue
+        n = len(view.xyz)
+        predicted = project(
+            np.broadcast_to(one.rotation, (n, 3, 3)),
+            np.broadcast_to(one.position_mm, (n, 3)),
+            view.xyz,
+            interior,
+        )
+        in_front = np.isfinite(predicted).all(axis=1)
+        pixels.append(view.uv[in_front])
+        residuals.append((view.uv - predicted)[in_front])
+    basis = functions(np.concatenate(pixels))
+    values = np.concatenate(residuals)
+    weight = np.ones(len(values))
+    for _ in range(ROUNDS):
+        root = np.sqrt(weight)[:, None]
+        coefficients = np.linalg.lstsq(root * basis, root * values, rcond=1e-9)[0]
+        squared = np.sum((values - basis @ coefficients) ** 2, axis=1)
+        variance = max(float(np.median(squared)) / (2 * np.log(2)), 1e-12)
+        weight = Noise(nu=NU).weight(squared / variance)
+    return lambda uv: functions(uv) @ coefficients

@@ -1,0 +1,245 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What the program finds, as data: kind, place, cause, advice, severity and numbers.
+
+A Finding travels from where it is made to the edge (command, report, file, message), which prints
+its sentence. Whatever decides by a finding reads its kind and numbers, never the sentence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from enum import Enum, IntEnum
+
+
+class Severity(IntEnum):
+    """How much a finding matters; the values are the levels of diagnostics and of DriftStatus."""
+
+    NOTE = 0
+    WARNING = 1
+    ERROR = 2
+
+
+class Kind(str, Enum):
+    """Kind of a finding; the values are written to files and stay the same between versions."""
+
+    # Data that cannot be read or used, of no other kind.
+    DATA = 'data'
+
+    # Checks of a verdict; the values are the names of the checks in validation.json.
+    BEADS = 'beads'
+    DISTANCES = 'distances'
+    DRIFT = 'drift'
+    EXPOSURES = 'exposures'
+    GIVEN_INTERIOR = 'given_interior'
+    HALVES = 'halves'
+    HELD_OUT = 'held_out'
+    PRECISION = 'precision'
+    VALIDATION = 'validation'
+    VARIATION = 'variation'
+    WHITENESS = 'whiteness'
+    WORST_AREA = 'worst_area'
+
+    # Exposures, image points and targets that are excluded from a calibration.
+    COPIED_EXPOSURE = 'copied_exposure'
+    FALSE_MATCHES = 'false_matches'
+    FEW_RAYS = 'few_rays'
+    FEW_TARGETS = 'few_targets'
+    NOT_ORIENTED = 'not_oriented'
+    POOR_FIT = 'poor_fit'
+    SHARED_EXPOSURE = 'shared_exposure'
+    STRAY_POINTS = 'stray_points'
+
+    # Observations that do not suffice.
+    FEW_EXPOSURES = 'few_exposures'
+    ONE_POSE = 'one_pose'
+    UNDETERMINED = 'undetermined'
+    UNTILTED_TARGETS = 'untilted_targets'
+
+    # Input that cannot be right.
+    DUPLICATE_NAME = 'duplicate_name'
+    FRAMES_SHIFTED = 'frames_shifted'
+    IDS_REVERSED = 'ids_reversed'
+    IDS_SHIFTED = 'ids_shifted'
+    IMAGE_MIRRORED = 'image_mirrored'
+    IMAGE_TRANSPOSED = 'image_transposed'
+    IMPLAUSIBLE_NUMBER = 'implausible_number'
+    MIXED_UNITS = 'mixed_units'
+    OTHER_PHANTOM = 'other_phantom'
+    REMOTE_TARGETS = 'remote_targets'
+    REPEATED_COORDINATES = 'repeated_coordinates'
+    SOURCE_TOO_NEAR = 'source_too_near'
+    WRONG_IMAGE_SIZE = 'wrong_image_size'
+    WRONG_KNOWN_ORIENTATION = 'wrong_known_orientation'
+    WRONG_UNIT = 'wrong_unit'
+
+    # Results that are impossible.
+    FEW_INLIERS = 'few_inliers'
+    FLUOROSCOPES_INTERCHANGED = 'fluoroscopes_interchanged'
+    INTERIOR_UNDETERMINED = 'interior_undetermined'
+    LARGE_RESIDUALS = 'large_residuals'
+    PRINCIPAL_POINT_OFF = 'principal_point_off'
+    WRONG_PRINCIPAL_DISTANCE = 'wrong_principal_distance'
+
+    # A fixed calibration and other exposures.
+    CORRECTED_ALREADY = 'corrected_already'
+    POOR_CALIBRATION_FIT = 'poor_calibration_fit'
+
+    # Orientation of the rig.
+    NO_COMMON_TARGETS = 'no_common_targets'
+    PAIRS_CONTRADICT = 'pairs_contradict'
+    PAIRS_EXCLUDED = 'pairs_excluded'
+    RAYS_DO_NOT_MEET = 'rays_do_not_meet'
+    RIG_DEPENDS_ON_ANGLE = 'rig_depends_on_angle'
+    RIG_MOVED = 'rig_moved'
+    RIG_NOTE = 'rig_note'  # one or more of these, as a file tells them
+    RIG_NOT_ORIENTED = 'rig_not_oriented'
+
+    # Images of the phantom.
+    BEADS_NOT_MEASURED = 'beads_not_measured'
+    FEW_BEADS = 'few_beads'
+    IMAGE_ENCODING = 'image_encoding'
+    IMAGE_EMPTY = 'image_empty'
+    NO_POSE = 'no_pose'
+    POSE_AMBIGUOUS = 'pose_ambiguous'
+    POSE_UNSURE = 'pose_unsure'
+
+    # Predicted beads of the phantom that are not observed.
+    BEAD_ALONE = 'bead_alone'
+    BEAD_AWAY = 'bead_away'
+    BEAD_CONTRAST = 'bead_contrast'
+    BEAD_DISTURBED = 'bead_disturbed'
+    BEAD_HIDDEN = 'bead_hidden'
+    BEAD_LOST = 'bead_lost'
+    BEAD_UNSURE = 'bead_unsure'
+
+    # Ids of markers that may be wrong, and markers that are not seen.
+    MARKER_FOUND_AGAIN = 'marker_found_again'
+    MARKER_MOVES_ALONE = 'marker_moves_alone'
+    FEW_MARKERS = 'few_markers'
+    NO_MARKERS = 'no_markers'
+    OTHER_VIEW_MISSING = 'other_view_missing'
+    OTHER_SHADOW = 'other_shadow'
+    SHADOWS_MET = 'shadows_met'
+
+    # Files that do not belong together.
+    EDITED_RESULT = 'edited_result'
+    EXCHANGED_CALIBRATION = 'exchanged_calibration'
+    NOT_IN_BOTH = 'not_in_both'
+    WRONG_FORMAT = 'wrong_format'
+
+    # Drift of an image, live or in a recording.
+    CLUSTER_CHANGE = 'cluster_change'
+    IMAGE_DRIFT = 'image_drift'
+    LEARNING = 'learning'
+    NO_DRIFT = 'no_drift'
+    NOT_WATCHED = 'not_watched'
+    SHORT_RECORDING = 'short_recording'
+
+
+@dataclass(frozen=True)
+class Place:
+    """What a finding is about.
+
+    Attributes
+    ----------
+    fluoroscopes : tuple of str
+    exposures : tuple of int
+        Their numbers.
+    target_id : tuple of int
+    pixel : (float, float) or None
+        (u, v).
+    name : str or None
+        What the place is called in a sentence; None: fluoroscopes and exposures; '': the cause
+        names it.
+    """
+
+    fluoroscopes: tuple[str, ...] = ()
+    exposures: tuple[int, ...] = ()
+    target_id: tuple[int, ...] = ()
+    pixel: tuple[float, float] | None = None
+    name: str | None = None
+
+    @classmethod
+    def at(cls, fluoroscope: str, uv: Iterable[float]) -> Place:
+        """Return the place of a pixel (2,) in the images of a fluoroscope."""
+        u, v = uv
+        return cls((fluoroscope,), pixel=(float(u), float(v)))
+
+    @property
+    def fluoroscope(self) -> str:
+        """The only or first fluoroscope, '' for none."""
+        return self.fluoroscopes[0] if self.fluoroscopes else ''
+
+    def __str__(self) -> str:
+        parts = (_named('fluoroscope', self.fluoroscopes), _named('exposure', self.exposures))
+        return ', '.join(filter(None, parts)) if self.name is None else self.name
+
+
+@dataclass(frozen=True)
+class Finding:
+    """What was found.
+
+    Attributes
+    ----------
+    kind : Kind
+    cause : str
+        What was found, in words.
+    place : Place
+    advice : str
+        What to do; '' for nothing.
+    severity : Severity
+    numbers : mapping of str to float
+        What was measured, by name, with the unit at the end of the name.
+    """
+
+    kind: Kind
+    cause: str
+    place: Place = Place()
+    advice: str = ''
+    severity: Severity = Severity.ERROR
+    numbers: Mapping[str, float] = field(default_factory=dict, hash=False)
+
+    @property
+    def sentence(self) -> str:
+        """Place, cause and advice in a sentence for people."""
+        return sentence_of(self.place, self.cause, self.advice)
+
+    def __str__(self) -> str:
+        return self.sentence
+
+    def at(self, where: object) -> Finding:
+        """Return the finding with what names its place put in front, such as a path."""
+        if not str(where):
+            return self
+        return replace(self, place=replace(self.place, name=sentence_of(where, self.place)))
+
+    def explained_by(self, why: Finding | None) -> Finding:
+        """Return the finding at its place with the kind, cause and numbers of why, if known."""
+        if why is None:
+            return self
+        numbers = {**self.numbers, **why.numbers}
+        cause = f'{self.cause}; {why.cause}'
+        return replace(self, kind=why.kind, cause=cause, advice=why.advice, numbers=numbers)
+
+
+def sentences(findings: Iterable[Finding], severity: Severity | None = None) -> list[str]:
+    """Return the sentences of findings, of one severity or of all."""
+    return [one.sentence for one in findings if severity is None or one.severity is severity]
+
+
+def sentence_of(*parts: object) -> str:
+    """Return place, cause and advice as a sentence, without those that are empty."""
+    return ': '.join(filter(None, map(str, parts)))
+
+
+def _named(noun: str, things: tuple[object, ...]) -> str:
+    """Return things with their noun, '' for none."""
+    *others, last = map(str, things) if things else ('',)
+    both = f'{", ".join(others)} and {last}' if others else last
+    return f'{noun}{"s" * bool(others)} {both}' if things else ''

@@ -1,0 +1,357 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""From a radiograph to observations: detect, match, measure all predicted beads, check."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..errors import DataError
+from ..findings import Finding, Kind
+from .detection import Detections, detect_beads
+from .following import Far, follow
+from .growth import Match, Seen, smoothed, supported
+from .matching import PhantomModel, match
+from .measurement import FIRST_STEPS, STEPS, estimate_noise, estimate_profile, measure_beads
+from .shadow_fit import Beads, Noise
+from .shadow_profile import Profile
+from .view import Lens, View, fit_view
+
+MAX_SIGMA_PX = 0.3
+MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
+MAX_MISFIT = 5.0
+DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for that of a typical one
+RESIDUAL_SIGMAS = 4.5  # from the prediction by neighbours
+FIRST_RESIDUAL_PX = 2.5
+MIN_ACCEPTED = 0.5  # of the matched beads that are measured well
+MIN_SCATTER_PX = 0.05
+# Why predicted beads are not observed, where no number belongs to it.
+LOST = Finding(Kind.BEAD_LOST, 'cut off, or lost while it was measured')
+DISTURBED = Finding(Kind.BEAD_DISTURBED, 'something else is beside it')
+HIDDEN = Finding(Kind.BEAD_HIDDEN, 'hidden by another bead')
+ALONE = Finding(Kind.BEAD_ALONE, 'its neighbours are not found')
+
+
+@dataclass(frozen=True)
+class Refusal:
+    """A predicted bead without observation: its row, the prediction (2,) [px], and why."""
+
+    bead: int
+    uv: np.ndarray
+    finding: Finding
+
+
+@dataclass(frozen=True)
+class Extraction:
+    """Observations of one radiograph.
+
+    Attributes
+    ----------
+    bead : (n,) ndarray of int
+        Rows of the phantom.
+    uv : (n, 2) ndarray
+        Centres [px].
+    sigma : (n,) ndarray
+        Standard deviation of a coordinate [px].
+    overlapped : (n,) ndarray of bool
+        The shadow of another bead reaches into that of the bead.
+    refused : tuple of Refusal
+    view : View
+    detections : Detections
+    match : Match
+    profile : Profile
+    noise : Noise
+    followed : bool
+        The pose comes from the exposure before, not from a search.
+    """
+
+    bead: NDArray[np.int64]
+    uv: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    overlapped: NDArray[np.bool_]
+    refused: tuple[Refusal, ...]
+    view: View
+    detections: Detections
+    match: Match
+    profile: Profile
+    noise: Noise
+    followed: bool = False
+
+    @property
+    def nearby(self) -> Nearby:
+        """What an exposure nearby begins with."""
+        found = self.detections
+        return Nearby(
+            self.view,
+            self.match.scale_px,
+            profile=self.profile,
+            noise=self.noise,
+            radius_px=found.radius_px,
+            inverted=found.inverted,
+        )
+
+
+@dataclass(frozen=True)
+class Nearby:
+    """What is taken over from an exposure nearby, such as the previous one of a video.
+
+    Attributes
+    ----------
+    view : View
+    scale_px : float
+        Robust standard deviation of its residuals [px].
+    profile : Profile
+    noise : Noise
+    radius_px : float
+        Of a bead.
+    inverted : bool
+        Beads are bright.
+    far : Far or None
+        For images that were left out since.
+    """
+
+    view: View
+    scale_px: float
+    profile: Profile
+    noise: Noise
+    radius_px: float
+    inverted: bool
+    far: Far | None = None
+
+
+def extract_beads(
+    image: np.ndarray, model: PhantomModel, lens: Lens, near: Nearby | None = None
+) -> Extraction:
+    """Extract the beads of a phantom from a radiograph.
+
+    Parameters
+    ----------
+    image : (h, w) ndarray of uint8 or uint16
+    model : PhantomModel
+    lens : Lens
+    near : Nearby, optional
+        The exposure before. Where the phantom has moved little since then, this is several times
+        faster; elsewhere its pose is searched for as without it.
+
+    Returns
+    -------
+    Extraction
+
+    Raises
+    ------
+    DataError
+        Where there is no phantom in the image, or its pose is not sure, with the reason.
+    """
+    if near is not None:
+        followed = _followed(image, model, near)
+        if followed is not None:
+            return followed
+    detections = detect_beads(image)
+    seen = _seen(detections)
+    found = match(seen, model, lens)
+    noise = estimate_noise(detections.light, detections.field)
+    return _measured(detections, seen, found, model, _Imaging(noise))
+
+
+def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extraction | None:
+    """Return the extraction from an exposure nearby, None where it does not lead to the pose."""
+    try:
+        detections = detect_beads(image, near.radius_px, near.inverted)
+        if image.shape != near.view.lens.image_size[::-1]:
+            return None
+        seen = _seen(detections)
+        found = follow(seen, model, near.view, near.scale_px, near.far)
+        if found is None:
+            return None
+        imaging = _Imaging(near.noise, near.profile)
+        followed = _measured(
+            detections, seen, found=found, model=model, imaging=imaging, passes=(STEPS,)
+        )
+    except DataError:
+        return None
+    return replace(followed, followed=True)
+
+
+def _seen(detections: Detections) -> Seen:
+    return Seen.of(detections.uv, detections.field, detections.radius_px, detections.strength)
+
+
+@dataclass(frozen=True)
+class _Imaging:
+    """What is known of noise and shadows before beads are measured."""
+
+    noise: Noise
+    profile: Profile | None = None
+
+
+def _measured(
+    detections: Detections,
+    seen: Seen,
+    found: Match,
+    model: PhantomModel,
+    imaging: _Imaging,
+    passes: tuple[int, ...] = (FIRST_STEPS, STEPS),
+) -> Extraction:
+    """Measure all predicted beads, by default twice: the second time from a better prediction."""
+    view = found.view
+    predicted = found.predicted
+    bead = found.bead
+    uv = seen.uv[found.detection]
+    light = detections.light
+    noise = imaging.noise
+    profile = imaging.profile
+    for steps in passes:
+        rows = np.flatnonzero(seen.in_field(predicted))
+        start = _starts(predicted, rows, bead, uv, seen)
+        radius = _relative_radius(view, model)
+        if profile is None:
+            known = np.isin(rows, bead)
+            profile = estimate_profile(
+                light, detections.field, start[known], radius[rows[known]], seen.radius_px
+            )
+        beads = measure_beads(
+            light,
+            detections.field,
+            uv=start,
+            relative_radius=radius[rows],
+            profile=profile,
+            noise=noise,
+            steps=steps,
+        )
+        reasons = _reasons(beads, predicted[rows])
+        good = np.array([reason is None for reason in reasons], dtype=bool)
+        if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(found.bead)):
+            measured_well = int(np.count_nonzero(good))
+            raise DataError(
+                f'the phantom is found with {len(found.bead)} beads, of which only '
+                f'{measured_well} can be measured',
+                kind=Kind.BEADS_NOT_MEASURED,
+                numbers={'beads': len(found.bead), 'measured': measured_well},
+            )
+        bead = rows[good]
+        uv = beads.uv[good]
+        view, _ = fit_view(view, model.xyz[bead], uv, 3)
+        predicted = view.project(model.xyz) + smoothed(view, model.xyz, bead, uv)
+    measured = (rows, beads, reasons, predicted)
+    extraction = _checked(detections, found, view, measured, _Imaging(noise, profile))
+    return _with_support(extraction, model, rows)
+
+
+def _checked(
+    detections: Detections,
+    found: Match,
+    view: View,
+    measured: tuple[np.ndarray, Beads, list[Finding | None], np.ndarray],
+    imaging: _Imaging,
+) -> Extraction:
+    """Exclude beads that are not where their neighbours say, or measured badly."""
+    rows, beads, reasons, predicted = measured
+    residual = np.linalg.norm(beads.uv - predicted[rows], axis=1)
+    good = np.array([reason is None for reason in reasons], dtype=bool)
+    scatter = max(float(np.median(residual[good])) / np.sqrt(2 * np.log(2)), MIN_SCATTER_PX)
+    # The scatter contains what the survey and the smoothing leave open.
+    limit = RESIDUAL_SIGMAS * np.hypot(scatter, beads.sigma)
+    far = good & ~(residual < limit)
+    for number in np.flatnonzero(far):
+        cause = f'{residual[number]:.2f} px from where its neighbours say'
+        reasons[number] = Finding(
+            Kind.BEAD_AWAY, cause, numbers={'off_px': float(residual[number])}
+        )
+    good &= ~far
+    usual = float(np.median(beads.sigma[good]))
+    vague = good & (beads.sigma > MAX_SIGMAS * usual)
+    for number in np.flatnonzero(vague):
+        cause = f'sigma {beads.sigma[number]:.2f} px, that of most is {usual:.2f} px'
+        reasons[number] = Finding(
+            Kind.BEAD_UNSURE, cause, numbers={'sigma_px': float(beads.sigma[number])}
+        )
+    good &= ~vague
+    refused = tuple(
+        Refusal(int(row), predicted[row], reason)
+        for row, reason in zip(rows, reasons)
+        if reason is not None
+    )
+    assert imaging.profile is not None
+    return Extraction(
+        rows[good],
+        beads.uv[good],
+        sigma=beads.sigma[good],
+        overlapped=beads.overlapped[good],
+        refused=refused,
+        view=view,
+        detections=detections,
+        match=found,
+        profile=imaging.profile,
+        noise=imaging.noise,
+    )
+
+
+def _with_support(extraction: Extraction, model: PhantomModel, rows: np.ndarray) -> Extraction:
+    """Exclude beads of which most neighbours among the predicted ones (n,) are refused."""
+    good = np.isin(rows, extraction.bead)
+    alone = rows[good & ~supported(model.xyz[rows], good)]
+    if not len(alone):
+        return extraction
+    kept = ~np.isin(extraction.bead, alone)
+    refused = tuple(
+        Refusal(int(extraction.bead[number]), extraction.uv[number], ALONE)
+        for number in np.flatnonzero(~kept)
+    )
+    return replace(
+        extraction,
+        bead=extraction.bead[kept],
+        uv=extraction.uv[kept],
+        sigma=extraction.sigma[kept],
+        overlapped=extraction.overlapped[kept],
+        refused=extraction.refused + refused,
+    )
+
+
+def _starts(
+    predicted: np.ndarray, rows: np.ndarray, bead: np.ndarray, uv: np.ndarray, seen: Seen
+) -> np.ndarray:
+    """Start values (n, 2) of predicted beads: what was found of one alone, else the prediction."""
+    start = predicted.copy()
+    if len(rows) > 1:
+        distance = cKDTree(predicted[rows]).query(predicted[bead], k=[2])[0][:, 0]
+        alone = distance > 2.5 * seen.radius_px
+        start[bead[alone]] = uv[alone]
+    return start[rows]
+
+
+def _relative_radius(view: View, model: PhantomModel) -> np.ndarray:
+    """Radii (n,) of the shadows of all beads, 1 for a typical one."""
+    depth = view.depth(model.xyz)
+    radius = np.median(depth) / np.where(depth > 0, depth, np.median(depth))
+    if model.diameter_mm is not None:
+        radius = radius * model.diameter_mm / np.median(model.diameter_mm)
+    return np.clip(radius, 0.2, 5.0)
+
+
+def _reasons(beads: Beads, predicted: np.ndarray) -> list[Finding | None]:
+    """Why beads are not observed, None for those that are."""
+    away = np.linalg.norm(beads.uv - predicted, axis=1)
+    out: list[Finding | None] = []
+    for number in range(len(beads.uv)):
+        depth = float(beads.depth[number])
+        off = float(away[number])
+        reason: Finding | None = None
+        if not beads.measured[number]:
+            reason = LOST
+        elif not DEPTH[0] < depth < DEPTH[1]:
+            cause = f'a shadow of {depth:.0%} of that of a bead'
+            reason = Finding(Kind.BEAD_CONTRAST, cause, numbers={'depth': depth})
+        elif beads.misfit[number] > MAX_MISFIT:
+            reason = DISTURBED
+        elif beads.sigma[number] > MAX_SIGMA_PX:
+            reason = HIDDEN
+        elif off > FIRST_RESIDUAL_PX:
+            cause = f'{off:.1f} px from its prediction'
+            reason = Finding(Kind.BEAD_AWAY, cause, numbers={'off_px': off})
+        out.append(reason)
+    return out

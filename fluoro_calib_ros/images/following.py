@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The pose of a phantom from that of an exposure nearby, such as the previous one of a video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..errors import DataError
+from ..photogrammetry.rotations import matrix_from_vector, rotation_angle, vector_from_matrix
+from .growth import Match, Seen, grow, settle, start_view
+from .matching import LEVELS, MIN_BEADS, PhantomModel, is_sure, seeds_of, unambiguous
+from .pose_search import LocalPose, local_poses, nearby_map
+from .view import View
+
+REACH = 0.1  # of the image, by which a phantom may move between exposures
+# Of the exposures between which images were left out.
+FAR_REACH = 0.25  # of the image
+FAR_TURN_RAD = np.deg2rad(35)
+FAR_SCALES = (0.8, 1.25)  # factors
+FAR_SEEDS = 6  # beads of the image from which the pose is searched for
+FAR_POSES = 3  # of each
+SCATTER_FACTOR = 1.5  # on the residuals of the exposure before
+SCATTER_PX = 0.1
+
+
+@dataclass(frozen=True)
+class Far:
+    """Images were left out since the exposure nearby.
+
+    Attributes
+    ----------
+    ahead : View or None
+        The pose to which the phantom should have moved since.
+    """
+
+    ahead: View | None = None
+
+
+def follow(
+    seen: Seen, model: PhantomModel, near: View, scale_px: float, far: Far | None = None
+) -> Match | None:
+    """Match what was found in an image from a pose nearby.
+
+    Parameters
+    ----------
+    seen : Seen
+    model : PhantomModel
+    near : View
+    scale_px : float
+        Robust standard deviation of the residuals of the image nearby [px].
+    far : Far, optional
+        Where images were left out in between: the pose is searched for farther away.
+
+    Returns
+    -------
+    Match or None
+        None where the pose is too far, or not sure.
+    """
+    if len(seen.uv) < MIN_BEADS:
+        return None
+    limit = SCATTER_FACTOR * scale_px + SCATTER_PX
+    expected = settle(near, model.xyz, seen)
+    if _fits(expected, limit):
+        return expected
+    for found in _elsewhere(seen, model, near, far):
+        if found is None or not _fits(found, limit):
+            continue
+        try:
+            # A grid may have gone by a step of its pattern.
+            found = unambiguous(found, seen, model, FAR_TURN_RAD)
+        except DataError:
+            return None
+        return found if _fits(found, limit) else None
+    return None
+
+
+def _fits(found: Match | None, limit_px: float) -> bool:
+    """Return whether a match is sure, with residuals as small as before.
+
+    A phantom that was turned by nearly a symmetry of its own would have larger ones.
+    """
+    return (
+        found is not None
+        and is_sure(found)
+        and found.scale_px < limit_px
+        and len(found.bead) >= MIN_BEADS
+    )
+
+
+def moved_on(
+    before: View, last: View, centre_mm: NDArray[np.float64], factor: float
+) -> View | None:
+    """Return the view after a further motion like that from one view to the next.
+
+    Parameters
+    ----------
+    before, last : View
+    centre_mm : (3,) ndarray
+        Of the phantom, which moves on a straight line while it turns about a fixed axis.
+    factor : float
+        On the motion.
+
+    Returns
+    -------
+    View or None
+        None where the motion is not small.
+    """
+    turn = vector_from_matrix(last.rotation @ before.rotation.T)
+    if factor * np.linalg.norm(turn) > FAR_TURN_RAD:
+        return None
+    rotation = matrix_from_vector(factor * turn) @ last.rotation
+    first, second = (view.rotation @ (centre_mm - view.position) for view in (before, last))
+    sensor = second + factor * (second - first)
+    return replace(last, rotation=rotation, position=centre_mm - rotation.T @ sensor)
+
+
+def _elsewhere(
+    seen: Seen, model: PhantomModel, near: View, far: Far | None
+) -> Iterator[Match | None]:
+    """Yield the matches from a pose that is moved on, shifted over the image, or searched for."""
+    if far is not None and far.ahead is not None:
+        yield settle(far.ahead, model.xyz, seen)
+    yield _over_the_image(seen, model.xyz, near)
+    if far is not None:
+        yield from _farther(seen, model, near)
+
+
+def _over_the_image(seen: Seen, xyz: np.ndarray, near: View) -> Match | None:
+    """Return the match of a pose nearby that is shifted, None where there is none."""
+    predicted = near.project(xyz)
+    row = np.flatnonzero(seen.in_field(predicted))
+    shift = _shift(predicted[row], seen) if len(row) >= MIN_BEADS else None
+    if shift is None:
+        return None
+    view = _shifted(near, shift, float(np.median(near.depth(xyz))))
+    from_middle = np.linalg.norm(predicted[row] - predicted[row].mean(axis=0), axis=1)
+    return grow(view, int(row[np.argmin(from_middle)]), xyz, seen)
+
+
+def _farther(seen: Seen, model: PhantomModel, near: View) -> Iterator[Match | None]:
+    """Yield the matches of poses that are some way off, by triples of beads seen nearby."""
+    predicted = near.project(model.xyz)
+    with np.errstate(invalid='ignore'):
+        size = np.array(seen.field.shape[::-1])
+        seen_before = (np.abs(predicted - size / 2) < (0.5 + FAR_REACH) * size).all(axis=1)
+    if not seen_before.any():
+        return
+    beads = nearby_map(seen.uv, near.lens.image_size, seen.tolerance_px)
+    beads[~seen.field] = 2
+    scale = near.principal_distance_px / float(np.median(near.depth(model.xyz[seen_before])))
+    scales = (FAR_SCALES[0] * scale, FAR_SCALES[1] * scale)
+    neighbours = LEVELS[0][1]
+    reach = FAR_REACH * max(seen.field.shape)
+    for seed in seeds_of(seen)[:FAR_SEEDS]:
+        _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
+        around = around[around != seed]
+        with np.errstate(invalid='ignore'):
+            close = np.linalg.norm(predicted - seen.uv[seed], axis=1) < reach
+        triples = model.triples[0].of_beads(close)
+        poses = local_poses(
+            int(seed), seen.uv, near=around, triples=triples, found=beads, scales=scales
+        )
+        turned = [_turned(pose, near, model.xyz) for pose in poses]
+        started = [(pose, view) for pose, view in zip(poses, turned) if view is not None]
+        for pose, view in started[:FAR_POSES]:
+            yield grow(view, pose.bead, model.xyz, seen)
+
+
+def _turned(pose: LocalPose, near: View, xyz: np.ndarray) -> View | None:
+    """Return a view nearby in the pose of a bead, None where it is turned too far."""
+    c = near.principal_distance_px
+    start = start_view(pose, replace(near.lens, principal_distance_px=c), xyz)
+    if rotation_angle(start.rotation @ near.rotation.T) > FAR_TURN_RAD:
+        return None
+    view = replace(near, rotation=start.rotation, position=start.position)
+    bead = xyz[[pose.bead]]
+    # The bead is seen with the distortion of the fluoroscope, which is known by now.
+    return _shifted(view, pose.uv - view.project(bead)[0], float(view.depth(bead)[0]))
+
+
+def _shifted(view: View, shift: np.ndarray, depth_mm: float) -> View:
+    """Return a view that sees points at a depth shifted by (2,) [px]."""
+    sensor = np.append(shift, 0) * depth_mm / view.principal_distance_px
+    return replace(view, position=view.position - view.rotation.T @ sensor)
+
+
+def _shift(predicted: np.ndarray, seen: Seen) -> np.ndarray | None:
+    """Shift (2,) [px] that takes most predictions (n, 2) to something that was found."""
+    reach = REACH * max(seen.field.shape)
+    pairs = cKDTree(predicted).query_ball_tree(seen.tree, reach)
+    steps = np.concatenate(
+        [seen.uv[near] - at for at, near in zip(predicted, pairs) if near] or [np.zeros((0, 2))]
+    )
+    if not len(steps):
+        return None
+    cells = int(np.ceil(reach / seen.tolerance_px))
+    cell = np.rint(steps / seen.tolerance_px).astype(int) + cells
+    size = 2 * cells + 1
+    count = np.bincount(cell[:, 0] * size + cell[:, 1], minlength=size**2).reshape(size, size)
+    # A shift near the edge of two cells counts in both.
+    smooth = cv2.boxFilter(count.astype(float), -1, (3, 3), normalize=False)
+    place = np.unravel_index(np.argmax(smooth), smooth.shape)
+    return (np.array(place) - cells) * seen.tolerance_px

@@ -1,0 +1,300 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Grow a pose of a few beads to all beads of an image, and say what speaks for it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .pose_search import LocalPose
+from .view import SMOOTHING, SMOOTHING_PRIOR, Lens, View, fit_view
+
+START_BEADS = 14  # within the first radius
+GROWTH = 1.25  # of the radius in a step
+MIN_SHARE = 0.5  # of the predicted beads that are found, below which a pose is given up
+DEGREE = 5
+LAST_DEGREE = 6
+LAST_STEPS = 4
+LAST_TOLERANCE_PX = 2.5
+CELLS = 5  # regions across the image
+MIN_CELL = 5  # predicted beads of a region that is judged
+AMBIGUOUS_PX = 1.5  # by which another prediction must be farther
+SUPPORT = 12  # neighbours in space, and the share of them that must be found as well
+MIN_SUPPORT = 0.5
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What was found in an image.
+
+    Attributes
+    ----------
+    uv : (n, 2) ndarray
+        Beads [px].
+    tree : cKDTree
+        Of uv.
+    field : (h, w) ndarray of bool
+        The field of view.
+    radius_px : float
+        Of a bead: two closer than this may be found as one.
+    tolerance_px : float
+        Largest distance from a prediction at which a bead is matched while the pose grows.
+    strength : (n,) ndarray or None
+        Response to each bead, which increases with its size.
+    """
+
+    uv: NDArray[np.float64]
+    tree: cKDTree
+    field: NDArray[np.bool_]
+    radius_px: float
+    tolerance_px: float
+    strength: NDArray[np.float64] | None = None
+
+    @classmethod
+    def of(
+        cls,
+        uv: np.ndarray,
+        field: np.ndarray,
+        radius_px: float,
+        strength: np.ndarray | None = None,
+    ) -> Seen:
+        """Return what was found, with a tolerance from the distances between beads."""
+        tree = cKDTree(uv)
+        distance = tree.query(uv, k=[min(4, len(uv))])[0][:, 0]
+        tolerance = float(np.clip(0.2 * np.median(distance), 2.5, 6))
+        return cls(
+            uv, tree, field=field, radius_px=radius_px, tolerance_px=tolerance, strength=strength
+        )
+
+    def in_field(self, uv: np.ndarray) -> np.ndarray:
+        """Return (n,) whether pixels (n, 2) lie in the field; NaN does not."""
+        height, width = self.field.shape
+        places = np.rint(np.where(np.isfinite(uv), uv, -1)).astype(int)
+        inside = np.asarray(((places >= 0) & (places < (width, height))).all(axis=1))
+        inside[inside] = self.field[places[inside, 1], places[inside, 0]]
+        return inside
+
+
+@dataclass(frozen=True)
+class Match:
+    """A pose with its matched beads and the evidence for it.
+
+    Attributes
+    ----------
+    view : View
+    bead, detection : (n,) ndarray of int
+        Rows of the phantom and of the image that belong together.
+    predicted : (m, 2) ndarray
+        Pixels of all beads of the phantom, with the residuals of neighbours.
+    found : float
+        Share of the beads predicted in the field that are found.
+    explained : float
+        Share of what was found in the image that is predicted.
+    scale_px : float
+        Robust standard deviation of the residuals.
+    expected : int
+        Number of beads predicted in the field.
+    """
+
+    view: View
+    bead: NDArray[np.int64]
+    detection: NDArray[np.int64]
+    predicted: NDArray[np.float64]
+    found: float
+    explained: float
+    scale_px: float
+    expected: int
+
+    @property
+    def score(self) -> float:
+        """Matched beads, less those that are predicted but not found."""
+        return len(self.bead) - self.expected * (1 - self.found)
+
+
+def start_view(pose: LocalPose, lens: Lens, xyz: np.ndarray) -> View:
+    """Return the perspective view of a scaled-orthographic pose around a bead."""
+    c = lens.principal_distance_px
+    ray = np.append((pose.uv - lens.centre) / c, 1.0)
+    rotation = _turn_to(ray) @ pose.rotation
+    # The scale holds across the ray, at its length.
+    sensor = ray * (c / pose.scale)
+    position = xyz[pose.bead] - rotation.T @ sensor
+    view = View(
+        lens,
+        rotation,
+        position=position,
+        principal_distance_px=c,
+        coefficients=np.zeros((2, 0)),
+        degree=DEGREE,
+    )
+    expected = lens.expected(DEGREE)
+    # The expected distortion is in the image already, where the bead was found.
+    return View(
+        lens,
+        view.rotation,
+        position=view.position,
+        principal_distance_px=c,
+        coefficients=expected,
+        degree=DEGREE,
+    )
+
+
+def _turn_to(ray: np.ndarray) -> np.ndarray:
+    """Smallest rotation (3, 3) that takes the z axis to a direction (3,)."""
+    z = ray / np.linalg.norm(ray)
+    axis = np.array([-z[1], z[0], 0.0])
+    k = np.array([[0, 0, axis[1]], [0, 0, -axis[0]], [-axis[1], axis[0], 0]])
+    return np.eye(3) + k + k @ k / (1 + z[2])
+
+
+def grow(view: View, start: int, xyz: np.ndarray, seen: Seen) -> Match | None:
+    """Grow a view from one bead over the phantom; None where it does not fit.
+
+    The radius around the bead grows, in space: what lies behind it in the image is predicted last,
+    when the pose is known better. Beads found near their predictions are matched. start is the row
+    of the bead in xyz (n, 3) [mm].
+    """
+    distance = np.linalg.norm(xyz - xyz[start], axis=1)
+    radius = float(np.partition(distance, min(START_BEADS, len(xyz) - 1))[:START_BEADS].max())
+    farthest = float(distance.max())
+    while True:
+        for _ in range(2):
+            row = np.flatnonzero(distance <= radius)
+            predicted = view.project(xyz[row])
+            inside = seen.in_field(predicted)
+            row = row[inside]
+            if len(row) < 4:
+                return None
+            bead, detection = pairs(predicted[inside], seen, seen.tolerance_px)
+            if len(bead) < max(4, MIN_SHARE * len(row)):
+                return None
+            view, _ = fit_view(view, xyz[row[bead]], seen.uv[detection], 1, 0.3)
+        if radius >= farthest:
+            break
+        radius *= GROWTH
+    return settle(view, xyz, seen)
+
+
+def settle(view: View, xyz: np.ndarray, seen: Seen) -> Match | None:
+    """Match all beads by a view that is near the right one, and refine it."""
+    view = view.with_degree(max(view.degree, LAST_DEGREE))
+    tolerance = seen.tolerance_px
+    scale = 0.0
+    bead = detection = np.zeros(0, dtype=int)
+    residual = np.zeros_like(xyz[:, :2])
+    for step in range(LAST_STEPS):
+        predicted = view.project(xyz) + residual
+        row = np.flatnonzero(seen.in_field(predicted))
+        if len(row) < 4:
+            return None
+        bead, detection = pairs(predicted[row], seen, tolerance)
+        if len(bead) < 4:
+            return None
+        bead = row[bead]
+        if len(bead) < MIN_SHARE * len(row) and step:
+            return None
+        view, scale = fit_view(view, xyz[bead], seen.uv[detection], 2)
+        residual = smoothed(view, xyz, bead, seen.uv[detection])
+        tolerance = max(0.6 * tolerance, min(LAST_TOLERANCE_PX, seen.tolerance_px))
+    predicted = view.project(xyz) + residual
+    return _judged(view, xyz, seen, predicted, scale)
+
+
+def pairs(predicted: np.ndarray, seen: Seen, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of predictions (n, 2) and of what was found that are nearest to each other."""
+    distance, detection = seen.tree.query(predicted, distance_upper_bound=tolerance)
+    row = np.flatnonzero(np.isfinite(distance))
+    order = row[np.argsort(distance[row], kind='stable')]
+    _, first = np.unique(detection[order], return_index=True)
+    kept = order[np.sort(first)]
+    return kept, detection[kept]
+
+
+def smoothed(view: View, xyz: np.ndarray, bead: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Residuals (n, 2) of all beads, as their matched neighbours in the image have them.
+
+    A matched bead does not take part in its own value. xyz (n, 3) are all beads, bead (m,) the
+    matched rows with pixels uv (m, 2).
+    """
+    predicted = view.project(xyz)
+    residual = uv - predicted[bead]
+    count = min(SMOOTHING + 1, len(bead))
+    usable = np.where(np.isfinite(predicted), predicted, 1e9)
+    _, near = cKDTree(predicted[bead]).query(usable, k=count)
+    near = near.reshape(len(xyz), -1)
+    other = bead[near] != np.arange(len(xyz))[:, None]
+    values = residual[near]
+    # The median is not moved by a false match among the neighbours.
+    limit = 3 * np.median(np.abs(residual), axis=0) + 0.2
+    values = np.clip(values, -limit, limit)
+    total = np.sum(values * other[..., None], axis=1)
+    return total / (other.sum(axis=1, keepdims=True) + SMOOTHING_PRIOR)
+
+
+def _judged(
+    view: View, xyz: np.ndarray, seen: Seen, predicted: np.ndarray, scale: float
+) -> Match | None:
+    """Return the match of settled predictions (n, 2), without regions that ran away."""
+    row = np.flatnonzero(seen.in_field(predicted))
+    if len(row) < 4:
+        return None
+    tolerance = min(LAST_TOLERANCE_PX, seen.tolerance_px)
+    bead, detection = pairs(predicted[row], seen, tolerance)
+    is_found = np.zeros(len(row), dtype=bool)
+    is_found[bead] = True
+    # Two beads that overlap are found as one, somewhere between them.
+    merged, _ = seen.tree.query(predicted[row], distance_upper_bound=1.2 * seen.radius_px)
+    other = cKDTree(predicted[row]).query(predicted[row], k=[2])[0][:, 0]
+    is_found |= np.isfinite(merged) & (other < 2 * seen.radius_px)
+    near, _ = cKDTree(predicted[row]).query(
+        seen.uv, distance_upper_bound=max(tolerance, 1.2 * seen.radius_px)
+    )
+    good = _good_cells(predicted[row], is_found, seen.field.shape)
+    # A detection between two predictions may be either.
+    tree = cKDTree(predicted[row])
+    distance, _ = tree.query(seen.uv[detection], k=2)
+    sure = distance[:, 1] > distance[:, 0] + AMBIGUOUS_PX
+    matched = np.zeros(len(row), dtype=bool)
+    matched[bead[sure]] = True
+    good &= supported(xyz[row], matched)
+    kept = good[bead] & sure
+    return Match(
+        view,
+        row[bead[kept]],
+        detection=detection[kept],
+        predicted=predicted,
+        found=float(np.mean(is_found)),
+        explained=float(np.mean(np.isfinite(near))),
+        scale_px=scale,
+        expected=len(row),
+    )
+
+
+def supported(xyz: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """Return (n,) whether most neighbours in space of beads (n, 3) are good (n,).
+
+    Where a face is seen from its edge, a prediction that is off by one bead still finds something
+    now and then.
+    """
+    count = min(SUPPORT + 1, len(xyz))
+    _, near = cKDTree(xyz).query(xyz, k=count)
+    near = near.reshape(len(xyz), -1)
+    other = near != np.arange(len(xyz))[:, None]
+    share = np.sum(good[near] & other, axis=1) / np.maximum(other.sum(axis=1), 1)
+    return np.asarray(share >= MIN_SUPPORT)
+
+
+def _good_cells(uv: np.ndarray, found: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    """Return (n,) whether most predicted beads (n, 2) of the same region are found."""
+    height, width = shape
+    cell = (np.clip(uv / (width, height), 0, 0.999) * CELLS).astype(int)
+    number = cell[:, 0] * CELLS + cell[:, 1]
+    total = np.bincount(number, minlength=CELLS * CELLS)
+    hits = np.bincount(number, weights=found, minlength=CELLS * CELLS)
+    bad = (total >= MIN_CELL) & (hits < 0.6 * total)
+    return ~bad[number]

@@ -1,0 +1,236 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Poses of flat grids: beads are numbered along rows and columns in the image and in the phantom.
+
+Both numberings differ by a change of the basis of the lattice and a shift. All small changes of
+the basis are tried, and the shifts by which most beads of the image fall on beads of the phantom.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from itertools import product
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from .growth import Match, Seen, settle
+from .view import Lens, View, fit_view
+
+FLAT = 0.02  # thickness over the extent of a phantom that counts as flat
+REACH = 0.3  # of the spacing, within which a bead lies at its place in the lattice
+MIN_ANGLE = np.deg2rad(35.0)  # between the steps of a lattice, also in an oblique view
+STARTS = 8  # beads from which the numbering is tried
+MIN_NUMBERED = 0.6  # share of the beads that a numbering must reach
+SHIFTS = 6  # best shifts of each basis
+SETTLED = 12  # best candidates that are refined
+MIN_OVERLAP = 0.5  # of the numbered beads that fall on beads of the phantom
+DEGREE = 3  # of the distortion while a candidate is refined
+STEPS = 3
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """Beads of a plane in rows and columns.
+
+    Attributes
+    ----------
+    row : (n,) ndarray of int
+        Rows of the beads that are numbered.
+    index : (n, 2) ndarray of int
+        Their places along both steps of the lattice.
+    """
+
+    row: NDArray[np.int64]
+    index: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class FlatGrid:
+    """A flat phantom on a lattice.
+
+    Attributes
+    ----------
+    lattice : Lattice
+    centre : (3,) ndarray
+        [mm]
+    axes : (3, 3) ndarray
+        Rows: two directions in the plane, and its normal.
+    """
+
+    lattice: Lattice
+    centre: NDArray[np.float64]
+    axes: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, xyz: np.ndarray) -> FlatGrid | None:
+        """Return the grid of beads (n, 3) [mm]; None where they are not flat, or on no lattice."""
+        centre = xyz.mean(axis=0)
+        _, extent, axes = np.linalg.svd(xyz - centre, full_matrices=False)
+        if len(extent) < 3 or extent[2] > FLAT * extent[0]:
+            return None
+        lattice = number_lattice((xyz - centre) @ axes[:2].T)
+        return None if lattice is None else cls(lattice, centre, axes)
+
+
+def number_lattice(points: np.ndarray) -> Lattice | None:
+    """Number points (n, 2) of a plane along the steps of their lattice; None for no lattice.
+
+    The lattice may be bent: a step is compared with those beside it.
+    """
+    if len(points) < 9:
+        return None
+    tree = cKDTree(points)
+    middle = np.argsort(np.linalg.norm(points - np.median(points, axis=0), axis=1), kind='stable')
+    for start in middle[:STARTS]:
+        basis = _basis(points, tree, int(start))
+        if basis is None:
+            continue
+        number = _numbered(points, tree, int(start), basis)
+        if len(number) >= MIN_NUMBERED * len(points):
+            return Lattice(np.array(list(number)), np.array(list(number.values())))
+    return None
+
+
+def _basis(points: np.ndarray, tree: cKDTree, start: int) -> np.ndarray | None:
+    """Two steps (2, 2) of the lattice at a point: the shortest one, and the next across it."""
+    _, near = tree.query(points[start], k=min(13, len(points)))
+    steps = points[near[1:]] - points[start]
+    first = steps[0]
+    for second in steps[1:]:
+        length = np.linalg.norm(first) * np.linalg.norm(second)
+        sine = abs(first[0] * second[1] - first[1] * second[0]) / max(length, 1e-12)
+        if sine > np.sin(MIN_ANGLE):
+            return np.stack([first, second])
+    return None
+
+
+def _numbered(
+    points: np.ndarray, tree: cKDTree, start: int, basis: np.ndarray
+) -> dict[int, tuple[int, int]]:
+    """Return the places of points that are reached step by step from one of them."""
+    number = {start: (0, 0)}
+    taken = {(0, 0)}
+    steps = {start: basis}
+    waiting = deque([start])
+    while waiting:
+        point = waiting.popleft()
+        local = steps[point]
+        reach = REACH * float(np.linalg.norm(local, axis=1).min())
+        for axis, sign in product((0, 1), (1, -1)):
+            place = list(number[point])
+            place[axis] += sign
+            key = (place[0], place[1])
+            if key in taken:
+                continue
+            distance, other = tree.query(points[point] + sign * local[axis])
+            if distance > reach or other in number:
+                continue
+            taken.add(key)
+            number[other] = key
+            # Half of the new step: one bead off its place does not turn the lattice.
+            bent = local.copy()
+            bent[axis] = 0.5 * (local[axis] + sign * (points[other] - points[point]))
+            steps[other] = bent
+            waiting.append(other)
+    return number
+
+
+def grid_matches(grid: FlatGrid, xyz: np.ndarray, seen: Seen, lens: Lens) -> Iterator[Match]:
+    """Yield matches of a flat grid with what was found in an image, the likeliest first."""
+    found = number_lattice(seen.uv)
+    if found is None:
+        return
+    candidates: list[tuple[int, np.ndarray, np.ndarray]] = []
+    for change in _changes():
+        turned = found.index @ change
+        for shift, overlap in _shifts(turned, grid.lattice.index):
+            if overlap >= MIN_OVERLAP * len(turned):
+                candidates.append((overlap, change, shift))
+    candidates.sort(key=lambda candidate: -candidate[0])
+    row_at = {tuple(place): row for place, row in zip(grid.lattice.index, grid.lattice.row)}
+    settled = 0
+    for _, change, shift in candidates:
+        places = found.index @ change + shift
+        bead = np.array([row_at.get((int(a), int(b)), -1) for a, b in places])
+        known = bead >= 0
+        view = _view(grid, xyz[bead[known]], seen.uv[found.row[known]], lens)
+        match = None if view is None else settle(view, xyz, seen)
+        if match is not None:
+            yield match
+            settled += 1
+            if settled >= SETTLED:
+                return
+
+
+def _changes() -> Iterator[np.ndarray]:
+    """Yield the changes (2, 2) of the basis of a lattice by at most one step."""
+    for entries in product((-1, 0, 1), repeat=4):
+        change = np.array(entries).reshape(2, 2)
+        if abs(round(float(np.linalg.det(change)))) == 1:
+            yield change
+
+
+def _shifts(image: np.ndarray, phantom: np.ndarray) -> list[tuple[np.ndarray, int]]:
+    """Shifts (2,) of places (n, 2) that fall on most places (m, 2), with the number that does."""
+    corner = image.min(axis=0)
+    other = phantom.min(axis=0)
+    there = _raster(phantom - other)
+    here = _raster(image - corner)
+    shape = tuple(np.array(there.shape) + here.shape - 1)
+    product = np.fft.rfft2(there, shape) * np.fft.rfft2(here[::-1, ::-1], shape)
+    overlap = np.rint(np.fft.irfft2(product, shape)).astype(int)
+    best = np.argsort(-overlap, axis=None, kind='stable')[:SHIFTS]
+    out = []
+    for place in np.column_stack(np.unravel_index(best, overlap.shape)):
+        shift = place - (np.array(here.shape) - 1) - corner + other
+        out.append((shift, int(overlap[tuple(place)])))
+    return out
+
+
+def _raster(places: np.ndarray) -> np.ndarray:
+    """Return an image with 1 at places (n, 2), which begin at 0."""
+    image = np.zeros(places.max(axis=0) + 1)
+    image[tuple(places.T)] = 1
+    return image
+
+
+def _view(grid: FlatGrid, xyz: np.ndarray, uv: np.ndarray, lens: Lens) -> View | None:
+    """Return the view of matched beads of a grid; None where no pose fits them.
+
+    Collins and Bartoli, "Infinitesimal plane-based pose estimation", IJCV 109, 2014.
+    """
+    c = lens.principal_distance_px
+    interior = np.array([[c, 0, lens.centre[0]], [0, c, lens.centre[1]], [0, 0, 1]])
+    turn = grid.axes if np.linalg.det(grid.axes) > 0 else grid.axes * [[1], [1], [-1]]
+    plane = (xyz - grid.centre) @ turn.T
+    plane[:, 2] = 0
+    try:
+        _, vectors, shifts, _ = cv2.solvePnPGeneric(
+            plane, uv, interior, None, flags=cv2.SOLVEPNP_IPPE
+        )
+    except cv2.error:
+        return None
+    best: tuple[float, View] | None = None
+    for vector, shift in zip(vectors, shifts):
+        rotation = cv2.Rodrigues(vector)[0] @ turn
+        position = grid.centre - rotation.T @ shift.ravel()
+        view = View(
+            lens,
+            rotation,
+            position=position,
+            principal_distance_px=c,
+            coefficients=lens.expected(DEGREE),
+            degree=DEGREE,
+        )
+        if (view.depth(xyz) <= 0).any():
+            continue
+        view, scale = fit_view(view, xyz, uv, STEPS, 0.3)
+        if best is None or scale < best[0]:
+            best = scale, view
+    return None if best is None else best[1]

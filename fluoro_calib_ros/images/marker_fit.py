@@ -1,0 +1,254 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Measure centres of moving markers: all windows of an image in one Gauss-Newton iteration.
+
+The model of a window is that of `shadow_fit`. A marker that moves while the light is on has a
+shadow that is the mean of shadows along its way (Gauss-Legendre quadrature), and its centre is
+that of the middle of the exposure.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
+
+from .marker_intensity import LightWindows
+from .shadow_fit import (
+    DEPTH_SD,
+    DISTURBED,
+    MARGIN_PX,
+    MIN_PASSED,
+    TERMS,
+    Beads,
+    FineGrid,
+    FitSettings,
+    Noise,
+    NormalEquations,
+    ShadowFit,
+)
+from .shadow_profile import Profile
+
+SETTINGS = FitSettings(
+    steps=4,  # of markers whose shadows touch
+    crossing_steps=(2,),
+    crowds=((1, 1), (2, 3)),
+    max_step_px=0.8,
+    pooled=120.0,
+    crossed=1.2,
+    dtype=np.float64,
+    whole_scale=True,
+    robust_relative=False,
+    moves_unusable=True,
+)
+STEPS_ALONE = 3
+# Largest motion [px] for a number of points along the way.
+QUADRATURE = ((0.7, 1), (3.0, 2), (6.0, 3), (10.0, 5), (np.inf, 7))
+
+
+@dataclass(frozen=True)
+class MarkerGuess:
+    """Where markers may be, and what they look like.
+
+    Attributes
+    ----------
+    uv : (n, 2) ndarray
+        Centres [px].
+    depth, depth_sd : (n,) ndarray
+        Of their shadows, 1 for the profile.
+    motion : (n, 2) ndarray
+        Way of their shadows while the light is on [px].
+    """
+
+    uv: NDArray[np.float64]
+    depth: NDArray[np.float64]
+    depth_sd: NDArray[np.float64]
+    motion: NDArray[np.float64]
+
+
+def fit_markers(
+    windows: LightWindows, guess: MarkerGuess, profile: Profile, noise: Noise
+) -> Beads:
+    """Measure all markers near a guess at once."""
+    fit = _MarkerFit(windows, guess, profile, noise)
+    fit.run()
+    return fit.result()
+
+
+class _MarkerFit(ShadowFit):
+    """Fit of markers of one size, which may move."""
+
+    def __init__(
+        self, windows: LightWindows, guess: MarkerGuess, profile: Profile, noise: Noise
+    ) -> None:
+        length = np.sqrt((guess.motion**2).sum(axis=1))
+        longest = float(length.max(initial=0.0))
+        points = next(count for limit, count in QUADRATURE if longest <= limit)
+        node, weight = np.polynomial.legendre.leggauss(points)
+        self.way = 0.5 * node[:, None, None] * guess.motion  # (q, n, 2)
+        self.way_weight = 0.5 * weight
+        reach = profile.reach_px + 0.5 * np.ceil(longest)
+        super().__init__(
+            SETTINGS,
+            profile,
+            noise=noise,
+            uv=guess.uv,
+            depth=guess.depth,
+            window_px=reach + MARGIN_PX,
+        )
+        self.guess = guess
+        self.offset_u, self.offset_v = np.ascontiguousarray(self.offset.T, dtype=float)
+        self.inflation = 1.0
+        grey, valid = windows.read(self.middle, self.offset)
+        self._set_windows(grey, valid, bright=grey)
+        self._set_groups(self._near(2 * reach + MARGIN_PX))
+
+    def _near(self, together: float) -> np.ndarray:
+        """Neighbours (n, k) of the markers, -1 for none; notes the distances of the nearest."""
+        distance = cdist(self.uv, self.uv)
+        np.fill_diagonal(distance, np.inf)
+        self.distance = distance.min(axis=1, initial=np.inf)
+        close = distance < together
+        self.crowded = np.flatnonzero(close.any(axis=1))
+        self.neighbours = [np.flatnonzero(row) for row in close]
+        near = np.argsort(distance, axis=1, kind='stable')[:, : self.settings.neighbours]
+        return np.where(np.take_along_axis(close, near, axis=1), near, -1)
+
+    def run(self) -> None:
+        """Take Gauss-Newton steps; the last one gives standard deviations as well."""
+        for step in range(self.settings.steps):
+            if step in self.settings.crossing_steps and len(self.crowded):
+                self._cross()
+            for rows, near in self.groups:
+                alone = not near.shape[1]
+                if alone and step >= STEPS_ALONE:
+                    continue
+                final = step == (STEPS_ALONE if alone else self.settings.steps) - 1
+                uv, depth, background = self._step(rows, near, final)
+                self.uv[rows] = uv
+                self.depth[rows] = depth
+                self.background[rows] = background
+
+    def _shadow(
+        self, rows: np.ndarray, middle: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Shadows (g, k, m) in windows around pixels middle (g, 2), and derivatives by the centre.
+
+        rows (g, k) are the markers.
+        """
+        # Points along the way are the first axis; few large arrays are faster than many small.
+        centre = self.way[:, rows] + (self.uv[rows] - middle[:, None])
+        x = self.offset_u - centre[..., 0, None]
+        y = self.offset_v - centre[..., 1, None]
+        distance = np.sqrt(x * x + y * y)
+        value, derivative = self.profile.shadow(distance)
+        derivative /= np.maximum(distance, 1e-9)
+        x *= derivative
+        y *= derivative
+        if len(self.way) == 1:
+            return value[0], -x[0], -y[0]
+        weight = self.way_weight[:, None, None, None]
+        return (
+            (weight * value).sum(axis=0),
+            -(weight * x).sum(axis=0),
+            -(weight * y).sum(axis=0),
+        )
+
+    def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Light (g, m) and its derivatives (g, OWN + 3 k, m)."""
+        everyone = np.concatenate([rows[:, None], near], axis=1)
+        shadow, by_u, by_v = self._shadow(everyone, self.middle[rows])
+        scatter = self.profile.scatter
+        plane = self._plane(rows)
+        if not near.shape[1]:  # the same in fewer operations
+            depth = self.depth[rows, None]
+            relative = 1 - (1 - scatter) * np.minimum(depth * shadow[:, 0], 1 - MIN_PASSED)
+            jacobian = self._jacobian(relative, 1)
+            by_shadow = (scatter - 1) * plane
+            by_place = by_shadow * depth
+            np.multiply(by_place, by_u[:, 0], out=jacobian[:, TERMS])
+            np.multiply(by_place, by_v[:, 0], out=jacobian[:, TERMS + 1])
+            np.multiply(by_shadow, shadow[:, 0], out=jacobian[:, TERMS + 2])
+            return plane * relative, jacobian
+        there = everyone >= 0
+        depth = np.where(there, self.depth[everyone], 0.0)[..., None]
+        passed = np.maximum(1 - depth * shadow, MIN_PASSED)
+        product = np.prod(passed, axis=1)
+        relative = scatter + (1 - scatter) * (product + self._crossing_in(rows))
+        jacobian = self._jacobian(relative, everyone.shape[1])
+        by_shadow = -(1 - scatter) * (plane * product)[:, None] / passed
+        by_place = by_shadow * depth
+        jacobian[:, TERMS::3] = by_place * by_u
+        jacobian[:, TERMS + 1 :: 3] = by_place * by_v
+        jacobian[:, TERMS + 2 :: 3] = by_shadow * shadow * there[..., None]
+        return plane * relative, jacobian
+
+    def _disturbed(self, rows: np.ndarray, near: np.ndarray, final: bool) -> np.ndarray:
+        if final or near.shape[1]:
+            return self.misfit[rows] > DISTURBED * self.typical()
+        return np.zeros(len(rows), dtype=bool)
+
+    def _depth_sd(self, rows: np.ndarray, near: np.ndarray) -> float | np.ndarray:
+        # The depth of a marker alone tells whether it is one, so it is hardly constrained.
+        return self.guess.depth_sd[rows] if near.shape[1] else DEPTH_SD
+
+    def _solve(
+        self, rows: np.ndarray, near: np.ndarray, equations: NormalEquations, final: bool
+    ) -> np.ndarray:
+        if not final:
+            return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
+        inverse = np.linalg.inv(equations.matrix)
+        variance = 0.5 * (inverse[:, TERMS, TERMS] + inverse[:, TERMS + 1, TERMS + 1])
+        self.sigma[rows] = np.sqrt(np.maximum(variance, 0))
+        if not near.shape[1]:
+            self._inflate(inverse[:, TERMS, None] @ equations.weighted)
+        return (inverse @ equations.right[..., None])[..., 0]
+
+    def _inflate(self, influence: np.ndarray) -> None:
+        """Note the factor on variances by the correlation of noise.
+
+        influence (g, 1, m) of the pixels on a centre.
+        """
+        correlation = self.noise.correlation
+        if np.count_nonzero(correlation) < 2:
+            return
+        half = int(np.abs(self.offset).max())
+        image = np.zeros((2 * half + 1, 2 * half + 1))
+        image[self.offset[:, 1] + half, self.offset[:, 0] + half] = influence[len(influence) // 2]
+        spread = cv2.filter2D(image, cv2.CV_64F, correlation, borderType=cv2.BORDER_CONSTANT)
+        self.inflation = max(float((image * spread).sum() / (image * image).sum()), 1.0)
+
+    def _cross(self) -> None:
+        """Note what shadows that touch have together, beyond the product of both."""
+        reach = 2 * (self.profile.radius_px + self.profile.blur_px)
+        reach += float(np.abs(self.way).max(initial=0.0)) * 2
+        rows = self.crowded[self.distance[self.crowded] < reach]
+        if not len(rows):
+            return
+        self.crossing = np.zeros((len(self.uv), len(self.offset)))
+        grid = FineGrid(self.offset, self.profile.blur_px)
+        axis = grid.axis
+        for one in rows:
+            members = np.concatenate([[one], self.neighbours[one][: self.settings.neighbours]])
+            together = np.zeros((len(axis), len(axis)))
+            for weight, way in zip(self.way_weight, self.way):
+                passed = np.ones_like(together)
+                for member in members:
+                    u, v = self.uv[member] + way[member] - self.middle[one]
+                    squared = (axis[:, None] - v) ** 2 + (axis - u) ** 2
+                    passed *= 1 - self.depth[member] * self.profile.absorbed(squared)
+                together += weight * passed
+            shadow, _, _ = self._shadow(members[None], self.middle[one][None])
+            apart = np.prod(1 - self.depth[members][:, None] * shadow[0], axis=0)
+            self.crossing[one] = grid.blurred(together) - apart
+
+    def result(self) -> Beads:
+        """Return what was measured."""
+        away = np.abs(self.uv - self.start).max(axis=1, initial=0.0)
+        measured = self.usable & np.isfinite(self.uv).all(axis=1) & np.isfinite(self.sigma)
+        measured &= away < self.settings.steps * self.settings.max_step_px
+        return self._beads(measured, self.typical(), self.inflation)

@@ -1,0 +1,287 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Ids of markers from the shapes of their rigid clusters, in the images of one exposure.
+
+Round shadows of both views are intersected, each with each, as far as their rays meet (epipolar
+distance). Among these points in space, the members of a cluster are those with its distances: a
+search with backtracking, in the manner of the interpretation trees of Grimson and Lozano-Perez
+("Localizing overlapping parts by searching the interpretation tree", IEEE PAMI 9, 1987). The
+mirror image of a cluster has the same distances, and is excluded by the rotation that fits. A
+cluster that fits in two ways is refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.epipolar import EpipolarGeometry
+from ..reconstruction.intersection import OK, OUTSIDE, Intersector
+from .marker_geometry import fitted_pose, project_observed
+from .marker_intensity import check_image, learn_look, search_image
+from .markers import FirstMarkers
+
+MARKER_SCALES = (1.1, 1.5, 2.1)  # of the blur at which markers stand out [px]
+SHARE = 0.4  # of the response to a typical marker
+SHADOW_SD_PX = 0.25  # of the place of a shadow that is not measured
+AGREE = 4.0  # standardised epipolar distance
+TOLERANCE_MM = 0.6  # of a distance between two points that are not measured yet
+RMS_MM = 0.35  # of the members of a cluster about its shape
+MIN_MEMBERS = 4
+MIN_SHARE = 0.6  # of the members that are found
+BETTER = 2.0  # factor on the RMS of another way to fit as many members
+MAX_SHADOWS = 120
+MAX_STEPS = 200_000  # of the search
+
+
+@dataclass(frozen=True)
+class ClusterShape:
+    """Markers (k,) that are rigid together, and their coordinates (k, 3) in a frame [mm]."""
+
+    name: str
+    target_id: np.ndarray
+    xyz_mm: np.ndarray
+
+    def __post_init__(self) -> None:
+        if len(self.target_id) < MIN_MEMBERS:
+            raise DataError(
+                f'cluster {self.name}: {len(self.target_id)} markers give no ids, at least '
+                f'{MIN_MEMBERS} are needed'
+            )
+
+
+@dataclass(frozen=True)
+class _Rig:
+    """Orientation and calibrations of two fluoroscopes, and the angles of their C-arms [rad]."""
+
+    orientation: RigOrientation
+    calibrations: Mapping[str, FluoroscopeCalibration]
+    angles: Mapping[str, float | None]
+
+
+@dataclass(frozen=True)
+class _Fit:
+    """Points (k,) of the members of a cluster, -1 for none, and how well they fit."""
+
+    point: np.ndarray
+    rms_mm: float
+
+    @property
+    def count(self) -> int:
+        return int(np.count_nonzero(self.point >= 0))
+
+
+def identify_markers(
+    images: Mapping[str, np.ndarray],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation,
+    shapes: Sequence[ClusterShape],
+    angles: Mapping[str, float | None] | None = None,
+) -> dict[str, FirstMarkers]:
+    """Find the markers of rigid clusters in the images of one exposure.
+
+    Parameters
+    ----------
+    images : mapping of str to ndarray
+        Of two fluoroscopes.
+    calibrations : mapping of str to FluoroscopeCalibration
+    orientation : RigOrientation
+        Of these two.
+    shapes : sequence of ClusterShape
+    angles : mapping of str to float or None, optional
+        Of the C-arms [rad], for corrections that change with them; None where they are unknown.
+
+    Returns
+    -------
+    dict of str to FirstMarkers
+        By fluoroscope. Members of a cluster that are not seen are where it says.
+
+    Raises
+    ------
+    DataError
+        For a cluster that is not found, or fits in two ways.
+    """
+    names = list(orientation.fluoroscopes)
+    rig = _Rig(orientation, calibrations, angles or {})
+    for name in names:
+        check_image(images[name], calibrations[name].image_size)
+    count = sum(len(shape.target_id) for shape in shapes)
+    reason: DataError | None = None
+    # What else is round in the images may be larger, and more distinct.
+    for scale in MARKER_SCALES:
+        try:
+            shadows = [_shadows(images[name], count, scale) for name in names]
+            return _identified(shadows, rig, shapes)
+        except DataError as error:
+            reason = reason or error
+    assert reason is not None
+    raise reason
+
+
+def _shadows(image: np.ndarray, count: int, scale: float) -> np.ndarray:
+    """Places (n, 2) of the most distinct shadows of a size. Raises DataError for none."""
+    found = search_image(image, learn_look(image, None, 2 * count, (scale,)), SHARE)
+    strongest = np.argsort(-found.strength, kind='stable')[:MAX_SHADOWS]
+    return np.asarray(found.uv[strongest])
+
+
+def _identified(
+    shadows: Sequence[np.ndarray], rig: _Rig, shapes: Sequence[ClusterShape]
+) -> dict[str, FirstMarkers]:
+    """Find clusters among shadows of both views. Raises DataError."""
+    xyz, pairs = _points(shadows, rig)
+    fits: list[tuple[ClusterShape, _Fit]] = []
+    free = np.ones(len(xyz), dtype=bool)
+    for shape in sorted(shapes, key=lambda shape: -len(shape.target_id)):
+        fit = _fit(shape, xyz, free)
+        fits.append((shape, fit))
+        taken = pairs[fit.point[fit.point >= 0]]
+        # A shadow is that of one marker, except where two lie behind each other.
+        free &= ~(np.isin(pairs[:, 0], taken[:, 0]) & np.isin(pairs[:, 1], taken[:, 1]))
+    return {
+        name: _first(view, rig, fits, (xyz, pairs, shadows[view]))
+        for view, name in enumerate(rig.orientation.fluoroscopes)
+    }
+
+
+def _points(shadows: Sequence[np.ndarray], rig: _Rig) -> tuple[np.ndarray, np.ndarray]:
+    """Points (n, 3) [mm] where rays of shadows meet, and the rows (n, 2) of these shadows."""
+    orientation = rig.orientation
+    names = orientation.fluoroscopes
+    corrected = [
+        rig.calibrations[name].correct(uv, angle=rig.angles.get(name))
+        for name, uv in zip(names, shadows)
+    ]
+    a, b = np.indices((len(shadows[0]), len(shadows[1]))).reshape(2, -1)
+    uv = np.stack([corrected[0].uv[a], corrected[1].uv[b]])
+    sigma = np.hypot(np.stack([corrected[0].sigma[a], corrected[1].sigma[b]]), SHADOW_SD_PX)
+    rays = EpipolarGeometry(orientation, *names).residuals(uv[0], uv[1], sigma[0], sigma[1])
+    near = np.abs(rays.residual) < AGREE * rays.sd_total
+    uv = uv[:, near]
+    sigma = sigma[:, near]
+    a = a[near]
+    b = b[near]
+    points = Intersector(orientation, None).intersect(uv, sigma)
+    good = np.isin(points.status, (OK, OUTSIDE)) & (points.standardised < AGREE)
+    return points.xyz_mm[good], np.column_stack([a, b])[good]
+
+
+def _fit(shape: ClusterShape, xyz: np.ndarray, free: np.ndarray) -> _Fit:
+    """Find the members of a cluster among points (n, 3). Raises DataError."""
+    search = _Search(shape, xyz, free)
+    search.run()
+    least = max(MIN_MEMBERS, int(np.ceil(MIN_SHARE * len(shape.target_id))))
+    best = search.best
+    if best is None or best.count < least:
+        found = 0 if best is None else best.count
+        raise DataError(
+            f'cluster {shape.name}: only {found} of {len(shape.target_id)} markers fit its shape '
+            'in this exposure'
+        )
+    if search.second is not None and search.second.rms_mm < BETTER * best.rms_mm:
+        raise DataError(
+            f'cluster {shape.name}: its shape fits in more than one way in this exposure, its '
+            'distances do not tell the markers apart'
+        )
+    return best
+
+
+class _Search:
+    """Search of a cluster with backtracking: members are points with the right distances."""
+
+    def __init__(self, shape: ClusterShape, xyz: np.ndarray, free: np.ndarray) -> None:
+        self.shape = shape
+        self.xyz = xyz
+        self.wanted = np.linalg.norm(shape.xyz_mm[:, None] - shape.xyz_mm[None], axis=2)
+        self.given = np.linalg.norm(xyz[:, None] - xyz[None], axis=2)
+        self.free = free
+        self.best: _Fit | None = None
+        self.second: _Fit | None = None
+        self.steps = 0
+        self.point = np.full(len(shape.target_id), -1)
+
+    def run(self) -> None:
+        """Search from the first member on."""
+        self._extend(0, self.free.copy())
+
+    def _extend(self, member: int, free: np.ndarray) -> None:
+        """Choose a point for a member, and for those after it."""
+        self.steps += 1
+        if self.steps > MAX_STEPS:
+            raise DataError(f'cluster {self.shape.name}: too many round shadows to search')
+        size = len(self.point)
+        chosen = np.flatnonzero(self.point >= 0)
+        least = self.best.count if self.best is not None else MIN_MEMBERS
+        if len(chosen) + size - member < least:
+            return
+        if member == size:
+            self._note()
+            return
+        fits = free.copy()
+        for other in chosen:
+            away = self.given[self.point[other]] - self.wanted[other, member]
+            fits &= np.abs(away) < TOLERANCE_MM
+        for point in np.flatnonzero(fits).tolist():
+            self.point[member] = point
+            free[point] = False
+            self._extend(member + 1, free)
+            free[point] = True
+        self.point[member] = -1
+        self._extend(member + 1, free)
+
+    def _note(self) -> None:
+        """Compare a complete choice with the best ones."""
+        chosen = self.point >= 0
+        if np.count_nonzero(chosen) < MIN_MEMBERS:
+            return
+        xyz = self.xyz[self.point[chosen]]
+        rotation, shift = fitted_pose(self.shape.xyz_mm[chosen], xyz)
+        error = self.shape.xyz_mm[chosen] @ rotation.T + shift - xyz
+        rms = float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+        if rms > RMS_MM:
+            return
+        fit = _Fit(self.point.copy(), rms)
+        if self.best is None or (fit.count, -fit.rms_mm) > (self.best.count, -self.best.rms_mm):
+            if self.best is not None and self.best.count == fit.count:
+                self._rival(self.best)
+            else:
+                self.second = None
+            self.best = fit
+        elif fit.count == self.best.count:
+            self._rival(fit)
+
+    def _rival(self, fit: _Fit) -> None:
+        """Note another choice with as many members."""
+        if self.second is None or fit.rms_mm < self.second.rms_mm:
+            self.second = fit
+
+
+def _first(
+    view: int,
+    rig: _Rig,
+    fits: Sequence[tuple[ClusterShape, _Fit]],
+    found: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> FirstMarkers:
+    """Return the markers of a view; found are points, their pairs, and the shadows of the view."""
+    xyz, pairs, shadows = found
+    name = rig.orientation.fluoroscopes[view]
+    calibration = rig.calibrations[name]
+    ids = []
+    places = []
+    for shape, fit in fits:
+        chosen = fit.point >= 0
+        rotation, shift = fitted_pose(shape.xyz_mm[chosen], xyz[fit.point[chosen]])
+        members = shape.xyz_mm @ rotation.T + shift
+        place = project_observed(rig.orientation, view, calibration, members, rig.angles.get(name))
+        place[chosen] = shadows[pairs[fit.point[chosen], view]]
+        width, height = calibration.image_size
+        inside = ((place > 0) & (place < np.array([width - 1, height - 1]))).all(axis=1)
+        ids.append(np.asarray(shape.target_id)[inside])
+        places.append(place[inside])
+    return FirstMarkers(np.concatenate(ids), np.concatenate(places))

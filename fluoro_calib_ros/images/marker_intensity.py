@@ -1,0 +1,285 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Light of an image around markers: windows of grey values, round shadows in them.
+
+Only windows around predictions are looked at, which is a twentieth of an image. They are filtered
+as one tall image, so that a handful of calls to OpenCV serve all markers. The response to a round
+shadow is the smaller eigenvalue of the Hessian, as in `detection`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..errors import DataError
+from ..findings import Kind
+from .detection import BLOB_RADIUS, MIN_SIZE, field_of_view
+
+SCALES = (1.1, 1.5, 2.1, 3.0, 4.2)  # standard deviations of the blur [px]
+NOISE_WEIGHT = 0.1  # of the response, in the noise that it is compared with
+NEAR_PX = 3  # from a given point, within which its shadow is
+MIN_CONTRAST = 0.02  # of a response, as a fraction of the light around it
+MIN_SNR = 4.5  # of a response, over the noise of the response
+WINDOW_BACKGROUND_PX = 6  # the same along the rows of a window
+BACKGROUND_PX = 15  # half the width of the box whose mean is the light around a pixel
+SAME_PX = 1.0  # between maxima that are one shadow
+BORDER = 3  # scales of the blur at the edge of a window that are not searched
+
+
+@dataclass(frozen=True)
+class Shadows:
+    """Round shadows: places (n, 2) [px] to some 0.1 px, and strengths (n,).
+
+    A strength is the response over the light around the shadow.
+    """
+
+    uv: np.ndarray
+    strength: np.ndarray
+
+    def distinct(self) -> Shadows:
+        """Return the shadows without those at the place of a stronger one."""
+        order = np.argsort(-self.strength, kind='stable')
+        uv = self.uv[order]
+        tree = cKDTree(uv)
+        again = {int(two) for one, two in tree.query_pairs(SAME_PX) if one < two}
+        kept = order[[number for number in range(len(order)) if number not in again]]
+        return Shadows(self.uv[kept], self.strength[kept])
+
+
+@dataclass(frozen=True)
+class MarkerLook:
+    """What markers look like in the images of a sequence.
+
+    Attributes
+    ----------
+    scale : float
+        Blur at which they stand out most [px].
+    inverted : bool
+        Markers are bright in the image.
+    field : (h, w) ndarray of bool
+        The field of view.
+    strength : float
+        Response to a typical marker over the light around it.
+    floor : float
+        Response below which noise is, in the light of the middle of the range.
+    light : float
+        That light.
+    """
+
+    scale: float
+    inverted: bool
+    field: NDArray[np.bool_]
+    strength: float
+    floor: float
+    light: float
+
+    @property
+    def radius_px(self) -> float:
+        """Radius of a blurred marker [px]."""
+        return self.scale * BLOB_RADIUS
+
+
+class LightWindows:
+    """Reads windows of one image, markers dark."""
+
+    def __init__(self, image: np.ndarray, look: MarkerLook) -> None:
+        self._flat = image.reshape(-1)
+        self._field = look.field.reshape(-1)
+        self._all = bool(look.field.all())
+        self.shape = image.shape
+        self._top = float(np.iinfo(image.dtype).max) if look.inverted else None
+
+    def read(self, middle: np.ndarray, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return grey values (n, m) of float32 at middle (n, 2) + offset (m, 2), and validity."""
+        height, width = self.shape
+        column = middle[:, :1] + offset[:, 0]
+        row = middle[:, 1:] + offset[:, 1]
+        reach = int(np.abs(offset).max(initial=0))
+        inside = (
+            (middle.min(initial=reach) >= reach)
+            and (middle[:, 0].max(initial=0) < width - reach)
+            and (middle[:, 1].max(initial=0) < height - reach)
+        )
+        if inside:
+            index = row * width + column
+            valid = np.ones(index.shape, dtype=bool) if self._all else self._field[index]
+        else:
+            valid = (column >= 0) & (column < width) & (row >= 0) & (row < height)
+            index = np.clip(row, 0, height - 1) * width + np.clip(column, 0, width - 1)
+            valid &= self._field[index]
+        grey = self._flat[index].astype(np.float32)
+        return (grey if self._top is None else self._top - grey), valid
+
+
+def check_image(image: np.ndarray, size: tuple[int, int] | None = None) -> None:
+    """Raise DataError, in one sentence, for an image in which nothing can be seen.
+
+    size is the width and height that it should have.
+    """
+    if not isinstance(image, np.ndarray) or image.ndim != 2:
+        raise DataError('an image must be an array of rows and columns of grey values')
+    if image.dtype not in (np.uint8, np.uint16):
+        raise DataError(f'the image has pixels of {image.dtype}, not of 8 or 16 bits')
+    height, width = image.shape
+    if min(image.shape) < MIN_SIZE:
+        raise DataError(f'the image has only {width} x {height} px')
+    if size is not None and (width, height) != size:
+        raise DataError(
+            f'the image is {width} x {height} px, but the first one is {size[0]} x {size[1]} px'
+        )
+    # A coarse look is enough, and takes no time.
+    sample = image[::16, ::16]
+    if sample.min() == sample.max() and image.min() == image.max():
+        cause = f'the image is empty: every pixel has the grey value {int(image.flat[0])}'
+        raise DataError(cause, kind=Kind.IMAGE_EMPTY)
+
+
+def learn_look(
+    image: np.ndarray,
+    near: np.ndarray | None,
+    count: int,
+    scales: Sequence[float] = SCALES,
+) -> MarkerLook:
+    """Learn what markers look like, from an image and points (n, 2) near them.
+
+    Without points, the count strongest shadows of each scale decide. scales are those that are
+    tried. Raises DataError where there is nothing round.
+    """
+    grey = image.astype(np.float32)
+    around = cv2.blur(grey, (2 * BACKGROUND_PX + 1,) * 2)
+    top = float(np.iinfo(image.dtype).max)
+    best: tuple[float, float, float, bool] | None = None
+    for scale in scales:
+        for inverted, response in zip((False, True), _responses(grey, scale)):
+            relative = response / np.maximum(top - around if inverted else around, 1e-3 * top)
+            typical = _typical(relative, scale, near, count)
+            # Small scales have the strongest response to noise, too.
+            noise = float(np.median(relative[relative > 0])) if (relative > 0).any() else 1.0
+            merit = typical / (noise + NOISE_WEIGHT * typical)
+            if best is None or merit * typical > best[0]:
+                best = (merit * typical, typical, scale, inverted)
+    assert best is not None
+    _, strength, scale, inverted = best
+    light = top - grey if inverted else grey
+    field = field_of_view(light, scale)
+    relative = _responses(light, scale)[0] / np.maximum(
+        cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2), 1e-3 * top
+    )
+    quiet = relative[field]
+    noise = float(np.median(quiet[quiet > 0])) if (quiet > 0).any() else 0.0
+    floor = max(MIN_SNR * noise, MIN_CONTRAST)
+    if strength < floor:
+        cause = 'there is nothing round where the markers should be'
+        if near is None:
+            cause = 'there are no markers in the image, nothing round rises above the noise'
+        raise DataError(cause, kind=Kind.NO_MARKERS)
+    usual = float(np.median(light[field])) if field.any() else float(light.mean())
+    return MarkerLook(
+        scale, inverted, field=field, strength=strength, floor=floor, light=max(usual, 1.0)
+    )
+
+
+def search_image(image: np.ndarray, look: MarkerLook, share: float) -> Shadows:
+    """Search a whole image for shadows with a share of the strength of a typical marker."""
+    grey = image.astype(np.float32)
+    light = float(np.iinfo(image.dtype).max) - grey if look.inverted else grey
+    around = cv2.blur(light, (2 * BACKGROUND_PX + 1,) * 2)
+    response = _relative(_responses(light, look.scale)[0], around, look)
+    response[~look.field] = 0
+    response[[0, -1]] = 0
+    response[:, [0, -1]] = 0
+    return _peaks(response, look, share)
+
+
+def search_windows(
+    windows: LightWindows, middle: np.ndarray, half: int, look: MarkerLook, share: float
+) -> Shadows:
+    """Search windows of 2 half + 1 px around pixels middle (n, 2), each shadow found once."""
+    border = int(np.ceil(BORDER * look.scale))
+    size = 2 * (half + border) + 1
+    axis = np.arange(-half - border, half + border + 1)
+    offset = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    grey, valid = windows.read(middle, offset)
+    around = cv2.blur(grey.reshape(-1, size), (2 * WINDOW_BACKGROUND_PX + 1, 1))
+    response = _relative(_responses(grey.reshape(-1, size), look.scale)[0], around, look)
+    response = response.reshape(len(middle), size, size)
+    response *= valid.reshape(response.shape)
+    # The seams between windows lie in their borders.
+    response[:, :border] = 0
+    response[:, -border:] = 0
+    response[:, :, :border] = 0
+    response[:, :, -border:] = 0
+    found = _peaks(response.reshape(-1, size), look, share)
+    number = (found.uv[:, 1] + 0.5).astype(int) // size
+    place = found.uv.copy()
+    place[:, 1] -= number * size
+    place += middle[number] - half - border
+    # Windows that overlap contain the same shadow.
+    return Shadows(place, found.strength).distinct() if len(place) else found
+
+
+def _relative(response: np.ndarray, around: np.ndarray, look: MarkerLook) -> np.ndarray:
+    """Responses over the light around, 0 where noise explains them: it grows in the dark."""
+    light = np.maximum(around, 1e-3 * look.light)
+    relative = response / light
+    relative[relative < look.floor * np.sqrt(np.maximum(look.light / light, 1.0))] = 0
+    return np.asarray(relative)
+
+
+def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Responses (h, w) to dark and to bright blobs: the smaller eigenvalue, or 0."""
+    smooth = cv2.GaussianBlur(grey, (0, 0), scale)
+    twice = np.array([1.0, -2.0, 1.0], dtype=np.float32)
+    one = np.array([0.0, 1.0, 0.0], dtype=np.float32)
+    once = np.array([-0.5, 0.0, 0.5], dtype=np.float32)
+    xx = cv2.sepFilter2D(smooth, cv2.CV_32F, twice, one)
+    yy = cv2.sepFilter2D(smooth, cv2.CV_32F, one, twice)
+    xy = cv2.sepFilter2D(smooth, cv2.CV_32F, once, once)
+    mean = (0.5 * scale**2) * (xx + yy)
+    difference = 0.5 * (xx - yy)
+    spread = scale**2 * cv2.sqrt(difference * difference + xy * xy)
+    return np.maximum(mean - spread, 0), np.maximum(-mean - spread, 0)
+
+
+def _typical(response: np.ndarray, scale: float, near: np.ndarray | None, count: int) -> float:
+    """Median response near given points, or of the count strongest maxima."""
+    size = 2 * NEAR_PX + 1 if near is not None else 2 * max(1, round(scale)) + 1
+    dilated = cv2.dilate(response, np.ones((size, size), np.uint8))
+    if near is not None:
+        height, width = response.shape
+        column = np.clip(np.rint(near[:, 0]).astype(int), 0, width - 1)
+        row = np.clip(np.rint(near[:, 1]).astype(int), 0, height - 1)
+        return float(np.median(dilated[row, column]))
+    values = np.sort(response[(response >= dilated) & (response > 0)])[::-1][: max(count, 3)]
+    return float(np.median(values)) if len(values) else 0.0
+
+
+def _peaks(response: np.ndarray, look: MarkerLook, share: float) -> Shadows:
+    """Local maxima of a response (h, w) that is 0 at its edge, to a part of a pixel."""
+    size = 2 * max(1, round(look.scale)) + 1
+    dilated = cv2.dilate(response, np.ones((size, size), np.uint8))
+    row, column = np.nonzero(
+        (response >= dilated) & (response > max(share * look.strength, look.floor))
+    )
+    at = response[row, column]
+    uv = np.column_stack(
+        [
+            column + _vertex(response[row, column - 1], at, response[row, column + 1]),
+            row + _vertex(response[row - 1, column], at, response[row + 1, column]),
+        ]
+    )
+    return Shadows(uv, at)
+
+
+def _vertex(before: np.ndarray, at: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """Places (n,) of the vertices of parabolas through three samples, relative to the middle."""
+    curvature = before - 2 * at + after
+    shift = 0.5 * (before - after) / np.where(curvature < 0, curvature, -1.0)
+    return np.clip(np.where(curvature < 0, shift, 0), -0.5, 0.5)

@@ -1,0 +1,280 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Motion of markers in an image: prediction, assignment, and which ids may have been exchanged.
+
+Each marker has a Kalman filter of constant velocity whose disturbance is a white acceleration
+(Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+6.3.2), of a size that is learned from the innovations. Shadows are assigned to all markers
+together (Kuhn and Munkres, by scipy), at the largest likelihood: a squared Mahalanobis distance
+and the logarithm of the determinant of its covariance (ibid., 5.4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import cKDTree
+
+FIRST_SPEED_PX = 6.0  # standard deviation of the unknown first velocity [px a frame]
+FIRST_ACCELERATION_PX = 0.5
+MIN_ACCELERATION_PX = 0.05  # px a squared frame
+FORGET = 0.9  # share of the earlier squared innovations that is kept
+COMPARED = 5  # images before the motion of two markers is known to be alike
+STRANGE_PX = 0.4  # difference of velocities that is not strange [px a frame]
+LEADERS = 4  # markers whose changes of velocity an unseen one follows
+LED = 0.5  # share of the acceleration that they do not explain
+MAX_SD_PX = 60.0  # of a prediction
+MODEL_SD_PX = 0.05  # of a place, beyond the noise of the measurement
+FAR = 1e6
+VOTE_PX = 2.0  # from a shadow, within which a marker votes for a shift
+MIN_VOTES = 1.5
+MIN_VOTE_SHARE = 0.3
+
+
+@dataclass
+class Motion:
+    """State of the filters of n markers.
+
+    Attributes
+    ----------
+    uv, velocity : (n, 2) ndarray
+        [px], [px a frame].
+    covariance : (n, 2, 2) ndarray
+        Of place and velocity, the same along u and v.
+    squared : (n,) ndarray
+        Running mean of squared accelerations.
+    unlike : (n, n) ndarray
+        Running mean of squared differences of velocities.
+    together : (n, n) ndarray of int
+        Images in which they were compared.
+    """
+
+    uv: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    squared: NDArray[np.float64]
+    unlike: NDArray[np.float64]
+    together: NDArray[np.int64]
+
+    @classmethod
+    def start(cls, uv: np.ndarray, sd_px: float) -> Motion:
+        """Return filters of markers at uv (n, 2), whose velocity is not known."""
+        n = len(uv)
+        covariance = np.zeros((n, 2, 2))
+        covariance[:, 0, 0] = sd_px**2
+        covariance[:, 1, 1] = FIRST_SPEED_PX**2
+        squared = np.full(n, FIRST_ACCELERATION_PX**2)
+        unlike = np.full((n, n), FIRST_SPEED_PX**2)
+        np.fill_diagonal(unlike, np.inf)
+        together = np.zeros((n, n), dtype=int)
+        return cls(
+            np.array(uv, dtype=float),
+            np.zeros((n, 2)),
+            covariance=covariance,
+            squared=squared,
+            unlike=unlike,
+            together=together,
+        )
+
+    @property
+    def variance(self) -> np.ndarray:
+        """Variances (n,) of a coordinate [px^2]."""
+        return self.covariance[:, 0, 0]
+
+    def predict(self, frames: int, led: np.ndarray | None = None) -> None:
+        """Move all markers on by a number of frames.
+
+        led (n,) are those whose velocity follows that of others.
+        """
+        t = float(frames)
+        self.uv += t * self.velocity
+        pooled = float(np.median(self.squared)) if len(self.squared) else 0.0
+        q = np.maximum(np.maximum(self.squared, pooled), MIN_ACCELERATION_PX**2)
+        if led is not None:
+            q = np.where(led, LED**2 * pooled + MIN_ACCELERATION_PX**2, q)
+        p = self.covariance
+        cross = p[:, 0, 1] + t * p[:, 1, 1]
+        p[:, 0, 0] += t * (p[:, 0, 1] + cross) + q * t**4 / 4
+        p[:, 0, 1] = p[:, 1, 0] = cross + q * t**3 / 2
+        p[:, 1, 1] += q * t**2
+        too_wide = p[:, 0, 0] > MAX_SD_PX**2
+        if too_wide.any():
+            factor = np.where(too_wide, MAX_SD_PX**2 / p[:, 0, 0], 1.0)
+            p *= factor[:, None, None]
+
+    def innovation_variance(self, sigma: np.ndarray) -> np.ndarray:
+        """Variances (n,) of a measured less a predicted coordinate."""
+        return self.variance + sigma**2 + MODEL_SD_PX**2
+
+    def update(self, rows: np.ndarray, uv: np.ndarray, sigma: np.ndarray, frames: int) -> None:
+        """Take in measured centres (m, 2) of some markers."""
+        innovation = uv - self.uv[rows]
+        p = self.covariance[rows]
+        s = p[:, 0, 0] + sigma**2 + MODEL_SD_PX**2
+        gain = p[:, :, 0] / s[:, None]
+        self.uv[rows] += gain[:, :1] * innovation
+        self.velocity[rows] += gain[:, 1:] * innovation
+        self.covariance[rows] = p - gain[:, :, None] * p[:, None, 0, :]
+        # What the innovation says of the acceleration; a first or late one says little.
+        settled = self.settled[rows] & (p[:, 1, 1] < FIRST_SPEED_PX**2 / 4)
+        seen = 0.5 * (innovation**2).sum(axis=1) / float(frames) ** 4
+        seen = np.maximum(seen - sigma**2, 0)
+        update = FORGET * self.squared[rows] + (1 - FORGET) * seen
+        self.squared[rows] = np.where(settled, update, self.squared[rows])
+
+    def lead(self, seen: np.ndarray, before: np.ndarray, sure: np.ndarray) -> np.ndarray:
+        """Let unseen markers follow those that move alike; returns (n,) which do.
+
+        seen (n,) were measured now, and had velocities before (n, 2). Which markers move alike is
+        learned from those that are sure (n,).
+        """
+        rows = np.flatnonzero(seen & self.settled)
+        led = np.zeros(len(seen), dtype=bool)
+        if len(rows) < LEADERS:
+            return led
+        velocity = self.velocity[rows]
+        difference = ((velocity[:, None] - velocity[None]) ** 2).sum(axis=2)
+        both = np.ix_(rows, rows)
+        learned = sure[rows, None] & sure[rows]
+        self.together[both] += learned
+        share = learned * np.maximum(1 / np.maximum(self.together[both], 1), 1 - FORGET)
+        before_unlike = np.where(learned & (self.together[both] == 1), 0.0, self.unlike[both])
+        np.fill_diagonal(before_unlike, 0.0)
+        self.unlike[both] = (1 - share) * before_unlike + share * difference
+        self.unlike[rows, rows] = np.inf
+        change = velocity - before[rows]
+        for row in np.flatnonzero(~seen & self.settled).tolist():
+            alike = np.argsort(self.unlike[row, rows], kind='stable')[:LEADERS]
+            self.velocity[row] += np.median(change[alike], axis=0)
+            led[row] = True
+        return led
+
+    def strangeness(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Compare velocities with those of the markers that moved alike so far.
+
+        Returns, for markers in rows (k,), the ratio (k,) of the squared difference to what it used
+        to be, and the velocities (k, 2) of the others. seen (n,) were measured now.
+        """
+        rows = np.flatnonzero(seen & self.settled)
+        if len(rows) <= LEADERS:
+            return np.zeros(0, dtype=int), np.zeros(0), np.zeros((0, 2))
+        both = np.ix_(rows, rows)
+        unlike = np.where(self.together[both] < COMPARED, np.inf, self.unlike[both])
+        order = np.argsort(unlike, axis=1, kind='stable')[:, :LEADERS]
+        usual = np.take_along_axis(unlike, order, axis=1).mean(axis=1)
+        others = np.median(self.velocity[rows][order], axis=1)
+        squared = ((self.velocity[rows] - others) ** 2).sum(axis=1)
+        return rows, squared / (usual + STRANGE_PX**2), others
+
+    def place(
+        self, rows: np.ndarray, uv: np.ndarray, velocity: np.ndarray, sd_px: np.ndarray
+    ) -> None:
+        """Put some markers where a better prediction says, if it is better."""
+        better = sd_px**2 < self.variance[rows]
+        rows = rows[better]
+        self.uv[rows] = uv[better]
+        self.velocity[rows] = velocity[better]
+        self.covariance[rows] = np.eye(2) * (sd_px[better] ** 2)[:, None, None]
+
+    def scatter(self, row: int) -> None:
+        """Forget where a marker is."""
+        self.covariance[row] = np.diag([MAX_SD_PX**2, FIRST_SPEED_PX**2])
+
+    @property
+    def settled(self) -> np.ndarray:
+        """Return (n,) whether the velocity of a marker is known."""
+        return np.asarray(self.covariance[:, 1, 1] < FIRST_SPEED_PX**2 / 4)
+
+    def redirect(self, row: int, uv: np.ndarray, velocity: np.ndarray, sd_px: float) -> None:
+        """Put a marker at a place (2,), with a velocity (2,) [px a frame]."""
+        self.uv[row] = uv
+        self.velocity[row] = velocity
+        self.covariance[row] = np.eye(2) * sd_px**2
+
+    def exchange(self, one: int, other: int) -> None:
+        """Exchange the states of two markers."""
+        for values in (self.uv, self.velocity, self.covariance, self.squared):
+            values[[one, other]] = values[[other, one]]
+        self.unlike[[one, other]] = self.unlike[[other, one]]
+        self.unlike[:, [one, other]] = self.unlike[:, [other, one]]
+        self.together[[one, other]] = self.together[[other, one]]
+        self.together[:, [one, other]] = self.together[:, [other, one]]
+
+
+def costs(uv: np.ndarray, variance: np.ndarray, found: np.ndarray) -> np.ndarray:
+    """Costs (n, m), -2 log likelihood, of places (m, 2) for markers predicted at uv (n, 2)."""
+    away = uv[:, None] - found[None]
+    squared = (away * away).sum(axis=2)
+    return squared / variance[:, None] + 2 * np.log(variance)[:, None]
+
+
+def assign(
+    uv: np.ndarray, variance: np.ndarray, found: np.ndarray, gate_sigmas: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Assign places (m, 2) to markers predicted at uv (n, 2); rows of both.
+
+    As many markers as possible get a place within their gate, at the smallest sum of costs.
+    """
+    if not len(uv) or not len(found):
+        return np.zeros(0, dtype=int), np.zeros(0, dtype=int)
+    cost = costs(uv, variance, found)
+    away = uv[:, None] - found[None]
+    inside = (away * away).sum(axis=2) < gate_sigmas**2 * variance[:, None]
+    row, column = linear_sum_assignment(np.where(inside, cost, FAR))
+    good = inside[row, column]
+    return row[good], column[good]
+
+
+def common_shift(
+    uv: np.ndarray, row: int, beside: np.ndarray, found: cKDTree, reach_px: float
+) -> np.ndarray | None:
+    """Shift (2,) of a marker that takes most of the markers beside it to shadows, or None.
+
+    uv (n, 2) are predictions, beside (k,) rows of markers that move with it.
+    """
+    near = found.query_ball_point(uv[row], reach_px)
+    if not near:
+        return None
+    shift = found.data[near] - uv[row]
+    there = found.query((uv[beside][None] + shift[:, None]).reshape(-1, 2))[0]
+    close = np.minimum(there.reshape(len(near), -1) / VOTE_PX, 1.0)
+    score = (1 - close**2).sum(axis=1) - 0.5 * np.linalg.norm(shift, axis=1) / reach_px
+    best = int(np.argmax(score))
+    if score[best] < max(MIN_VOTES, MIN_VOTE_SHARE * len(beside)):
+        return None
+    return np.asarray(shift[best])
+
+
+def doubtful_pairs(
+    uv: NDArray[np.float64],
+    variance: NDArray[np.float64],
+    measured: NDArray[np.bool_],
+    found: np.ndarray,
+    margin: float,
+) -> np.ndarray:
+    """Pairs (k, 2) of markers whose places could as well be exchanged.
+
+    Parameters
+    ----------
+    uv : (n, 2) ndarray
+        Predictions.
+    variance : (n,) ndarray
+        Of a measured less a predicted coordinate.
+    measured : (n,) ndarray of bool
+    found : (n, 2) ndarray
+        Measured centres; anything where there is none.
+    margin : float
+        Of -2 log likelihood, below which the other way round is not excluded.
+    """
+    cost = costs(uv, variance, np.where(measured[:, None], found, FAR))
+    own = np.where(measured, np.diagonal(cost), 0.0)
+    other = np.where(measured[None], cost, 0.0)
+    # Both measured: exchanged. One measured: its place may be that of the other.
+    excess = other + other.T - own[:, None] - own[None]
+    there = measured[:, None] | measured[None]
+    one, two = np.nonzero(np.triu(there & (excess < margin), 1))
+    return np.stack([one, two], axis=1)

@@ -1,0 +1,140 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Rays of markers in two views: corrected, intersected, and projected back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.intersection import Intersector
+from .marker_geometry import project_observed
+from .markers import MarkerFrame
+
+AGREE = 4.0  # standardised epipolar distance up to which two rays belong together
+SYSTEMATIC_PX = 0.1  # of a corrected image point, beyond its standard deviation
+
+
+@dataclass(frozen=True)
+class PairExposure:
+    """Markers of one exposure in all views, by row of all ids.
+
+    Attributes
+    ----------
+    observed, corrected : (2, n, 2) ndarray
+        [px], NaN where a view does not see a marker.
+    sigma : (2, n) ndarray
+        Of the corrected image points.
+    doubtful : (2, n) ndarray of bool
+    xyz_mm : (n, 3) ndarray
+    standardised : (n,) ndarray
+        Epipolar distance.
+    """
+
+    observed: NDArray[np.float64]
+    corrected: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    doubtful: NDArray[np.bool_]
+    xyz_mm: NDArray[np.float64]
+    standardised: NDArray[np.float64]
+
+    @property
+    def agree(self) -> np.ndarray:
+        """Return (n,) whether both rays of a marker meet."""
+        return (self.standardised < AGREE) & np.isfinite(self.xyz_mm).all(axis=1)
+
+    @property
+    def sure(self) -> np.ndarray:
+        """Return (n,) whether both rays of a marker meet, and no view doubts its id."""
+        return self.agree & ~self.doubtful.any(axis=0)
+
+
+class PairRays:
+    """Rays of markers in two calibrated views.
+
+    Parameters
+    ----------
+    calibrations : mapping of str to FluoroscopeCalibration
+    orientation : RigOrientation
+        That they belong to.
+    names : sequence of str
+        The two fluoroscopes.
+    target_id : (n,) ndarray
+        Of all markers, ascending.
+    """
+
+    def __init__(
+        self,
+        calibrations: Mapping[str, FluoroscopeCalibration],
+        orientation: RigOrientation,
+        names: Sequence[str],
+        target_id: np.ndarray,
+    ) -> None:
+        self._calibrations = calibrations
+        self._names = names
+        self._target_id = target_id
+        self._intersector = Intersector(orientation.subset(names), None)
+
+    def intersect(
+        self, views: Mapping[str, MarkerFrame], angles: Mapping[str, float | None]
+    ) -> PairExposure:
+        """Correct and intersect the markers of an exposure at angles [rad]."""
+        n = len(self._target_id)
+        observed = np.full((2, n, 2), np.nan)
+        corrected = np.full((2, n, 2), np.nan)
+        sigma = np.full((2, n), np.nan)
+        doubtful = np.zeros((2, n), dtype=bool)
+        for view, name in enumerate(self._names):
+            found = views[name]
+            rows = np.searchsorted(self._target_id, found.target_id)
+            observed[view, rows] = found.uv
+            u, v, total, _, _ = self._calibrations[name].correct_arrays(
+                found.uv[:, 0].copy(), found.uv[:, 1].copy(), found.sigma, angles.get(name)
+            )
+            corrected[view, rows] = np.stack([u, v], axis=1)
+            sigma[view, rows] = np.hypot(total, SYSTEMATIC_PX)
+            doubtful[view, rows] = found.doubtful
+        points = self._intersector.intersect(corrected, sigma)
+        return PairExposure(
+            observed,
+            corrected,
+            sigma=sigma,
+            doubtful=doubtful,
+            xyz_mm=points.xyz_mm,
+            standardised=points.standardised,
+        )
+
+    def exchanged(self, exposure: PairExposure, view: int, rows: Sequence[int]) -> np.ndarray:
+        """Standardised epipolar distances (2,) of two markers if a view exchanged them."""
+        pair = list(rows)
+        uv = exposure.corrected[:, pair].copy()
+        sigma = exposure.sigma[:, pair].copy()
+        uv[view] = uv[view, ::-1]
+        sigma[view] = sigma[view, ::-1]
+        return self._intersector.intersect(uv, sigma).standardised
+
+    def project(
+        self, view: int, xyz_mm: np.ndarray, angles: Mapping[str, float | None]
+    ) -> np.ndarray:
+        """Observed pixels (k, 2) of points (k, 3) in the rig frame [mm] at angles [rad].
+
+        They are NaN where a point is.
+        """
+        name = self._names[view]
+        uv = np.full((len(xyz_mm), 2), np.nan)
+        known = np.isfinite(xyz_mm).all(axis=1)
+        if known.any():
+            uv[known] = project_observed(
+                self._intersector.orientation,
+                view,
+                self._calibrations[name],
+                xyz_mm[known],
+                angles.get(name),
+            )
+        return uv

@@ -1,0 +1,403 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Follow implanted markers through the images of one fluoroscope.
+
+Ids come from a first frame. In every further image, shadows are searched near the predictions,
+assigned to all markers together, and measured at once. A marker that is not seen coasts, and is
+found again where it may be by then. Where two markers could have been exchanged, the tracker says
+so: their ids stay doubtful until a second view, or the user, confirms them.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+from ..findings import Finding, Kind
+from ..options import option, validate_options
+from .marker_company import follow_beside, shift_together
+from .marker_doubts import MarkerDoubts
+from .marker_intensity import LightWindows, MarkerLook, check_image
+from .marker_measurement import MarkerMeasurement
+from .marker_search import MarkerSearch
+from .marker_start import learn_start
+from .marker_states import MarkerStates, MeasuredMarkers
+from .marker_watch import MarkerWatch
+from .shadow_profile import Profile
+
+
+@dataclass(frozen=True)
+class MarkerOptions:
+    """Options of following. Raises ValueError for a value that an option cannot have."""
+
+    gate: float = option(
+        4.5,
+        'distance from its prediction within which a marker is looked for',
+        minimum=1,
+        maximum=20,
+        unit='standard deviations',
+    )
+    margin: float = option(
+        14.0,
+        'difference of twice the log likelihood below which two ids may have been exchanged',
+        minimum=0,
+        maximum=1000,
+    )
+    search_every: int = option(
+        30,
+        'images between searches of the whole image, where a marker is lost',
+        minimum=1,
+        maximum=100000,
+        unit='images',
+    )
+    lost_after: int = option(
+        10,
+        'images without a marker after which it is lost, and searched in the whole image',
+        minimum=1,
+        maximum=100000,
+        unit='images',
+    )
+    shutter: float = option(
+        0.5,
+        'share of the time between two images during which the light is on; blurs what moves',
+        minimum=0,
+        maximum=1,
+    )
+
+    def __post_init__(self) -> None:
+        validate_options(self)
+
+
+@dataclass(frozen=True)
+class FirstMarkers:
+    """Markers of one image: ids (n,) and places (n, 2) [px], to a pixel or two."""
+
+    target_id: np.ndarray
+    uv: np.ndarray
+
+    def __post_init__(self) -> None:
+        ids = np.asarray(self.target_id, dtype=np.int64).reshape(-1)
+        uv = np.asarray(self.uv, dtype=float)
+        if not len(ids):
+            raise DataError('the first frame has no markers')
+        if uv.shape != (len(ids), 2):
+            raise DataError(f'{len(ids)} markers, but places of shape {uv.shape}')
+        if not np.isfinite(uv).all():
+            bad = ids[~np.isfinite(uv).all(axis=1)][0]
+            raise DataError(f'marker {bad} of the first frame has no place')
+        unique, count = np.unique(ids, return_counts=True)
+        if (count > 1).any():
+            raise DataError(f'marker {unique[count > 1][0]} occurs twice in the first frame')
+        object.__setattr__(self, 'target_id', ids)
+        object.__setattr__(self, 'uv', uv)
+
+
+@dataclass(frozen=True)
+class MarkerFrame:
+    """Markers of one image.
+
+    Attributes
+    ----------
+    frame : int
+    target_id : (n,) ndarray of int
+        Of the markers that were measured.
+    uv : (n, 2) ndarray
+        Centres [px], of the middle of the exposure.
+    sigma : (n,) ndarray
+        Standard deviation of a coordinate [px].
+    overlapped : (n,) ndarray of bool
+        The shadow of another marker reaches into that of the marker.
+    doubtful : (n,) ndarray of bool
+        The id may be wrong.
+    missing : (k,) ndarray of int
+        Markers that were not measured.
+    predicted : (k, 2) ndarray
+        Where they are believed to be [px].
+    lost : (k,) ndarray of bool
+        Whether they are searched in the whole image.
+    doubts : tuple of Finding
+        Two markers that may have been exchanged, or one that may be something else.
+        Those that began with this image.
+    finding : Finding or None
+        Why nothing was measured.
+    seconds : float
+    """
+
+    frame: int
+    target_id: NDArray[np.int64]
+    uv: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    overlapped: NDArray[np.bool_]
+    doubtful: NDArray[np.bool_]
+    missing: NDArray[np.int64]
+    predicted: NDArray[np.float64]
+    lost: NDArray[np.bool_]
+    doubts: tuple[Finding, ...] = ()
+    finding: Finding | None = None
+    seconds: float = 0.0
+
+    @property
+    def reason(self) -> str:
+        """Why nothing was measured, in words; '' where something was."""
+        return '' if self.finding is None else self.finding.cause
+
+
+@dataclass(frozen=True)
+class _Followed:
+    """What follows markers, from the first image on.
+
+    Attributes
+    ----------
+    states : MarkerStates
+        Predicted, then updated.
+    doubts : MarkerDoubts
+    look : MarkerLook
+    size : tuple of int
+        Width and height of the images [px].
+    search, measurement, watch
+        The steps of an image, in their order.
+    """
+
+    states: MarkerStates
+    doubts: MarkerDoubts
+    look: MarkerLook
+    size: tuple[int, int]
+    search: MarkerSearch
+    measurement: MarkerMeasurement
+    watch: MarkerWatch
+
+
+class MarkerTracker:
+    """Follows markers through the images of one fluoroscope.
+
+    Parameters
+    ----------
+    options : MarkerOptions, optional
+    first : FirstMarkers
+        Ids and places in the first image.
+    """
+
+    def __init__(self, options: MarkerOptions | None = None, *, first: FirstMarkers) -> None:
+        self.options = options or MarkerOptions()
+        self.first = first
+        self._followed: _Followed | None = None
+        self._frame = 0
+        self._gap = 1  # frames between the last two images
+        self._images = 0  # since the first one
+        self._led: np.ndarray | None = None
+        self._suggested: tuple[np.ndarray, ...] | None = None
+
+    @property
+    def target_id(self) -> np.ndarray:
+        """Ids (n,) of all markers."""
+        return self.first.target_id
+
+    @property
+    def profile(self) -> Profile | None:
+        """Shadow of a typical marker, None before the first image."""
+        return None if self._followed is None else self._followed.measurement.profile
+
+    def update(self, image: np.ndarray | None, frame: int) -> MarkerFrame:
+        """Measure the markers of the next image.
+
+        Parameters
+        ----------
+        image : (h, w) ndarray of uint8 or uint16, or None
+            None where there is no image of this number.
+        frame : int
+            Number of the image, above that of the one before; markers move on through numbers
+            that are left out.
+
+        Returns
+        -------
+        MarkerFrame
+            With all markers missing, and why, for an image in which nothing can be seen.
+
+        Raises
+        ------
+        DataError
+            For a number that does not grow; for a first image without the markers.
+        """
+        begin = time.perf_counter()
+        followed = self._followed
+        if followed is not None and frame <= self._frame:
+            raise DataError(f'image {frame} does not come after image {self._frame}')
+        try:
+            if image is None:
+                raise DataError('there is no image')
+            check_image(image, None if followed is None else followed.size)
+        except DataError as error:
+            if followed is None:
+                raise
+            self._advance(frame)
+            nothing = MeasuredMarkers.nothing(len(self.target_id))
+            return self._result(nothing, (), error.finding, begin)
+        if followed is None:
+            self._followed = self._start(image)
+            self._frame = frame
+        else:
+            self._advance(frame)
+        found, doubts = self._measure(image, frame)
+        none_seen = Finding(Kind.NO_MARKERS, 'no marker is seen')
+        return self._result(found, doubts, None if found.measured.any() else none_seen, begin)
+
+    def doubted_since(self, target_id: int) -> int | None:
+        """Return the image since which an id may be wrong, None for one that is sure."""
+        return self._known().doubts.since(self._row(target_id))
+
+    def confirm(self, target_id: int) -> None:
+        """Take back the doubt in a marker."""
+        self._known().doubts.confirm(self._row(target_id))
+
+    def exchange(self, one: int, other: int) -> None:
+        """Exchange two ids that were found to be the wrong way round."""
+        self._known().states.exchange(self._row(one), self._row(other))
+
+    def partners(self, target_id: int) -> set[int]:
+        """Return the ids that a marker may be exchanged with; its own for something else."""
+        rows = self._known().doubts.partners(self._row(target_id))
+        return {int(self.target_id[row]) for row in rows}
+
+    def part(self, one: int, other: int) -> None:
+        """Take back the doubt that two markers were exchanged."""
+        self._known().doubts.part(self._row(one), self._row(other))
+
+    def forget(self, target_id: int) -> None:
+        """Give up the place of a marker that was found to be something else."""
+        followed = self._known()
+        row = self._row(target_id)
+        followed.doubts.confirm(row)
+        followed.states.forget(row, self.options.lost_after + 1)
+
+    def doubt(self, target_id: int, frame: int) -> None:
+        """Note that an id may be wrong."""
+        self._known().doubts.add(self._row(target_id), frame)
+
+    def unsure(self) -> np.ndarray:
+        """Ids (k,) of markers that were not measured last, or are doubtful."""
+        followed = self._known()
+        return self.target_id[(followed.states.unseen > 0) | followed.doubts.doubtful]
+
+    def suggest(
+        self,
+        target_id: NDArray[np.int64],
+        uv: NDArray[np.float64],
+        velocity: NDArray[np.float64],
+        sd_px: NDArray[np.float64],
+    ) -> None:
+        """Offer predictions for the next image, such as those from another view.
+
+        Parameters
+        ----------
+        target_id : (k,) ndarray
+        uv, velocity : (k, 2) ndarray
+            [px], [px a frame].
+        sd_px : (k,) ndarray
+            Where it is smaller than that of the own prediction, this one is used.
+        """
+        rows = np.array([self._row(int(i)) for i in target_id], dtype=int)
+        self._suggested = (rows, np.asarray(uv), np.asarray(velocity), np.asarray(sd_px))
+
+    def _known(self) -> _Followed:
+        if self._followed is None:
+            raise DataError('there was no image yet')
+        return self._followed
+
+    def _row(self, target_id: int) -> int:
+        rows = np.flatnonzero(self.first.target_id == target_id)
+        if not len(rows):
+            raise DataError(f'there is no marker {target_id}')
+        return int(rows[0])
+
+    def _start(self, image: np.ndarray) -> _Followed:
+        """Learn from the first image. Raises DataError where the markers are not there."""
+        start = learn_start(image, self.target_id, self.first.uv)
+        options = self.options
+        doubts = MarkerDoubts(len(self.target_id))
+        return _Followed(
+            start.states,
+            doubts,
+            start.look,
+            start.size,
+            search=MarkerSearch(
+                start.look,
+                gate=options.gate,
+                lost_after=options.lost_after,
+                search_every=options.search_every,
+            ),
+            measurement=MarkerMeasurement(
+                start.profile, start.noise, gate=options.gate, shutter=options.shutter
+            ),
+            watch=MarkerWatch(
+                self.target_id,
+                doubts,
+                gate=options.gate,
+                margin=options.margin,
+                density=start.density,
+            ),
+        )
+
+    def _advance(self, frame: int) -> None:
+        """Predict all markers for an image."""
+        states = self._known().states
+        self._gap = frame - self._frame
+        self._frame = frame
+        self._images += 1
+        states.advance(self._gap, self._led)
+        if self._suggested is not None:
+            states.motion.place(*self._suggested)
+            self._suggested = None
+
+    def _measure(
+        self, image: np.ndarray, frame: int
+    ) -> tuple[MeasuredMarkers, tuple[Finding, ...]]:
+        """Find and measure the markers of an image, and say which ids it leaves doubtful."""
+        followed = self._known()
+        states = followed.states
+        watch = followed.watch
+        windows = LightWindows(image, followed.look)
+        shadows = followed.search.shadows(image, windows, states, self._images)
+        if self._images:
+            follow_beside(states, self._gap)
+            shift_together(states.motion, shadows, self.options.gate, self._gap)
+        found = followed.measurement.measure(windows, shadows, states)
+        found, doubts = watch.shadows_met(found, states, frame)
+        doubts += watch.found_again(found, states, frame)
+        doubts += watch.other_shadows(found, states, frame)
+        velocity_before = states.motion.velocity.copy()
+        states.update(found, self._gap)
+        doubts += watch.moving_alone(found, states, frame, self._gap)
+        sure = ~followed.doubts.doubtful
+        self._led = states.motion.lead(states.unseen == 0, velocity_before, sure)
+        return found, doubts
+
+    def _result(
+        self,
+        found: MeasuredMarkers,
+        doubts: tuple[Finding, ...],
+        finding: Finding | None,
+        begin: float,
+    ) -> MarkerFrame:
+        """Return the markers of the present image."""
+        followed = self._known()
+        measured = found.measured
+        missing = ~measured
+        return MarkerFrame(
+            self._frame,
+            self.target_id[measured],
+            uv=found.uv[measured],
+            sigma=found.sigma[measured],
+            overlapped=found.overlapped[measured],
+            doubtful=followed.doubts.doubtful[measured],
+            missing=self.target_id[missing],
+            predicted=followed.states.motion.uv[missing],
+            lost=followed.search.lost(followed.states)[missing],
+            doubts=doubts,
+            finding=finding,
+            seconds=time.perf_counter() - begin,
+        )

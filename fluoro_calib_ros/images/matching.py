@@ -1,0 +1,429 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Match beads of an image with a phantom, from nothing or from a pose nearby.
+
+A pose is only accepted by evidence: most of the beads that it predicts are found, most of what is
+found is predicted, and no other pose, such as that of the phantom turned by a symmetry of its own,
+fits nearly as well.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import permutations, product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+from ..errors import DataError
+from ..findings import Kind
+from ..photogrammetry.rotations import rotation_angle
+from .growth import Match, Seen, grow, settle, start_view
+from .lattice import FlatGrid, grid_matches
+from .pose_search import Triples, local_poses, nearby_map, triples_of
+from .view import Lens, View, fit_view
+
+MIN_BEADS = 10
+MIN_EXPLAINED = 0.4
+# Shares found and explained from which a pose is accepted. Where many beads overlap, fewer are
+# found, but nothing else is seen.
+EVIDENT = ((0.72, MIN_EXPLAINED), (0.6, 0.85))
+NEARLY_FOUND = 0.6
+SETTLINGS = 6  # of a match that is nearly evident
+# The same at which the search ends.
+SURE = ((0.85, 0.4), (0.75, 0.95))
+# By how much the score of the best pose must exceed that of another one: as a share of it, and in
+# beads. What is missed by chance is less.
+MARGIN = 0.06
+MARGIN_BEADS = 8
+# Levels of the search: neighbours of a bead in the phantom, in the image, beads tried (from, to),
+# and limits of the scale by the extent of what is seen. The first finds most poses, the second and
+# third find those that see all faces of a phantom from the edge. The others find a phantom with
+# other things around it, and a small part of a phantom.
+LEVELS = (
+    (8, 6, (0, 8), (0.85, 1.4)),
+    (8, 6, (8, 80), (0.85, 1.4)),
+    (14, 8, (0, 12), (0.85, 1.4)),
+    (8, 6, (0, 24), (0.6, 0.85)),
+    (8, 6, (0, 6), (1.4, 3.0)),
+)
+CENTRAL = 8  # beads of the middle that are tried first
+APART = 0.6  # share of the beads, those farthest from their neighbours, that are tried next
+AGREED = 3  # matches of the same pose after which the search ends, if it is evident
+CLIMBS = 12  # from a match to a better one by a symmetry
+RIVAL_STEPS = 3
+MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
+SIZE_MARGIN = 10.0  # log-likelihood by which sizes must prefer a pose
+SIZE_TAIL = 6.0
+CLOSER = 2.0  # factor on the residuals of one pose from which another is the better one
+SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
+SYMMETRY_REACH = 0.3  # of the distance between neighbours
+SHIFTS = 6  # to neighbours, as candidates of symmetries
+SCALE_BY_SIZE = (0.55, 1.6)  # of a bead's image over its diameter, with the blur
+
+
+@dataclass(frozen=True)
+class Symmetry:
+    """A motion that takes many beads of a phantom near to others.
+
+    Attributes
+    ----------
+    rotation : (3, 3) ndarray
+    shift : (3,) ndarray
+        [mm]
+    row : (n,) ndarray of int
+        Rows of the beads that beads are taken to, -1 for none.
+    """
+
+    rotation: NDArray[np.float64]
+    shift: NDArray[np.float64]
+    row: NDArray[np.int64]
+
+    @property
+    def turn_rad(self) -> float:
+        """Angle of the rotation."""
+        return float(rotation_angle(self.rotation))
+
+    def turned(self, view: View) -> View:
+        """Return the view that sees the moved phantom as this view sees the phantom."""
+        return replace(
+            view,
+            rotation=view.rotation @ self.rotation.T,
+            position=self.rotation @ view.position + self.shift,
+        )
+
+
+@dataclass(frozen=True)
+class PhantomModel:
+    """Beads of a phantom, prepared for matching.
+
+    Attributes
+    ----------
+    xyz : (n, 3) ndarray
+        [mm]
+    diameter_mm : (n,) ndarray or None
+    triples : tuple of Triples
+        By level of the search.
+    symmetries : tuple of Symmetry
+    grid : FlatGrid or None
+        For a flat grid.
+    regular : bool
+        Any of several poses that fit equally well is taken: a regular grid looks alike in all.
+    """
+
+    xyz: NDArray[np.float64]
+    diameter_mm: NDArray[np.float64] | None
+    triples: tuple[Triples, ...]
+    symmetries: tuple[Symmetry, ...]
+    grid: FlatGrid | None
+    regular: bool = False
+
+    @classmethod
+    def of(
+        cls, xyz: np.ndarray, diameter_mm: np.ndarray | None = None, regular: bool = False
+    ) -> PhantomModel:
+        """Return the model of beads (n, 3) [mm] with diameters (n,) [mm], if they are known.
+
+        Raises DataError for a regular phantom that is no flat grid.
+        """
+        grid = FlatGrid.of(xyz)
+        if regular and grid is None:
+            raise DataError('the phantom is no flat grid with rows and columns')
+        by_count = {level[0]: triples_of(xyz, level[0]) for level in LEVELS}
+        triples = tuple(by_count[level[0]] for level in LEVELS)
+        return cls(
+            xyz,
+            diameter_mm,
+            triples=triples,
+            symmetries=tuple(_symmetries(xyz)),
+            grid=grid,
+            regular=regular,
+        )
+
+
+def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
+    """Match what was found in an image with a phantom.
+
+    Parameters
+    ----------
+    seen : Seen
+    model : PhantomModel
+    lens : Lens
+
+    Returns
+    -------
+    Match
+
+    Raises
+    ------
+    DataError
+        Where no pose is sure, with the reason.
+    """
+    if len(seen.uv) < MIN_BEADS:
+        raise DataError(
+            f'only {len(seen.uv)} beads are found in the image, at least {MIN_BEADS} are needed',
+            kind=Kind.FEW_BEADS,
+            numbers={'beads': len(seen.uv)},
+        )
+    best: Match | None = None
+    agreed = 0
+    for candidate in _candidates(seen, model, lens):
+        candidate = _improved(candidate, seen, model)
+        agreed += best is not None and _same(candidate, best)
+        if best is None or candidate.score > best.score:
+            agreed = agreed if best is not None and _same(candidate, best) else 1
+            best = candidate
+            if _is_evident(best) and not is_sure(best):
+                best, _ = _climbed(best, seen, model)
+        if is_sure(best) or (agreed >= AGREED and _is_evident(best)):
+            break
+    if best is None:
+        raise DataError('no pose of the phantom fits the beads in the image', kind=Kind.NO_POSE)
+    _check_evidence(best)
+    best = unambiguous(best, seen, model)
+    _check_evidence(best)
+    return best
+
+
+def is_sure(best: Match) -> bool:
+    """Return whether a better match need not be searched for."""
+    return any(best.found >= found and best.explained >= explained for found, explained in SURE)
+
+
+def _improved(one: Match, seen: Seen, model: PhantomModel) -> Match:
+    """Return a match that is nearly evident after further steps, while they find more beads.
+
+    Where faces are seen from the edge, a pose reaches the far side of the phantom only by and by.
+    """
+    for _ in range(SETTLINGS):
+        if is_sure(one) or one.found < NEARLY_FOUND or one.explained < MIN_EXPLAINED:
+            break
+        again = settle(one.view, model.xyz, seen)
+        if again is None or again.score <= one.score:
+            break
+        one = again
+    return one
+
+
+def _is_evident(best: Match) -> bool:
+    """Return whether enough of what is predicted is found, and the reverse."""
+    return any(best.found >= found and best.explained >= explained for found, explained in EVIDENT)
+
+
+def _check_evidence(best: Match) -> None:
+    """Raise DataError where too few predicted beads are found, or the reverse."""
+    enough = best.explained < MIN_EXPLAINED or _is_evident(best)
+    if not enough or len(best.bead) < MIN_BEADS:
+        cause = (
+            f'predicts {best.expected} beads in the image, of which only {best.found:.0%} are '
+            'found'
+        )
+    elif best.explained < MIN_EXPLAINED:
+        cause = f'explains only {best.explained:.0%} of the beads in the image'
+    else:
+        return
+    raise DataError(
+        f'the best pose of the phantom {cause}',
+        kind=Kind.POSE_UNSURE,
+        numbers={
+            'expected': best.expected,
+            'found': best.found,
+            'explained': best.explained,
+        },
+    )
+
+
+def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = np.pi) -> Match:
+    """Return the best of a match and what the symmetries of the phantom make of it.
+
+    Those that turn it by more than an angle do not count. Raises DataError where another one fits
+    nearly as well, unless the phantom is regular.
+    """
+    if model.regular:
+        return best
+    first, rivals = _climbed(best, seen, model, turn_rad)
+    limit = first.score - max(MARGIN_BEADS, MARGIN * first.score)
+    equal = [one for one in rivals if one.score > limit and not _same(one, first)]
+    closest = min([first, *equal], key=lambda one: one.scale_px)
+    if all(one is closest or one.scale_px > CLOSER * closest.scale_px for one in [first, *equal]):
+        return closest
+    by_size = _best_by_size([first, *equal], seen, model)
+    if by_size is None:
+        raise DataError(
+            'the pose is ambiguous: the phantom fits nearly as well in another one '
+            f'({len(equal[0].bead)} beads instead of {len(first.bead)}); mark it by beads '
+            'that break its symmetry',
+            kind=Kind.POSE_AMBIGUOUS,
+            numbers={'beads': len(first.bead), 'beads_of_other': len(equal[0].bead)},
+        )
+    return by_size
+
+
+def _best_by_size(matches: list[Match], seen: Seen, model: PhantomModel) -> Match | None:
+    """Return the match in which beads are seen as large as they are; None where none stands out.
+
+    The logarithm of the response to a bead is linear in that of the size of its shadow. Matches
+    are compared by the likelihood of the residuals from that line.
+    """
+    diameter = model.diameter_mm
+    if seen.strength is None or diameter is None or np.ptp(diameter) < MIN_SIZES * diameter.min():
+        return None
+    likelihoods = []
+    for one in matches:
+        size = np.log(diameter[one.bead] / np.abs(one.view.depth(model.xyz[one.bead])))
+        response = np.log(np.maximum(seen.strength[one.detection], 1e-3))
+        x = size - size.mean()
+        slope = max(float(x @ response / max(x @ x, 1e-12)), 0.0)
+        residual = response - np.median(response - slope * x) - slope * x
+        spread = 1.4826 * float(np.median(np.abs(residual)))
+        # Beads that overlap or are cut off have any response.
+        squared = np.minimum(residual**2, (SIZE_TAIL * spread) ** 2)
+        likelihoods.append(-0.5 * len(x) * np.log(max(float(squared.mean()), 1e-12)))
+    order = np.argsort(likelihoods)
+    if likelihoods[order[-1]] - likelihoods[order[-2]] < SIZE_MARGIN:
+        return None
+    return matches[order[-1]]
+
+
+def _climbed(
+    best: Match, seen: Seen, model: PhantomModel, turn_rad: float = np.pi
+) -> tuple[Match, list[Match]]:
+    """Return the best match that symmetries of the phantom lead to, and those from it.
+
+    On a nearly regular phantom the search finds poses that are several steps of its pattern off.
+    """
+    symmetries = [one for one in model.symmetries if one.turn_rad <= turn_rad]
+    for _ in range(CLIMBS):
+        rivals = list(_alternatives(best, seen, model, symmetries))
+        better = max(rivals, key=lambda one: one.score, default=best)
+        if better.score <= best.score:
+            break
+        best = better
+    return best, rivals
+
+
+def _alternatives(
+    best: Match, seen: Seen, model: PhantomModel, symmetries: Sequence[Symmetry]
+) -> Iterator[Match]:
+    """Yield the matches of the phantom moved by its symmetries, where they fit at all."""
+    for symmetry in symmetries:
+        other = symmetry.row[best.bead]
+        known = other >= 0
+        if np.count_nonzero(known) < MIN_BEADS:
+            continue
+        view, scale = fit_view(
+            symmetry.turned(best.view),
+            model.xyz[other[known]],
+            seen.uv[best.detection[known]],
+            RIVAL_STEPS,
+            0.3,
+        )
+        rival = settle(view, model.xyz, seen) if scale <= seen.tolerance_px else None
+        if rival is not None:
+            yield rival
+
+
+def _same(one: Match, other: Match) -> bool:
+    """Return whether most beads of the image are matched with the same beads of the phantom."""
+    a = dict(zip(one.detection.tolist(), one.bead.tolist()))
+    b = dict(zip(other.detection.tolist(), other.bead.tolist()))
+    same = sum(a.get(detection) == bead for detection, bead in b.items())
+    return same > 0.5 * min(len(a), len(b))
+
+
+def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
+    """Yield matches of poses, the likeliest first."""
+    if model.grid is not None:
+        yield from grid_matches(model.grid, model.xyz, seen, lens)
+    beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
+    beads[~seen.field] = 2
+    order = seeds_of(seen)
+    for triples, (_, neighbours, (first, last), limits) in zip(model.triples, LEVELS):
+        scales = _scales(seen, model, limits)
+        for seed in order[first:last]:
+            _, around = seen.tree.query(seen.uv[seed], k=min(neighbours + 1, len(seen.uv)))
+            around = around[around != seed]
+            for pose in local_poses(
+                seed, seen.uv, near=around, triples=triples, found=beads, scales=scales
+            ):
+                view = start_view(pose, lens, model.xyz)
+                found = grow(view, pose.bead, model.xyz, seen)
+                if found is not None:
+                    yield found
+
+
+def seeds_of(seen: Seen) -> np.ndarray:
+    """Rows of beads to begin with: some of the middle, then those that stand apart, at random.
+
+    Distortion is least in the middle. Where faces are seen from the edge, beads of several faces
+    are neighbours in the image, the least so where beads stand apart.
+    """
+    n = len(seen.uv)
+    rng = np.random.default_rng(0)
+    centre = np.median(seen.uv, axis=0)
+    distance = np.linalg.norm(seen.uv - centre, axis=1)
+    middle = np.argsort(distance, kind='stable')[: max(60, n // 2)]
+    first = np.concatenate([middle[:1], rng.permutation(middle[1:])])[:CENTRAL]
+    spacing = seen.tree.query(seen.uv, k=[min(4, n)])[0][:, 0]
+    order = np.argsort(-spacing, kind='stable')
+    apart = rng.permutation(order[: int(np.ceil(APART * n))])
+    rest = order[int(np.ceil(APART * n)) :]
+    later = np.concatenate([apart, rest])
+    return np.concatenate([first, later[~np.isin(later, first)]])
+
+
+def _scales(seen: Seen, model: PhantomModel, limits: tuple[float, float]) -> tuple[float, float]:
+    """Smallest and largest scale [px/mm]; limits are those by the extent of what is seen."""
+    spread = np.sqrt(np.mean(np.sum((seen.uv - np.median(seen.uv, axis=0)) ** 2, axis=1)))
+    extent = np.sqrt(np.mean(np.sum((model.xyz - model.xyz.mean(axis=0)) ** 2, axis=1)))
+    by_extent = spread / (np.sqrt(2 / 3) * extent)
+    low, high = (by_extent * factor for factor in limits)
+    if model.diameter_mm is None:
+        return low, high
+    by_size = 2 * seen.radius_px / float(np.median(model.diameter_mm))
+    return max(low, by_size * SCALE_BY_SIZE[0]), min(high, by_size * SCALE_BY_SIZE[1])
+
+
+def _symmetries(xyz: np.ndarray) -> Iterator[Symmetry]:
+    """Yield motions of a phantom (n, 3) onto itself: turns, and shifts by a neighbour.
+
+    The turns are the 24 of a cube, about the axes of the phantom's frame and its principal axes.
+    """
+    centre = (xyz.min(axis=0) + xyz.max(axis=0)) / 2
+    tree = cKDTree(xyz)
+    distance, near = tree.query(xyz, k=min(SHIFTS + 1, len(xyz)))
+    reach = SYMMETRY_REACH * float(np.median(distance[:, 1]))
+    _, _, principal = np.linalg.svd(xyz - xyz.mean(axis=0), full_matrices=False)
+    seen: set[bytes] = {np.arange(len(xyz)).tobytes()}
+    turns = [axes.T @ turn @ axes for axes in (np.eye(3), principal) for turn in _turns_of_cube()]
+    candidates = [(turn, centre - turn @ centre) for turn in turns]
+    steps = (xyz[near[:, 1:]] - xyz[:, None]).reshape(-1, 3)
+    common = _common(steps, reach)
+    candidates += [(np.eye(3), step) for step in common]
+    for rotation, shift in candidates:
+        offset, row = tree.query(xyz @ rotation.T + shift)
+        row = np.where(offset < reach, row, -1)
+        if np.mean(row >= 0) >= SYMMETRY_SHARE and row.tobytes() not in seen:
+            seen.add(row.tobytes())
+            yield Symmetry(rotation, shift, row)
+
+
+def _turns_of_cube() -> Iterator[np.ndarray]:
+    """Yield the 24 rotations (3, 3) of a cube."""
+    for order in permutations(range(3)):
+        for signs in product((-1.0, 1.0), repeat=3):
+            turn = np.zeros((3, 3))
+            turn[range(3), order] = signs
+            if np.linalg.det(turn) > 0:
+                yield turn
+
+
+def _common(steps: np.ndarray, reach: float) -> list[np.ndarray]:
+    """Return the steps (3,) to a neighbour that occur most often among steps (n, 3)."""
+    cell = np.rint(steps / max(2 * reach, 1e-9)).astype(int)
+    _, inverse, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
+    most = np.argsort(-count, kind='stable')[: 2 * SHIFTS]
+    return [steps[inverse.ravel() == number].mean(axis=0) for number in most]

@@ -1,0 +1,381 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Measure centres of beads of a phantom: blurred shadows of spheres fitted to the grey values.
+
+Hundreds of beads of different sizes are fitted at once, in single precision. Light that passes two
+beads is attenuated by both.
+"""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+from scipy.spatial import cKDTree
+
+from .shadow_fit import (
+    DEPTH_SD,
+    DISTURBED,
+    MARGIN_PX,
+    MIN_PASSED,
+    MIN_VARIANCE,
+    TERMS,
+    Beads,
+    FineGrid,
+    FitSettings,
+    Noise,
+    NormalEquations,
+    ShadowFit,
+)
+from .shadow_profile import Profile, fit_profile
+
+SETTINGS = FitSettings(
+    steps=5,
+    crossing_steps=(2, 3),
+    crowds=((1, 2), (3, 6)),
+    max_step_px=0.6,
+    pooled=60.0,
+    crossed=1.35,
+    dtype=np.float32,
+    whole_scale=False,
+    robust_relative=True,
+    moves_unusable=False,
+)
+STEPS = SETTINGS.steps
+FIRST_STEPS = 4  # that only have to tell beads from other things
+PROFILE_STEPS = 3
+NOISE_BLOCK = 16  # [px]
+PROFILE_BEADS = 150
+PROFILE_ROUNDS = 3
+START_BLUR_PX = 0.9
+START_ATTENUATION = 1.5
+START_SCATTER = 0.1
+MAX_SHIFT_PX = 4.0  # of a centre, beyond which the fit has lost its bead
+MIN_CORRELATION = 0.08  # that is told from slow changes of the light
+LAGS = 4  # pixels over which noise is correlated
+HELD = 1e12  # weight of a term that stays zero
+
+
+def estimate_noise(light: np.ndarray, field: np.ndarray) -> Noise:
+    """Estimate the noise of an image (h, w) from what a plane does not explain.
+
+    The second differences of Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, by
+    blocks, robustly, against the mean grey value.
+    """
+    kernel = np.outer([1, -2, 1], [1, -2, 1]) / 6.0
+    high = cv2.filter2D(light, cv2.CV_32F, kernel)
+    height, width = (size // NOISE_BLOCK * NOISE_BLOCK for size in light.shape)
+
+    def blocks(values: np.ndarray) -> np.ndarray:
+        cut = values[:height, :width].reshape(
+            height // NOISE_BLOCK, NOISE_BLOCK, width // NOISE_BLOCK, NOISE_BLOCK
+        )
+        return cut.swapaxes(1, 2).reshape(-1, NOISE_BLOCK**2)
+
+    used = np.asarray(blocks(field).all(axis=1))
+    if not used.any():
+        used = np.ones(len(used), dtype=bool)
+    mean = np.median(blocks(light)[used], axis=1)
+    variance = (1.4826 * np.median(np.abs(blocks(high)[used]), axis=1)) ** 2
+    variance = np.maximum(variance, MIN_VARIANCE)
+    weight = 1 / variance
+    gain = constant = 0.0
+    for _ in range(3):
+        rows = np.column_stack([np.ones_like(mean), mean]) * weight[:, None]
+        (constant, gain), _ = nnls(rows, variance * weight)
+        weight = 1 / np.maximum(constant + gain * mean, MIN_VARIANCE)
+    return Noise(max(constant, MIN_VARIANCE), gain, _correlation(light, field))
+
+
+def _correlation(light: np.ndarray, field: np.ndarray) -> np.ndarray:
+    """Correlation of the noise, from the background less its blur, clipped at beads."""
+    height, width = light.shape
+    middle = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    light = light[middle]
+    field = field[middle]
+    rest = light - cv2.GaussianBlur(light, (0, 0), 3 * LAGS)
+    limit = 3 * 1.4826 * float(np.median(np.abs(rest[field]))) if field.any() else np.inf
+    valid = (field & (np.abs(rest) < limit)).astype(np.float32)
+    valid = cv2.erode(valid, np.ones((3, 3), np.uint8))
+    rest = rest * valid
+    out = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
+    total = float(np.sum(rest * rest)) / max(float(valid.sum()), 1.0)
+    height, width = rest.shape
+    for row in range(LAGS + 1):
+        for column in range(-LAGS, LAGS + 1):
+            a = np.s_[: height - row, max(0, -column) : width - max(0, column)]
+            b = np.s_[row:, max(0, column) : width + min(0, column)]
+            pairs = max(float(np.sum(valid[a] * valid[b])), 1.0)
+            value = float(np.sum(rest[a] * rest[b])) / pairs / max(total, 1e-12)
+            out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = value
+    # What is left of slow changes of the light is no noise.
+    edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
+    out = np.maximum(out - edge, 0) / max(1 - edge, 1e-6)
+    out[out < MIN_CORRELATION] = 0
+    out[LAGS, LAGS] = 1
+    return out
+
+
+def estimate_profile(
+    light: np.ndarray,
+    field: NDArray[np.bool_],
+    uv: NDArray[np.float64],
+    relative_radius: NDArray[np.float64],
+    radius_px: float,
+) -> Profile:
+    """Estimate the shadow of a typical bead from those that stand alone.
+
+    Parameters
+    ----------
+    light : (h, w) ndarray
+        Grey values, beads dark.
+    field : (h, w) ndarray of bool
+    uv : (n, 2) ndarray
+        Beads [px].
+    relative_radius : (n,) ndarray
+        1 for a typical bead.
+    radius_px : float
+        First value of its radius.
+    """
+    profile = Profile(radius_px * 0.95, START_BLUR_PX, START_ATTENUATION, START_SCATTER)
+    noise = Noise(0.0, 1.0, np.ones((1, 1)))
+    distance = cKDTree(uv).query(uv, k=[2])[0][:, 0] if len(uv) > 1 else np.full(1, np.inf)
+    alone = np.argsort(-distance, kind='stable')[:PROFILE_BEADS]
+    for _ in range(PROFILE_ROUNDS):
+        fit = _BeadFit(
+            light,
+            field,
+            uv=uv[alone],
+            relative_radius=relative_radius[alone],
+            profile=profile,
+            noise=noise,
+        )
+        fit.plane_only = True
+        fit.run(PROFILE_STEPS)
+        place, absorbed, weight = fit.shadows()
+        profile = fit_profile(place, absorbed, weight, profile)
+    return profile
+
+
+def measure_beads(
+    light: np.ndarray,
+    field: np.ndarray,
+    uv: np.ndarray,
+    relative_radius: np.ndarray,
+    profile: Profile,
+    noise: Noise,
+    steps: int = STEPS,
+) -> Beads:
+    """Measure all beads near pixels uv (n, 2) at once, in so many Gauss-Newton steps.
+
+    The other arguments are those of `estimate_profile` and what was estimated.
+    """
+    fit = _BeadFit(
+        light, field, uv=uv, relative_radius=relative_radius, profile=profile, noise=noise
+    )
+    fit.run(steps)
+    return fit.result()
+
+
+class _BeadFit(ShadowFit):
+    """Fit of beads of a phantom, whose radii differ."""
+
+    def __init__(
+        self,
+        light: np.ndarray,
+        field: np.ndarray,
+        uv: np.ndarray,
+        relative_radius: np.ndarray,
+        profile: Profile,
+        noise: Noise,
+    ) -> None:
+        self.radius = np.asarray(relative_radius, dtype=float)
+        reach = profile.reach_px * float(self.radius.max(initial=1.0))
+        window = reach + MARGIN_PX
+        super().__init__(
+            SETTINGS, profile, noise=noise, uv=uv, depth=np.ones(len(uv)), window_px=window
+        )
+        self.measured = np.zeros(len(uv), dtype=bool)
+        self.disturbed = np.zeros(len(uv), dtype=bool)
+        self.inflation: float | None = None
+        self.plane_only = False
+        self._set_groups(self._near(window + reach))
+        self._read(light, field)
+
+    def _near(self, together: float) -> np.ndarray:
+        """Neighbours (n, k) of the beads, -1 for none; notes the distances of the nearest."""
+        n = len(self.uv)
+        count = min(self.settings.neighbours + 1, n)
+        if count < 2:
+            return np.zeros((n, 0), dtype=int)
+        distance, near = cKDTree(self.uv).query(self.uv, k=count, distance_upper_bound=together)
+        other = near != np.arange(n)[:, None]
+        # A bead at the very place of another is not always its own nearest.
+        order = np.argsort(~other | ~np.isfinite(distance), axis=1, kind='stable')
+        near = np.take_along_axis(np.where(other & np.isfinite(distance), near, -1), order, axis=1)
+        self.distance = np.where(other, distance, np.inf).min(axis=1)
+        return near[:, : count - 1]
+
+    def _read(self, light: np.ndarray, field: np.ndarray) -> None:
+        """Read the windows (n, m) around the beads."""
+        height, width = light.shape
+        places = self.middle[:, None] + self.offset
+        inside = ((places >= 0) & (places < (width, height))).all(axis=2)
+        column = np.clip(places[..., 0], 0, width - 1)
+        row = np.clip(places[..., 1], 0, height - 1)
+        valid = inside & field[row, column]
+        grey = light[row, column].astype(np.float32)
+        self._set_windows(grey, valid, bright=np.where(valid, grey, 0.0))
+
+    def run(self, steps: int) -> None:
+        """Take Gauss-Newton steps; the last one gives standard deviations as well."""
+        for step in range(steps):
+            if step in self.settings.crossing_steps:
+                self._cross()
+            moved = [self._step(rows, near, final=step == steps - 1) for rows, near in self.groups]
+            if step == steps // 2:
+                self.disturbed = self.misfit > DISTURBED * self.typical()
+            for (rows, _), (uv, depth, background) in zip(self.groups, moved):
+                lost = np.linalg.norm(uv - self.start[rows], axis=1) > MAX_SHIFT_PX
+                self.usable[rows[lost]] = False
+                kept = rows[~lost]
+                self.uv[kept] = uv[~lost]
+                self.depth[kept] = depth[~lost]
+                self.background[kept] = background[~lost]
+
+    def _cross(self) -> None:
+        """Note what shadows that touch have together, beyond the product of both.
+
+        It is computed of the two nearest neighbours.
+        """
+        if self.crossing is None:
+            self.crossing = np.zeros((len(self.uv), len(self.offset)), dtype=np.float32)
+        reach = 2 * (self.profile.radius_px + self.profile.blur_px)
+        for rows, near in self.groups:
+            if not near.shape[1]:
+                continue
+            first = near[:, 0]
+            touching = np.linalg.norm(self.uv[rows] - self.uv[first], axis=1) < reach
+            touching &= first >= 0
+            if touching.any():
+                chosen = rows[touching]
+                members = np.concatenate([chosen[:, None], near[touching, :2]], axis=1)
+                self.crossing[chosen] = self._crossing(chosen, members)
+
+    def _crossing(self, rows: np.ndarray, members: np.ndarray) -> np.ndarray:
+        """Differences (g, m) for windows of beads (g,) and shadows of members (g, k) or -1."""
+        grid = FineGrid(self.offset, self.profile.blur_px)
+        axis = grid.axis
+        raw = np.ones((len(rows), len(axis), len(axis)), dtype=np.float32)
+        blurred = np.ones((len(rows), len(self.offset)))
+        for column in members.T:
+            there = column >= 0
+            bead = np.where(there, column, 0)
+            centre = self.uv[bead] - self.middle[rows]
+            scale = 1 / self.radius[bead]
+            depth = self.depth[bead] * there
+            squared = (axis[None, :, None] - centre[:, 1, None, None]) ** 2 + (
+                axis[None, None, :] - centre[:, 0, None, None]
+            ) ** 2
+            absorbed = self.profile.absorbed(squared * scale[:, None, None] ** 2)
+            raw *= (1 - depth[:, None, None] * absorbed).astype(np.float32)
+            away = np.linalg.norm(self.offset - centre[:, None], axis=2) * scale[:, None]
+            blurred *= 1 - depth[:, None] * self.profile.shadow(away)[0]
+        out = np.empty_like(blurred)
+        for number, image in enumerate(raw):
+            out[number] = grid.blurred(image)
+        return out - blurred
+
+    def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Light (g, m) and its derivatives (g, OWN + 3 k, m), of single precision."""
+        everyone = np.concatenate([rows[:, None], near], axis=1)
+        there = everyone >= 0
+        scale = (1 / self.radius[everyone]).astype(np.float32)[..., None]
+        centre = (self.middle[rows, None] - self.uv[everyone]).astype(np.float32)
+        x = centre[..., :1] + self.offset[:, 0].astype(np.float32)
+        y = centre[..., 1:] + self.offset[:, 1].astype(np.float32)
+        distance = np.sqrt(x * x + y * y)
+        shadow, slope = self.profile.shadow(distance * scale)
+        shadow *= there[..., None]
+        slope *= there[..., None] * scale / np.maximum(distance, 1e-6)
+        depth = self.depth[everyone].astype(np.float32)[..., None]
+        passed = np.maximum(1 - depth * shadow, np.float32(MIN_PASSED))
+        product = np.prod(passed, axis=1)
+        transmitted = np.float32(1 - self.profile.scatter)
+        plane = self._plane(rows)
+        relative = np.float32(self.profile.scatter) + transmitted * (
+            product + self._crossing_in(rows)
+        )
+        by_shadow = (-transmitted * plane * product)[:, None] / passed
+        by_distance = -by_shadow * depth * slope
+        jacobian = self._jacobian(relative, everyone.shape[1])
+        np.multiply(by_distance, x, out=jacobian[:, TERMS::3])
+        np.multiply(by_distance, y, out=jacobian[:, TERMS + 1 :: 3])
+        np.multiply(by_shadow, shadow, out=jacobian[:, TERMS + 2 :: 3])
+        return plane * relative, jacobian
+
+    def _disturbed(self, rows: np.ndarray, near: np.ndarray, final: bool) -> np.ndarray:
+        return self.disturbed[rows]
+
+    def _depth_sd(self, rows: np.ndarray, near: np.ndarray) -> float:
+        return DEPTH_SD
+
+    def _prior(self, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
+        prior = super()._prior(rows, near)
+        if self.plane_only:
+            prior[:, 3:TERMS] = HELD
+        return prior
+
+    def _solve(
+        self, rows: np.ndarray, near: np.ndarray, equations: NormalEquations, final: bool
+    ) -> np.ndarray:
+        if final:
+            self._precision(rows, equations.matrix, equations.weighted)
+        return np.linalg.solve(equations.matrix, equations.right[..., None])[..., 0]
+
+    def _precision(self, rows: np.ndarray, normal: np.ndarray, weighted: np.ndarray) -> None:
+        """Note standard deviations of centres."""
+        covariance = np.linalg.inv(normal)[:, TERMS : TERMS + 2, TERMS : TERMS + 2]
+        variance = 0.5 * np.trace(covariance, axis1=1, axis2=2)
+        self.sigma[rows] = np.sqrt(np.maximum(variance, 0))
+        self.measured[rows] = self.usable[rows] & np.isfinite(variance)
+        if len(weighted) and self.inflation is None:
+            # The influence of each pixel on a centre: noise of neighbouring pixels adds up.
+            influence = np.linalg.solve(normal[:20], weighted[:20])[:, TERMS]
+            self.inflation = _inflation(influence, self.offset, self.noise)
+
+    def shadows(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distances [px] of pixels from beads, absorbed shares there, and weights (n,)."""
+        plane = self._plane(np.arange(len(self.uv)))
+        away = self.middle[:, None] + self.offset - self.uv[:, None]
+        distance = np.hypot(away[..., 0], away[..., 1]) / self.radius[:, None]
+        good = self.valid & (self.measured & (self.misfit < 4 * np.median(self.misfit)))[:, None]
+        weight = plane / np.maximum(np.median(plane), 1e-9)
+        return distance[good], (1 - self.grey / plane)[good], weight[good]
+
+    def result(self) -> Beads:
+        """Return what was measured."""
+        measured = self.measured & np.isfinite(self.uv).all(axis=1)
+        typical = float(np.median(self.misfit[measured])) if measured.any() else 1.0
+        return self._beads(measured, typical, self.inflation or 1.0)
+
+
+def _inflation(influence: np.ndarray, offset: np.ndarray, noise: Noise) -> float:
+    """Factor on the variance of a centre for correlated noise.
+
+    influence (g, m) of the pixels of windows with offsets (m, 2).
+    """
+    half = int(np.abs(offset).max())
+    image = np.zeros((len(influence), 2 * half + 1, 2 * half + 1))
+    image[:, offset[:, 1] + half, offset[:, 0] + half] = influence
+    lags = len(noise.correlation) // 2
+    total = 0.0
+    for row in range(-lags, lags + 1):
+        for column in range(-lags, lags + 1):
+            value = noise.correlation[row + lags, column + lags]
+            if value:
+                shifted = np.roll(image, (row, column), axis=(1, 2))
+                total += value * float(np.sum(image * shifted))
+    return max(total / max(float(np.sum(image * image)), 1e-300), 1.0)

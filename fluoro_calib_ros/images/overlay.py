@@ -1,0 +1,144 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Pictures of what was found in a radiograph, matched and refused."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import cv2
+import numpy as np
+
+from ..errors import DataError
+from .detection import detect_beads
+from .extraction import Extraction
+from .markers import MarkerFrame
+
+# Blue, green, red.
+MATCHED = (80, 220, 60)
+OVERLAPPED = (230, 200, 40)
+REFUSED = (60, 60, 255)
+UNEXPLAINED = (0, 190, 255)
+TEXT_HEIGHT = 18
+
+
+def draw_overlay(image: np.ndarray, extraction: Extraction | None, reason: str = '') -> np.ndarray:
+    """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w).
+
+    Green circles are observations, light blue ones overlapped observations, red crosses predicted
+    beads without one, yellow squares what was found and is no bead of the phantom. Without an
+    extraction, all that was found is yellow, and reason says why it was refused.
+    """
+    low, high = np.percentile(image, [0.5, 99.8])
+    grey = np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
+    factor = 2 if max(image.shape) <= 512 else 1
+    if factor > 1:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    if extraction is None:
+        try:
+            detections = detect_beads(image)
+            for uv in detections.uv:
+                _square(picture, uv, factor, detections.radius_px)
+        except DataError:
+            pass  # the reason says it
+        return _labelled(picture, [(reason or 'refused', REFUSED)])
+    radius = extraction.profile.reach_px
+    explained = np.linalg.norm(
+        extraction.detections.uv[:, None] - extraction.match.predicted[None], axis=2
+    )
+    for uv, distance in zip(extraction.detections.uv, explained.min(axis=1)):
+        if not distance < radius:
+            _square(picture, uv, factor, radius)
+    for uv, overlapped in zip(extraction.uv, extraction.overlapped):
+        colour = OVERLAPPED if overlapped else MATCHED
+        cv2.circle(picture, _place(uv, factor), round(factor * radius), colour, 1, cv2.LINE_AA)
+    for refusal in extraction.refused:
+        place = _place(refusal.uv, factor)
+        cv2.drawMarker(picture, place, REFUSED, cv2.MARKER_TILTED_CROSS, round(2 * radius), 1)
+    overlapped = int(extraction.overlapped.sum())
+    unexplained = int(np.count_nonzero(~(explained.min(axis=1) < radius)))
+    lines = [
+        (f'{len(extraction.bead) - overlapped} beads', MATCHED),
+        (f'{overlapped} overlapped', OVERLAPPED),
+        (f'{len(extraction.refused)} predicted, not measured', REFUSED),
+        (f'{unexplained} not of the phantom', UNEXPLAINED),
+    ]
+    return _labelled(picture, lines)
+
+
+def _place(uv: np.ndarray, factor: int) -> tuple[int, int]:
+    """Pixel of the picture of a pixel (2,) of the image."""
+    u, v = np.rint((np.asarray(uv) + 0.5) * factor - 0.5).astype(int)
+    return int(u), int(v)
+
+
+def _square(picture: np.ndarray, uv: np.ndarray, factor: int, radius: float) -> None:
+    u, v = _place(uv, factor)
+    r = round(factor * radius)
+    cv2.rectangle(picture, (u - r, v - r), (u + r, v + r), UNEXPLAINED, 1)
+
+
+def _labelled(picture: np.ndarray, lines: list[tuple[str, tuple[int, int, int]]]) -> np.ndarray:
+    """Return a picture with lines of text below it."""
+    width = picture.shape[1]
+    band = np.zeros((TEXT_HEIGHT * len(lines) + 8, width, 3), np.uint8)
+    for number, (text, colour) in enumerate(lines):
+        place = (6, TEXT_HEIGHT * (number + 1) - 2)
+        cv2.putText(band, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return np.vstack([picture, band])
+
+
+# Pictures of the markers that were followed.
+
+RADIUS_PX = 7
+
+
+def draw_markers(
+    image: np.ndarray, found: MarkerFrame, target_names: Mapping[int, str] | None = None
+) -> np.ndarray:
+    """Draw a picture (h, w, 3) of uint8, blue, green, red, of an image (h, w).
+
+    Green circles are markers, light blue ones overlapped markers, yellow ones markers whose id
+    is doubtful; red crosses are where markers that are not seen are believed to be.
+    """
+    target_names = target_names or {}
+    low, high = np.percentile(image[::4, ::4], [0.5, 99.8])
+    grey = np.clip((image - low) * (255 / max(high - low, 1)), 0, 255).astype(np.uint8)
+    factor = 2 if max(image.shape) <= 512 else 1
+    if factor > 1:
+        grey = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_NEAREST)
+    picture = cv2.cvtColor(grey, cv2.COLOR_GRAY2BGR)
+    size = cv2.getTextSize('0', cv2.FONT_HERSHEY_SIMPLEX, 0.35, 1)[0][1]
+    marks = [
+        (target, uv, UNEXPLAINED if doubtful else OVERLAPPED if overlapped else MATCHED, True)
+        for target, uv, overlapped, doubtful in zip(
+            found.target_id, found.uv, found.overlapped, found.doubtful
+        )
+    ]
+    marks += [(target, uv, REFUSED, False) for target, uv in zip(found.missing, found.predicted)]
+    for target, uv, colour, seen in marks:
+        if not np.isfinite(uv).all() or np.abs(uv).max() > 2**14:
+            continue
+        u, v = np.rint((uv + 0.5) * factor - 0.5).astype(int).tolist()
+        if seen:
+            cv2.circle(picture, (u, v), RADIUS_PX, colour, 1, cv2.LINE_AA)
+        else:
+            cv2.drawMarker(picture, (u, v), colour, cv2.MARKER_TILTED_CROSS, RADIUS_PX, 1)
+        text = target_names.get(int(target), str(int(target)))
+        place = (u + RADIUS_PX + 1, v + size // 2)
+        font = cv2.FONT_HERSHEY_SIMPLEX
+        cv2.putText(picture, text, place, font, 0.35, colour, 1, cv2.LINE_AA)
+    lines = [
+        (f'{len(found.target_id)} markers, {int(found.overlapped.sum())} overlapped', MATCHED),
+        (f'{int(found.doubtful.sum())} with a doubtful id', UNEXPLAINED),
+        (f'{len(found.missing)} not seen', REFUSED),
+    ]
+    if found.reason:
+        lines.append((found.reason, REFUSED))
+    band = np.zeros((TEXT_HEIGHT * len(lines) + 8, picture.shape[1], 3), np.uint8)
+    for number, (text, colour) in enumerate(lines):
+        place = (6, TEXT_HEIGHT * (number + 1) - 2)
+        cv2.putText(band, text, place, cv2.FONT_HERSHEY_SIMPLEX, 0.45, colour, 1, cv2.LINE_AA)
+    return np.vstack([picture, band])

@@ -1,0 +1,325 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Where a phantom may stand: three beads of an image against triples of the phantom.
+
+A bead of the image and two of its neighbours are compared with all triples of a bead of the
+phantom and two of its neighbours. Three points give a scaled-orthographic pose in closed form
+(Huttenlocher and Ullman, "Recognizing solid objects by alignment with an image", IJCV 5, 1990),
+with a mirror solution. Further neighbours vote for a pose if there is something at their predicted
+places.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
+
+MIN_SINE = 0.3  # of the angle between the sides of a triple of the phantom
+MIN_IMAGE_SINE = 0.2  # of the angle between the sides of three beads in the image
+VOTERS = 18  # neighbours that vote
+# The nearest of them, which select the poses that the others vote on: one of the first few must be
+# found, and the share FIRST_VOTE of all.
+FIRST_VOTERS = (3, 6)
+MAX_POSES = 6000  # poses that all voters vote on
+FIRST_VOTE = 0.5
+MIN_VOTE = 0.55
+SURE_VOTE = 0.85
+PAIRS_AT_ONCE = 4
+FLAT = 0.1  # of the shorter side, within which voters lie in a plane
+KEPT = 10  # best poses of three beads
+
+
+@dataclass(frozen=True)
+class Triples:
+    """Triples of a phantom: a bead, and two of its k nearest neighbours.
+
+    Attributes
+    ----------
+    bead : (t, 3) ndarray of int
+    products : (4, t) ndarray
+        Squares of both sides, their product [mm^2], and the determinant of these [mm^4].
+    voter : (VOTERS, 3, t) ndarray of float32
+        Neighbours of the first bead, the nearest first, in the axes of both sides and their cross
+        product.
+    sides : (t, 2, 3) ndarray
+        From the first bead [mm].
+    planar : (t,) ndarray of bool
+        All voters lie in one plane, so that both solutions have the same votes.
+    """
+
+    bead: NDArray[np.int64]
+    products: NDArray[np.float64]
+    voter: NDArray[np.float64]
+    sides: NDArray[np.float64]
+    planar: NDArray[np.bool_]
+
+    def of_beads(self, chosen: np.ndarray) -> Triples:
+        """Return the triples whose first bead is one of those that are chosen (n,)."""
+        row = np.flatnonzero(chosen[self.bead[:, 0]])
+        return Triples(
+            self.bead[row],
+            self.products[:, row],
+            self.voter[..., row],
+            self.sides[row],
+            self.planar[row],
+        )
+
+
+@dataclass(frozen=True)
+class LocalPose:
+    """A scaled-orthographic pose around one bead.
+
+    Attributes
+    ----------
+    bead : int
+        Row of the phantom.
+    uv : (2,) ndarray
+        Its pixel.
+    rotation : (3, 3) ndarray
+        Phantom -> a sensor that looks along the ray of the bead.
+    scale : float
+        [px/mm]
+    vote : float
+        Share of the voters that are found.
+    """
+
+    bead: int
+    uv: NDArray[np.float64]
+    rotation: NDArray[np.float64]
+    scale: float
+    vote: float
+
+
+def triples_of(xyz: np.ndarray, neighbours: int) -> Triples:
+    """Return the triples of beads (n, 3) [mm] with so many neighbours each."""
+    n = len(xyz)
+    count = min(max(neighbours, VOTERS) + 1, n)
+    _, near = cKDTree(xyz).query(xyz, k=count)
+    first, second = np.nonzero(~np.eye(min(neighbours, count - 1), dtype=bool))
+    bead = np.stack(
+        [
+            np.repeat(np.arange(n), len(first)),
+            near[:, 1 + first].ravel(),
+            near[:, 1 + second].ravel(),
+        ],
+        axis=1,
+    )
+    a = xyz[bead[:, 1]] - xyz[bead[:, 0]]
+    b = xyz[bead[:, 2]] - xyz[bead[:, 0]]
+    aa = np.sum(a * a, axis=1)
+    bb = np.sum(b * b, axis=1)
+    ab = np.sum(a * b, axis=1)
+    products = np.stack([aa, bb, ab, aa * bb - ab**2])
+    good = products[3] > MIN_SINE**2 * aa * bb
+    products = np.ascontiguousarray(products[:, good])
+    bead = bead[good]
+    a = a[good]
+    b = b[good]
+    axes = np.linalg.inv(np.stack([a, b, np.cross(a, b)], axis=2))
+    others = near[bead[:, 0], 1 : 1 + VOTERS]
+    offsets = xyz[others] - xyz[bead[:, 0], None]
+    coordinates = axes @ np.swapaxes(offsets, 1, 2)
+    height_mm = np.abs(coordinates[:, 2]) * np.linalg.norm(np.cross(a, b), axis=1)[:, None]
+    spacing = np.sqrt(np.minimum(products[0], products[1]))
+    planar = height_mm.max(axis=1) < FLAT * spacing
+    voter = np.ascontiguousarray(coordinates.astype(np.float32).transpose(2, 1, 0))
+    return Triples(bead, products, voter, np.stack([a, b], axis=1), planar)
+
+
+def nearby_map(uv: np.ndarray, image_size: tuple[int, int], reach_px: float) -> np.ndarray:
+    """Mask (h, w) of uint8: 1 within a distance of a pixel (n, 2), else 0."""
+    width, height = image_size
+    empty = np.full((height, width), 255, dtype=np.uint8)
+    places = np.rint(uv).astype(int)
+    inside = ((places >= 0) & (places < (width, height))).all(axis=1)
+    empty[places[inside, 1], places[inside, 0]] = 0
+    distance = cv2.distanceTransform(empty, cv2.DIST_L2, 5)
+    return (distance <= reach_px).astype(np.uint8)
+
+
+def local_poses(
+    seed: int,
+    uv: NDArray[np.float64],
+    near: NDArray[np.int64],
+    triples: Triples,
+    found: NDArray[np.uint8],
+    scales: tuple[float, float],
+) -> list[LocalPose]:
+    """Return the poses with the most votes for a bead of the image, the best first.
+
+    Parameters
+    ----------
+    seed : int
+        Row of the bead.
+    uv : (n, 2) ndarray
+        Beads of the image [px].
+    near : (k,) ndarray of int
+        Neighbours of the bead that make triples with it.
+    triples : Triples
+    found : (h, w) ndarray of uint8
+        1 near a bead of the image, 2 outside of the field, else 0.
+    scales : tuple of float
+        Smallest and largest scale [px/mm].
+    """
+    centre = uv[seed].astype(np.float32)
+    sides = [
+        (uv[near[i]] - uv[seed], uv[near[j]] - uv[seed])
+        for i in range(len(near))
+        for j in range(i)
+    ]
+    found_poses: list[LocalPose] = []
+    for start in range(0, len(sides), PAIRS_AT_ONCE):
+        parts = [
+            _solutions(p, q, triples, scales) for p, q in sides[start : start + PAIRS_AT_ONCE]
+        ]
+        found_poses += _best(parts, triples, centre, found)
+        if any(pose.vote >= SURE_VOTE for pose in found_poses):
+            break
+    return sorted(found_poses, key=lambda pose: -pose.vote)[:KEPT]
+
+
+def _best(
+    parts: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]],
+    triples: Triples,
+    centre: np.ndarray,
+    found: np.ndarray,
+) -> list[LocalPose]:
+    """Return the poses with the most votes of the solutions of several triples of an image."""
+    triple, axes, scale = (np.concatenate(values) for values in zip(*parts))
+    # A frame of pixels around the image stands for all that is off it.
+    field = np.pad(found, 1, constant_values=2)
+    kept, votes = _elected(centre, axes, triple, triples.voter, field)
+    if len(kept) > MAX_POSES:
+        kept = kept[np.argsort(-votes, kind='stable')[:MAX_POSES]]
+    axes = axes[kept]
+    triple = triple[kept]
+    scale = scale[kept]
+    votes = _votes(*_hits(centre, axes, triple, triples.voter, field), len(triples.voter))
+    out: list[LocalPose] = []
+    seen: set[tuple[int, ...]] = set()
+    for row in np.argsort(-votes, kind='stable'):
+        if votes[row] < MIN_VOTE or len(out) >= KEPT:
+            break
+        bead = int(triples.bead[triple[row], 0])
+        # Both solutions have the same votes where the neighbours lie in one plane.
+        for mirror in (1, -1):
+            both = axes[row] * np.array([[1], [1], [mirror]])
+            rotation = _rotation(triples.sides[triple[row]], both, scale[row])
+            # Poses of one bead that differ little are one.
+            key = (bead, *np.rint(rotation[2] * 4).astype(int).tolist())
+            if key not in seen:
+                seen.add(key)
+                out.append(
+                    LocalPose(bead, centre.astype(float), rotation, float(scale[row]), votes[row])
+                )
+            if not triples.planar[triple[row]]:
+                break
+    return out
+
+
+def _solutions(
+    p: np.ndarray, q: np.ndarray, triples: Triples, scales: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows of triples, image (m, 3, 2) of their axes, scales (m,), for sides p and q (2,) [px]."""
+    pp = p @ p
+    qq = q @ q
+    pq = p @ q
+    area = pp * qq - pq * pq
+    nothing = np.zeros(0, dtype=int), np.zeros((0, 3, 2), np.float32), np.zeros(0)
+    if area <= MIN_IMAGE_SINE**2 * pp * qq:
+        return nothing
+    A, B, C, a = triples.products
+    half = 0.5 * (A * qq + B * pp) - C * pq
+    squared = (half + np.sqrt(np.maximum(half * half - a * area, 0))) / a
+    row = np.flatnonzero((squared > scales[0] ** 2) & (squared < scales[1] ** 2))
+    squared = squared[row]
+    scale = np.sqrt(squared)
+    first = np.sqrt(np.maximum(squared * A[row] - pp, 0))
+    second = np.sqrt(np.maximum(squared * B[row] - qq, 0))
+    second = np.where(squared * C[row] < pq, -second, second)
+    # The image of the cross product of both sides; its sign tells the two solutions apart.
+    normal = np.stack([p[1] * second - first * q[1], first * q[0] - p[0] * second], axis=1)
+    normal = normal / scale[:, None]
+    other = np.flatnonzero(~triples.planar[row])
+    axes = np.empty((len(row) + len(other), 3, 2), dtype=np.float32)
+    axes[:, 0] = p
+    axes[:, 1] = q
+    axes[: len(row), 2] = normal
+    axes[len(row) :, 2] = -normal[other]
+    return (
+        np.concatenate([row, row[other]]),
+        axes,
+        np.concatenate([scale, scale[other]]),
+    )
+
+
+def _elected(
+    centre: np.ndarray,
+    axes: np.ndarray,
+    triple: np.ndarray,
+    voter: np.ndarray,
+    field: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (k,) of the solutions that the nearest voters elect, and their votes."""
+    some, nearest = FIRST_VOTERS
+    hits, inside = _hits(centre, axes, triple, voter[:some], field)
+    row = np.flatnonzero(hits)
+    more = _hits(centre, axes[row], triple[row], voter[some:nearest], field)
+    votes = _votes(hits[row] + more[0], inside[row] + more[1], nearest)
+    elected = votes >= FIRST_VOTE
+    return row[elected], votes[elected]
+
+
+def _hits(
+    centre: np.ndarray,
+    axes: np.ndarray,
+    triple: np.ndarray,
+    voters: np.ndarray,
+    field: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Numbers (m,) of voters (k, 3, t) that are found, and that are in the field of view.
+
+    axes (m, 3, 2) are the images of the axes of triples (m,), field the map with its frame.
+    """
+    hits = np.zeros(len(triple), dtype=np.int8)
+    inside = np.zeros(len(triple), dtype=np.int8)
+    height, width = field.shape
+    flat = field.ravel()
+    # Voter after voter, coordinate after coordinate: numpy is slow with many small matrices.
+    a, b, c = np.ascontiguousarray(axes.transpose(1, 2, 0))
+    for voter in voters:
+        x, y, z = (values[triple] for values in voter)
+        column, row = (
+            np.clip(x * a[k] + y * b[k] + z * c[k] + (centre[k] + 1.5), 0, size - 1)
+            for k, size in enumerate((width, height))
+        )
+        value = flat[row.astype(np.int32) * width + column.astype(np.int32)]
+        hits += value == 1
+        inside += value < 2
+    return hits, inside
+
+
+def _votes(hits: np.ndarray, inside: np.ndarray, voters: int) -> np.ndarray:
+    """Shares (m,) of the voters that are found.
+
+    A pose that puts its voters off the image must not win by the rest of them.
+    """
+    return hits / np.maximum(inside, 0.6 * voters)
+
+
+def _rotation(sides: np.ndarray, axes: np.ndarray, scale: float) -> np.ndarray:
+    """Rotation (3, 3) that takes sides (2, 3) [mm] to their image (3, 2) [px]."""
+    a, b = sides
+    normal = np.cross(a, b)
+    # Rows 1 and 2 of the scaled rotation, by the images of a, b and a x b.
+    images = axes.astype(float) / np.array([[scale], [scale], [scale]])
+    rows = np.linalg.solve(np.stack([a, b, normal]), images)
+    u, _, vt = np.linalg.svd(rows.T, full_matrices=False)
+    first, second = u @ vt
+    return np.stack([first, second, np.cross(first, second)])

@@ -1,0 +1,360 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Fit blurred shadows of spheres to the grey values of windows: what all such fits share.
+
+A window around a bead has a polynomial of degree 2 as its background. Neighbours that reach into
+it are fitted with it, so the standard deviation of a centre contains what the overlap leaves open.
+All windows of an image take their Gauss-Newton steps at once.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from .shadow_profile import Profile
+
+MARGIN_PX = 2.0  # of background around the shadow
+TERMS = 6  # of the background: a polynomial of degree 2
+OWN = TERMS + 3  # unknowns of a bead alone: its background, centre and depth
+NEIGHBOUR_SD_PX = 0.3  # of a step of a neighbour, which its own fit finds
+NEIGHBOUR_SD = 0.2  # of a step of a neighbour's depth
+DEPTH_SD = 1.0  # of the depth of a shadow, 1 for the profile
+DEPTHS = (0.05, 3.0)  # bounds; a shadow takes light away
+MIN_PASSED = 0.02  # of the light, behind a bead: derivatives are divided by it
+MIN_PIXELS = 0.6  # of a window that lie in the field
+MIN_VARIANCE = 1 / 12  # of rounding
+FINE = 3  # points across a pixel of the grid on which shadows that touch are blurred
+OVERLAP = 0.85  # times both reaches; shadows that are nearer overlap
+DISTURBED = 1.6  # lack of fit from which pixels with large residuals count less
+ROBUST = 2.5  # residual of half weight [standard deviations of the noise]
+
+# Rows of beads (g,) and of their neighbours (g, k), -1 for none.
+Group = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variance of a grey value: constant + gain * grey value; and its correlation.
+
+    Attributes
+    ----------
+    constant, gain : float
+    correlation : (2 LAGS + 1, 2 LAGS + 1) ndarray
+        Of the noise of pixels at lags (row, column), 1 in the middle.
+    """
+
+    constant: float
+    gain: float
+    correlation: NDArray[np.float64]
+
+    def variance(self, light: np.ndarray) -> np.ndarray:
+        """Variance of grey values of an expected light."""
+        return np.maximum(self.constant + self.gain * np.maximum(light, 0), MIN_VARIANCE)
+
+
+@dataclass(frozen=True)
+class Beads:
+    """Measured beads, in the order in which they were given.
+
+    Attributes
+    ----------
+    uv : (n, 2) ndarray
+        Centres [px].
+    sigma : (n,) ndarray
+        Standard deviation of a coordinate [px].
+    depth : (n,) ndarray
+        Of the shadow, 1 for the profile.
+    misfit : (n,) ndarray
+        Mean squared residual over the noise, 1 where the model is right.
+    overlapped : (n,) ndarray of bool
+        The shadow of another bead reaches into that of the bead.
+    measured : (n,) ndarray of bool
+        False where the window is cut off or the fit failed.
+    """
+
+    uv: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    depth: NDArray[np.float64]
+    misfit: NDArray[np.float64]
+    overlapped: NDArray[np.bool_]
+    measured: NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """What differs between fits of shadows.
+
+    Attributes
+    ----------
+    steps : int
+        Gauss-Newton steps.
+    crossing_steps : tuple of int
+        Before which shadows that touch are blurred together.
+    crowds : tuple of tuple of int
+        Least and largest number of neighbours of the beads that are fitted together.
+    max_step_px : float
+        Largest step of a centre.
+    pooled : float
+        Degrees of freedom of the noise of all beads, in that of one.
+    crossed : float
+        Factor on the standard deviation where shadows cross.
+    dtype : type
+        Precision of model and derivatives.
+    whole_scale : bool
+        Whether the polynomial of the background is scaled by a whole number of pixels.
+    robust_relative : bool
+        Whether a residual of half weight is relative to the typical lack of fit.
+    moves_unusable : bool
+        Whether beads move whose windows are cut off.
+
+    The last three keep the numbers of two fits that were once apart.
+    """
+
+    steps: int
+    crossing_steps: tuple[int, ...]
+    crowds: tuple[tuple[int, int], ...]
+    max_step_px: float
+    pooled: float
+    crossed: float
+    dtype: type[np.floating]
+    whole_scale: bool
+    robust_relative: bool
+    moves_unusable: bool
+
+    @property
+    def neighbours(self) -> int:
+        """Neighbours that are fitted with a bead, at most."""
+        return self.crowds[-1][1]
+
+
+@dataclass(frozen=True)
+class NormalEquations:
+    """Normal equations of some windows, for steps of u = 6 + 3 + 3 k unknowns.
+
+    Attributes
+    ----------
+    matrix : (g, u, u) ndarray
+    right : (g, u) ndarray
+    weighted : (g, u, m) ndarray
+        Derivatives of the pixels times their weights.
+    """
+
+    matrix: NDArray[np.float64]
+    right: NDArray[np.float64]
+    weighted: np.ndarray
+
+
+def window_offsets(radius_px: float) -> np.ndarray:
+    """Pixels (m, 2) of a round window, from its middle."""
+    half = int(np.ceil(radius_px))
+    axis = np.arange(-half, half + 1)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    return grid[(grid * grid).sum(axis=1) <= radius_px**2]
+
+
+class FineGrid:
+    """Grid finer than the pixels, on which light that passes several beads is blurred.
+
+    The blur of the light that passes two beads is not the product of their blurred shadows.
+
+    Attributes
+    ----------
+    axis : (a,) ndarray
+        Coordinates of its points, from the middle of a window [px].
+    """
+
+    def __init__(self, offset: np.ndarray, blur_px: float) -> None:
+        half = int(np.abs(offset).max()) + int(np.ceil(3 * blur_px))
+        self.axis = np.arange(-half * FINE, half * FINE + 1) / FINE
+        self._sigma = float(FINE * np.sqrt(blur_px**2 + 1 / 12))
+        self._column, self._row = (offset.T + half) * FINE
+
+    def blurred(self, light: np.ndarray) -> np.ndarray:
+        """Light (a, a), blurred, in the pixels (m,) of a window."""
+        smooth = cv2.GaussianBlur(light, (0, 0), self._sigma, borderType=cv2.BORDER_REPLICATE)
+        return smooth[self._row, self._column]
+
+
+class ShadowFit(ABC):
+    """Gauss-Newton fit of windows, each with the neighbours of its bead.
+
+    Parameters
+    ----------
+    settings : FitSettings
+    profile : Profile
+    noise : Noise
+    uv : (n, 2) ndarray
+        Centres to start from [px].
+    depth : (n,) ndarray
+        Of the shadows, also what is expected of them.
+    window_px : float
+        Radius of the windows.
+    """
+
+    def __init__(
+        self,
+        settings: FitSettings,
+        profile: Profile,
+        noise: Noise,
+        uv: np.ndarray,
+        depth: np.ndarray,
+        window_px: float,
+    ) -> None:
+        self.settings = settings
+        self.profile = profile
+        self.noise = noise
+        self.start = np.array(uv, dtype=float)
+        self.uv = self.start.copy()
+        self.expected_depth = np.array(depth, dtype=float)
+        self.depth = self.expected_depth.copy()
+        self.middle = np.rint(self.uv).astype(int)
+        self.offset = window_offsets(window_px)
+        scale = np.ceil(window_px) if settings.whole_scale else window_px
+        x, y = (self.offset.T / scale).astype(settings.dtype)
+        self.basis = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=1)
+        n = len(self.uv)
+        self.background = np.zeros((n, TERMS))
+        self.sigma = np.full(n, np.inf)
+        self.misfit = np.full(n, np.inf)
+        self.distance = np.full(n, np.inf)  # of the nearest bead
+        self.crossing: np.ndarray | None = None
+        self.groups: list[Group] = []
+
+    def _set_windows(self, grey: np.ndarray, valid: np.ndarray, bright: np.ndarray) -> None:
+        """Note the grey values (n, m) of the windows, and whether they are valid.
+
+        bright has the grey values whose upper quartile is the first background.
+        """
+        self.grey = grey.astype(self.settings.dtype)
+        self.valid = valid
+        self.usable = valid.mean(axis=1) >= MIN_PIXELS
+        place = int(0.75 * len(self.offset))
+        self.background[:, 0] = np.partition(bright, place, axis=1)[:, place]
+
+    def _set_groups(self, near: np.ndarray) -> None:
+        """Group beads by the number of their neighbours near (n, k), -1 for none, nearest first.
+
+        Those alone are the first group.
+        """
+        crowd = (near >= 0).sum(axis=1)
+        for low, high in ((0, 0), *self.settings.crowds):
+            rows = np.flatnonzero((crowd >= low) & (crowd <= high))
+            if len(rows):
+                self.groups.append((rows, near[rows, :high]))
+
+    # ---- what a fit must say
+
+    @abstractmethod
+    def _model(self, rows: np.ndarray, near: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Light (g, m) and its derivatives (g, OWN + 3 k, m): background, then u, v, depth."""
+
+    @abstractmethod
+    def _disturbed(self, rows: np.ndarray, near: np.ndarray, final: bool) -> np.ndarray:
+        """Windows (g,) in which pixels with large residuals count less."""
+
+    @abstractmethod
+    def _depth_sd(self, rows: np.ndarray, near: np.ndarray) -> float | np.ndarray:
+        """Standard deviation of what is expected of the depths."""
+
+    @abstractmethod
+    def _solve(
+        self, rows: np.ndarray, near: np.ndarray, equations: NormalEquations, final: bool
+    ) -> np.ndarray:
+        """Steps (g, u); where they are final, standard deviations are noted as well."""
+
+    # ---- parts of the model
+
+    def _plane(self, rows: np.ndarray) -> np.ndarray:
+        """Light (g, m) in windows without beads."""
+        background = self.background[rows].astype(self.settings.dtype)
+        plane = background @ self.basis.T
+        return np.maximum(plane, 1e-3 * np.abs(background[:, :1]) + 1e-6)
+
+    def _crossing_in(self, rows: np.ndarray) -> np.ndarray:
+        """What shadows that touch have together in windows, beyond the product of both."""
+        return self.settings.dtype(0) if self.crossing is None else self.crossing[rows]
+
+    def _jacobian(self, relative: np.ndarray, beads: int) -> np.ndarray:
+        """Derivatives (g, TERMS + 3 beads, m); only those by the background are set."""
+        shape = (len(relative), TERMS + 3 * beads, len(self.offset))
+        jacobian = np.empty(shape, dtype=self.settings.dtype)
+        np.multiply(relative[:, None], self.basis.T, out=jacobian[:, :TERMS])
+        return jacobian
+
+    # ---- Gauss-Newton steps
+
+    def _step(
+        self, rows: np.ndarray, near: np.ndarray, final: bool
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return centres, depths and backgrounds of some beads after a step."""
+        step = self._solve(rows, near, self._equations(rows, near, final), final)
+        moving = self.usable[rows] | self.settings.moves_unusable
+        step = np.where(moving[:, None], step, 0)
+        longest = self.settings.max_step_px
+        return (
+            self.uv[rows] + np.clip(step[:, TERMS : TERMS + 2], -longest, longest),
+            np.clip(self.depth[rows] + step[:, TERMS + 2], *DEPTHS),
+            self.background[rows] + step[:, :TERMS],
+        )
+
+    def _equations(self, rows: np.ndarray, near: np.ndarray, final: bool) -> NormalEquations:
+        """Return the normal equations of some beads, and note their lack of fit."""
+        light, jacobian = self._model(rows, near)
+        dtype = self.settings.dtype
+        residual = self.grey[rows] - light
+        valid = self.valid[rows]
+        weight = valid / self.noise.variance(light)
+        squared = residual * residual * weight
+        self.misfit[rows] = squared.sum(axis=1) / np.maximum(valid.sum(axis=1) - OWN, 1)
+        disturbed = self._disturbed(rows, near, final)
+        if disturbed.any():
+            usual = self.typical() if self.settings.robust_relative else 1.0
+            weight = weight / (1 + disturbed[:, None] * squared / (ROBUST**2 * usual))
+        weighted = jacobian * weight.astype(dtype)[:, None]
+        prior = self._prior(rows, near)
+        normal = (weighted @ np.swapaxes(jacobian, 1, 2)).astype(float)
+        diagonal = np.arange(normal.shape[1])
+        normal[:, diagonal, diagonal] += prior + 1e-9 * normal[:, diagonal, diagonal] + 1e-12
+        right = (weighted @ residual.astype(dtype)[..., None])[..., 0].astype(float)
+        expected = self.expected_depth[rows]
+        right[:, TERMS + 2] -= prior[:, TERMS + 2] * (self.depth[rows] - expected)
+        return NormalEquations(normal, right, weighted)
+
+    def _prior(self, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
+        """Weights (g, OWN + 3 k) of what is expected of the unknowns."""
+        prior = np.zeros((len(rows), OWN + 3 * near.shape[1]))
+        prior[:, TERMS + 2] = self._depth_sd(rows, near) ** -2.0
+        # An absent neighbour has no derivatives; any prior keeps its step zero.
+        prior[:, OWN::3] = prior[:, OWN + 1 :: 3] = NEIGHBOUR_SD_PX**-2
+        prior[:, OWN + 2 :: 3] = NEIGHBOUR_SD**-2
+        return prior
+
+    def typical(self) -> float:
+        """Median lack of fit of the beads whose fit goes on."""
+        values = self.misfit[self.usable & np.isfinite(self.misfit)]
+        return float(np.median(values)) if len(values) else 1.0
+
+    def _beads(self, measured: np.ndarray, typical: float, inflation: float) -> Beads:
+        """Return what was measured, given the usual lack of fit and the inflation of variances."""
+        pixels = self.valid.sum(axis=1)
+        pooled_freedom = self.settings.pooled
+        # The noise of one window is known to some 10 %; that of all windows helps.
+        pooled = (self.misfit * pixels + typical * pooled_freedom) / (pixels + pooled_freedom)
+        factor = np.sqrt(np.maximum(pooled, typical) * inflation)
+        # Where shadows cross, their model is less right than its noise says.
+        touching = self.distance < 2 * self.profile.radius_px
+        factor = np.where(touching, self.settings.crossed * factor, factor)
+        return Beads(
+            self.uv.copy(),
+            self.sigma * factor,
+            depth=self.depth.copy(),
+            misfit=self.misfit / max(typical, 1e-12),
+            overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
+            measured=measured,
+        )

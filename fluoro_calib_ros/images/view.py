@@ -1,0 +1,290 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The view of a fluoroscope in one exposure: orientation, principal distance and a polynomial.
+
+The polynomial is the distortion as a function of the undistorted pixel. It only has to predict
+where beads are, so its coefficients have a prior of zero: where observations do not determine it,
+a prediction falls back to the perspective of the pose. All unknowns are estimated at once by
+robust Gauss-Newton steps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..findings import Finding, Kind
+from ..photogrammetry.collinearity import project_with_jacobian
+from ..photogrammetry.rotations import matrix_from_vector
+
+# Standard deviations of coefficients by degree, at the border of the image, as fractions of half
+# its width. Pincushion is of degree 3; an image intensifier has up to some 6 % of it.
+PRIOR_SD = (0.01, 0.012, 0.03, 0.008, 0.008, 0.003, 0.003)
+TAIL = 2.5  # residual, in robust standard deviations, at which the weight is halved
+POSE = 7  # unknowns before the coefficients: rotation, shift, log of the principal distance
+DAMPING = 1e-6
+SMOOTHING = 8  # matched neighbours whose residuals correct a prediction
+SMOOTHING_PRIOR = 2.0  # neighbours of residual 0 among them
+
+
+@dataclass(frozen=True)
+class Lens:
+    """What is known of a fluoroscope before an exposure is seen.
+
+    Attributes
+    ----------
+    image_size : tuple of int
+        Width and height [px].
+    principal_distance_px : float
+    principal_distance_sd : float
+        Relative standard deviation.
+    coefficients : (2, k) ndarray
+        Expected polynomial [px], of any degree; empty for zero.
+    certainty : float
+        Factor on the standard deviations of the coefficients.
+    """
+
+    image_size: tuple[int, int]
+    principal_distance_px: float
+    principal_distance_sd: float = 0.08
+    coefficients: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 0)))
+    certainty: float = 1.0
+
+    @property
+    def centre(self) -> np.ndarray:
+        """Middle of the image (2,) [px], where the principal point is assumed."""
+        return (np.asarray(self.image_size, dtype=float) - 1) / 2
+
+    @property
+    def half_px(self) -> float:
+        """Half the larger side of the image."""
+        return max(self.image_size) / 2
+
+    def expected(self, degree: int) -> np.ndarray:
+        """Expected coefficients (2, k) of a polynomial of some degree."""
+        out = np.zeros((2, len(exponents(degree))))
+        count = min(out.shape[1], self.coefficients.shape[1])
+        out[:, :count] = self.coefficients[:, :count]
+        return out
+
+    def deviations(self, degree: int) -> np.ndarray:
+        """Standard deviations (k,) of the coefficients [px]."""
+        order = exponents(degree).sum(axis=1)
+        return self.certainty * self.half_px * np.asarray(PRIOR_SD)[order - 1]
+
+
+@dataclass(frozen=True)
+class View:
+    """Orientation and distortion of an exposure.
+
+    Attributes
+    ----------
+    lens : Lens
+    rotation : (3, 3) ndarray
+        Phantom -> sensor.
+    position : (3,) ndarray
+        The source in the frame of the phantom [mm].
+    principal_distance_px : float
+    coefficients : (2, k) ndarray
+        Of the polynomial [px].
+    degree : int
+    """
+
+    lens: Lens
+    rotation: NDArray[np.float64]
+    position: NDArray[np.float64]
+    principal_distance_px: float
+    coefficients: NDArray[np.float64]
+    degree: int
+
+    @property
+    def interior(self) -> np.ndarray:
+        """Interior orientation (3,): xp, yp, c [px]."""
+        return np.append(self.lens.centre, self.principal_distance_px)
+
+    def with_degree(self, degree: int) -> View:
+        """Return the view with a polynomial of another degree."""
+        coefficients = np.zeros((2, len(exponents(degree))))
+        count = min(coefficients.shape[1], self.coefficients.shape[1])
+        coefficients[:, :count] = self.coefficients[:, :count]
+        return replace(self, coefficients=coefficients, degree=degree)
+
+    def project(self, xyz: np.ndarray) -> np.ndarray:
+        """Predicted pixels (n, 2) of points (n, 3) [mm]; NaN for one behind the source."""
+        x = (xyz - self.position) @ self.rotation.T
+        z = np.where(x[:, 2] > 1e-9, x[:, 2], np.nan)
+        ideal = self.lens.centre + self.principal_distance_px * x[:, :2] / z[:, None]
+        return ideal + self._distortion(ideal)[0]
+
+    def depth(self, xyz: np.ndarray) -> np.ndarray:
+        """Distances (n,) of points (n, 3) from the source along the axis [mm]."""
+        return (xyz - self.position) @ self.rotation[2]
+
+    def _distortion(self, ideal: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distortion (n, 2) [px] of undistorted pixels (n, 2), derivatives (n, 2, 2), basis."""
+        # Far outside of the image the polynomial stays what it is at one and a half of its size.
+        x = np.clip((ideal - self.lens.centre) / self.lens.half_px, -1.5, 1.5)
+        basis, by_x, by_y = _monomials(x, self.degree)
+        slope = np.stack([by_x @ self.coefficients.T, by_y @ self.coefficients.T], axis=2)
+        return basis @ self.coefficients.T, slope / self.lens.half_px, basis
+
+
+def exponents(degree: int) -> np.ndarray:
+    """Exponents (k, 2) of the monomials of degree 1 to `degree`, in the order of degree."""
+    return np.array([(n - j, j) for n in range(1, degree + 1) for j in range(n + 1)])
+
+
+def _monomials(x: np.ndarray, degree: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Values (n, k) of the monomials at points (n, 2), and their derivatives."""
+    powers = np.ones((degree + 1, *x.shape))
+    for n in range(1, degree + 1):
+        powers[n] = powers[n - 1] * x
+    i, j = exponents(degree).T
+    value = powers[i, :, 0] * powers[j, :, 1]
+    by_x = i[:, None] * powers[np.maximum(i - 1, 0), :, 0] * powers[j, :, 1]
+    by_y = j[:, None] * powers[i, :, 0] * powers[np.maximum(j - 1, 0), :, 1]
+    return value.T, by_x.T, by_y.T
+
+
+def fit_view(
+    view: View,
+    xyz: NDArray[np.float64],
+    uv: NDArray[np.float64],
+    steps: int = 2,
+    floor_px: float = 0.05,
+) -> tuple[View, float]:
+    """Refine a view by matched beads.
+
+    Parameters
+    ----------
+    view : View
+    xyz : (n, 3) ndarray
+        Beads [mm].
+    uv : (n, 2) ndarray
+        Their pixels.
+    steps : int
+        Robust Gauss-Newton steps.
+    floor_px : float
+        Smallest standard deviation of a residual.
+
+    Returns
+    -------
+    view : View
+    scale : float
+        Robust standard deviation of a coordinate's residual before the last step [px].
+    """
+    lens = view.lens
+    expected = lens.expected(view.degree).ravel()
+    prior = np.concatenate(
+        [
+            np.zeros(6),
+            [1 / lens.principal_distance_sd**2],
+            np.tile(lens.deviations(view.degree) ** -2.0, 2),
+        ]
+    )
+    scale = floor_px
+    for _ in range(steps):
+        residual, jacobian = _linearised(view, xyz, uv)
+        valid = np.isfinite(residual).all(axis=1)
+        residual = residual[valid]
+        if len(residual) < 3:
+            break
+        squared = np.sum(residual**2, axis=1)
+        scale = max(float(np.sqrt(np.median(squared) / (2 * np.log(2)))), floor_px)
+        weight = 1 / (1 + squared / (TAIL * scale) ** 2)
+        rows = jacobian[valid].reshape(-1, jacobian.shape[2])
+        weighted = rows * np.repeat(weight / scale**2, 2)[:, None]
+        deviation = np.concatenate(
+            [
+                np.zeros(6),
+                [np.log(view.principal_distance_px / lens.principal_distance_px)],
+                view.coefficients.ravel() - expected,
+            ]
+        )
+        normal = weighted.T @ rows + np.diag(prior)
+        normal[np.diag_indices_from(normal)] *= 1 + DAMPING
+        step = np.linalg.solve(normal, weighted.T @ residual.ravel() - prior * deviation)
+        view = _moved(view, step)
+    return view, scale
+
+
+def _linearised(view: View, xyz: np.ndarray, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (n, 2) and derivatives (n, 2, 7 + 2 k) of the predictions.
+
+    The first unknowns are those of `project_with_jacobian`: position, rotation vector.
+    """
+    n = len(xyz)
+    ideal, d_exterior, _, _ = project_with_jacobian(
+        np.broadcast_to(view.rotation, (n, 3, 3)),
+        np.broadcast_to(view.position, (n, 3)),
+        xyz,
+        view.interior,
+    )
+    shift, slope, basis = view._distortion(ideal)
+    stretch = np.eye(2) + slope
+    count = basis.shape[1]
+    jacobian = np.zeros((n, 2, POSE + 2 * count))
+    jacobian[:, :, :6] = stretch @ d_exterior
+    jacobian[:, :, 6] = (stretch @ (ideal - view.lens.centre)[..., None])[..., 0]
+    jacobian[:, 0, POSE : POSE + count] = basis
+    jacobian[:, 1, POSE + count :] = basis
+    return uv - ideal - shift, jacobian
+
+
+def _moved(view: View, step: np.ndarray) -> View:
+    """Return a view after a step of all unknowns."""
+    turn = step[3:6]
+    angle = float(np.linalg.norm(turn))
+    if angle > 0.3:  # a first step from three beads may be wild
+        turn = turn * (0.3 / angle)
+    return replace(
+        view,
+        rotation=matrix_from_vector(turn) @ view.rotation,
+        position=view.position + step[:3],
+        principal_distance_px=view.principal_distance_px
+        * float(np.exp(np.clip(step[6], -0.1, 0.1))),
+        coefficients=view.coefficients + step[POSE:].reshape(2, -1),
+    )
+
+
+# What is assumed of a fluoroscope before an image, and from the other images of it.
+
+# Without a principal distance: that of image intensifiers and of biplane laboratories, which are
+# three to five times as far from the source as they are wide.
+USUAL_DISTANCE = 4.0
+USUAL_SD = 0.25
+GIVEN_SD = 0.08
+SHARED_SD = 0.03  # of the principal distance, once other images of the fluoroscope are known
+SHARED_CERTAINTY = 0.3
+# Of images in which the beads were seen, and may be found with the distortion of the others.
+NOT_FOUND = (Kind.NO_POSE, Kind.POSE_UNSURE, Kind.POSE_AMBIGUOUS, Kind.BEADS_NOT_MEASURED)
+MIN_SHARED = 3  # images whose distortion helps with the others
+
+
+def assumed_lens(image_size: tuple[int, int], principal_distance_px: float | None) -> Lens:
+    """Return what is assumed of a fluoroscope before its first image; None: not known."""
+    if principal_distance_px is not None:
+        return Lens(image_size, principal_distance_px, GIVEN_SD)
+    return Lens(image_size, USUAL_DISTANCE * max(image_size), USUAL_SD)
+
+
+def shared_lens(lens: Lens, views: Sequence[View]) -> Lens | None:
+    """Return the lens with the distortion of the images that were solved, None for too few."""
+    if len(views) < MIN_SHARED:
+        return None
+    return replace(
+        lens,
+        principal_distance_px=float(np.median([view.principal_distance_px for view in views])),
+        principal_distance_sd=SHARED_SD,
+        coefficients=np.median([view.coefficients for view in views], axis=0),
+        certainty=SHARED_CERTAINTY,
+    )
+
+
+def may_be_found(found: Finding | None) -> bool:
+    """Return whether an image is refused because no sure pose was found for its beads."""
+    return found is not None and found.kind in NOT_FOUND

@@ -1,0 +1,261 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Files of named arrays: .npz archives as numpy.savez writes them, but validated and repeatable.
+
+Nothing is unpickled. Data type, shape, finiteness and range of every array are validated when it
+is written and when it is read, and so is the CRC of every member. The same arrays give the same
+bytes.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import re
+import struct
+import sys
+import zipfile
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import DataError
+from ..limits import read_limits
+from ..records import Field
+from .access import PathLike, read_bytes
+from .atomic import atomic_file
+
+_DATE = (1980, 1, 1, 0, 0, 0)  # of every member, so that the same arrays give the same bytes
+_UNIX = 3  # system of every member, for the same reason
+# The beginning of an .npy file, versions 1 to 3, of plain numbers or text (numpy.lib.format).
+# numpy evaluates it as Python, which raises almost anything for a crafted one.
+_HEADER = re.compile(
+    rb'\x93NUMPY[\x01\x02\x03]\0(.{2}|.{4})\{'
+    rb"'descr': '([<>|=]?(?:b1|[iu][1248]|f[248]|U[0-9]{1,6}))', "
+    rb"'fortran_order': (True|False), "
+    rb"'shape': \(((?:[0-9]{1,18}, ?)*(?:[0-9]{1,18})?)\), ?\} *\n",
+    re.DOTALL,
+)
+_SURROGATES = 0xD800 >> 11
+_DTYPES = {'int': np.dtype('<i8'), 'float': np.dtype('<f8'), 'bool': np.dtype('?')}
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Layout of a file.
+
+    Attributes
+    ----------
+    content : str
+        What the file holds, with its article, such as 'a calibration'.
+    fields : sequence of Field
+        Its arrays.
+    version : int
+        Version that is written; all earlier ones can be read.
+    """
+
+    content: str
+    fields: Sequence[Field]
+    version: int
+
+
+def to_arrays(where: object, layout: Layout, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return values as the arrays that a file of this layout contains.
+
+    where begins the message of the DataError that is raised for a value that could not be read
+    again.
+    """
+    return {field.name: _to_array(where, values[field.name], field) for field in layout.fields}
+
+
+def to_values(arrays: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Return arrays with Python numbers and text in place of arrays without dimensions."""
+    return {name: array.item() if array.ndim == 0 else array for name, array in arrays.items()}
+
+
+def write_arrays(path: PathLike, layout: Layout, arrays: Mapping[str, np.ndarray]) -> None:
+    """Write the arrays that `to_arrays` returned.
+
+    Raises DataError where the file cannot be written; an earlier file is then unchanged.
+    """
+    version = np.array(layout.version, dtype=_DTYPES['int'])
+    with atomic_file(path) as file, zipfile.ZipFile(file, 'w', zipfile.ZIP_STORED) as archive:
+        _write_member(archive, 'format_version', version)
+        for name, array in arrays.items():
+            _write_member(archive, name, array)
+
+
+def read_arrays(path: PathLike, layout: Layout) -> dict[str, np.ndarray]:
+    """Read the arrays of a file.
+
+    Raises DataError for a file of another kind, a damaged one, a version of the layout that is
+    not known, and an array that does not meet its requirements.
+    """
+    content = read_bytes(path)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            arrays = _read_members(path, archive, layout)
+    except DataError:
+        raise
+    except (
+        zipfile.BadZipFile,
+        zlib.error,
+        EOFError,
+        OSError,
+        RuntimeError,  # unknown compression
+        ValueError,  # offsets before the file, names that are not text
+        struct.error,
+    ):
+        raise DataError(f'{path}: this is not {layout.content} file, or it is damaged') from None
+    for field in layout.fields:
+        _validate(path, arrays[field.name], field)
+    return arrays
+
+
+def _to_array(where: object, value: Any, spec: Field) -> np.ndarray:
+    array = np.asarray(value)
+    if spec.dtype == 'text':
+        array = array.astype(str)
+    else:
+        is_whole = array.dtype.kind in 'iub' and spec.dtype in ('int', 'float')
+        if is_whole or array.dtype.kind == spec.dtype[0]:
+            array = array.astype(_DTYPES[spec.dtype])
+        array = np.ascontiguousarray(array).reshape(array.shape)
+    _validate(where, array, spec)
+    return array
+
+
+def _write_member(archive: zipfile.ZipFile, name: str, array: np.ndarray) -> None:
+    info = zipfile.ZipInfo(f'{name}.npy', date_time=_DATE)
+    info.create_system = _UNIX
+    info.external_attr = 0o644 << 16
+    buffer = io.BytesIO()
+    np.lib.format.write_array(buffer, array, version=(1, 0), allow_pickle=False)
+    archive.writestr(info, buffer.getvalue())
+
+
+def _read_members(
+    path: PathLike, archive: zipfile.ZipFile, layout: Layout
+) -> dict[str, np.ndarray]:
+    """Return the arrays of an archive; its version is checked first."""
+    members = archive.namelist()
+    total = sum(info.file_size for info in archive.infolist())
+    limits = read_limits()
+    if total > limits.max_file_bytes:
+        raise DataError(
+            f'{path}: its arrays take {total / 1e6:.0f} MB, more than {limits.max_file_mb} MB are '
+            'not read'
+        )
+    version = _read_version(path, archive, layout)
+    for field in layout.fields:
+        if field.since <= version and f'{field.name}.npy' not in members:
+            noun = layout.content.partition(' ')[2]
+            raise DataError(f'{path}: the {noun} has no array {field.name}')
+    return {
+        field.name: _read_member(path, archive, field.name)
+        if field.since <= version
+        else field.before
+        for field in layout.fields
+    }
+
+
+def _read_version(path: PathLike, archive: zipfile.ZipFile, layout: Layout) -> int:
+    """Return the version of the layout. Raises DataError for one that is not known."""
+    if 'format_version.npy' not in archive.namelist():
+        raise DataError(
+            f'{path}: this is not {layout.content} file, it has no array format_version'
+        )
+    version = _read_member(path, archive, 'format_version')
+    if version.shape != () or version.dtype.kind not in 'iu':
+        raise DataError(
+            f'{path}: this is not {layout.content} file, its format_version is not a whole number'
+        )
+    if not 1 <= version <= layout.version:
+        last = layout.version
+        known = 'version 1' if last == 1 else f'versions 1 to {last}'
+        raise DataError(
+            f'{path}: the file has layout version {int(version)}, this program knows {known}'
+        )
+    return int(version)
+
+
+def _read_member(path: PathLike, archive: zipfile.ZipFile, name: str) -> np.ndarray:
+    """Return an array of an archive. Raises DataError unless it is one of plain numbers or text.
+
+    The header is compared with the size of the member before anything is made of it.
+    """
+    info = archive.getinfo(f'{name}.npy')
+    if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise DataError(f'{path}: the array {name} is compressed in a way that numpy does not use')
+    content = archive.read(info)
+    match = _HEADER.match(content)
+    if match is None:
+        raise _no_plain_array(path, name)
+    length, descr, order, shape_text = match.groups()
+    offset = match.end(1) + int.from_bytes(length, 'little')
+    dtype = np.dtype(descr.decode())
+    shape = tuple(int(number) for number in shape_text.split(b',') if number.strip())
+    # The product of Python integers does not overflow.
+    if not dtype.itemsize or math.prod(shape) * dtype.itemsize != len(content) - offset:
+        raise _no_plain_array(path, name)
+    try:
+        array = np.frombuffer(content, dtype, offset=offset)
+        array = array.reshape(shape, order='F' if order == b'True' else 'C')
+    except ValueError:
+        raise _no_plain_array(path, name) from None
+    if dtype.kind == 'U':
+        codes = np.frombuffer(content, np.dtype('u4').newbyteorder(dtype.byteorder), offset=offset)
+        if ((codes > sys.maxunicode) | ((codes >> 11) == _SURROGATES)).any():  # no characters
+            raise _no_plain_array(path, name)
+    return array.astype(dtype.newbyteorder('='))  # a copy that can be written to
+
+
+def _no_plain_array(path: PathLike, name: str) -> DataError:
+    return DataError(
+        f'{path}: the array {name} does not contain plain numbers or text, and nothing else is '
+        'read'
+    )
+
+
+def _validate(where: object, array: np.ndarray, spec: Field) -> None:
+    """Raise DataError, beginning with where, for an array that does not meet its requirements."""
+    name = spec.name
+    if spec.dtype == 'text':
+        is_expected = array.dtype.kind == 'U'
+    else:
+        is_expected = array.dtype == _DTYPES[spec.dtype]
+    if not is_expected:
+        expected = _DTYPES.get(spec.dtype, spec.dtype)
+        raise DataError(f'{where}: the array {name} has dtype {array.dtype}, not {expected}')
+    if len(array.shape) != len(spec.shape) or any(
+        isinstance(length, int) and length != actual
+        for length, actual in zip(spec.shape, array.shape)
+    ):
+        shape = ', '.join(map(str, spec.shape))
+        raise DataError(f'{where}: the array {name} has shape {array.shape}, not ({shape})')
+    if spec.longest is not None and max(array.shape, default=0) > spec.longest:
+        raise DataError(
+            f'{where}: the array {name} has shape {array.shape}, lengths above {spec.longest} are '
+            'not read'
+        )
+    if spec.dtype == 'float':
+        valid = np.isfinite(array)
+        if spec.allowed == 'inf':
+            valid = valid | (array == np.inf)
+        elif spec.allowed == 'nan':
+            valid = valid | np.isnan(array)
+        if not valid.all():
+            raise DataError(
+                f'{where}: the array {name} holds {array[~valid].flat[0]}, '
+                f'which is not a finite number'
+            )
+    if spec.minimum is not None and (array < spec.minimum).any():
+        raise DataError(
+            f'{where}: the array {name} holds {array.min()}, which is below {spec.minimum}'
+        )
+    if spec.maximum is not None and (np.abs(array[np.isfinite(array)]) > spec.maximum).any():
+        raise DataError(f'{where}: the array {name} holds a value beyond {spec.maximum:g}')

@@ -1,0 +1,408 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Read one .mcap file, with every damage reported as DataError."""
+
+from __future__ import annotations
+
+import os
+import re
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+import yaml
+import zstandard
+from mcap.exceptions import EndOfFile
+from mcap.reader import SeekingReader
+from mcap.records import Channel, McapRecord, Message, Schema
+from mcap.stream_reader import StreamReader
+from mcap.summary import Summary
+from rosbags.rosbag2 import Reader
+
+from ...errors import DataError
+from ...limits import MAX_CHUNK, MAX_TOPICS
+from ..access import check_regular_file, os_error_reason, read_text
+from ..text_files import parse_yaml
+from .metadata import to_yaml
+
+MAGIC = b'\x89MCAP0\r\n'
+FOOTER_SIZE = 1 + 8 + 8 + 8 + 4  # bytes: opcode, length, two offsets, CRC
+FOOTER_OPCODE = 2
+CHUNK_OPCODE = 6
+DATA_END_OPCODE = 15
+CHUNK_HEAD = 100  # bytes that contain sizes and compression of a chunk
+_RECORD = struct.Struct('<BQ')  # opcode and length
+MAX_CAUSE = 120  # characters
+
+
+class BagMessage(NamedTuple):
+    """A message of a bag.
+
+    Attributes
+    ----------
+    topic, type : str
+    log_time_ns : int
+        Time at which it was received [ns].
+    data : bytes
+        CDR.
+    """
+
+    topic: str
+    type: str
+    log_time_ns: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class ChannelInfo:
+    """A channel of a file, its schema (None where the file has none) and number of messages."""
+
+    channel: Channel
+    schema: Schema | None
+    count: int
+
+
+@dataclass
+class _Scan:
+    """What a pass over all records of a file found, by id."""
+
+    schemas: dict[int, Schema] = field(default_factory=dict)
+    channels: dict[int, Channel] = field(default_factory=dict)
+    counts: dict[int, int] = field(default_factory=dict)
+    ordered: bool = True  # by log time
+
+
+def channels_of_file(path: str) -> list[ChannelInfo]:
+    """Return all channels of a file. Raises DataError for a damaged file."""
+    with _open_checked(path) as file:
+        summary = _complete_summary(file)
+        if summary is not None and summary.statistics is not None:
+            schemas = summary.schemas
+            channels = summary.channels
+            counts = summary.statistics.channel_message_counts
+        else:
+            _check_chunks(file)
+            scan = _scan(file)
+            schemas = scan.schemas
+            channels = scan.channels
+            counts = scan.counts
+        if len(channels) > MAX_TOPICS:
+            raise DataError(
+                f'{path}: the bag has {len(channels)} channels, more than {MAX_TOPICS} are not '
+                'read'
+            )
+        return [
+            ChannelInfo(channel, schemas.get(channel.schema_id), counts.get(number, 0))
+            for number, channel in channels.items()
+        ]
+
+
+def messages_of_file(path: str, topics: Collection[str] | None) -> Iterator[BagMessage]:
+    """Yield the messages of a file in the order of log time.
+
+    topics are the names of those to read, None for all. Raises DataError for a damaged file.
+    """
+    with _open_checked(path) as file:
+        _check_chunks(file)
+        summary = _complete_summary(file)
+        if summary is None or not summary.chunk_indexes:
+            yield from _unindexed_messages(file, topics)
+            return
+        reader = SeekingReader(file, validate_crcs=True)
+        for schema, channel, message in reader.iter_messages(topics=topics):
+            yield BagMessage(
+                channel.topic, schema.name if schema else '', message.log_time, message.data
+            )
+
+
+@contextmanager
+def _open_checked(path: str) -> Iterator[BinaryIO]:
+    """Open a file and check both of its ends; errors of the MCAP reader become DataError."""
+    try:
+        check_regular_file(path)
+        with open(path, 'rb') as file:
+            _check_ends(path, file)
+            yield file
+    except DataError:
+        raise
+    except OSError as error:
+        raise DataError(f'{path}: the bag cannot be read ({os_error_reason(error)})') from None
+    except (EndOfFile, struct.error):
+        raise DataError(f'{path}: the bag is damaged, a record ends too early') from None
+    except Exception as error:  # damaged bytes make the reader raise almost anything
+        raise DataError(f'{path}: the bag is damaged ({_one_line(error)})') from None
+
+
+def _check_ends(path: str, file: BinaryIO) -> None:
+    """Check the magic at both ends and the CRC of the summary, which the MCAP reader does not."""
+    size = file.seek(0, os.SEEK_END)
+    file.seek(0)
+    if size == 0:
+        raise DataError(f'{path}: the file is empty')
+    if file.read(len(MAGIC)) != MAGIC:
+        raise DataError(f'{path}: this is not an MCAP file')
+    file.seek(max(size - len(MAGIC), 0))
+    if size < 2 * len(MAGIC) + FOOTER_SIZE or file.read() != MAGIC:
+        raise DataError(f'{path}: the bag is cut off, the end of the file is missing')
+    file.seek(size - len(MAGIC) - FOOTER_SIZE)
+    opcode, _, start, _, crc = struct.unpack('<BQQQI', file.read(FOOTER_SIZE))
+    if opcode != FOOTER_OPCODE or start > size:
+        raise DataError(f'{path}: the bag is damaged, it has no footer')
+    if start and crc:
+        file.seek(start)
+        if zlib.crc32(file.read(size - len(MAGIC) - 4 - start)) != crc:
+            raise DataError(f'{path}: the bag is damaged, its summary has a wrong checksum')
+    file.seek(0)
+
+
+def _check_chunks(file: BinaryIO) -> None:
+    """Raise DataError for a chunk that would take too much memory; none is decompressed."""
+    position = len(MAGIC)
+    size = file.seek(0, os.SEEK_END)
+    while position + _RECORD.size <= size:
+        file.seek(position)
+        head = file.read(CHUNK_HEAD)
+        opcode, length = _RECORD.unpack_from(head)
+        if opcode == CHUNK_OPCODE and len(head) == CHUNK_HEAD:
+            (held,) = struct.unpack_from('<Q', head, _RECORD.size + 16)
+            (name_length,) = struct.unpack_from('<I', head, _RECORD.size + 28)
+            start = _RECORD.size + 32 + name_length + 8
+            if head[_RECORD.size + 32 : start - 8] == b'zstd':
+                with suppress(zstandard.ZstdError):
+                    held = max(held, zstandard.frame_content_size(head[start:]))
+            if held > MAX_CHUNK:
+                raise DataError(
+                    f'{file.name}: a chunk of the bag takes {held / 1e6:.0f} MB, more than '
+                    f'{MAX_CHUNK / 1e6:.0f} MB are not read'
+                )
+        elif opcode == DATA_END_OPCODE:
+            break
+        position += _RECORD.size + length
+    file.seek(0)
+
+
+def _complete_summary(file: BinaryIO) -> Summary | None:
+    """Return the summary of a file, None unless it lists all channels and their schemas."""
+    summary = SeekingReader(file).get_summary()
+    if summary is None:
+        return None
+    if not summary.channels and (summary.statistics is None or summary.statistics.channel_count):
+        return None
+    used = {channel.schema_id for channel in summary.channels.values()} - {0}
+    return summary if used <= set(summary.schemas) else None
+
+
+def _unindexed_messages(file: BinaryIO, topics: Collection[str] | None) -> Iterator[BagMessage]:
+    """Yield the messages of a file without chunk index in the order of log time.
+
+    They are read one after the other if that is their order, else sorted in memory.
+    """
+    ordered = _scan(file).ordered
+    messages = _messages_in_file_order(file, topics)
+    yield from messages if ordered else sorted(messages, key=lambda message: message.log_time_ns)
+
+
+def _messages_in_file_order(
+    file: BinaryIO, topics: Collection[str] | None
+) -> Iterator[BagMessage]:
+    type_names: dict[int, str] = {}
+    channels: dict[int, Channel] = {}
+    for record in _records(file):
+        if isinstance(record, Schema):
+            type_names[record.id] = record.name
+        elif isinstance(record, Channel):
+            channels[record.id] = record
+        elif isinstance(record, Message):
+            channel = channels[record.channel_id]
+            if topics is None or channel.topic in topics:
+                name = type_names.get(channel.schema_id, '')
+                yield BagMessage(channel.topic, name, record.log_time, record.data)
+
+
+def _scan(file: BinaryIO) -> _Scan:
+    """Read all records of a file for its channels and counts."""
+    scan = _Scan()
+    last = 0
+    for record in _records(file):
+        if isinstance(record, Schema):
+            scan.schemas[record.id] = record
+        elif isinstance(record, Channel):
+            scan.channels[record.id] = record
+        elif isinstance(record, Message):
+            scan.counts[record.channel_id] = scan.counts.get(record.channel_id, 0) + 1
+            scan.ordered = scan.ordered and record.log_time >= last
+            last = record.log_time
+    return scan
+
+
+def _records(file: BinaryIO) -> Iterator[McapRecord]:
+    file.seek(0)
+    return StreamReader(file, validate_crcs=True).records
+
+
+def _one_line(error: Exception) -> str:
+    text = ' '.join(str(error).split())
+    return text[:MAX_CAUSE] or type(error).__name__
+
+
+# Storage files of a bag: an .mcap file, or those in the folder of a rosbag2 bag.
+
+PathLike = str | os.PathLike[str]
+
+
+def storage_files(source: PathLike) -> list[str]:
+    """Return the paths of the .mcap files of a bag, in order.
+
+    A bag folder has those that its metadata.yaml lists; without metadata.yaml all of them count,
+    in the order of their numbers. Raises DataError for a source that is not a bag.
+    """
+    if not os.path.lexists(source):
+        raise DataError(f'{source}: there is no such bag')
+    if not os.path.isdir(source):
+        return [os.fspath(source)]
+    metadata = os.path.join(source, 'metadata.yaml')
+    if os.path.lexists(metadata):
+        return _listed_files(source, metadata)
+    return _files_in(source)
+
+
+def candidate_files(source: PathLike) -> list[str]:
+    """Return the paths of the .mcap files of a damaged bag, whatever its metadata.yaml says.
+
+    Raises DataError for a source that is not a bag.
+    """
+    if not os.path.lexists(source):
+        raise DataError(f'{source}: there is no such bag')
+    return _files_in(source) if os.path.isdir(source) else [os.fspath(source)]
+
+
+def _files_in(source: PathLike) -> list[str]:
+    """Return the paths of the .mcap files in a folder, in the order of their numbers."""
+    try:
+        names = [name for name in os.listdir(source) if name.endswith('.mcap') and name[0] != '.']
+    except OSError as error:
+        raise DataError(
+            f'{source}: the folder cannot be read ({os_error_reason(error)})'
+        ) from None
+    if not names:
+        raise DataError(
+            f'{source}: this folder is not a bag, it has neither metadata.yaml nor an .mcap file'
+        )
+    return [os.path.join(source, name) for name in sorted(names, key=_natural_order)]
+
+
+def _natural_order(name: str) -> list[tuple[int, str]]:
+    """Return a sort key by which bag_10 follows bag_9."""
+    return [
+        (int(part), '') if part.isdigit() else (-1, part) for part in re.split(r'([0-9]+)', name)
+    ]
+
+
+def _listed_files(source: PathLike, path: str) -> list[str]:
+    """Return the files that metadata.yaml lists. Raises DataError."""
+    try:
+        information = parse_yaml(read_text(path))['rosbag2_bagfile_information']
+        storage = str(information['storage_identifier'])
+        names = list(information['relative_file_paths'])
+    except (yaml.YAMLError, KeyError, TypeError, AttributeError):
+        raise DataError(f'{path}: this is not the metadata of a bag, or it is damaged') from None
+    if storage != 'mcap':
+        raise DataError(
+            f'{path}: the bag is stored as {storage}, only mcap and sqlite3 are supported; '
+            f'convert it with ros2 bag convert'
+        )
+    if not names or not all(isinstance(name, str) for name in names):
+        raise DataError(f'{path}: the bag has no files')
+    paths = [os.path.join(source, os.path.basename(name)) for name in names]
+    for each in paths:
+        if not os.path.exists(each):
+            raise DataError(
+                f'{path}: it lists {os.path.basename(each)}, but the folder has no such file'
+            )
+    return paths
+
+
+# Bags of other storages, read by the library rosbags: sqlite3, and compressed ones.
+#
+# A bag is compressed by rosbag2 file by file (`file`) or message by message (`message`).
+
+MAX_FOREIGN_CAUSE = 200  # characters
+SQLITE = b'SQLite format 3\0'
+
+
+def is_foreign(source: PathLike) -> bool:
+    """Return whether a bag is not stored in plain .mcap files."""
+    if os.path.isdir(source):
+        path = os.path.join(source, 'metadata.yaml')
+        if not os.path.isfile(path):
+            return False
+        try:
+            information = parse_yaml(read_text(path))['rosbag2_bagfile_information']
+            mode = str(information.get('compression_mode') or 'none').lower()
+            return str(information['storage_identifier']) == 'sqlite3' or mode != 'none'
+        except (DataError, yaml.YAMLError, KeyError, TypeError, AttributeError):
+            return False  # the reader of MCAP bags says what is wrong
+    if not os.path.isfile(source):
+        return False
+    try:
+        with open(source, 'rb') as file:
+            return file.read(len(SQLITE)) == SQLITE
+    except OSError:
+        return False
+
+
+def channels_of_bag(source: PathLike) -> list[ChannelInfo]:
+    """Return all channels of a bag. Raises DataError for one that cannot be read."""
+    out = []
+    with _opened(source) as bag:
+        for number, connection in enumerate(bag.connections, 1):
+            text = connection.msgdef.data
+            if not all(isinstance(v, str) for v in (connection.topic, connection.msgtype, text)):
+                raise DataError(f'{source}: the bag is damaged, the name of a topic is no text')
+            metadata = {'topic_type_hash': connection.digest or ''}
+            profiles = getattr(connection.ext, 'offered_qos_profiles', '')
+            metadata['offered_qos_profiles'] = (
+                profiles if isinstance(profiles, str) else to_yaml(_plain(profiles))
+            )
+            encoding = getattr(connection.ext, 'serialization_format', 'cdr')
+            channel = Channel(number, connection.topic, encoding, metadata, number)
+            schema = Schema(number, text.encode(), 'ros2msg', connection.msgtype)
+            out.append(ChannelInfo(channel, schema, connection.msgcount))
+    return out
+
+
+def messages_of_bag(source: PathLike, topics: Collection[str] | None) -> Iterator[BagMessage]:
+    """Yield the messages of a bag in the order of log time. Raises DataError."""
+    with _opened(source) as bag:
+        wanted = [c for c in bag.connections if topics is None or c.topic in topics]
+        if wanted:
+            for connection, time_ns, data in bag.messages(wanted):
+                yield BagMessage(connection.topic, connection.msgtype, time_ns, bytes(data))
+
+
+def _plain(profiles: object) -> list[object]:
+    """Return QoS profiles, of which rosbags makes objects, as YAML contains them; or none."""
+    if isinstance(profiles, list) and all(isinstance(item, dict) for item in profiles):
+        return profiles
+    return []
+
+
+@contextmanager
+def _opened(source: PathLike) -> Iterator[Reader]:
+    """Open a bag; every error of the library becomes a DataError."""
+    check_regular_file(source)
+    for name in os.listdir(source) if os.path.isdir(source) else ():
+        check_regular_file(os.path.join(source, name))
+    try:
+        with Reader(Path(source)) as bag:
+            yield bag
+    except DataError:
+        raise
+    except Exception as error:  # a damaged bag makes the library raise almost anything
+        cause = ' '.join(str(error).split())[:MAX_FOREIGN_CAUSE] or type(error).__name__
+        raise DataError(f'{source}: the bag cannot be read ({cause})') from None

@@ -1,0 +1,432 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Read bags: an .mcap file, or a rosbag2 folder with one or more of them."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from mcap.records import Schema
+
+from ...errors import DataError
+from ...exposures.angles import AngleOptions, JointAngles
+from ...exposures.frame import Frame, validate_frame
+from ...exposures.strays import without_strays
+from ...images.codec import decode
+from ...limits import MAX_OBSERVATIONS
+from ..access import check_safe_name
+from .definitions import (
+    TARGET_OBSERVATIONS,
+    fields_of,
+    fluoroscope_of_topic,
+    frame_from_message,
+    from_cdr,
+    type_hash,
+    typestore,
+)
+from .mcap_file import (
+    BagMessage,
+    ChannelInfo,
+    PathLike,
+    channels_of_bag,
+    channels_of_file,
+    is_foreign,
+    messages_of_bag,
+    messages_of_file,
+    storage_files,
+)
+from .metadata import parse_profiles
+
+
+class TopicInfo(NamedTuple):
+    """A topic of a bag: type, number of messages, and offered QoS profiles [{policy: value}]."""
+
+    type: str
+    count: int  # type: ignore[assignment]  # a tuple has a method count
+    offered_qos: list[dict[str, Any]]
+
+
+@dataclass(frozen=True)
+class BagContents:
+    """Frames of a bag in the order of time, and the topics they were read from, by fluoroscope.
+
+    notes are sentences about image points that were left out.
+    """
+
+    frames: dict[str, list[Frame]]
+    topics: dict[str, str]
+    notes: tuple[str, ...] = ()
+
+
+def read_frames(source: PathLike, validate: bool = True) -> BagContents:
+    """Read all frames of a bag: those of every topic of type TargetObservations.
+
+    The fluoroscope is the part of the topic's name before the last. Where the frame numbers of a
+    stream begin again, a power of ten is added to those that follow, so that they differ.
+
+    Parameters
+    ----------
+    source : path-like
+        An .mcap file or a bag folder.
+    validate : bool
+        Whether every frame is validated; else only the lengths of its arrays are checked.
+
+    Returns
+    -------
+    BagContents
+
+    Raises
+    ------
+    DataError
+        For a source that is not a bag, a damaged or truncated one, one without observations, a
+        different definition of the message, and an invalid or repeated frame. The message names
+        bag, topic and message.
+    """
+    fluoroscopes = _observation_topics(source)
+    _check_definitions(source, fluoroscopes)
+    frames: dict[str, list[Frame]] = {name: [] for name in sorted(fluoroscopes.values())}
+    notes: list[str] = []
+    first: dict[tuple[str, int, int], int] = {}  # message in which a frame occurred first
+    restarts = dict.fromkeys(frames, 0)
+    segments: dict[str, list[int]] = {name: [] for name in frames}
+    for message in iterate_messages(source, fluoroscopes):
+        name = fluoroscopes[message.topic]
+        number = len(frames[name]) + 1
+        where = f'{source}, topic {message.topic}, message {number}'
+        try:
+            if len(message.data) > MAX_OBSERVATIONS:
+                raise DataError(
+                    f'the message has {len(message.data)} bytes, more than {MAX_OBSERVATIONS} '
+                    'are not read'
+                )
+            frame = frame_from_message(from_cdr(message.data, TARGET_OBSERVATIONS), name)
+            if validate:
+                frame, stray = without_strays(frame)
+                notes += [f'not used: {stray}'] if stray else []
+                validate_frame(frame)
+        except DataError as error:
+            raise error.at(where) from None
+        if frames[name] and _is_restart(frames[name][-1], frame):
+            restarts[name] += 1
+        segments[name].append(restarts[name])
+        key = (name, restarts[name], frame.number)
+        if validate and key in first:
+            raise DataError(
+                f'{where}: frame {frame.number} is already given in message {first[key]}'
+            )
+        first[key] = number
+        frames[name].append(frame)
+    if validate and any(restarts.values()):
+        frames, step = _renumbered(frames, segments)
+        counts = ', '.join(f'{name} {count}' for name, count in restarts.items() if count)
+        notes.append(
+            f'{source}: the frame numbers begin again ({counts} times), '
+            f'{step} is added to those that follow each time'
+        )
+    topics = {name: topic for topic, name in fluoroscopes.items() if frames[name]}
+    if not topics:
+        raise DataError(f'{source}: the bag has no message on {" or ".join(fluoroscopes)}')
+    return BagContents(
+        {name: of_fluoroscope for name, of_fluoroscope in frames.items() if of_fluoroscope},
+        dict(sorted(topics.items())),
+        tuple(notes),
+    )
+
+
+def _is_restart(last: Frame, frame: Frame) -> bool:
+    """Return whether the numbers of a stream begin again while time goes on."""
+    return frame.number < last.number and frame.stamp_ns > last.stamp_ns
+
+
+def _renumbered(
+    frames: Mapping[str, Sequence[Frame]], segments: Mapping[str, Sequence[int]]
+) -> tuple[dict[str, list[Frame]], int]:
+    """Return frames with numbers that differ between segments of their streams, and the step."""
+    largest = max(frame.number for each in frames.values() for frame in each)
+    step = 10 ** len(str(largest))
+    renumbered = {
+        name: [
+            replace(frame, number=frame.number + step * segment)
+            for frame, segment in zip(each, segments[name], strict=True)
+        ]
+        for name, each in frames.items()
+    }
+    return renumbered, step
+
+
+def iterate_messages(
+    source: PathLike, topics: Iterable[str] | None = None
+) -> Iterator[BagMessage]:
+    """Yield the messages of a bag in the order of log time; only a few chunks are in memory.
+
+    topics are the names of those to read, by default all. Raises DataError, also while iterating,
+    for a damaged or truncated bag.
+    """
+    wanted = None if topics is None else set(topics)
+    if is_foreign(source):
+        yield from messages_of_bag(source, wanted)
+        return
+    parts = [messages_of_file(path, wanted) for path in storage_files(source)]
+    yield from heapq.merge(*parts, key=lambda message: message.log_time_ns)
+
+
+def topics_of(source: PathLike) -> dict[str, TopicInfo]:
+    """Return the topics of a bag, sorted by name. Raises DataError."""
+    out: dict[str, TopicInfo] = {}
+    for path, channels in _channels(source):
+        for info in channels:
+            topic = info.channel.topic
+            name = info.schema.name if info.schema else ''
+            known = out.get(topic, TopicInfo(name, 0, []))
+            if known.type != name:
+                raise DataError(
+                    f'{path}: topic {topic} is of type {known.type} and of type {name}'
+                )
+            profiles = known.offered_qos or parse_profiles(
+                info.channel.metadata.get('offered_qos_profiles', '')
+            )
+            out[topic] = TopicInfo(name, known.count + info.count, profiles)
+    return dict(sorted(out.items()))
+
+
+def _channels(source: PathLike) -> Iterator[tuple[PathLike, list[ChannelInfo]]]:
+    """Yield every file of a bag and its channels. Raises DataError."""
+    if is_foreign(source):
+        yield source, channels_of_bag(source)
+        return
+    for path in storage_files(source):
+        yield path, channels_of_file(path)
+
+
+def _observation_topics(source: PathLike) -> dict[str, str]:
+    """Return the fluoroscopes of a bag by topic. Raises DataError."""
+    out: dict[str, str] = {}
+    for topic, info in topics_of(source).items():
+        if info.type != TARGET_OBSERVATIONS:
+            continue
+        try:
+            name = fluoroscope_of_topic(topic)
+        except DataError as error:
+            raise error.at(source) from None
+        check_safe_name(name, f'{source}, topic {topic}')
+        for other, fluoroscope in out.items():
+            if fluoroscope == name:
+                raise DataError(
+                    f'{source}: the topics {other} and {topic} are both of fluoroscope {name}'
+                )
+        out[topic] = name
+    if not out:
+        raise DataError(f'{source}: the bag has no topic of type {TARGET_OBSERVATIONS}')
+    return out
+
+
+def _check_definitions(source: PathLike, topics: Collection[str]) -> None:
+    """Raise DataError unless a bag defines TargetObservations as this program does."""
+    for path, channels in _channels(source):
+        for info in channels:
+            if info.channel.topic not in topics:
+                continue
+            try:
+                _check_definition(info)
+            except DataError as error:
+                raise error.at(f'{path}, topic {info.channel.topic}') from None
+
+
+def _check_definition(info: ChannelInfo) -> None:
+    encoding = info.channel.message_encoding
+    if encoding != 'cdr':
+        raise DataError(f'the messages are encoded as {encoding!r}, only cdr is supported')
+    assert info.schema is not None  # the type of the topic is the name of the schema
+    if not _is_same_definition(info.schema, info.channel.metadata.get('topic_type_hash', '')):
+        raise DataError(f'the bag defines {TARGET_OBSERVATIONS} differently from this program')
+
+
+def _is_same_definition(schema: Schema, recorded_hash: str) -> bool:
+    """Return whether a definition in a bag has the fields that this program knows.
+
+    Without a text the recorded hash decides; without either the definition is accepted.
+    """
+    if not schema.data.strip():
+        return recorded_hash in ('', type_hash(TARGET_OBSERVATIONS))
+    text = schema.data.decode(errors='replace')
+    known = typestore().fielddefs
+    return all(
+        name in known and known[name][1] == fields
+        for name, fields in fields_of(TARGET_OBSERVATIONS, text, schema.encoding).items()
+    )
+
+
+# Images of a bag: sensor_msgs/Image and CompressedImage, without ROS.
+
+IMAGE = 'sensor_msgs/msg/Image'
+COMPRESSED_IMAGE = 'sensor_msgs/msg/CompressedImage'
+PIXEL_TYPES = {'mono8': 'u1', '8UC1': 'u1', 'mono16': 'u2', '16UC1': 'u2'}
+
+
+class BagImage(NamedTuple):
+    """An image (h, w) of a bag, its place in words, and its stamp [ns], None where it is damaged.
+
+    In place of an image that cannot be read there is the DataError that says why.
+    """
+
+    place: str
+    image: np.ndarray | DataError
+    stamp_ns: int | None
+
+
+def image_topics(source: PathLike) -> dict[str, str]:
+    """Return the topics of a bag with images by fluoroscope, the part of the name before the last.
+
+    The suffix /compressed of image_transport does not count. Where a fluoroscope has both, the
+    images that are not compressed are taken. Raises DataError.
+    """
+    out: dict[str, str] = {}
+    for kind in (COMPRESSED_IMAGE, IMAGE):
+        for topic, info in topics_of(source).items():
+            if info.type == kind and info.count:
+                base = topic.removesuffix('/compressed')
+                parts = [part for part in base.split('/') if part]
+                out[parts[0] if len(parts) == 1 else fluoroscope_of_topic(base)] = topic
+    return out
+
+
+def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
+    """Yield the images of a topic. Raises DataError for a damaged bag."""
+    kind = topics_of(source)[topic].type
+    for number, message in enumerate(iterate_messages(source, [topic]), 1):
+        stamp_ns = None
+        where = f'{source}, topic {topic}, message {number}'
+        try:
+            content = from_cdr(message.data, kind)
+            stamp = content.header.stamp
+            stamp_ns = stamp.sec * 10**9 + stamp.nanosec
+            image = decode(content.data) if kind == COMPRESSED_IMAGE else _pixels(content)
+        except DataError as error:
+            yield BagImage(where, error.at(where), stamp_ns)
+        else:
+            yield BagImage(where, image, stamp_ns)
+
+
+def _pixels(message: Any) -> np.ndarray:
+    """Grey values (h, w) of an Image. Raises DataError."""
+    if message.encoding not in PIXEL_TYPES:
+        raise DataError(f'the encoding {message.encoding} is none of {", ".join(PIXEL_TYPES)}')
+    order = '>' if message.is_bigendian else '<'
+    dtype = np.dtype(order + PIXEL_TYPES[message.encoding])
+    if message.step < message.width * dtype.itemsize:
+        raise DataError(f'a row has {message.step} bytes, too few for {message.width} px')
+    data = np.asarray(message.data, dtype=np.uint8)
+    if len(data) < message.step * message.height:
+        raise DataError('the image has fewer pixels than it says')
+    rows = data[: message.step * message.height].reshape(message.height, message.step)
+    grey = np.ascontiguousarray(rows[:, : message.width * dtype.itemsize]).view(dtype)
+    return grey.astype(dtype.newbyteorder('='), copy=False)
+
+
+# Angles of C-arms in a bag, from the states of their joints.
+
+JOINT_STATE = 'sensor_msgs/msg/JointState'
+
+
+def joint_topics(source: PathLike) -> list[str]:
+    """Return the topics of a bag that hold states of joints. Raises DataError."""
+    return [
+        name for name, info in topics_of(source).items() if info.type == JOINT_STATE and info.count
+    ]
+
+
+def with_angles(
+    source: PathLike, frames: Mapping[str, Sequence[Frame]], options: AngleOptions
+) -> tuple[dict[str, list[Frame]], tuple[str, ...]]:
+    """Return frames of a bag with the angles that the nodes give them, and notes about them.
+
+    Parameters
+    ----------
+    source : path-like
+    frames : mapping of str to sequence of Frame
+        By fluoroscope.
+    options : AngleOptions
+        Which joint is the C-arm, in any topic of joint states.
+
+    Raises
+    ------
+    DataError
+        For a bag without this joint, with states of it on several topics or damaged ones, and for
+        a joint of another fluoroscope.
+    """
+    angles = angles_in(source, frames, options)
+    if not angles.joints:
+        return {name: list(each) for name, each in frames.items()}, ()
+    out = {
+        name: [replace(frame, angle=angles.at(name, frame.stamp_ns)) for frame in each]
+        for name, each in frames.items()
+    }
+    return out, tuple(_notes(source, out, angles))
+
+
+def angles_in(source: PathLike, fluoroscopes: Iterable[str], options: AngleOptions) -> JointAngles:
+    """Return the angles of fluoroscopes by all joint states of a bag.
+
+    Raises DataError as with_angles.
+    """
+    try:
+        angles = options.tracks(fluoroscopes, capacity=None)
+    except ValueError as error:
+        raise DataError(f'{source}: {error}') from None
+    try:
+        if angles.joints:
+            _read_states(source, angles)
+    except DataError as error:
+        hint = "; the joint is that of rig.toml, --angle-joint '' leaves it out"
+        raise DataError(f'{error}{hint if options.of_rig else ""}') from None
+    return angles
+
+
+def _read_states(source: PathLike, angles: JointAngles) -> None:
+    """Add all states of joints in a bag to their tracks. Raises DataError."""
+    topics = joint_topics(source)
+    wanted = set(angles.joints.values())
+    if not topics:
+        raise DataError(
+            f'{source}: the bag has no joint states ({JOINT_STATE}), so the angle of joint '
+            f'{", ".join(sorted(wanted))} is unknown'
+        )
+    found: dict[str, set[str]] = {}  # topics by joint
+    for message in iterate_messages(source, topics):
+        try:
+            state = from_cdr(message.data, JOINT_STATE)
+        except DataError as error:
+            raise error.at(f'{source}, topic {message.topic}') from None
+        for joint in state.name:
+            found.setdefault(joint, set()).add(message.topic)
+        stamp = state.header.stamp
+        angles.add(stamp.sec * 10**9 + stamp.nanosec, state.name, state.position)
+    for joint in sorted(wanted):
+        if joint not in found:
+            raise DataError(
+                f'{source}: the bag has no joint {joint!r}, only {", ".join(sorted(found))}'
+            )
+        if len(found[joint]) > 1:
+            raise DataError(
+                f'{source}: joint {joint!r} is on the topics {", ".join(sorted(found[joint]))}; '
+                'its angle must come from one of them'
+            )
+
+
+def _notes(
+    source: PathLike, frames: Mapping[str, Sequence[Frame]], angles: JointAngles
+) -> Iterable[str]:
+    """Yield a sentence for each fluoroscope with frames whose angle is unknown."""
+    for name, each in frames.items():
+        unknown = [frame for frame in each if frame.angle is None]
+        if name in angles.joints and unknown:
+            yield (
+                f'{source}: {len(unknown)} of {len(each)} frames of fluoroscope {name} have no '
+                f'angle, the first is frame {unknown[0].number} '
+                f'({angles.doubt(name, unknown[0].stamp_ns)})'
+            )

@@ -1,0 +1,233 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Record messages as they come: queued, written by a thread, and flushed to disk regularly."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+from ...errors import DataError
+from ...options import option, validate_options
+from .definitions import Definition
+from .mcap_file import PathLike
+from .writer import BagWriter
+
+MEGABYTE = 10**6
+SMALL_BYTES = 65536  # of a message that is no image
+LARGE_SHARE = 0.9  # of the queue that large messages may fill: images must not displace frames
+WAIT_S = 0.1  # after which the thread looks whether it has to flush or to end
+
+
+@dataclass(frozen=True)
+class RecordingOptions:
+    """Options of a recording. Raises ValueError for a value that an option cannot have."""
+
+    split_size: float = option(
+        0.0, 'size after which a new file is begun; 0: never', minimum=0.0, maximum=1e7, unit='MB'
+    )
+    split_duration: float = option(
+        0.0, 'time after which a new file is begun; 0: never', minimum=0.0, maximum=1e7, unit='s'
+    )
+    flush_period: float = option(
+        1.0,
+        'longest time after which chunks are closed and flushed to disk',
+        minimum=0.05,
+        maximum=60.0,
+        unit='s',
+    )
+    queue_size: float = option(
+        256.0,
+        'messages that may wait for the disk; more are dropped and counted',
+        minimum=1.0,
+        maximum=1e5,
+        unit='MB',
+    )
+
+    def __post_init__(self) -> None:
+        validate_options(self)
+
+
+class TopicToRecord(NamedTuple):
+    """A topic, its type, the QoS profiles offered, and the definition of the type.
+
+    latched: how many of its last messages are written again at the start of each file.
+    """
+
+    name: str
+    msg_type: str
+    qos: list[dict[str, Any]]
+    definition: Definition
+    latched: int = 0
+
+
+class _Message(NamedTuple):
+    topic: str
+    data: bytes
+    received_ns: int
+    sent_ns: int
+
+
+class Recording:
+    """A bag that is being recorded, from start() to stop().
+
+    put() never waits: where the disk is slower than the messages, they wait in a queue of limited
+    size, and what does not fit is dropped and counted, large messages first. Every flush_period
+    the open chunk is closed and flushed to disk, so that a crash or a power failure costs no
+    more. Where the disk is full, what was not flushed counts as dropped.
+    """
+
+    def __init__(self, path: PathLike, options: RecordingOptions | None = None) -> None:
+        self.path = path
+        self.options = options or RecordingOptions()
+        self.counts: Counter[str] = Counter()
+        self.dropped: Counter[str] = Counter()
+        self._unflushed: Counter[str] = Counter()  # written, but perhaps not yet on disk
+        self.fault = ''  # why nothing is written any more
+        self.waiting_bytes = 0
+        self.most_waiting_bytes = 0
+        self._writer = BagWriter(path, live=True)
+        self._topics: dict[str, TopicToRecord] = {}
+        self._latched: dict[str, deque[_Message]] = {}
+        self._queue: deque[_Message | TopicToRecord] = deque()
+        self._condition = threading.Condition()
+        self._stopping = False
+        self._file_start = 0.0
+        self._thread = threading.Thread(target=self._run, name='recording', daemon=True)
+
+    @property
+    def files(self) -> int:
+        """Number of files so far."""
+        return self._writer.file_count
+
+    def start(self) -> None:
+        """Make the bag and begin. Raises DataError where that is not possible."""
+        self._writer.__enter__()
+        self._file_start = time.monotonic()
+        self._thread.start()
+
+    def add_topic(self, topic: TopicToRecord) -> None:
+        """Add a topic, before its first message."""
+        with self._condition:
+            self._queue.append(topic)
+            self._condition.notify()
+
+    def put(self, topic: str, data: bytes, received_ns: int, sent_ns: int) -> bool:
+        """Queue a message; returns False where it had to be dropped."""
+        with self._condition:
+            share = 1.0 if len(data) <= SMALL_BYTES else LARGE_SHARE
+            full = self.waiting_bytes + len(data) > share * self.options.queue_size * MEGABYTE
+            if self.fault or (full and self.waiting_bytes):
+                self.dropped[topic] += 1
+                return False
+            self._queue.append(_Message(topic, data, received_ns, sent_ns))
+            self.waiting_bytes += len(data)
+            self.most_waiting_bytes = max(self.most_waiting_bytes, self.waiting_bytes)
+            self._condition.notify()
+        return True
+
+    def stop(self) -> None:
+        """Write what waits, close the file and write metadata.yaml; `fault` says what failed."""
+        with self._condition:
+            self._stopping = True
+            self._condition.notify()
+        self._thread.join()
+        try:
+            self._writer.__exit__(None, None, None)
+        except DataError as error:
+            self._fail(self.fault or str(error), [])
+
+    def _run(self) -> None:
+        flushed = time.monotonic()
+        while not self.fault:
+            with self._condition:
+                if not self._queue and not self._stopping:
+                    self._condition.wait(WAIT_S)
+                items = list(self._queue)
+                self._queue.clear()
+                if not items and self._stopping:
+                    return
+            try:
+                for number, item in enumerate(items):
+                    self._write(item)
+                    items[number] = None  # type: ignore[call-overload]  # frees its memory
+                    flushed = self._flush_if_due(flushed)
+                flushed = self._flush_if_due(flushed)
+            except DataError as error:
+                self._fail(str(error), [item for item in items if item is not None])
+            except Exception as error:  # a bug must not end the recording silently
+                self._fail(
+                    f'{self.path}: the recording failed unexpectedly: {error!r}',
+                    [item for item in items if item is not None],
+                )
+
+    def _flush_if_due(self, flushed: float) -> float:
+        """Flush what is written to disk once in a period; returns when this was last done."""
+        # A part of each period is left for the flush itself.
+        if time.monotonic() - flushed <= 0.5 * self.options.flush_period:
+            return flushed
+        self._writer.flush(to_disk=True)
+        self._unflushed.clear()
+        return time.monotonic()
+
+    def _fail(self, fault: str, items: list[_Message | TopicToRecord]) -> None:
+        """Count what can no longer be written as dropped."""
+        with self._condition:
+            self.fault = fault
+            self.counts -= self._unflushed  # what an open chunk holds
+            self.dropped += self._unflushed
+            self._unflushed.clear()
+            for item in (*items, *self._queue):
+                if isinstance(item, _Message):
+                    self.dropped[item.topic] += 1
+            self._queue.clear()
+            self.waiting_bytes = 0
+
+    def _write(self, item: _Message | TopicToRecord) -> None:
+        if isinstance(item, TopicToRecord):
+            self._topics[item.name] = item
+            self._writer.add_topic(item.name, item.msg_type, item.qos, item.definition)
+            if item.latched:
+                self._latched[item.name] = deque(maxlen=item.latched)
+            return
+        if self._is_full():
+            self._writer.split()
+            self._file_start = time.monotonic()
+            for messages in self._latched.values():
+                for latched in messages:
+                    self._write_message(latched._replace(received_ns=item.received_ns))
+        self._write_message(item)
+        self.counts[item.topic] += 1
+        self._unflushed[item.topic] += 1
+        if item.topic in self._latched:
+            self._latched[item.topic].append(item)
+        with self._condition:
+            self.waiting_bytes -= len(item.data)
+
+    def _write_message(self, message: _Message) -> None:
+        self._writer.write(
+            message.topic,
+            self._topics[message.topic].msg_type,
+            message.data,
+            message.received_ns,
+            message.sent_ns,
+        )
+
+    def _is_full(self) -> bool:
+        """Return whether a new file is to be begun."""
+        size = self.options.split_size * MEGABYTE
+        duration = self.options.split_duration
+        return bool(
+            (size and self._writer.file_bytes >= size)
+            or (duration and time.monotonic() - self._file_start >= duration)
+        )
+
+
+def lost_text(dropped: Mapping[str, int]) -> str:
+    """Return the numbers of dropped messages by topic, for people."""
+    return ', '.join(f'{topic} {count}' for topic, count in sorted(dropped.items()))

@@ -1,0 +1,698 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Read what is left of a damaged or cut-off .mcap file.
+
+The file is read from its beginning, without its index. A chunk counts if its checksum is right.
+Behind damaged bytes, reading goes on at the next chunk. The layout of the records is that of the
+MCAP specification (https://mcap.dev/spec).
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import re
+import struct
+import sys
+import zlib
+from collections import Counter
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from io import BytesIO
+from typing import NamedTuple
+
+import lz4.frame
+import numpy as np
+import yaml
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.opcode import Opcode
+from mcap.records import Channel, MessageIndex, Schema, Statistics
+
+from ...errors import DataError
+from ...limits import MAX_CHUNK
+from ..access import check_regular_file, os_error_reason, read_text
+from ..text_files import parse_yaml
+from .definitions import PACKAGE, TARGET_OBSERVATIONS, Definition, fluoroscope_of_topic, typestore
+from .mcap_file import PathLike, candidate_files
+from .metadata import parse_profiles, profile
+from .writer import BagWriter
+
+MAGIC = b'\x89MCAP0\r\n'
+_HEAD = struct.Struct('<BQ')  # of a record: opcode and length
+_CHUNK = struct.Struct('<QQQI')  # of a chunk: first and last time, size, checksum
+_MESSAGE = struct.Struct('<HIQQ')  # of a message: channel, sequence, log and publish time
+_FOOTER = struct.Struct('<BQQQI')
+# Where a chunk may begin: a short record with its opcode, or the name of its compression.
+_CANDIDATE = re.compile(rb'\x06[\x00-\xff]{4}\x00{4}|\x04\x00{3}zstd|\x03\x00{3}lz4')
+_TO_COMPRESSION = _HEAD.size + _CHUNK.size  # bytes
+
+
+class SalvagedMessage(NamedTuple):
+    """A message that is intact, with the times at which it was received and sent [ns]."""
+
+    topic: str
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes
+
+
+@dataclass(frozen=True)
+class SalvagedTopic:
+    """A topic of a file as it was recorded: definition of its type, and QoS profiles as YAML."""
+
+    name: str
+    msg_type: str
+    encoding: str  # of the messages
+    schema_encoding: str
+    text: str
+    qos: str
+    type_hash: str
+
+
+@dataclass(frozen=True)
+class Damage:
+    """Bytes of a file that cannot be used.
+
+    Attributes
+    ----------
+    path : str
+    cause : str
+    start_ns, end_ns : int or None
+        Messages between these times may be missing [ns]; None: from the beginning, to the end.
+    lost : mapping of str to int
+        Number of lost messages by topic, empty where it is not known.
+    """
+
+    path: str
+    cause: str
+    start_ns: int | None
+    end_ns: int | None
+    lost: dict[str, int] = field(default_factory=dict)
+
+
+class _Chunk(NamedTuple):
+    content: bytes | memoryview
+    end: int  # position behind it
+
+
+class FileSalvage:
+    """The intact messages of an .mcap file; damages are known after messages() has ended."""
+
+    def __init__(self, path: str) -> None:
+        self.path = path
+        self.topics: dict[str, SalvagedTopic] = {}
+        self.damages: list[Damage] = []
+        self.counts: Counter[str] = Counter()
+        self.expected: Counter[str] = Counter()  # number of messages, where the end is intact
+        self._schemas: dict[int, Schema] = {}
+        self._channels: dict[int, Channel] = {}
+        self._last_ns: int | None = None
+        self._open_damage: tuple[str, int | None, dict[str, int]] | None = None
+        self._has_end = False
+
+    def messages(self) -> Iterator[SalvagedMessage]:
+        """Yield the intact messages in the order in which they were written.
+
+        Raises DataError for a file that cannot be read at all.
+        """
+        check_regular_file(self.path)
+        try:
+            with open(self.path, 'rb') as file:
+                if os.fstat(file.fileno()).st_size == 0:
+                    self._note('the file is empty')
+                    self._close_damage(None)
+                    return
+                with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
+                    self._read_summary(data)
+                    yield from self._records(data)
+        except OSError as error:
+            raise DataError(f'{self.path}: cannot be read ({os_error_reason(error)})') from None
+        if not self._has_end and self._open_damage is None:
+            self._note('the end of the file is missing')
+        self._close_damage(None)
+
+    def _records(self, data: mmap.mmap) -> Iterator[SalvagedMessage]:
+        """Yield the messages of the data section."""
+        size = len(data)
+        position = len(MAGIC)
+        if data[:position] != MAGIC:
+            self._note('the beginning is no MCAP file')
+            position = self._next_chunk(data, 0)
+        while position < size and not self._has_end:
+            end = self._end_of_record(data, position)
+            if end is None or data[position] == Opcode.CHUNK or _looks_like_chunk(data, position):
+                chunk = _chunk_at(data, position)
+                if chunk is not None:
+                    yield from self._messages_of(chunk.content)
+                    position = chunk.end
+                    continue
+                self._note_lost_chunk(data, position, end)
+                position = self._next_chunk(data, position + 1)
+                continue
+            is_end = data[position] == Opcode.DATA_END
+            # A damaged length may reach over chunks.
+            chunk_at = self._next_chunk(data, position + 1, size if is_end else end)
+            if chunk_at < size:
+                self._note('these bytes are damaged')
+                position = chunk_at
+                continue
+            self._has_end = is_end
+            yield from self._record(data[position], data[position + _HEAD.size : end])
+            position = end
+
+    def _end_of_record(self, data: mmap.mmap, position: int) -> int | None:
+        """Return the position behind a record, None where there is no complete record."""
+        if position + _HEAD.size > len(data):
+            return None
+        opcode, length = _HEAD.unpack_from(data, position)
+        end = position + _HEAD.size + length
+        return end if 0 < opcode <= Opcode.DATA_END and end <= len(data) else None
+
+    def _next_chunk(self, data: mmap.mmap, position: int, limit: int = sys.maxsize) -> int:
+        """Return the position of the next intact chunk, or the end of the file.
+
+        It is looked for as far as a limit.
+        """
+        for match in _CANDIDATE.finditer(data, position, limit):
+            is_head = data[match.start()] == Opcode.CHUNK
+            start = match.start() if is_head else match.start() - _TO_COMPRESSION
+            if start >= position and _chunk_at(data, start) is not None:
+                return start
+        return len(data)
+
+    def _messages_of(self, content: bytes | memoryview) -> Iterator[SalvagedMessage]:
+        """Yield the messages of an intact chunk."""
+        position = 0
+        while position + _HEAD.size <= len(content):
+            opcode, length = _HEAD.unpack_from(content, position)
+            position += _HEAD.size
+            yield from self._record(opcode, bytes(content[position : position + length]))
+            position += length
+
+    def _record(self, opcode: int, content: bytes) -> Iterator[SalvagedMessage]:
+        """Yield the message of a record, if it is one; remember schemas and channels."""
+        if opcode == Opcode.MESSAGE and len(content) >= _MESSAGE.size:
+            number, sequence, received, sent = _MESSAGE.unpack_from(content)
+            topic = self._topic(number)
+            if topic is None:
+                self._note('the topic of messages is unknown', {'(unknown)': 1})
+                return
+            self._close_damage(received)
+            self._last_ns = received
+            self.counts[topic] += 1
+            yield SalvagedMessage(topic, received, sent, sequence, content[_MESSAGE.size :])
+        elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._define(opcode, content)
+
+    def _define(self, opcode: int, content: bytes) -> None:
+        """Remember a schema or channel; one that cannot be read is a damage."""
+        try:
+            if opcode == Opcode.SCHEMA:
+                schema = Schema.read(ReadDataStream(BytesIO(content)))
+                self._schemas[schema.id] = schema
+            else:
+                channel = Channel.read(ReadDataStream(BytesIO(content)))
+                self._channels[channel.id] = channel
+        except Exception:  # damaged bytes make the reader raise almost anything
+            self._note('the definition of a topic is damaged')
+
+    def _topic(self, number: int) -> str | None:
+        """Return the topic of a channel, None where it is not known."""
+        channel = self._channels.get(number)
+        if channel is None:
+            return None
+        if channel.topic not in self.topics:
+            schema = self._schemas.get(channel.schema_id)
+            self.topics[channel.topic] = SalvagedTopic(
+                channel.topic,
+                schema.name if schema else '',
+                encoding=channel.message_encoding,
+                schema_encoding=schema.encoding if schema else '',
+                text=schema.data.decode(errors='replace') if schema else '',
+                qos=channel.metadata.get('offered_qos_profiles', ''),
+                type_hash=channel.metadata.get('topic_type_hash', ''),
+            )
+        return channel.topic
+
+    def _read_summary(self, data: mmap.mmap) -> None:
+        """Read topics and counts of an intact end: their first chunk may be damaged."""
+        size = len(data)
+        footer = size - len(MAGIC) - _FOOTER.size
+        if footer < len(MAGIC) or data[-len(MAGIC) :] != MAGIC:
+            return
+        opcode, _, start, _, checksum = _FOOTER.unpack_from(data, footer)
+        if opcode != Opcode.FOOTER or not len(MAGIC) < start <= footer or not checksum:
+            return
+        if zlib.crc32(data[start : footer + _FOOTER.size - 4]) != checksum:
+            return
+        position = start
+        while position < footer:
+            opcode, length = _HEAD.unpack_from(data, position)
+            position += _HEAD.size
+            content = data[position : position + length]
+            position += length
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._define(opcode, content)
+            elif opcode == Opcode.STATISTICS:
+                counts = Statistics.read(ReadDataStream(BytesIO(content))).channel_message_counts
+                for number, count in counts.items():
+                    topic = self._topic(number)
+                    if topic is not None:
+                        self.expected[topic] += count
+
+    def _note_lost_chunk(self, data: mmap.mmap, position: int, end: int | None) -> None:
+        """Note a damaged chunk, with what its message index says about it."""
+        if end is None:
+            is_cut = position + _HEAD.size > len(data) or data[position] in range(1, 16)
+            self._note(
+                'the file is cut off or damaged here' if is_cut else 'these bytes are damaged'
+            )
+            return
+        lost: dict[str, int] = {}
+        position = end
+        while (behind := self._end_of_record(data, position)) is not None:
+            if data[position] != Opcode.MESSAGE_INDEX:
+                break
+            try:
+                content = BytesIO(data[position + _HEAD.size : behind])
+                index = MessageIndex.read(ReadDataStream(content))
+            except Exception:  # damaged bytes make the reader raise almost anything
+                break
+            topic = self._topic(index.channel_id) or '(unknown)'
+            lost[topic] = lost.get(topic, 0) + len(index.records)
+            position = behind
+        self._note('a chunk is damaged', lost)
+
+    def _note(self, cause: str, lost: dict[str, int] | None = None) -> None:
+        """Begin a damage, or extend the one that has begun."""
+        if self._open_damage is None:
+            self._open_damage = (cause, self._last_ns, {})
+        for topic, count in (lost or {}).items():
+            known = self._open_damage[2]
+            known[topic] = known.get(topic, 0) + count
+
+    def _close_damage(self, next_ns: int | None) -> None:
+        """End a damage at the time of the next message, None at the end of the file."""
+        if self._open_damage is not None:
+            cause, start_ns, lost = self._open_damage
+            self.damages.append(Damage(self.path, cause, start_ns, next_ns, lost))
+            self._open_damage = None
+
+
+def _looks_like_chunk(data: mmap.mmap, position: int) -> bool:
+    """Return whether a record names a compression where a chunk does."""
+    start = position + _TO_COMPRESSION
+    return data[start : start + 8].startswith((b'\x04\0\0\0zstd', b'\x03\0\0\0lz4'))
+
+
+def _chunk_at(data: mmap.mmap, position: int) -> _Chunk | None:
+    """Return the content of the chunk at a position, None unless it is intact.
+
+    Its length is taken from its own fields: opcode and length of the record may be damaged.
+    """
+    start = position + _HEAD.size
+    if start + _CHUNK.size + 4 > len(data):
+        return None
+    _, _, size, checksum = _CHUNK.unpack_from(data, start)
+    position = start + _CHUNK.size
+    (length,) = struct.unpack_from('<I', data, position)
+    position += 4
+    if length > 4 or position + length + 8 > len(data):
+        return None
+    compression = data[position : position + length]
+    position += length
+    (length,) = struct.unpack_from('<Q', data, position)
+    position += 8
+    if position + length > len(data):
+        return None
+    content = _decompressed(compression, memoryview(data)[position : position + length], size)
+    if content is None or not content:
+        return None
+    if checksum and zlib.crc32(content) != checksum:
+        return None
+    return _Chunk(content, position + length) if checksum or _is_whole(content) else None
+
+
+def _decompressed(compression: bytes, data: memoryview, size: int) -> bytes | None:
+    """Return the content of a chunk, None where it cannot be decompressed."""
+    try:
+        if compression == b'zstd':
+            held = zstandard.frame_content_size(data)
+            if not 0 <= held <= MAX_CHUNK and not 0 < size <= MAX_CHUNK:
+                return None
+            limit = held if held >= 0 else size
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=limit)
+        if compression == b'lz4':
+            return lz4.frame.decompress(bytes(data)) if 0 < size <= MAX_CHUNK else None
+        return bytes(data) if compression == b'' and len(data) <= MAX_CHUNK else None
+    except (zstandard.ZstdError, RuntimeError, ValueError, MemoryError):
+        return None
+    finally:
+        data.release()
+
+
+def _is_whole(content: bytes) -> bool:
+    """Return whether a chunk without checksum consists of whole records."""
+    position = 0
+    while position + _HEAD.size <= len(content):
+        opcode, length = _HEAD.unpack_from(content, position)
+        if opcode not in (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE):
+            return False
+        position += _HEAD.size + length
+    return position == len(content)
+
+
+# Recover a bag: all intact messages of a damaged or cut-off one, written as a valid bag.
+
+
+@dataclass(frozen=True)
+class Recovery:
+    """What was recovered from a bag.
+
+    Attributes
+    ----------
+    counts : mapping of str to int
+        Number of recovered messages by topic.
+    expected : mapping of str to int
+        Number of messages that the bag had, as far as it says so, by topic.
+    damages : sequence of Damage
+    skipped : mapping of str to str
+        Why topics were left out.
+    """
+
+    counts: dict[str, int]
+    expected: dict[str, int]
+    damages: tuple[Damage, ...]
+    skipped: dict[str, str]
+
+    @property
+    def lost(self) -> dict[str, int]:
+        """Number of messages that are known to be lost, by topic."""
+        lost = {t: n - self.counts.get(t, 0) for t, n in self.expected.items()}
+        return {topic: count for topic, count in lost.items() if count > 0}
+
+
+class Salvage:
+    """The intact messages of a bag, file by file; topics and damages as far as it was read."""
+
+    def __init__(self, source: PathLike) -> None:
+        self.files = [FileSalvage(path) for path in candidate_files(source)]
+        self._metadata = _expected_of_metadata(source)
+
+    def messages(self) -> Iterator[tuple[FileSalvage, SalvagedMessage]]:
+        """Yield file and message in the order in which they were written. Raises DataError."""
+        for file in self.files:
+            for message in file.messages():
+                yield file, message
+
+    @property
+    def damages(self) -> tuple[Damage, ...]:
+        """All damages that were found."""
+        return tuple(damage for file in self.files for damage in file.damages)
+
+    @property
+    def expected(self) -> dict[str, int]:
+        """Number of messages that the bag had, as far as it says so, by topic."""
+        total: Counter[str] = Counter()
+        for file in self.files:
+            total += file.expected
+        return {**total, **self._metadata}
+
+
+def recover_bag(source: PathLike, out: PathLike) -> Recovery:
+    """Write the intact messages of a bag to a new one.
+
+    Parameters
+    ----------
+    source : path-like
+        An .mcap file or a bag folder.
+    out : path-like
+        Folder of the new bag, which must not exist.
+
+    Returns
+    -------
+    Recovery
+
+    Raises
+    ------
+    DataError
+        For a source without any intact message, and where the bag cannot be written.
+    """
+    salvage = Salvage(source)
+    if os.path.realpath(out).startswith(os.path.join(os.path.realpath(source), '')):
+        raise DataError(f'{out}: the output lies in the input {source}, choose another output')
+    counts: Counter[str] = Counter()
+    skipped: dict[str, str] = {}
+    with BagWriter(out) as bag:
+        for file, message in salvage.messages():
+            topic = file.topics[message.topic]
+            if message.topic not in counts and message.topic not in skipped:
+                reason = _added(bag, topic)
+                if reason:
+                    skipped[message.topic] = reason
+            if message.topic in skipped:
+                continue
+            bag.write(
+                message.topic,
+                topic.msg_type,
+                message.data,
+                message.log_time_ns,
+                message.publish_time_ns,
+            )
+            counts[message.topic] += 1
+        if not counts:
+            causes = sorted({damage.cause for damage in salvage.damages} | {*skipped.values()})
+            raise DataError(
+                f'{source}: nothing can be recovered ({"; ".join(causes) or "no messages"})'
+            )
+    return Recovery(dict(sorted(counts.items())), salvage.expected, salvage.damages, skipped)
+
+
+def _added(bag: BagWriter, topic: SalvagedTopic) -> str:
+    """Add a topic to a bag; returns why that is not possible, or ''."""
+    if topic.encoding != 'cdr':
+        return f'the messages are encoded as {topic.encoding!r}'
+    definition = Definition(topic.text, topic.schema_encoding, topic.type_hash)
+    try:
+        bag.add_topic(
+            topic.name, topic.msg_type, parse_profiles(topic.qos) or [profile()], definition
+        )
+    except DataError as error:
+        return str(error)
+    return ''
+
+
+def _expected_of_metadata(source: PathLike) -> dict[str, int]:
+    """Return the numbers of messages by topic in metadata.yaml, if there is one."""
+    path = os.path.join(source, 'metadata.yaml')
+    if not os.path.isdir(source) or not os.path.exists(path):
+        return {}
+    try:
+        information = parse_yaml(read_text(path))['rosbag2_bagfile_information']
+        return {
+            str(entry['topic_metadata']['name']): int(entry['message_count'])
+            for entry in information['topics_with_message_count']
+        }
+    except (DataError, yaml.YAMLError, KeyError, TypeError, ValueError):
+        return {}
+
+
+# What is in a bag, and what is wrong with it; damaged bags, too.
+
+JUMP_NS = 1_000_000  # a time that much before the last one runs backwards
+STREAM_NS = 100_000_000  # messages of a stream follow each other in less than that
+GAP = 10  # times the usual interval of a stream is a gap
+_NUMBERED = (TARGET_OBSERVATIONS, f'{PACKAGE}/msg/CorrectedObservations')
+
+
+@dataclass
+class TopicReport:
+    """What a topic holds.
+
+    Attributes
+    ----------
+    type : str
+    log_ns, stamp_ns : list of int
+        Times at which the messages were received, and those of their headers, if any [ns].
+    numbers : list of int
+        Frame numbers, of observations only.
+    undecodable : int
+        Messages whose header cannot be read.
+    """
+
+    type: str
+    log_ns: list[int] = field(default_factory=list)
+    stamp_ns: list[int] = field(default_factory=list)
+    numbers: list[int] = field(default_factory=list)
+    undecodable: int = 0
+
+    @property
+    def duration_s(self) -> float:
+        """Time from the first message to the last."""
+        return (max(self.log_ns) - min(self.log_ns)) * 1e-9 if self.log_ns else 0.0
+
+    @property
+    def interval_ns(self) -> float:
+        """Usual time between two messages, by their stamps if they have some; NaN for one."""
+        times = self.stamp_ns if len(self.stamp_ns) > 1 else self.log_ns
+        return float(np.median(np.diff(times))) if len(times) > 1 else float('nan')
+
+    @property
+    def longest_gap_s(self) -> float:
+        """Longest time between two messages, by stamps or when they were received."""
+        steps = [np.diff(t).max() for t in (self.stamp_ns, self.log_ns) if len(t) > 1]
+        return float(max(steps, default=0)) * 1e-9
+
+    @property
+    def has_gap(self) -> bool:
+        """Whether a stream was interrupted; only messages with a header are a stream."""
+        usual = self.interval_ns
+        return (
+            len(self.stamp_ns) > 1
+            and 0 < usual < STREAM_NS
+            and self.longest_gap_s * 1e9 > max(GAP * usual, STREAM_NS)
+        )
+
+    @property
+    def backward_jumps(self) -> int:
+        """Number of times that a clock ran backwards."""
+        return sum(
+            int((np.diff(times) < -JUMP_NS).sum()) for times in (self.log_ns, self.stamp_ns)
+        )
+
+    @property
+    def restarts(self) -> int:
+        """Number of times that the frame numbers began again."""
+        return int((np.diff(self.numbers) < 0).sum())
+
+    @property
+    def repeated_frames(self) -> int:
+        """Number of frames with the number of the one before."""
+        return int((np.diff(self.numbers) == 0).sum())
+
+    @property
+    def missing_frames(self) -> int:
+        """Number of frame numbers that were passed over."""
+        steps = np.diff(self.numbers)
+        return int((steps[steps > 1] - 1).sum())
+
+
+@dataclass(frozen=True)
+class BagReport:
+    """What a bag holds, and its damages.
+
+    Attributes
+    ----------
+    files : list of str
+    topics : dict of str to TopicReport
+    without_partner : dict of str to int
+        Frames of every fluoroscope whose number another one does not have.
+    damages : tuple of Damage
+    lost : dict of str to int
+        Number of messages that are known to be lost, by topic.
+    """
+
+    files: list[str]
+    topics: dict[str, TopicReport]
+    without_partner: dict[str, int]
+    damages: tuple[Damage, ...]
+    lost: dict[str, int]
+
+    @property
+    def faults(self) -> list[str]:
+        """What is wrong, in sentences."""
+        found = [f'{d.path}: {d.cause}' for d in self.damages]
+        found += [f'{topic}: {count} messages are lost' for topic, count in self.lost.items()]
+        for topic, report in self.topics.items():
+            found += [f'{topic}: {text}' for text in _faults(report)]
+        found += [
+            f'fluoroscope {name}: {count} {"frame" if count == 1 else "frames"} without partner'
+            for name, count in self.without_partner.items()
+            if count
+        ]
+        return found
+
+
+def inspect_bag(source: PathLike) -> BagReport:
+    """Read a bag, also a damaged one, and report on it.
+
+    Raises DataError for a source that is not a bag.
+    """
+    salvage = Salvage(source)
+    topics: dict[str, TopicReport] = {}
+    for file, message in salvage.messages():
+        report = topics.get(message.topic)
+        if report is None:
+            report = topics[message.topic] = TopicReport(file.topics[message.topic].msg_type)
+        report.log_ns.append(message.log_time_ns)
+        _read_header(report, message.data)
+    if not topics and salvage.damages:
+        raise DataError(f'{source}: nothing can be read ({salvage.damages[0].cause})')
+    counts = {topic: len(report.log_ns) for topic, report in topics.items()}
+    lost = {t: n - counts.get(t, 0) for t, n in salvage.expected.items()}
+    return BagReport(
+        [file.path for file in salvage.files],
+        dict(sorted(topics.items())),
+        _without_partner(topics),
+        salvage.damages,
+        {topic: count for topic, count in lost.items() if count > 0},
+    )
+
+
+def _read_header(report: TopicReport, data: bytes) -> None:
+    """Read stamp and frame number of a message that has them."""
+    fields = typestore().fielddefs.get(report.type)
+    if fields is None or not fields[1] or 'std_msgs/msg/Header' not in str(fields[1][0]):
+        return
+    order = '<' if data[1:2] == b'\x01' else '>'
+    try:
+        sec, nanosec, length = struct.unpack_from(f'{order}iII', data, 4)
+        report.stamp_ns.append(sec * 10**9 + nanosec)
+        if report.type in _NUMBERED:
+            behind = 12 + length
+            (number,) = struct.unpack_from(f'{order}I', data, 4 + behind + -behind % 4)
+            report.numbers.append(number)
+    except struct.error:
+        report.undecodable += 1
+
+
+def _without_partner(topics: Mapping[str, TopicReport]) -> dict[str, int]:
+    """Return the number of frames without partner by fluoroscope, of two or more."""
+    numbers: dict[str, Counter[int]] = {}
+    for topic, report in topics.items():
+        if report.type == TARGET_OBSERVATIONS and topic.count('/') > 1:
+            numbers[fluoroscope_of_topic(topic)] = Counter(report.numbers)
+    if len(numbers) < 2:
+        return {}
+    common = Counter(next(iter(numbers.values())))
+    for each in numbers.values():
+        common &= each
+    return {name: (each - common).total() for name, each in sorted(numbers.items())}
+
+
+def _faults(report: TopicReport) -> list[str]:
+    found = []
+    if report.has_gap:
+        found.append(
+            f'a gap of {report.longest_gap_s:.3f} s, the usual interval is '
+            f'{report.interval_ns * 1e-6:.1f} ms'
+        )
+    if report.backward_jumps:
+        found.append(f'the clock runs backwards {_times(report.backward_jumps)}')
+    if report.missing_frames:
+        noun = 'frame is' if report.missing_frames == 1 else 'frames are'
+        found.append(f'{report.missing_frames} {noun} missing in the frame numbers')
+    if report.repeated_frames:
+        found.append(f'{report.repeated_frames} frame numbers are repeated')
+    if report.restarts:
+        found.append(f'the frame numbers begin again {_times(report.restarts)}')
+    if report.undecodable:
+        found.append(f'{report.undecodable} messages are too short for their type')
+    return found
+
+
+def _times(count: int) -> str:
+    return 'once' if count == 1 else f'{count} times'

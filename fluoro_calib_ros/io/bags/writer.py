@@ -1,0 +1,355 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Write a bag as rosbag2 (Jazzy) does: a folder NAME with NAME_0.mcap and metadata.yaml.
+
+The layout follows rosbag2's sources (sequential_writer.cpp, mcap_storage.cpp, yaml.hpp of the
+branch jazzy).
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+import shutil
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from types import TracebackType
+from typing import Any, BinaryIO
+
+from mcap.writer import CompressionType, Writer
+
+from ...errors import DataError
+from ...exposures.frame import Frame
+from ..access import os_error_reason
+from ..atomic import sync_folder, write_text
+from .definitions import (
+    TARGET_OBSERVATIONS,
+    Definition,
+    known_definition,
+    message_from_frame,
+    observations_topic,
+    to_cdr,
+)
+from .metadata import NO_MESSAGE_NS, PROFILES, BagTopic, FileSpan, bag_metadata, to_yaml
+
+LIBRARY = 'fluoro_calib_ros'
+CHUNK_SIZE = 768 * 1024  # that of rosbag2 [bytes]
+_TOPIC_NAME = re.compile(r'(/[A-Za-z_][A-Za-z0-9_]*)+')
+
+Qos = str | list[dict[str, Any]]  # a name in PROFILES, or QoS profiles
+
+
+class BagWriter:
+    """A new bag, as a context manager; the same messages give the same bytes.
+
+    The bag is written under a temporary name and renamed when the block ends without an error. An
+    exception leaves nothing behind, and a bag that is to be replaced as it was.
+
+    Parameters
+    ----------
+    path : path-like
+        Folder of the bag.
+    overwrite : bool
+        Whether a bag of that name is replaced.
+    live : bool
+        For recording: the bag is written under its own name, and what was written before an
+        exception is kept.
+    split_bytes : int
+        Size of a file [bytes] after which the next one is begun; 0 for a single file.
+
+    Raises
+    ------
+    DataError
+        For a folder or file that must not be replaced, where the bag cannot be written, and for
+        an invalid topic, type or message.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        overwrite: bool = False,
+        live: bool = False,
+        split_bytes: int = 0,
+    ) -> None:
+        self.path = os.path.abspath(path)
+        self.name = os.path.basename(self.path)
+        self._overwrite = overwrite
+        self._live = live
+        self._split_bytes = split_bytes
+        self._folder = self.path
+        if not live:
+            hidden = f'.{self.name}.{secrets.token_hex(8)}.tmp'
+            self._folder = os.path.join(os.path.dirname(self.path), hidden)
+        self._topics: dict[str, BagTopic] = {}
+        self._files: list[FileSpan] = []
+        self._total = FileSpan()
+        self._schemas: dict[str, int] = {}  # schema of a message type in the file being written
+        self._file: BinaryIO
+        self._mcap: Writer
+
+    def __enter__(self) -> BagWriter:
+        check_replaceable(self.path, self._overwrite)
+        try:
+            with _writing(self.path):
+                if self._live and os.path.isdir(self.path):
+                    shutil.rmtree(self.path)
+                os.makedirs(self._folder)
+                self._open_file()
+        except BaseException:
+            self._abandon()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if kind is not None and not self._live:
+            self._abandon()
+            return
+        try:
+            with _writing(self.path):
+                self._close_file()
+                write_text(os.path.join(self._folder, 'metadata.yaml'), self._metadata_yaml())
+                if not self._live:
+                    _put_in_place(self._folder, self.path, self._overwrite)
+        except BaseException:
+            self._abandon()
+            raise
+
+    def write(
+        self,
+        topic: str,
+        msg_type: str,
+        message: Any,
+        log_time_ns: int,
+        publish_time_ns: int | None = None,
+        qos: Qos = 'observations',
+    ) -> None:
+        """Write a message.
+
+        Parameters
+        ----------
+        topic : str
+        msg_type : str
+        message : object
+            A dataclass of the typestore, or CDR as bytes.
+        log_time_ns : int
+            Time at which the message was received [ns].
+        publish_time_ns : int, optional
+            Time at which it was sent [ns]; by default log_time_ns.
+        qos : str or list of dict
+            A name in PROFILES or QoS profiles; those of the first message of a topic count.
+
+        Raises
+        ------
+        DataError
+        """
+        is_cdr = isinstance(message, (bytes, bytearray, memoryview))
+        data = bytes(message) if is_cdr else to_cdr(message, msg_type)
+        received = int(log_time_ns)
+        sent = received if publish_time_ns is None else int(publish_time_ns)
+        for time_ns in (received, sent):
+            if not 0 <= time_ns < NO_MESSAGE_NS:
+                raise DataError(
+                    f'{self.path}, topic {topic}: {time_ns} ns is not a time that a bag can hold'
+                )
+        with _writing(self.path):
+            entry = self._topics.get(topic) or self.add_topic(topic, msg_type, qos)
+            if entry.msg_type != msg_type:
+                raise DataError(
+                    f'{self.path}, topic {topic}: a message of type {msg_type} does not belong to '
+                    f'this topic of type {entry.msg_type}'
+                )
+            if self._file_is_full():
+                self._close_file()
+                self._open_file()
+            self._mcap.add_message(entry.channel, received, data, sent)
+        entry.count += 1
+        self._files[-1].add(received)
+        self._total.add(received)
+
+    def write_frame(
+        self,
+        frame: Frame,
+        topic: str | None = None,
+        namespace: str = '',
+        log_time_ns: int | None = None,
+    ) -> None:
+        """Write a Frame as TargetObservations.
+
+        Parameters
+        ----------
+        frame : Frame
+        topic : str, optional
+            By default <namespace>/<fluoroscope>/target_observations.
+        namespace : str
+        log_time_ns : int, optional
+            By default the stamp of the frame.
+
+        Raises
+        ------
+        DataError
+        """
+        topic = topic or observations_topic(frame.fluoroscope, namespace)
+        time = frame.stamp_ns if log_time_ns is None else log_time_ns
+        self.write(topic, TARGET_OBSERVATIONS, message_from_frame(frame), time)
+
+    def add_topic(
+        self,
+        topic: str,
+        msg_type: str,
+        qos: Qos = 'observations',
+        definition: Definition | None = None,
+    ) -> BagTopic:
+        """Add a topic, which may remain without messages.
+
+        Without definition the type is one that this program knows. Raises DataError for an
+        invalid name and an unknown type.
+        """
+        if not _TOPIC_NAME.fullmatch(topic):
+            raise DataError(f'{self.path}: {topic!r} cannot be the name of a ROS topic')
+        definition = definition or known_definition(msg_type)
+        profiles = [PROFILES[qos]] if isinstance(qos, str) else list(qos)
+        self._topics[topic] = BagTopic(topic, msg_type, profiles, definition)
+        self._register(self._topics[topic])
+        return self._topics[topic]
+
+    def flush(self, to_disk: bool = False) -> None:
+        """Close the open chunk: its messages survive the end of the process.
+
+        to_disk: they survive a power failure, too.
+        """
+        with _writing(self.path):
+            self._mcap.flush()
+            self._file.flush()
+            if to_disk:
+                os.fsync(self._file.fileno())
+
+    @property
+    def file_bytes(self) -> int:
+        """Size of the file that is being written, without the open chunk [bytes]."""
+        return self._file.tell()
+
+    @property
+    def file_count(self) -> int:
+        """Number of files so far."""
+        return len(self._files)
+
+    def split(self) -> None:
+        """Close the file and begin the next one."""
+        with _writing(self.path):
+            self._close_file()
+            self._open_file()
+
+    def _file_is_full(self) -> bool:
+        return bool(
+            self._split_bytes and self._files[-1].count and self._file.tell() >= self._split_bytes
+        )
+
+    def _open_file(self) -> None:
+        name = f'{self.name}_{len(self._files)}.mcap'
+        self._files.append(FileSpan(name))
+        self._file = open(os.path.join(self._folder, name), 'xb')  # noqa: SIM115
+        chunk_size = min(CHUNK_SIZE, self._split_bytes or CHUNK_SIZE)  # a file grows by chunks
+        self._mcap = Writer(
+            self._file,
+            chunk_size=chunk_size,
+            compression=CompressionType.ZSTD,
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        self._mcap.start(profile='ros2', library=LIBRARY)
+        self._write_metadata([])  # as rosbag2 does: a recording that was killed has metadata
+        self._schemas = {}
+        for topic in self._topics.values():
+            self._register(topic)
+
+    def _register(self, topic: BagTopic) -> None:
+        """Write schema and channel of a topic into the file."""
+        if topic.msg_type not in self._schemas:
+            self._schemas[topic.msg_type] = self._mcap.register_schema(
+                topic.msg_type, topic.definition.encoding, topic.definition.text.encode()
+            )
+        topic.channel = self._mcap.register_channel(
+            topic.name,
+            'cdr',
+            self._schemas[topic.msg_type],
+            {
+                'offered_qos_profiles': to_yaml(topic.qos),
+                'topic_type_hash': topic.definition.type_hash,
+            },
+        )
+
+    def _close_file(self) -> None:
+        self._mcap.flush()  # the last chunk comes before the metadata
+        self._write_metadata(self._topics.values())
+        self._mcap.finish()
+        self._file.flush()
+        os.fsync(self._file.fileno())
+        self._file.close()
+
+    def _write_metadata(self, topics: Iterable[BagTopic]) -> None:
+        document = bag_metadata(topics, self._files, self._total)
+        self._mcap.add_metadata('rosbag2', {'serialized_metadata': to_yaml(document)})
+
+    def _metadata_yaml(self) -> str:
+        document = bag_metadata(self._topics.values(), self._files, self._total)
+        return to_yaml({'rosbag2_bagfile_information': document}) + '\n'
+
+    def _abandon(self) -> None:
+        """Close the file; delete the folder unless the bag is a recording."""
+        with suppress(OSError, AttributeError):
+            self._file.close()
+        if not self._live:
+            shutil.rmtree(self._folder, ignore_errors=True)
+
+
+def check_replaceable(path: str, overwrite: bool) -> None:
+    """Raise DataError unless a new bag may have this path.
+
+    There must be nothing, or with overwrite a folder with nothing but a bag.
+    """
+    if not os.path.lexists(path):
+        return
+    if not overwrite:
+        raise DataError(f'{path}: this already exists, and is not overwritten')
+    if not os.path.isdir(path) or os.path.islink(path):
+        raise DataError(f'{path}: this is not a bag folder, it is not overwritten')
+    for name in sorted(os.listdir(path)):
+        if name != 'metadata.yaml' and not name.endswith('.mcap'):
+            raise DataError(
+                f'{path}: the folder holds {name}, which does not belong to a bag; '
+                f'it is not overwritten'
+            )
+
+
+def _put_in_place(folder: str, path: str, overwrite: bool) -> None:
+    """Rename a finished folder; with overwrite the bag of that name is deleted last."""
+    sync_folder(folder)
+    old = f'{folder}.old'
+    replaced = overwrite and os.path.isdir(path)
+    if replaced:
+        os.rename(path, old)
+    try:
+        os.rename(folder, path)
+    except OSError:
+        if replaced:
+            os.rename(old, path)
+        raise
+    sync_folder(os.path.dirname(path))
+    if replaced:
+        shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def _writing(path: str) -> Iterator[None]:
+    """Raise DataError for an OSError while a bag is written."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f'{path}: the bag cannot be written ({os_error_reason(error)})') from None

@@ -1,0 +1,152 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The calibration file DIR/<fluoroscope>.calibration.npz; see docs/files.md."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..correction.calibration_record import FIELDS, VERSION
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError
+from ..limits import MAX_COINCIDENT, read_limits
+from .access import PathLike, check_safe_name, make_folder, os_error_reason
+from .arrays import Layout, read_arrays, to_arrays, to_values, write_arrays
+
+SUFFIX = '.calibration.npz'
+
+COINCIDENT_PX = 1e-3  # image points closer than this lie on one place
+LAYOUT = Layout('a calibration', FIELDS, VERSION)
+
+
+def calibration_path(directory: PathLike, fluoroscope: str) -> str:
+    """Return the path of the calibration file of a fluoroscope. Raises DataError for its name."""
+    check_safe_name(fluoroscope, directory)
+    return os.path.join(directory, fluoroscope + SUFFIX)
+
+
+def save_calibration(directory: PathLike, calibration: FluoroscopeCalibration) -> str:
+    """Write a calibration into a folder, which is created where it is missing.
+
+    Returns the path. The same calibration gives the same bytes; its `seconds` are not saved.
+    Raises DataError where the file cannot be written, or could not be read again; an earlier file
+    is then unchanged.
+    """
+    path = calibration_path(directory, calibration.fluoroscope)
+    arrays = validated_arrays(path, calibration.to_values())
+    make_folder(directory)
+    write_arrays(path, LAYOUT, arrays)
+    return path
+
+
+def validated_arrays(where: object, values: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Return the values of a calibration as the arrays that its file contains.
+
+    values: as `FluoroscopeCalibration.to_values` returns them; where begins the message of the
+    DataError that is raised for a value that a calibration cannot have, such as NaN.
+    """
+    arrays = to_arrays(where, LAYOUT, values)
+    _check_content(where, arrays)
+    return arrays
+
+
+def load_calibration(path: PathLike) -> FluoroscopeCalibration:
+    """Read a calibration, which is equal to the saved one to the last bit; its seconds are NaN.
+
+    The file of an earlier version may have the id that it gave; the calibration has that of this
+    version. Raises DataError for a file that is not a calibration, is damaged, or has a version of
+    the layout that is not known.
+    """
+    return read_with_id(path)[0]
+
+
+def read_with_id(path: PathLike) -> tuple[FluoroscopeCalibration, str]:
+    """Read a calibration as `load_calibration` does, and the id that its file has."""
+    arrays = read_arrays(path, LAYOUT)
+    _check_content(path, arrays)
+    values = to_values(arrays)
+    identity = values['calibration_id']
+    check_safe_name(values['fluoroscope'], path)
+    try:
+        calibration = FluoroscopeCalibration.from_values(values)
+    except ValueError as error:
+        raise DataError(f'{path}: {error}') from None
+    if identity not in (calibration.calibration_id, calibration.earlier_id):
+        raise DataError(
+            f'{path}: the content does not belong to its calibration_id {identity}, '
+            f'the file was changed'
+        )
+    return calibration, identity
+
+
+def load_calibrations(directory: PathLike) -> dict[str, FluoroscopeCalibration]:
+    """Read all calibrations in a folder, sorted by fluoroscope.
+
+    Raises DataError, also for a folder without calibrations.
+    """
+    try:
+        names = sorted(
+            name for name in os.listdir(directory) if name.endswith(SUFFIX) and name[0] != '.'
+        )
+    except FileNotFoundError:
+        raise DataError(f'{directory}: there is no such folder') from None
+    except NotADirectoryError:
+        raise DataError(f'{directory}: this is a file, not a folder with calibrations') from None
+    except OSError as error:
+        raise DataError(f'{directory}: cannot be read ({os_error_reason(error)})') from None
+    if not names:
+        raise DataError(f'{directory}: there is no calibration in this folder (no file *{SUFFIX})')
+    out = {}
+    for name in names:
+        path = os.path.join(directory, name)
+        calibration = load_calibration(path)
+        expected = calibration.fluoroscope + SUFFIX
+        if name != expected:
+            raise DataError(
+                f'{path}: this is the calibration of fluoroscope {calibration.fluoroscope}, '
+                f'its file is called {expected}'
+            )
+        out[calibration.fluoroscope] = calibration
+    return out
+
+
+def _check_content(where: object, arrays: Mapping[str, Any]) -> None:
+    """Raise DataError for training arrays of different lengths, and for impossible sizes."""
+    lengths = {name: len(arrays[name]) for name in ('train_uv', 'train_duv', 'train_exposure')}
+    if len(set(lengths.values())) > 1:
+        listed = ', '.join(f'{name} {length}' for name, length in lengths.items())
+        raise DataError(f'{where}: the training arrays differ in length ({listed})')
+    limits = read_limits()
+    if lengths['train_uv'] > limits.max_training_points:
+        raise DataError(
+            f'{where}: {lengths["train_uv"]} training points, more than '
+            f'{limits.max_training_points} are not read'
+        )
+    if _largest_heap(arrays['train_uv']) > MAX_COINCIDENT:
+        raise DataError(
+            f'{where}: more than {MAX_COINCIDENT} training points lie on one place of the image'
+        )
+    c = arrays['interior'][2]
+    if c <= 0:
+        raise DataError(f'{where}: the principal distance is {c:g} px')
+    width, height = arrays['image_size'].tolist()
+    if width * height > limits.max_pixels:
+        raise DataError(
+            f'{where}: the images have {width} x {height} px, those of more than '
+            f'{limits.max_image_megapixels} megapixels are not read'
+        )
+
+
+def _largest_heap(uv: np.ndarray) -> int:
+    """Return the largest number of points (n, 2) in one cell: no search tree can divide them."""
+    if not len(uv):
+        return 0
+    column, row = np.floor(uv / COINCIDENT_PX).astype(np.int64).T
+    keys = np.sort(column * 2**32 + row)
+    ends = np.flatnonzero(np.diff(keys, append=keys[-1] + 1))
+    return int(np.diff(ends, prepend=-1).max())

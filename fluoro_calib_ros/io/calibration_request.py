@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a calibration was made from: observations.csv, phantom.csv and options.json in its folder.
+
+A validation reads them; see docs/verdict.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration, digest_of_sources
+from ..errors import DataError
+from ..estimation.options import CalibrationOptions, CalibrationRequest
+from ..exposures.frame import Frame, validate_frame
+from ..exposures.phantom import Phantom
+from .access import PathLike
+from .csv_table import read_names, write_names
+from .known_orientation import read_known_orientations, write_known_orientations
+from .observations import read_observations_csv, write_observations_csv
+from .phantom import read_phantom, write_phantom
+from .result_document import delete_validation
+from .text_files import read_json, write_json
+
+OBSERVATIONS = 'observations.csv'
+PHANTOM = 'phantom.csv'
+OPTIONS = 'options.json'
+KNOWN_ORIENTATION = 'known_orientation.yaml'  # only where there are any
+VERSION = 1  # of options.json
+
+
+def write_request(directory: PathLike, request: CalibrationRequest) -> None:
+    """Write what a calibration was made from, and delete the verdict on an earlier one.
+
+    Raises DataError where a file cannot be written.
+    """
+    directory = Path(directory)
+    delete_validation(directory)
+    write_observations_csv(directory / OBSERVATIONS, request.frames)
+    write_phantom(directory / PHANTOM, request.phantom)
+    document = {
+        'format_version': VERSION,
+        'options': request.options.to_document(),
+        'joint': bool(request.joint),
+        'principal_distance': request.principal_distance,
+    }
+    write_json(directory / OPTIONS, document)
+    write_names(directory, request.names)
+    if request.known_orientations:
+        write_known_orientations(directory / KNOWN_ORIENTATION, request.known_orientations)
+    else:
+        (directory / KNOWN_ORIENTATION).unlink(missing_ok=True)
+
+
+def read_request(
+    directory: PathLike,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    frames: Mapping[str, Sequence[Frame]] | None = None,
+    phantom: Phantom | None = None,
+) -> CalibrationRequest:
+    """Read the request that the calibrations in a folder were made from.
+
+    Parameters
+    ----------
+    directory : path-like
+    calibrations : mapping of str to FluoroscopeCalibration
+        By fluoroscope.
+    frames : mapping of str to sequence of Frame, optional
+        Used instead of observations.csv.
+    phantom : Phantom, optional
+        Used instead of phantom.csv.
+
+    Returns
+    -------
+    CalibrationRequest
+
+    Raises
+    ------
+    DataError
+        For a file that is missing or damaged, and for frames or a phantom that the calibrations
+        were not made from.
+    """
+    directory = Path(directory)
+    options, joint, distance = read_options(directory / OPTIONS)
+    where: object = 'the source'
+    if frames is None:
+        where = directory / OBSERVATIONS
+        frames = _read_frames(directory / OBSERVATIONS, calibrations)
+    if phantom is None:
+        phantom = read_phantom(_require_file(directory / PHANTOM, '--phantom'))
+    for name, calibration in calibrations.items():
+        if name not in frames:
+            raise DataError(
+                f'{where}: there are no observations of fluoroscope {name}, which is calibrated'
+            )
+        if digest_of_sources(frames[name], phantom) != calibration.source_digest:
+            raise DataError(
+                f'{where}: these are not the observations and the phantom from which the '
+                f'calibration of fluoroscope {name} was made'
+            )
+    used = {name: frames[name] for name in calibrations}
+    names = read_names(directory)
+    path = directory / KNOWN_ORIENTATION
+    known = read_known_orientations(path) if path.exists() else {}
+    return CalibrationRequest(
+        used,
+        phantom,
+        options=options,
+        joint=joint,
+        principal_distance=distance,
+        names=names,
+        known_orientations=known,
+    )
+
+
+def _require_file(path: Path, option: str = '') -> Path:
+    """Return the path of a file that exists, else raise DataError.
+
+    option is the one of the command line that can be given instead.
+    """
+    if not path.exists():
+        instead = f'give {option}, or calibrate again' if option else 'calibrate again'
+        raise DataError(
+            f'{path}: there is no such file, the calibration was written without it: {instead}'
+        )
+    return path
+
+
+def _read_frames(
+    path: Path, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> dict[str, list[Frame]]:
+    """Read the frames of the calibrated fluoroscopes, with the image sizes of the calibrations."""
+    widths, heights = zip(*(c.image_size for c in calibrations.values()))
+    found = read_observations_csv(_require_file(path, '--source'), (max(widths), max(heights)))
+    frames: dict[str, list[Frame]] = {}
+    for name, of_fluoroscope in found.items():
+        if name in calibrations:
+            size = calibrations[name].image_size
+            frames[name] = [replace(frame, image_size=size) for frame in of_fluoroscope]
+    for of_fluoroscope in frames.values():
+        for frame in of_fluoroscope:
+            try:
+                validate_frame(frame)
+            except DataError as error:
+                raise error.at(path) from None
+    return frames
+
+
+def read_options(path: Path) -> tuple[CalibrationOptions, bool, float | None]:
+    """Read the options of a calibration, whether it was joint, and its principal distance [px]."""
+    document = read_json(_require_file(path))
+    if document.get('format_version') != VERSION:
+        raise DataError(
+            f'{path}: the file has layout version {document.get("format_version")}, '
+            f'this program knows version {VERSION}'
+        )
+    try:
+        options = CalibrationOptions(**document['options'])
+    except (KeyError, TypeError, ValueError) as error:
+        raise DataError(f'{path}: these are not options of a calibration ({error})') from None
+    joint = document.get('joint')
+    distance = document.get('principal_distance')
+    is_distance = distance is None or (type(distance) in (int, float) and distance > 0)
+    if not isinstance(joint, bool) or not is_distance:
+        raise DataError(
+            f'{path}: these are not options of a calibration '
+            f'(joint or principal_distance is wrong)'
+        )
+    return options, joint, distance

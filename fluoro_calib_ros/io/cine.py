@@ -1,0 +1,219 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Recordings of Phantom high-speed cameras: cine files, uncompressed and grey.
+
+The layout is that of the manufacturer's description "Cine file format" (Vision Research), little
+endian throughout: a file header (44 bytes), a BITMAPINFOHEADER (40 bytes), a SETUP with the frame
+rate, and a table of 64-bit offsets, one an image. In front of the pixels of an image are an
+annotation, whose size includes its own eight bytes, and the size of the pixels. Rows of 8 and 16
+bits are stored from the bottom, as in a BMP file, unless the height is negative; packed rows of 10
+bits from the top. Grey values are returned as they are stored: packed ones are on the camera's
+curve, not linear.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+from ..images.declared_size import check_size
+from .access import check_regular_file, os_error_reason
+
+SIGNATURE = b'CI'
+FILE_HEADER = struct.Struct('<2sHHHiIiIIIIQ')
+BITMAP_HEADER = struct.Struct('<IiiHHIIiiII')
+SETUP_MARK = 140  # offset in SETUP of the letters ST, which newer files have, and of its length
+FRAME_RATE = 768  # offset in SETUP, 32 bits; SETUP begins with a frame rate of 16 bits
+ANNOTATION = 8  # bytes at least
+GREY = 0  # compression of the file header; 1: JPEG, 2: mosaic of a colour sensor
+UNPACKED = 0  # biCompression
+PACKED_10 = 0x100
+PACKED_12 = 0x400
+MAX_IMAGES = 100_000_000
+SIDES = 2**30  # px, more cannot be meant
+
+
+@dataclass(frozen=True)
+class CineHeader:
+    """What the headers of a cine file say.
+
+    Attributes
+    ----------
+    width, height : int
+        Of the images [px].
+    bits : int
+        Of a pixel as it is stored: 8, 10 (packed) or 16.
+    from_bottom : bool
+        Whether the last row comes first.
+    offsets : (n,) ndarray of int64
+        Positions of the images in the file.
+    frame_rate : float
+        [Hz]
+    """
+
+    width: int
+    height: int
+    bits: int
+    from_bottom: bool
+    offsets: NDArray[np.int64]
+    frame_rate: float
+
+    @property
+    def image_bytes(self) -> int:
+        """Bytes of the pixels of an image, without padding."""
+        return self.height * ((self.width * self.bits + 7) // 8)
+
+
+def read_cine_header(path: Path) -> CineHeader:
+    """Read the headers of a cine file.
+
+    Raises DataError for a file that cannot be read, is no cine file, is cut off, is damaged, or
+    holds colours or compressed images.
+    """
+    check_regular_file(path)
+    try:
+        with open(path, 'rb') as file:
+            return _header(file, os.fstat(file.fileno()).st_size)
+    except DataError as error:
+        raise error.at(path) from None
+    except FileNotFoundError:
+        raise DataError('there is no such file', at=path) from None
+    except (OSError, ValueError) as error:
+        reason = os_error_reason(error) if isinstance(error, OSError) else error
+        raise DataError(f'cannot be read ({reason})', at=path) from None
+
+
+def read_cine_images(path: Path, header: CineHeader) -> Iterator[tuple[str, np.ndarray]]:
+    """Yield place and image (h, w) of uint8 or uint16, one after the other. Raises DataError."""
+    try:
+        with open(path, 'rb') as file:
+            for number, offset in enumerate(header.offsets.tolist(), 1):
+                where = f'{path}, frame {number}'
+                try:
+                    image = _image(file, offset, header)
+                except DataError as error:
+                    raise error.at(where) from None
+                yield where, image
+    except OSError as error:
+        raise DataError(f'cannot be read ({os_error_reason(error)})', at=path) from None
+
+
+def _header(file: BinaryIO, size: int) -> CineHeader:
+    """Return the header of a file of a size [bytes]. Raises DataError."""
+    fields = _unpack(file, 0, FILE_HEADER)
+    signature, _, compression, _, _, _, _, count, at_bitmap, at_setup, at_offsets, _ = fields
+    if signature != SIGNATURE:
+        raise DataError('this is no cine file: it does not begin with CI')
+    if compression != GREY:
+        kind = {1: 'JPEG images', 2: 'the mosaic of a colour sensor'}.get(
+            compression, 'an unknown kind of images'
+        )
+        raise DataError(f'the cine file holds {kind}; only uncompressed grey images are read')
+    bitmap = _unpack(file, at_bitmap, BITMAP_HEADER)
+    width, height = bitmap[1], bitmap[2]
+    bits = _bits(bitmap[4], bitmap[5])
+    if not 0 < width < SIDES or not 0 < abs(height) < SIDES:
+        raise DataError(f'the cine file is damaged: images of {width} x {height} px')
+    check_size(width, abs(height))
+    if not 0 < count < MAX_IMAGES or at_offsets + 8 * count > size:
+        raise DataError(f'the cine file is damaged or cut off: it claims {count} images')
+    file.seek(at_offsets)
+    offsets = np.frombuffer(file.read(8 * count), '<i8')
+    rate = _frame_rate(file, at_setup)
+    header = CineHeader(
+        width,
+        abs(height),
+        bits=bits,
+        from_bottom=bits != 10 and height > 0,
+        offsets=offsets,
+        frame_rate=rate,
+    )
+    needed = ANNOTATION + header.image_bytes
+    inside = (offsets >= FILE_HEADER.size) & (offsets <= size - needed)
+    if not inside.all():
+        raise DataError(
+            f'the cine file is damaged or cut off: only {int(inside.sum())} of {count} images are '
+            'in it'
+        )
+    return header
+
+
+def _bits(bit_count: int, compression: int) -> int:
+    """Return the bits of a stored pixel. Raises DataError."""
+    if compression == PACKED_10:
+        return 10
+    if compression == UNPACKED and bit_count in (8, 16):
+        return bit_count
+    if compression == PACKED_12:
+        kind = 'packed pixels of 12 bits'
+    elif compression == UNPACKED and bit_count in (24, 48):
+        kind = 'colours'
+    else:
+        kind = f'pixels of {bit_count} bits with compression {compression}'
+    raise DataError(
+        f'the cine file holds {kind}; only grey images of 8 and 16 bits, and packed ones of 10 '
+        'bits, are read'
+    )
+
+
+def _frame_rate(file: BinaryIO, at_setup: int) -> float:
+    """Return the frame rate [Hz]. Raises DataError."""
+    rate = _unpack(file, at_setup, struct.Struct('<H'))[0]
+    mark, length = _unpack(file, at_setup + SETUP_MARK, struct.Struct('<2sH'))
+    if mark == b'ST' and length >= FRAME_RATE + 4:
+        rate = _unpack(file, at_setup + FRAME_RATE, struct.Struct('<I'))[0] or rate
+    if not rate:
+        raise DataError('the cine file does not state its frame rate')
+    return float(rate)
+
+
+def _image(file: BinaryIO, offset: int, header: CineHeader) -> np.ndarray:
+    """Return the image at an offset. Raises DataError."""
+    annotation = _unpack(file, offset, struct.Struct('<I'))[0]
+    if not ANNOTATION <= annotation < 2**31:
+        raise DataError(f'the frame is damaged: an annotation of {annotation} bytes')
+    size = _unpack(file, offset + annotation - 4, struct.Struct('<I'))[0]
+    stride = size // header.height
+    row = header.image_bytes // header.height
+    if size % header.height or stride not in (row, -(-row // 4) * 4):  # padded to 4 bytes
+        raise DataError(
+            f'the frame is damaged: {size} bytes for {header.width} x {header.height} px of '
+            f'{header.bits} bits'
+        )
+    data = file.read(size)
+    if len(data) < size:
+        raise DataError('the frame is cut off')
+    rows = np.frombuffer(data, np.uint8).reshape(header.height, stride)
+    if header.bits == 10:
+        return _unpacked_10(rows, header.width)
+    row_bytes = header.width * header.bits // 8
+    image = rows[:, :row_bytes].copy().view('<u2' if header.bits == 16 else np.uint8)
+    image = image[::-1] if header.from_bottom else image
+    return np.ascontiguousarray(image, np.uint16 if header.bits == 16 else np.uint8)
+
+
+def _unpacked_10(rows: np.ndarray, width: int) -> np.ndarray:
+    """Return pixels (h, w) of rows in which four pixels take five bytes, highest bits first."""
+    bits = np.unpackbits(rows, axis=1)[:, : 10 * width].reshape(len(rows), width, 10)
+    padded = np.zeros((len(rows), width, 16), np.uint8)
+    padded[..., 6:] = bits
+    high_low = np.packbits(padded, axis=2).astype(np.uint16)
+    return (high_low[..., 0] << 8) | high_low[..., 1]
+
+
+def _unpack(file: BinaryIO, offset: int, layout: struct.Struct) -> tuple[Any, ...]:
+    """Return the fields at an offset. Raises DataError at the end of the file."""
+    file.seek(offset)
+    data = file.read(layout.size)
+    if len(data) < layout.size:
+        raise DataError('the cine file is damaged or cut off')
+    return layout.unpack(data)

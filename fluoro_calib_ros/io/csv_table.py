@@ -1,0 +1,342 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""CSV tables: columns by name, and errors that name the row.
+
+A header with semicolons announces a table with semicolons between the cells and decimal commas, as
+spreadsheets write it in many countries.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from itertools import islice
+from operator import itemgetter
+from pathlib import Path
+from typing import IO, Any, NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+from ..exposures.names import MAX_ID, Names, number_names
+from .access import PathLike, check_safe_name, os_error_reason, read_text
+from .atomic import atomic_file
+
+BLOCK = 10_000  # rows converted at a time, to bound the memory
+MAX_HEADER = 200  # characters of a header in a message
+
+
+@dataclass(frozen=True)
+class Block:
+    """Some rows of a table.
+
+    Attributes
+    ----------
+    path : path-like
+        File, for messages.
+    header : list of str
+        Names of the columns.
+    rows : list of list of str
+    lines : (n,) ndarray of int
+        Number of each row in the file; the header is row 1.
+    """
+
+    path: PathLike
+    header: list[str]
+    rows: list[list[str]]
+    lines: NDArray[np.int64]
+
+    def __contains__(self, name: str) -> bool:
+        return name in self.header
+
+    def strings(self, name: str) -> list[str]:
+        """Return the cells of a column without surrounding blanks."""
+        return list(map(str.strip, map(itemgetter(self.header.index(name)), self.rows)))
+
+    def floats(self, name: str) -> np.ndarray:
+        """Return a column (n,) of finite numbers. Raises DataError."""
+        values = np.array(self._convert(name, self.strings(name), float, 'a number'))
+        self.require(name, np.isfinite(values), 'not a finite number')
+        return values
+
+    def floats_or_nan(self, name: str) -> np.ndarray:
+        """Return a column (n,) of numbers, NaN for an empty cell. Raises DataError."""
+        cells = [cell or 'nan' for cell in self.strings(name)]
+        return np.array(self._convert(name, cells, float, 'a number'))
+
+    def ids(self, name: str) -> np.ndarray:
+        """Return a column (n,) of whole numbers from 0 to MAX_ID. Raises DataError."""
+        values = self._convert(name, self.strings(name), int, 'a whole number')
+        if len(values) and not 0 <= min(values) <= max(values) <= MAX_ID:
+            in_range = np.array([0 <= value <= MAX_ID for value in values])
+            self.require(name, in_range, f'not between 0 and {MAX_ID}')
+        return np.array(values, dtype=np.int64)
+
+    def require(self, name: str, valid: np.ndarray, cause: str) -> None:
+        """Raise DataError for the first row of a column that is not valid (n,)."""
+        if not np.all(valid):
+            index = int(np.argmin(valid))
+            self.fail(index, f'{name} is {self.strings(name)[index]!r}, {cause}')
+
+    def fail(self, index: int, cause: str) -> NoReturn:
+        """Raise DataError for the row with this index in the block."""
+        raise DataError(f'{self.path}, row {self.lines[index]}: {cause}')
+
+    def _convert(
+        self, name: str, cells: Sequence[str], kind: Callable[[str], Any], expected: str
+    ) -> list[Any]:
+        try:
+            if '_' in ''.join(cells):  # Python reads 1_0 as 10
+                raise ValueError
+            return list(map(kind, cells))
+        except ValueError:
+            index = next(i for i, cell in enumerate(cells) if not _is_number(cell, kind))
+            self.fail(index, f'{name} is {cells[index]!r}, not {expected}')
+
+
+def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
+    """Yield the rows of a CSV file as blocks of at most BLOCK rows.
+
+    The first row is the header. Columns may have any order, and there may be others besides the
+    required ones. Blank lines and lines that begin with # are skipped. Raises DataError for a file
+    that cannot be read, is empty, is not UTF-8 or has no rows, for missing or repeated columns,
+    and for a row with too few or too many cells.
+    """
+    text = read_text(path)
+    lines: Iterable[str] = io.StringIO(text, newline='')
+    if '#' in text:  # a comment becomes a blank line, so that the numbers of the rows remain
+        lines = ('\n' if line.lstrip().startswith('#') else line for line in lines)
+    rows_of_file = _RowReader(path, lines, _separator(text))
+    header = rows_of_file.read_header(required)
+    is_empty = True
+    while not rows_of_file.ended:
+        rows, numbers = rows_of_file.read(BLOCK)
+        if rows:
+            is_empty = False
+            _check_widths(path, header, rows, numbers)
+            yield Block(path, header, rows, numbers)
+    if is_empty:
+        raise DataError(f'{path}: the file has a header, but no rows')
+
+
+def decimal_point(cell: str) -> str:
+    """Return a number with a decimal comma as one with a point, any other cell as it is."""
+    if cell.count(',') != 1 or '.' in cell:
+        return cell
+    changed = cell.replace(',', '.')
+    return changed if _is_number(changed, float) else cell
+
+
+def write_rows(file: IO[Any], rows: Iterable[Iterable[Any]]) -> None:
+    """Write rows of cells to an open text file as CSV, with line feeds."""
+    csv.writer(file, lineterminator='\n').writerows(rows)
+
+
+def format_float(value: float) -> str:
+    """Return a float as text from which the same value is read again, '' for NaN."""
+    return '' if np.isnan(value) else repr(float(value))
+
+
+class _RowReader:
+    """Reads the rows of a CSV file that are not blank, with their numbers in the file."""
+
+    def __init__(self, path: PathLike, lines: Iterable[str], separator: str = ',') -> None:
+        self.ended = False
+        self._path = path
+        self._has_decimal_commas = separator == ';'
+        self._reader = csv.reader(lines, delimiter=separator, strict=True)
+
+    def read_header(self, required: Sequence[str]) -> list[str]:
+        """Return the column names in the first row that is not blank. Raises DataError."""
+        while not self.ended:
+            rows, lines = self.read(1)
+            if rows:
+                header = [name.strip() for name in rows[0]]
+                _check_header(f'{self._path}, row {lines[0]}', header, required)
+                return header
+        raise DataError(f'{self._path}: the file has no header, {",".join(required)} is expected')
+
+    def read(self, count: int) -> tuple[list[list[str]], np.ndarray]:
+        """Return those of the next `count` rows that are not blank, and their numbers."""
+        before = self._reader.line_num
+        try:
+            rows = list(islice(self._reader, count))
+        except csv.Error as error:
+            raise DataError(
+                f'{self._path}, row {self._reader.line_num}: this is not CSV ({error})'
+            ) from None
+        self.ended = len(rows) < count
+        lines = before + 1 + np.arange(len(rows))
+        if self._reader.line_num - before > len(rows):  # some cells contain line ends
+            line_ends = [sum(cell.count('\n') for cell in row) for row in rows[:-1]]
+            lines[1:] += np.cumsum(line_ends, dtype=int)
+        filled = np.array([not _is_blank(row) for row in rows], dtype=bool)
+        if not filled.all():
+            rows = [row for row, keep in zip(rows, filled) if keep]
+        if self._has_decimal_commas:
+            rows = [[decimal_point(cell.strip()) for cell in row] for row in rows]
+        return rows, lines[filled]
+
+
+def _separator(text: str) -> str:
+    """Return the separator of a table: a semicolon where its header has one and no comma."""
+    lines = (line for line in io.StringIO(text) if not line.lstrip().startswith('#'))
+    header = next((line for line in lines if line.strip()), '')
+    return ';' if ';' in header and ',' not in header else ','
+
+
+def _is_blank(row: Sequence[str]) -> bool:
+    return len(row) <= 1 and not (row and row[0].strip())
+
+
+def _check_header(where: str, header: Sequence[str], required: Sequence[str]) -> None:
+    """Raise DataError for missing and repeated columns; where begins its message."""
+    missing = [name for name in required if name not in header]
+    if missing:
+        found = ','.join(header)[:MAX_HEADER]
+        raise DataError(
+            f'{where}: the header has no column {" and no column ".join(missing)}; '
+            f'{",".join(required)} is expected, the header is {found!r}'
+        )
+    for name in header:
+        if name and header.count(name) > 1:
+            raise DataError(f'{where}: the header has the column {name} twice')
+
+
+def _check_widths(
+    path: PathLike, header: Sequence[str], rows: Sequence[Sequence[str]], lines: np.ndarray
+) -> None:
+    """Raise DataError for the first row with too few or too many cells."""
+    if set(map(len, rows)) != {len(header)}:
+        index = next(i for i, row in enumerate(rows) if len(row) != len(header))
+        raise DataError(
+            f'{path}, row {lines[index]}: {len(rows[index])} columns, '
+            f'but the header has {len(header)}'
+        )
+
+
+def _is_number(cell: str, kind: Callable[[str], Any]) -> bool:
+    try:
+        kind(cell)
+    except ValueError:
+        return False
+    return '_' not in cell
+
+
+# A column of ids in a CSV file, in which a lab may have written names.
+
+
+class NamedColumn:
+    """The ids of a column, read block by block.
+
+    Parameters
+    ----------
+    column : str
+    known : mapping of str to int, or None
+        Names with known ids; None where the column may only have whole numbers. A column has names
+        if none of its first cells is a number.
+    """
+
+    def __init__(self, column: str, known: Mapping[str, int] | None) -> None:
+        self._column = column
+        self._known = known
+        self._codes: dict[str, int] | None = None
+        self._is_first = True
+
+    def read(self, block: Block) -> np.ndarray:
+        """Return ids (n,), or codes of names in the order of occurrence. Raises DataError."""
+        if self._is_first:
+            self._is_first = False
+            if self._known is not None and _are_names(block.strings(self._column)):
+                self._codes = {}
+        if self._codes is None:
+            return block.ids(self._column)
+        cells = block.strings(self._column)
+        if '' in cells:
+            block.fail(cells.index(''), f'{self._column} is empty')
+        for name in dict.fromkeys(cells):
+            self._codes.setdefault(name, len(self._codes))
+        return np.array([self._codes[name] for name in cells], dtype=np.int64)
+
+    def ids(self) -> dict[str, int]:
+        """Return the ids of the names that were read; empty for a column of ids."""
+        if not self._codes:
+            return {}
+        ids = number_names(self._codes, self._known)
+        return {name: ids[name] for name in self._codes}
+
+    def numbers(self, values: np.ndarray) -> np.ndarray:
+        """Return the ids of what `read` returned, after all blocks were read."""
+        ids = self.ids()
+        return np.array(list(ids.values()), dtype=np.int64)[values] if ids else values
+
+
+def _are_names(cells: Sequence[str]) -> bool:
+    """Return whether no cell is a number."""
+    for cell in cells:
+        try:
+            float(cell or 'nan')
+        except ValueError:
+            continue
+        return False
+    return True
+
+
+# The file DIR/names.csv: names of targets, exposures and fluoroscopes, `kind,id,name`.
+#
+# It is there only where the files that a calibration was made from have names.
+
+NAMES_FILE = 'names.csv'
+COLUMNS = ('kind', 'id', 'name')
+_KINDS = {'target': 'targets', 'exposure': 'exposures', 'fluoroscope': 'fluoroscopes'}
+
+
+def write_names(directory: PathLike, names: Names) -> None:
+    """Write the names into a folder; delete the file there where no names are given.
+
+    Raises DataError where that is not possible.
+    """
+    path = Path(directory) / NAMES_FILE
+    if not names:
+        try:
+            path.unlink(missing_ok=True)
+        except OSError as error:
+            raise DataError(f'{path}: cannot be deleted ({os_error_reason(error)})') from None
+        return
+    with atomic_file(path, 'w') as file:
+        write_rows(file, [COLUMNS])
+        for kind, attribute in _KINDS.items():
+            table = getattr(names, attribute)
+            write_rows(file, ([kind, identity, name] for name, identity in table.items()))
+
+
+def read_names(directory: PathLike) -> Names:
+    """Read the names in a folder, none where there is no such file. Raises DataError."""
+    path = Path(directory) / NAMES_FILE
+    if not path.exists():
+        return Names()
+    found: dict[str, dict[str, Any]] = {attribute: {} for attribute in _KINDS.values()}
+    for block in read_blocks(path, COLUMNS):
+        columns = zip(*(block.strings(name) for name in COLUMNS))
+        for index, (kind, identity, name) in enumerate(columns):
+            if kind not in _KINDS:
+                block.fail(index, f'kind is {kind!r}, not {", ".join(_KINDS)}')
+            table = found[_KINDS[kind]]
+            value: Any = identity
+            if kind == 'fluoroscope':
+                check_safe_name(identity, f'{path}, row {block.lines[index]}')
+            else:
+                value = -1
+                with suppress(ValueError):
+                    value = int(identity)
+                if not 0 <= value <= MAX_ID:
+                    block.fail(index, f'id is {identity!r}, not a whole number')
+            if name in table or value in table.values():
+                block.fail(index, f'the {kind} {name!r}, id {identity}, is given twice')
+            table[name] = value
+    return Names(**found)

@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""C3D (c3d.org), read and written with ezc3d: points in mm, their residual, rate and names.
+
+The residual of a C3D point is in the unit of the points, and negative where there is no point. It
+is written as the standard deviation of the position, the root of the sum of its variances in x, y
+and z [mm]; 0 where that is unknown. C3D holds coordinates as float32, and residuals in 255 steps.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import struct
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+from ...errors import DataError
+from ...exposures.names import Names, number_names
+from ...processes import run_module
+from ..access import read_bytes
+from ..atomic import write_bytes
+from . import c3d_process
+from .content import UNITS_MM, Content, FileSettings, Format, Points, Sample, Written
+from .frames_of_points import at_constant_rate, labels, named_targets
+
+MISSING = -1.0
+STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
+# Of the process that reads: to start, for each byte of the file, and at most.
+BASE_SECONDS = 10
+SECONDS_OF_BYTE = 1e-6
+MAX_SECONDS = 60
+MAX_FRAME = 65535  # the header counts in uint16
+_MAGIC = 0x50
+_INTEL = 84  # processor type
+BLOCK = 512  # bytes
+
+
+def recognise(sample: Sample) -> bool:
+    """Return whether the second byte is that of C3D."""
+    return sample.suffix == '.c3d' and len(sample.head) > 1 and sample.head[1] == _MAGIC
+
+
+def _ezc3d() -> Any:
+    try:
+        import ezc3d
+    except ImportError:
+        raise DataError(
+            'C3D files need the package ezc3d, which is not installed: pip install ezc3d'
+        ) from None
+    return ezc3d
+
+
+def read(path: Path, settings: FileSettings) -> Content:
+    """Read points in space. Raises DataError."""
+    _check_size(path, read_bytes(path))
+    _ezc3d()
+    arrays = _arrays(path)
+    names = arrays['labels'].tolist()
+    unit = str(arrays['unit'])
+    rate = float(arrays['rate'])
+    first = int(arrays['first'])
+    xyz = arrays['xyz']
+    residual = arrays['residual']
+    if not xyz.size:
+        raise DataError(f'{path}: the file has no points')
+    mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(unit)
+    if mm is None:
+        raise DataError(f'{path}: the unit of the points is {unit!r}, give it with --units')
+    names = names[: xyz.shape[1]]
+    if len(set(names)) < xyz.shape[1]:
+        raise DataError(f'{path}: {xyz.shape[1]} points, but {len(set(names))} different names')
+    ids = number_names(names, settings.names.targets)
+    xyz = np.where((residual < 0)[..., None], np.nan, xyz * mm)
+    xyz[np.isnan(xyz).any(axis=2)] = np.nan
+    sd = np.where(residual > 0, residual * mm, np.nan)
+    points = Points(
+        np.arange(first, first + len(xyz)),
+        np.array([ids[name] for name in names], dtype=np.int64),
+        xyz_mm=xyz,
+        sd_mm=sd,
+        residual_px=np.full(sd.shape, np.nan),
+        rate_hz=rate,
+    )
+    return Content(points=points, names=Names(named_targets({n: ids[n] for n in names})))
+
+
+def _check_size(path: Path, content: bytes) -> None:
+    """Raise DataError for a file that is no C3D file or shorter than its header says.
+
+    The header is that of c3d.org, of a file with the numbers of Intel processors.
+    """
+    if content[1:2] != bytes([_MAGIC]):
+        raise DataError(f'{path}: this is not a C3D file')
+    if len(content) < BLOCK:
+        raise DataError(f'{path}: this C3D file is truncated')
+    start = (content[0] - 1) * BLOCK
+    if content[start + 3 : start + 4] != bytes([_INTEL]):
+        return
+    points, analog, first, last = struct.unpack_from('<4H', content, 2)
+    (scale,) = struct.unpack_from('<f', content, 12)
+    (data,) = struct.unpack_from('<H', content, 16)
+    values = (last - first + 1) * (4 * points + analog)
+    if last < MAX_FRAME and (data - 1) * BLOCK + values * (4 if scale < 0 else 2) > len(content):
+        raise DataError(f'{path}: this C3D file is truncated, or its header is damaged')
+
+
+def _arrays(path: Path) -> dict[str, np.ndarray]:
+    """Return the arrays of `c3d_process`. Raises DataError for a file that ezc3d cannot read."""
+    seconds = min(BASE_SECONDS + SECONDS_OF_BYTE * path.stat().st_size, MAX_SECONDS)
+    try:
+        done = run_module(c3d_process.__name__, os.fspath(path.resolve()), timeout_s=seconds)
+    except TimeoutError:
+        raise DataError(f'{path}: this C3D file cannot be read, it is damaged') from None
+    if done.returncode:
+        cause = done.stderr.decode('utf-8', 'replace').strip() if done.returncode == 1 else ''
+        raise DataError(
+            f'{path}: this C3D file cannot be read ({cause or "it is damaged"})'
+        ) from None
+    with np.load(io.BytesIO(done.stdout), allow_pickle=False) as arrays:
+        return dict(arrays)
+
+
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write points in space. Raises DataError."""
+    points = at_constant_rate(path, content, settings)
+    first = int(points.frame[0])
+    if not 1 <= first <= int(points.frame[-1]) <= MAX_FRAME:
+        raise DataError(
+            f'{path}: frames {first} to {points.frame[-1]}, but C3D counts from 1 to {MAX_FRAME}'
+        )
+    unit = settings.units or 'mm'
+    mm = UNITS_MM[unit]
+    file = _ezc3d().c3d()
+    missing = np.asarray(np.isnan(points.xyz_mm).any(axis=2))
+    xyz = np.where(missing[..., None], 0.0, points.xyz_mm / mm)
+    homogeneous = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
+    sd = np.nan_to_num(points.sd_mm / mm)
+    step = max(float(sd.max(initial=0.0)) / STEPS, 1e-6)
+    # The byte of a residual is cut off, not rounded.
+    residual = np.where(missing, MISSING, (np.round(sd / step) + 0.01) * step)
+    parameters = file['parameters']['POINT']
+    parameters['LABELS']['value'] = labels(content)
+    parameters['UNITS']['value'] = [unit]
+    parameters['RATE']['value'] = [points.rate_hz]
+    parameters['SCALE']['value'] = [-step]
+    file['header']['points']['first_frame'] = first - 1
+    file['data']['points'] = homogeneous.transpose(2, 1, 0)
+    file['data']['meta_points']['residuals'] = residual.T[None]
+    write_bytes(path, _bytes_of(file, path))
+    return Written((str(path),))
+
+
+def _bytes_of(file: Any, path: Path) -> bytes:
+    """Return a C3D file as bytes; ezc3d writes only to files, and its errors have no type."""
+    with TemporaryDirectory() as folder:
+        temporary = Path(folder) / 'points.c3d'
+        try:
+            file.write(os.fspath(temporary))
+            return temporary.read_bytes()
+        except Exception as error:
+            raise DataError(f'{path}: cannot be written ({error})') from None
+
+
+FORMAT = Format(
+    'c3d',
+    'C3D',
+    parts=('points',),
+    recognise=recognise,
+    read=read,
+    write=write,
+    looks_like='a binary file of c3d.org',
+)

@@ -1,0 +1,357 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What files of other programs contain, in the conventions of this package."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from decimal import Decimal
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ...errors import DataError
+from ...exposures.frame import Frame
+from ...exposures.names import Names
+from ...exposures.phantom import Phantom
+
+UNITS_MM = {'mm': 1.0, 'cm': 10.0, 'm': 1000.0}
+# Attributes of a Content, as messages call them.
+PARTS = {
+    'observations': 'image points',
+    'survey': 'a phantom',
+    'cameras': 'cameras',
+    'stations': 'exterior orientations',
+    'points': '3-D points',
+    'bodies': 'poses of rigid bodies',
+    'lookups': 'lookup tables of the distortion',
+    'grids': 'points of a distortion grid',
+}
+
+
+def from_units(values: np.ndarray, mm: float) -> np.ndarray:
+    """Return lengths in mm of lengths in units of mm, with the same decimal digits."""
+    return _shifted(values, mm, 1)
+
+
+def in_units(values_mm: np.ndarray, mm: float) -> np.ndarray:
+    """Return lengths in units of mm of lengths in mm, with the same decimal digits."""
+    return _shifted(values_mm, mm, -1)
+
+
+def _shifted(values: np.ndarray, mm: float, sign: int) -> np.ndarray:
+    """Move the decimal point: 11.39205 cm are 113.9205 mm, not 113.92050000000002."""
+    values = np.asarray(values, dtype=float)
+    digits = sign * round(math.log10(mm))
+    if not digits:
+        return values
+    moved = [float(Decimal(repr(value)).scaleb(digits)) for value in values.ravel().tolist()]
+    return np.array(moved).reshape(values.shape)
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: what a fluoroscope is once its images are corrected.
+
+    Attributes
+    ----------
+    name : str
+    matrix : (3, 3) ndarray
+        Camera matrix [px]; for a fluoroscope [[c, 0, xp], [0, c, yp], [0, 0, 1]].
+    image_size : (int, int) or None
+        Width and height [px].
+    rotation : (3, 3) ndarray or None
+        World -> sensor; None where the format has no exterior orientation.
+    translation_mm : (3,) ndarray or None
+        t of X_sensor = rotation P + t.
+    distortion : tuple of float
+        Coefficients of OpenCV's model (k1, k2, p1, p2, k3, ...), empty without.
+    """
+
+    name: str
+    matrix: NDArray[np.float64]
+    image_size: tuple[int, int] | None = None
+    rotation: NDArray[np.float64] | None = None
+    translation_mm: NDArray[np.float64] | None = None
+    distortion: tuple[float, ...] = ()
+
+    @property
+    def pose(self) -> tuple[np.ndarray, np.ndarray]:
+        """Rotation (3, 3) and translation (3,) [mm] of X_sensor = R X + t. Raises DataError."""
+        if self.rotation is None or self.translation_mm is None:
+            raise DataError(
+                f'camera {self.name} has no position and attitude, which this format needs: '
+                'orient the rig, or choose an exposure of the calibration with --exposure N'
+            )
+        return self.rotation, self.translation_mm
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height [px]. Raises DataError where they are unknown."""
+        if self.image_size is None:
+            raise DataError(
+                f'camera {self.name}: the source does not contain the image size, --image-size '
+                'WxH is needed'
+            )
+        return self.image_size
+
+    @property
+    def is_distorted(self) -> bool:
+        """Whether a coefficient of the distortion is not zero."""
+        return any(self.distortion)
+
+
+def camera_at(
+    name: str,
+    matrix: np.ndarray,
+    image_size: tuple[int, int] | None,
+    rotation: np.ndarray,
+    position_mm: np.ndarray,
+) -> Camera:
+    """Return the Camera whose source is at position_mm (3,)."""
+    return Camera(name, matrix, image_size, rotation, -rotation @ position_mm)
+
+
+@dataclass(frozen=True)
+class Station:
+    """Exterior orientation of one fluoroscope in one exposure: X = rotation (P - position_mm)."""
+
+    fluoroscope: str
+    exposure: int
+    rotation: np.ndarray
+    position_mm: np.ndarray
+
+
+@dataclass(frozen=True)
+class Points:
+    """Points in space over time; NaN where a point was not seen.
+
+    Attributes
+    ----------
+    frame : (m,) ndarray of int
+        Numbers of the frames, ascending.
+    target_id : (n,) ndarray of int
+    xyz_mm : (m, n, 3) ndarray
+    sd_mm : (m, n) ndarray
+        Standard deviation of the position, the root of the sum of its three variances; NaN where
+        it is unknown.
+    residual_px : (m, n) ndarray
+        RMS of the image residuals; NaN where it is unknown.
+    rate_hz : float or None
+        Frames per second; None where it is unknown.
+    """
+
+    frame: NDArray[np.int64]
+    target_id: NDArray[np.int64]
+    xyz_mm: NDArray[np.float64]
+    sd_mm: NDArray[np.float64]
+    residual_px: NDArray[np.float64]
+    rate_hz: float | None = None
+
+
+def points_without_precision(
+    frame: np.ndarray, target_id: np.ndarray, xyz_mm: np.ndarray, rate_hz: float | None = None
+) -> Points:
+    """Return Points of which only the coordinates are known."""
+    unknown = np.full(xyz_mm.shape[:2], np.nan)
+    return Points(
+        frame, target_id, xyz_mm=xyz_mm, sd_mm=unknown, residual_px=unknown, rate_hz=rate_hz
+    )
+
+
+@dataclass(frozen=True)
+class Bodies:
+    """Poses of rigid bodies over time, P_world = R P_body + t; NaN where there is none.
+
+    Attributes
+    ----------
+    names : tuple of str
+    frame : (m,) ndarray of int
+    rotation : (m, b, 3, 3) ndarray
+    translation_mm : (m, b, 3) ndarray
+    """
+
+    names: tuple[str, ...]
+    frame: NDArray[np.int64]
+    rotation: NDArray[np.float64]
+    translation_mm: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Content:
+    """What a file contains; a part that it does not have is None or empty.
+
+    Attributes
+    ----------
+    observations : mapping of str to sequence of Frame, or None
+        Image points by fluoroscope.
+    survey : Phantom or None
+    cameras : tuple of Camera
+    stations : tuple of Station
+    points : Points or None
+    bodies : Bodies or None
+    lookups : mapping of str to (2, h, w) ndarray
+        By fluoroscope the observed column and row of every pixel of the corrected image [px], NaN
+        without support.
+    grids : mapping of str to (n, 4) ndarray
+        By fluoroscope the observed u, v and the reference u, v of points of a distortion grid.
+    names : Names
+        The names in the file.
+    notes : tuple of str
+        What a user has to know about the conversion.
+    corrected_by : mapping of str to str
+        By fluoroscope the id of the calibration that corrected the observations; empty: they are
+        as observed.
+    """
+
+    observations: Mapping[str, Sequence[Frame]] | None = None
+    survey: Phantom | None = None
+    cameras: tuple[Camera, ...] = ()
+    stations: tuple[Station, ...] = ()
+    points: Points | None = None
+    bodies: Bodies | None = None
+    lookups: Mapping[str, np.ndarray] = field(default_factory=dict)
+    grids: Mapping[str, NDArray[np.float64]] = field(default_factory=dict)
+    names: Names = field(default_factory=Names)
+    notes: tuple[str, ...] = ()
+    corrected_by: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def parts(self) -> list[str]:
+        """Names of the attributes that are not empty."""
+        return [name for name in PARTS if has_content(getattr(self, name))]
+
+
+def has_content(part: Any) -> bool:
+    """Return whether a part of a Content is there."""
+    return part is not None and (not isinstance(part, (tuple, Mapping)) or len(part) > 0)
+
+
+@dataclass(frozen=True)
+class FileSettings:
+    """What a file does not say and a user does.
+
+    Attributes
+    ----------
+    image_size : (int, int) or None
+        Width and height [px].
+    units : {'mm', 'cm', 'm'} or None
+        Unit of lengths in the file; None: what the format says.
+    one_based : bool
+        Whether the file counts pixels from 1.
+    y_up : bool
+        Whether rows of the image are counted upwards in the file.
+    trial : str or None
+        Trial of an XMALab project.
+    rate_hz : float or None
+        Frames per second of 3-D points.
+    names : Names
+        Names with known ids.
+    fluoroscopes : tuple of str
+        Names for cameras that a file only numbers.
+    wanted : tuple of str
+        Parts to read from a format of several, names of PARTS.
+    """
+
+    image_size: tuple[int, int] | None = None
+    units: str | None = None
+    one_based: bool = False
+    y_up: bool = False
+    trial: str | None = None
+    rate_hz: float | None = None
+    names: Names = field(default_factory=Names)
+    fluoroscopes: tuple[str, ...] = ()
+    wanted: tuple[str, ...] = tuple(PARTS)
+
+    def unit_read(self, where: object) -> float:
+        """Return the mm of a unit of a file that does not say it. Raises DataError without."""
+        if self.units is None:
+            raise DataError(
+                f'{where}: this format does not say the unit of its lengths, --units '
+                f'{"|".join(UNITS_MM)} is needed'
+            )
+        return UNITS_MM[self.units]
+
+    def unit_or(self, default: str, what: str) -> tuple[float, tuple[str, ...]]:
+        """Return the mm of a unit, and a note where it is the default of the format."""
+        if self.units is not None:
+            return UNITS_MM[self.units], ()
+        note = f'{what}: lengths in {default}, as the format does not say a unit; change it with '
+        return UNITS_MM[default], (note + '--units',)
+
+
+@dataclass(frozen=True)
+class Written:
+    """Files that were written, and what a user has to know about them."""
+
+    paths: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+
+
+# What a format of another program is to the rest of the package.
+
+Reader = Callable[[Path, FileSettings], Content]
+Writer = Callable[[Path, Content, FileSettings], Written]
+
+
+@dataclass(frozen=True)
+class Sample:
+    """The name of a file and how it begins, by which formats recognise it.
+
+    Attributes
+    ----------
+    path : Path
+    head : bytes
+        The first bytes.
+    lines : list of str
+        The first lines that are not blank, without surrounding blanks; empty for a file that is
+        not text.
+    """
+
+    path: Path
+    head: bytes
+    lines: list[str]
+
+    @property
+    def suffix(self) -> str:
+        """Suffix of the name in lower case, with the dot."""
+        return self.path.suffix.lower()
+
+
+@dataclass(frozen=True)
+class Format:
+    """A format.
+
+    Attributes
+    ----------
+    kind : str
+        Name on the command line.
+    title : str
+        Name in messages.
+    parts : tuple of str
+        What it can contain, names of `content.PARTS`.
+    recognise : callable
+        Returns whether a file, by its Sample, has the format.
+    read : callable or None
+        Reads a Content; None where the format is only written. Raises DataError.
+    write : callable or None
+        Writes a part of a Content; None where the format is only read. Raises DataError.
+    looks_like : str
+        How a file of the format begins, for messages.
+    says_units : bool
+        Whether the format says the unit of its lengths, or has none.
+    """
+
+    kind: str
+    title: str
+    parts: tuple[str, ...]
+    recognise: Callable[[Sample], bool]
+    read: Reader | None
+    write: Writer | None
+    looks_like: str
+    says_units: bool = True

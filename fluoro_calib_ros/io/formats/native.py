@@ -1,0 +1,210 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The files of this package as formats: observations, phantom, reconstructed points, grid points.
+
+Targets, exposures and fluoroscopes may have names in them.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import DataError
+from ...exposures.names import Names, without_trivial
+from ..atomic import atomic_file
+from ..csv_table import format_float, read_blocks, write_rows
+from ..observations import COLUMNS as OBSERVATIONS
+from ..observations import corrections_of, read_named_observations, write_observations_csv
+from ..phantom import COLUMNS as PHANTOM
+from ..phantom import read_named_phantom, write_phantom
+from ..reconstructed_points import COLUMNS as POINTS
+from ..reconstructed_points import NAME_COLUMN
+from .content import Content, FileSettings, Format, Points, Sample, Written
+
+GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
+NS = 1e9
+
+
+def _has_columns(sample: Sample, columns: tuple[str, ...]) -> bool:
+    lines = [line for line in sample.lines if not line.startswith('#')]
+    if not lines:
+        return False
+    separator = ';' if ';' in lines[0] else ','
+    return set(columns) <= {cell.strip().strip('"') for cell in lines[0].split(separator)}
+
+
+def _read_observations(path: Path, settings: FileSettings) -> Content:
+    frames, names, stray = read_named_observations(path, settings.image_size, settings.names)
+    return Content(
+        observations=frames,
+        names=names,
+        notes=(stray,) if stray else (),
+        corrected_by=corrections_of(path),
+    )
+
+
+def _write_observations(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write the ids; names would not be read by programs that know this layout."""
+    assert content.observations is not None
+    write_observations_csv(path, content.observations, content.names, content.corrected_by)
+    return Written((str(path),))
+
+
+def _read_phantom(path: Path, settings: FileSettings) -> Content:
+    survey, names = read_named_phantom(path, settings.names)
+    return Content(survey=survey, names=names)
+
+
+def _write_phantom(path: Path, content: Content, settings: FileSettings) -> Written:
+    assert content.survey is not None
+    write_phantom(path, content.survey, content.names)
+    return Written((str(path),))
+
+
+def _read_points(path: Path, settings: FileSettings) -> Content:
+    """Read reconstructed points. Raises DataError."""
+    blocks = list(read_blocks(path, ('frame', 'target_id', 'x', 'y', 'z')))
+    frame, target = (
+        np.concatenate([block.ids(name) for block in blocks]) for name in ('frame', 'target_id')
+    )
+    numbers = {
+        name: np.concatenate([block.floats_or_nan(name) for block in blocks])
+        for name in ('x', 'y', 'z', 'sd_x', 'sd_y', 'sd_z', 'residual', 'stamp_ns')
+        if name in blocks[0]
+    }
+    unknown = np.full(len(frame), np.nan)
+    frames, row = np.unique(frame, return_inverse=True)
+    targets, column = np.unique(target, return_inverse=True)
+    cell = row * len(targets) + column
+    if len(np.unique(cell)) < len(cell):
+        index = np.setdiff1d(np.arange(len(cell)), np.unique(cell, return_index=True)[1])[0]
+        line = np.concatenate([block.lines for block in blocks])[index]
+        raise DataError(
+            f'{path}, row {line}: target {target[index]} of frame {frame[index]} is given twice'
+        )
+    shape = (len(frames), len(targets))
+
+    def table(values: np.ndarray) -> np.ndarray:
+        out = np.full(shape, np.nan)
+        out[row, column] = values
+        return out
+
+    xyz = np.stack([table(numbers[axis]) for axis in 'xyz'], axis=2)
+    xyz[np.isnan(xyz).any(axis=2)] = np.nan
+    sd = [numbers.get(f'sd_{axis}', unknown) for axis in 'xyz']
+    points = Points(
+        frames,
+        targets,
+        xyz_mm=xyz,
+        sd_mm=table(np.sqrt(sum(values**2 for values in sd))),
+        residual_px=table(numbers.get('residual', unknown)),
+        rate_hz=_rate(frame, numbers.get('stamp_ns', unknown)),
+    )
+    names = Names()
+    if NAME_COLUMN in blocks[0]:
+        cells = [cell for block in blocks for cell in block.strings(NAME_COLUMN)]
+        names = Names(without_trivial({n: int(i) for n, i in zip(cells, target.tolist()) if n}))
+    return Content(points=points, names=names)
+
+
+def _rate(frame: np.ndarray, stamp_ns: np.ndarray) -> float | None:
+    """Return the frames per second between the first and the last time stamp, None without."""
+    first = int(np.argmin(frame))
+    last = int(np.argmax(frame))
+    seconds = (stamp_ns[last] - stamp_ns[first]) / NS
+    if not seconds > 0:
+        return None
+    rate = (frame[last] - frame[first]) / seconds
+    whole = round(rate)
+    # Stamps are rounded to nanoseconds, clocks to some millionths.
+    return float(whole) if whole and abs(rate - whole) < 1e-5 * whole else float(rate)
+
+
+def _write_points(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write the points that were seen, with what is known about them."""
+    points = content.points
+    assert points is not None
+    named = content.names.target_names()
+    rate = settings.rate_hz or points.rate_hz
+    empty = dict.fromkeys(POINTS, '')
+    with atomic_file(path, 'w') as file:
+        write_rows(file, [[*POINTS, NAME_COLUMN]])
+        for row, number in enumerate(points.frame.tolist()):
+            stamp = '' if rate is None else round((number - int(points.frame[0])) / rate * NS)
+            for column, target in enumerate(points.target_id.tolist()):
+                xyz = points.xyz_mm[row, column].tolist()
+                if math.isnan(xyz[0]):
+                    continue
+                cells = {
+                    **empty,
+                    'frame': number,
+                    'stamp_ns': stamp,
+                    'target_id': target,
+                    **dict(zip('xyz', map(repr, xyz))),
+                    'residual': format_float(points.residual_px[row, column]),
+                }
+                write_rows(file, [[*cells.values(), named.get(target, '')]])
+    note = f'{path}: standard deviations of the coordinates are not written, only coordinates'
+    return Written((str(path),), (note,))
+
+
+def _read_grid(path: Path, settings: FileSettings) -> Content:
+    blocks = list(read_blocks(path, GRID))
+    names = np.array([name for block in blocks for name in block.strings('fluoroscope')])
+    numbers = np.concatenate(
+        [np.column_stack([block.floats(name) for name in GRID[1:]]) for block in blocks]
+    )
+    return Content(grids={str(n): numbers[names == n] for n in dict.fromkeys(names.tolist())})
+
+
+def _write_grid(path: Path, content: Content, settings: FileSettings) -> Written:
+    with atomic_file(path, 'w') as file:
+        write_rows(file, [GRID])
+        for name, rows in content.grids.items():
+            write_rows(file, ([name, *map(repr, row)] for row in rows.tolist()))
+    return Written((str(path),))
+
+
+_OWN = 'CSV of fluoro_calib_ros'
+FORMATS = (
+    Format(
+        'observations',
+        f'image points, {_OWN}',
+        parts=('observations',),
+        recognise=lambda sample: _has_columns(sample, OBSERVATIONS),
+        read=_read_observations,
+        write=_write_observations,
+        looks_like=','.join(OBSERVATIONS),
+    ),
+    Format(
+        'phantom',
+        f'phantom, {_OWN}',
+        parts=('survey',),
+        recognise=lambda sample: _has_columns(sample, PHANTOM),
+        read=_read_phantom,
+        write=_write_phantom,
+        looks_like=','.join(PHANTOM),
+    ),
+    Format(
+        'points',
+        f'reconstructed points, {_OWN}',
+        parts=('points',),
+        recognise=lambda sample: _has_columns(sample, ('frame', 'target_id', 'x', 'y', 'z')),
+        read=_read_points,
+        write=_write_points,
+        looks_like=','.join(POINTS),
+    ),
+    Format(
+        'grid',
+        f'points of a distortion grid, {_OWN}',
+        parts=('grids',),
+        recognise=lambda sample: _has_columns(sample, GRID),
+        read=_read_grid,
+        write=_write_grid,
+        looks_like=','.join(GRID),
+    ),
+)

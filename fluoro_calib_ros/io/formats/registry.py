@@ -1,0 +1,177 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The registry of the formats: the only place that lists them.
+
+A new format is a module with a `base.Format` and one line here. The command line takes the kinds
+from this module, and reads every source by it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from ...errors import DataError
+from ..access import PathLike, check_regular_file, os_error_reason
+from . import (
+    anipose,
+    bundle,
+    c3d,
+    camera_info,
+    dlt,
+    known_orientation,
+    mayacam1,
+    mayacam2,
+    native,
+    opencv_yaml,
+    trc,
+    xmalab_bodies,
+    xmalab_frame,
+    xmalab_lookup,
+    xmalab_points,
+    xmalab_points3d,
+    xmalab_project,
+)
+from .content import PARTS, Content, FileSettings, Format, Sample, Written, has_content
+
+HEAD = 65536  # bytes by which a format is recognised
+LINES = 20
+MAX_SHOWN = 60  # characters of a line in a message
+
+# The order is that in which a file is compared with them, and that of help texts.
+FORMATS: dict[str, Format] = {
+    format_.kind: format_
+    for format_ in (
+        *native.FORMATS,
+        known_orientation.FORMAT,
+        xmalab_points.FORMAT,
+        xmalab_project.FORMAT,
+        xmalab_frame.FORMAT,
+        xmalab_bodies.FORMAT,
+        xmalab_points3d.FORMAT,
+        mayacam2.FORMAT,
+        mayacam1.FORMAT,
+        dlt.FORMAT,
+        xmalab_lookup.FORMAT,
+        anipose.FORMAT,
+        opencv_yaml.FORMAT,
+        camera_info.FORMAT,
+        bundle.FORMAT,
+        c3d.FORMAT,
+        trc.FORMAT,
+    )
+}
+
+
+def kinds(condition: Callable[[Format], object]) -> tuple[str, ...]:
+    """Return the kinds of the formats that meet a condition."""
+    return tuple(kind for kind, format_ in FORMATS.items() if condition(format_))
+
+
+def sample_of(path: PathLike) -> Sample:
+    """Return how a file begins. Raises DataError for a file that cannot be read."""
+    path = Path(path)
+    check_regular_file(path)
+    try:
+        with path.open('rb') as file:
+            head = file.read(HEAD)
+    except FileNotFoundError:
+        raise DataError(f'{path}: there is no such file') from None
+    except OSError as error:
+        raise DataError(f'{path}: cannot be read ({os_error_reason(error)})') from None
+    except ValueError as error:  # a NUL byte in the name
+        raise DataError(f'{path}: cannot be read ({error})') from None
+    if not head:
+        raise DataError(f'{path}: the file is empty')
+    if b'\0' in head:
+        return Sample(path, head, [])
+    text = head.decode('utf-8-sig', 'replace')
+    lines = [line.strip() for line in text.splitlines()]
+    return Sample(path, head, [line for line in lines if line][:LINES])
+
+
+def recognised(path: PathLike) -> Format | None:
+    """Return the format of a file, None for an unknown one. Raises DataError where unreadable."""
+    sample = sample_of(path)
+    return next((f for f in FORMATS.values() if f.recognise(sample)), None)
+
+
+def read(path: PathLike, settings: FileSettings, kind: str | None = None) -> Content:
+    """Read a file of any format, or a folder with a file of one format for each camera.
+
+    kind is its format, by default the one it is recognised as. Raises DataError for a file that
+    is no such format, with what it looks like.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _read_folder(path, settings, kind)
+    found = recognised(path)
+    format_ = found if kind is None else FORMATS[kind]
+    if format_ is None:
+        raise DataError(f'{path}: the format is not known; {_beginning(path)}')
+    if format_.read is None:
+        raise DataError(f'{path}: {format_.title} is only written, not read')
+    try:
+        return format_.read(path, settings)
+    except DataError as error:
+        if found is None or found is format_:
+            raise
+        raise DataError(f'{error}; the file looks like {found.title} ({found.kind})') from None
+
+
+def _beginning(path: Path) -> str:
+    sample = sample_of(path)
+    if not sample.lines:
+        return 'it is not text'
+    return f'it begins with {sample.lines[0][:MAX_SHOWN]!r}'
+
+
+def _read_folder(folder: Path, settings: FileSettings, kind: str | None) -> Content:
+    """Read a folder with a file for each camera. Raises DataError."""
+    contents: dict[Path, tuple[str, Content]] = {}
+    for path in sorted(p for p in folder.iterdir() if p.is_file() and p.name[0] != '.'):
+        format_ = recognised(path)
+        if format_ is None or format_.read is None or (kind and format_.kind != kind):
+            continue
+        if format_.parts not in (('cameras',), ('lookups',)):
+            continue
+        contents[path] = (format_.kind, format_.read(path, settings))
+    found = dict.fromkeys(name for name, _ in contents.values())
+    if len(found) != 1:
+        what = f'files of {" and ".join(found)}' if found else 'no file of cameras'
+        raise DataError(
+            f'{folder}: the folder has {what}, but should be a result folder or have a file of '
+            'one format for each camera'
+        )
+    cameras = [camera for _, content in contents.values() for camera in content.cameras]
+    lookups = {n: maps for _, content in contents.values() for n, maps in content.lookups.items()}
+    notes = tuple(dict.fromkeys(n for _, content in contents.values() for n in content.notes))
+    for camera in cameras:
+        if sum(other.name == camera.name for other in cameras) > 1:
+            raise DataError(f'{folder}: two cameras are called {camera.name!r}')
+    return Content(cameras=tuple(cameras), lookups=lookups, notes=notes)
+
+
+def write(path: PathLike, kind: str, content: Content, settings: FileSettings) -> Written:
+    """Write a content as a format.
+
+    Raises DataError for a format that is only read, and for a content without what it holds.
+    """
+    format_ = FORMATS[kind]
+    if format_.write is None:
+        raise DataError(f'{path}: {format_.title} is only read, not written')
+    parts = [name for name in format_.parts if has_content(getattr(content, name))]
+    if not parts:
+        needed = ' or '.join(PARTS[name] for name in format_.parts)
+        has = (
+            ' and '.join(PARTS[name] for name in content.parts) or 'nothing that can be converted'
+        )
+        raise DataError(f'{format_.title} needs {needed}, but the source has {has}')
+    return format_.write(Path(path), content, settings)
+
+
+def settings_for(kind: str, settings: FileSettings) -> FileSettings:
+    """Return settings that read only what a format can hold."""
+    return replace(settings, wanted=FORMATS[kind].parts)

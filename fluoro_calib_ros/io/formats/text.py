@@ -1,0 +1,134 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Tables of numbers in text files, with errors that name the row."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import NoReturn
+
+import numpy as np
+
+from ...errors import DataError
+from ..access import PathLike, read_text
+from ..csv_table import decimal_point
+
+MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
+MAX_SHOWN = 40  # characters of a cell in a message
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of a table: its number in the file, counted from 1, and its cells without blanks."""
+
+    path: PathLike
+    line: int
+    cells: list[str]
+
+    def fail(self, cause: str) -> NoReturn:
+        """Raise DataError for the row."""
+        raise DataError(f'{self.path}, row {self.line}: {cause}')
+
+    def numbers(self, first: int = 0) -> list[float]:
+        """Return the cells from the given one on as finite numbers. Raises DataError."""
+        values = self.numbers_or_nan(first)
+        for column, value in enumerate(values, first):
+            if math.isnan(value):
+                self.fail(f'column {column + 1} is {self.cells[column]!r}, not a number')
+        return values
+
+    def numbers_or_nan(self, first: int = 0) -> list[float]:
+        """Return the cells from the given one on as numbers, NaN where one is missing."""
+        out = []
+        for column, cell in enumerate(self.cells[first:], first):
+            try:
+                if '_' in cell:  # Python reads 1_0 as 10
+                    raise ValueError
+                value = math.nan if cell.lower() in MISSING else float(cell)
+            except ValueError:
+                value = math.inf
+            if math.isinf(value):
+                self.fail(f'column {column + 1} is {cell[:MAX_SHOWN]!r}, not a number')
+            out.append(value)
+        return out
+
+    def whole(self, column: int, what: str) -> int:
+        """Return a cell as a whole number from 0. Raises DataError."""
+        cell = self.cells[column]
+        if not cell.isascii() or not cell.isdigit():
+            self.fail(f'{what} is {cell[:MAX_SHOWN]!r}, not a whole number')
+        return int(cell)
+
+
+def read_table(path: PathLike, separator: str | None = None) -> list[Row]:
+    """Return the rows of a text file that are not blank.
+
+    Parameters
+    ----------
+    path : path-like
+    separator : str, optional
+        ' ' for any blanks. By default a semicolon where the first row has one, then with decimal
+        commas, as spreadsheets write it in many countries; else a tabulator or a comma.
+
+    Raises
+    ------
+    DataError
+        For a file that cannot be read, is not text or has no rows.
+    """
+    return table_of(path, read_text(path), separator)
+
+
+def table_of(path: PathLike, text: str, separator: str | None = None) -> list[Row]:
+    """Return the rows of a text, as `read_table` does; path is for messages."""
+    if '\0' in text:
+        raise DataError(f'{path}: this is not text, it contains a byte 0')
+    if separator == ' ':
+        rows = [Row(path, n, line.split()) for n, line in enumerate(text.splitlines(), 1)]
+    else:
+        rows = _separated(path, text, separator or separator_of(text))
+    rows = [row for row in rows if any(row.cells)]
+    if not rows:
+        raise DataError(f'{path}: the file has no rows')
+    return rows
+
+
+def separator_of(text: str) -> str:
+    """Return the separator of a table: that of its first row that is not blank."""
+    first = next((line for line in text.splitlines() if line.strip()), '')
+    return next((mark for mark in ';\t' if mark in first), ',')
+
+
+def _separated(path: PathLike, text: str, separator: str) -> list[Row]:
+    reader = csv.reader(io.StringIO(text, newline=''), delimiter=separator, strict=True)
+    rows = []
+    try:
+        for cells in reader:
+            stripped = [cell.strip() for cell in cells]
+            if separator == ';':
+                stripped = [decimal_point(cell) for cell in stripped]
+            rows.append(Row(path, reader.line_num, stripped))
+    except csv.Error as error:
+        raise DataError(f'{path}, row {reader.line_num}: this is not a table ({error})') from None
+    return rows
+
+
+def require_width(rows: Iterable[Row], width: int, what: str) -> None:
+    """Raise DataError for the first row that does not have `width` cells."""
+    for row in rows:
+        if len(row.cells) != width:
+            row.fail(f'{len(row.cells)} columns, but {what} has {width}')
+
+
+def number_text(value: float) -> str:
+    """Return a number as text from which the same one is read again, NaN for a missing one."""
+    return 'NaN' if math.isnan(value) else repr(float(value))
+
+
+def joined(values: Sequence[float] | np.ndarray, separator: str = ',') -> str:
+    """Return numbers as a row of text."""
+    return separator.join(number_text(value) for value in np.asarray(values, dtype=float).tolist())

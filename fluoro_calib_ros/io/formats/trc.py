@@ -1,0 +1,133 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""TRC of Motion Analysis, as OpenSim reads it: points in space, at a constant rate.
+
+Header of five rows: PathFileType, names and values of DataRate, CameraRate, NumFrames, NumMarkers,
+Units, OrigDataRate, OrigDataStartFrame, OrigNumFrames; names of the markers; X1 Y1 Z1 and so on.
+Then a row a frame: its number, time [s] and coordinates, between tabulators. Where a marker is not
+seen, OpenSim writes and reads NaN; other programs leave the cell empty, which is read, too. TRC
+has no residuals.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import DataError
+from ...exposures.names import Names, number_names
+from ..access import read_text
+from ..atomic import atomic_file
+from .content import (
+    UNITS_MM,
+    Content,
+    FileSettings,
+    Format,
+    Sample,
+    Written,
+    from_units,
+    in_units,
+    points_without_precision,
+)
+from .frames_of_points import at_constant_rate, labels, named_targets
+from .text import Row, joined, number_text
+
+_HEADER_ROWS = 5
+TAB = '\t'
+_NAMES = (
+    *('DataRate', 'CameraRate', 'NumFrames', 'NumMarkers'),
+    *('Units', 'OrigDataRate', 'OrigDataStartFrame', 'OrigNumFrames'),
+)
+
+
+def recognise(sample: Sample) -> bool:
+    """Return whether the first row is that of TRC."""
+    return bool(sample.lines) and sample.lines[0].startswith('PathFileType')
+
+
+def read(path: Path, settings: FileSettings) -> Content:
+    """Read points in space. Raises DataError that names the row."""
+    lines = read_text(path).splitlines()
+    if len(lines) < _HEADER_ROWS or not lines[0].startswith('PathFileType'):
+        raise DataError(f'{path}: this is not a TRC file, it does not begin with PathFileType')
+    header = dict(zip(lines[1].split(), lines[2].split()))
+    for name in ('DataRate', 'NumMarkers', 'Units'):
+        if name not in header:
+            raise DataError(f'{path}, row 2: the header has no {name}')
+    mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(header['Units'].lower())
+    if mm is None:
+        raise DataError(f'{path}, row 3: the unit is {header["Units"]!r}, give it with --units')
+    (rate,) = Row(path, 3, [header['DataRate']]).numbers()
+    names = [cell.strip() for cell in lines[3].split('\t')[2:] if cell.strip()]
+    count = Row(path, 3, [header['NumMarkers']]).whole(0, 'NumMarkers')
+    if len(names) != count or len(set(names)) < count or not rate > 0:
+        raise DataError(
+            f'{path}, row 4: {len(set(names))} names of {count} markers at {rate:g} Hz'
+        )
+    frame = []
+    xyz = []
+    for number, line in enumerate(lines[_HEADER_ROWS:], _HEADER_ROWS + 1):
+        if line.strip():
+            row = Row(path, number, [cell.strip() for cell in line.split('\t')])
+            frame.append(row.whole(0, 'Frame#'))
+            xyz.append(_coordinates(row, count))
+    if not frame:
+        raise DataError(f'{path}: the file has no frames')
+    ids = number_names(names, settings.names.targets)
+    return Content(
+        points=points_without_precision(
+            np.array(frame),
+            np.array([ids[name] for name in names], dtype=np.int64),
+            from_units(np.array(xyz), mm),
+            rate,
+        ),
+        names=Names(named_targets({name: ids[name] for name in names})),
+    )
+
+
+def _coordinates(row: Row, count: int) -> np.ndarray:
+    """Return coordinates (count, 3), NaN where a marker is missing."""
+    cells = row.cells[2:]
+    while len(cells) > 3 * count and not cells[-1]:
+        cells = cells[:-1]
+    if len(cells) > 3 * count:
+        row.fail(f'{len(cells)} coordinates, but there are {count} markers')
+    values = Row(row.path, row.line, ['', '', *cells]).numbers_or_nan(2)
+    xyz = np.array(values + [math.nan] * (3 * count - len(values))).reshape(count, 3)
+    xyz[np.isnan(xyz).any(axis=1)] = np.nan
+    return xyz
+
+
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write points in space. Raises DataError."""
+    points = at_constant_rate(path, content, settings)
+    unit = settings.units or 'mm'
+    names = labels(content)
+    rate = number_text(points.rate_hz or math.nan)
+    frames = str(len(points.frame))
+    first = int(points.frame[0])
+    values = [rate, rate, frames, str(len(names)), unit, rate, str(first), frames]
+    axes = [f'{axis}{number}' for number in range(1, len(names) + 1) for axis in 'XYZ']
+    with atomic_file(path, 'w') as file:
+        file.write(f'PathFileType\t4\t(X/Y/Z)\t{path.name}\n')
+        file.write('\t'.join(_NAMES) + '\n' + '\t'.join(values) + '\n')
+        file.write('Frame#\tTime\t' + '\t\t\t'.join(names) + '\t\t\n')
+        file.write('\t\t' + '\t'.join(axes) + '\n\n')
+        for number, xyz in zip(points.frame.tolist(), in_units(points.xyz_mm, UNITS_MM[unit])):
+            time = (number - first) / points.rate_hz
+            file.write(f'{number}\t{time!r}\t{joined(xyz.ravel(), TAB)}\n')
+    return Written((str(path),), (f'{path}: TRC has no residuals',))
+
+
+FORMAT = Format(
+    'trc',
+    'TRC',
+    parts=('points',),
+    recognise=recognise,
+    read=read,
+    write=write,
+    looks_like='PathFileType  4  (X/Y/Z)',
+)

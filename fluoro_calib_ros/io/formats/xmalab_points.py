@@ -1,0 +1,220 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""XMALab 2-D points: `name_cam1_X,name_cam1_Y,name_cam2_X,...`, one row a frame.
+
+The layout is that of `Trial::save2dPoints` and `load2dPoints` of XMALab 2.2.7, which DeepLabCut
+and DLTdv users know, too: pixel centres at integers from (0, 0), v downwards, NaN where a marker
+is not seen. Variants, chosen in its dialogue and not visible in the file: pixels from 1
+(one_based), rows counted upwards (y_up). A further variant begins with the columns
+cam<n>_offset; XMALab writes their header without the separating commas. The row is the exposure,
+counted from 1, unless there is a column Frame.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import DataError
+from ...exposures.frame import Frame, points_on_image
+from ...exposures.names import Names, number_names
+from ..atomic import atomic_file
+from .content import Content, FileSettings, Format, Sample, Written
+from .frames_of_points import default_name, named_targets
+from .text import Row, joined, read_table, require_width
+
+COLUMN = re.compile(r'(?P<target>.+)_cam(?P<camera>\d+)_(?P<axis>[XY])', re.IGNORECASE)
+_OFFSET = re.compile(r'cam\d+_offset', re.IGNORECASE)
+MAX_ROWS = 10**6
+
+
+def recognise(sample: Sample) -> bool:
+    """Return whether the header has columns of a marker and a camera."""
+    return bool(sample.lines) and re.search(r'_cam\d+_[XY]\b', sample.lines[0], re.I) is not None
+
+
+def read(path: Path, settings: FileSettings) -> Content:
+    """Read image points. Raises DataError."""
+    rows = read_table(path)
+    header, offsets, first = _header(rows[0])
+    body = rows[1:]
+    if not body:
+        raise DataError(f'{path}: the file has a header, but no rows')
+    require_width(body, len(header) + offsets + first, 'the header')
+    targets = list(dict.fromkeys(name for name, _ in header[::2]))
+    cameras = sorted({camera for _, camera in header})
+    ids = number_names(targets, settings.names.targets)
+    labels = _labels(cameras, settings)
+    frames: dict[str, list[Frame]] = {labels[camera]: [] for camera in cameras}
+    column_camera = np.array([camera for _, camera in header[::2]])
+    column_id = np.array([ids[name] for name, _ in header[::2]], dtype=np.int64)
+    size = _image_size(path, settings)
+    for index, row in enumerate(body, 1):
+        number = row.whole(0, 'Frame') if first else index
+        _check_offsets(row, first, offsets)
+        uv = _pixels(row.numbers_or_nan(first + offsets), settings, size)
+        _check_point(row, uv, size, header)
+        for camera in cameras:
+            used = (column_camera == camera) & ~np.isnan(uv).any(axis=1)
+            if used.any():
+                frames[labels[camera]].append(
+                    Frame(
+                        labels[camera],
+                        number,
+                        column_id[used],
+                        uv[used],
+                        size,
+                        frame_id=f'{labels[camera]}_optical',
+                    )
+                )
+    return Content(
+        observations={name: of_camera for name, of_camera in frames.items() if of_camera},
+        names=Names(named_targets({name: ids[name] for name in targets})),
+    )
+
+
+def _header(row: Row) -> tuple[list[tuple[str, int]], int, int]:
+    """Return target and camera of every column of points, offset columns and Frame columns.
+
+    Raises DataError for columns that do not come in pairs of X and Y, or twice.
+    """
+    cells = list(row.cells)
+    first = int(cells[0].lower() == 'frame')
+    cells = cells[first:]
+    offsets = 0
+    while cells and _OFFSET.match(cells[0]):  # XMALab forgets the commas between them
+        offsets += 1
+        rest = cells[0][_OFFSET.match(cells[0]).end() :]  # type: ignore[union-attr]
+        cells = ([rest] if rest else []) + cells[1:]
+    found = [COLUMN.fullmatch(cell) for cell in cells]
+    for cell, match in zip(cells, found):
+        if match is None:
+            row.fail(f'the column {cell!r} is not <name>_cam<number>_X or _Y')
+    columns = [(m['target'], int(m['camera']), m['axis'].upper()) for m in found if m is not None]
+    for x, y in zip(columns[::2], [*columns[1::2], ('', 0, '')]):
+        if x[:2] != y[:2] or (x[2], y[2]) != ('X', 'Y'):
+            row.fail(f'the column {x[0]}_cam{x[1]}_X is not followed by {x[0]}_cam{x[1]}_Y')
+    pairs = [column[:2] for column in columns]
+    for pair in pairs[::2]:
+        if pairs.count(pair) > 2:
+            row.fail(f'{pair[0]}_cam{pair[1]} is given twice')
+    return pairs, offsets, first
+
+
+def _labels(cameras: Sequence[int], settings: FileSettings) -> dict[int, str]:
+    """Return the fluoroscopes of the numbered cameras."""
+    given = settings.fluoroscopes
+    plain = {camera: f'cam{camera}' for camera in cameras}
+    if len(given) == len(cameras) and not set(given) & set(plain.values()):
+        return dict(zip(cameras, given))
+    known = settings.names.fluoroscopes
+    return {camera: known.get(name, name) for camera, name in plain.items()}
+
+
+def _image_size(path: Path, settings: FileSettings) -> tuple[int, int]:
+    if settings.image_size is None:
+        raise DataError(
+            f'{path}: XMALab points do not contain the image size, --image-size WxH is needed'
+        )
+    return settings.image_size
+
+
+def _check_offsets(row: Row, first: int, offsets: int) -> None:
+    """Raise DataError for cameras that are not synchronous, as DLTdv allows them to be."""
+    if offsets and any(Row(row.path, row.line, row.cells[first : first + offsets]).numbers()):
+        row.fail('the cameras are offset against each other in time: write them without offset')
+
+
+def _pixels(values: Sequence[float], settings: FileSettings, size: tuple[int, int]) -> np.ndarray:
+    """Return pixels (n, 2) in our convention, NaN where either coordinate is missing."""
+    uv = np.array(values).reshape(-1, 2)
+    if settings.one_based:
+        uv = uv - 1.0
+    if settings.y_up:
+        uv[:, 1] = size[1] - 1 - uv[:, 1]
+    uv[np.isnan(uv).any(axis=1)] = np.nan
+    return uv
+
+
+def _check_point(
+    row: Row, uv: np.ndarray, size: tuple[int, int], header: Sequence[tuple[str, int]]
+) -> None:
+    """Raise DataError for a point off the image."""
+    wrong = ~points_on_image(uv, size) & ~np.isnan(uv).any(axis=1)
+    if wrong.any():
+        index = int(np.argmax(wrong))
+        target, camera = header[2 * index]
+        row.fail(
+            f'the point ({uv[index, 0]:g}, {uv[index, 1]:g}) of {target} in cam{camera} is off '
+            f'the image of {size[0]} x {size[1]} px'
+        )
+
+
+def write(path: Path, content: Content, settings: FileSettings) -> Written:
+    """Write image points, one column a target and camera, one row an exposure from 1 on."""
+    observations = content.observations or {}
+    cameras = camera_order(list(observations))
+    named = content.names.target_names()
+    frames = {name: {f.number: f for f in observations[name]} for name in cameras}
+    numbers = sorted({number for of_camera in frames.values() for number in of_camera})
+    ids = sorted({int(i) for of in frames.values() for f in of.values() for i in f.target_id})
+    labels = [named.get(i, default_name(i)) for i in ids]
+    shift = int(numbers[0] == 0)
+    if numbers[-1] + shift > MAX_ROWS:
+        raise DataError(f'{path}: frame {numbers[-1]} would need as many rows, at most {MAX_ROWS}')
+    with atomic_file(path, 'w') as file:
+        file.write(
+            ','.join(
+                f'{name}_cam{camera}_{axis}'
+                for name in labels
+                for camera in range(1, len(cameras) + 1)
+                for axis in 'XY'
+            )
+            + '\n'
+        )
+        for number in range(1 - shift, numbers[-1] + 1):
+            table = np.full((len(ids), len(cameras), 2), np.nan)
+            for column, name in enumerate(cameras):
+                if number in frames[name]:
+                    frame = frames[name][number]
+                    table[np.searchsorted(ids, frame.target_id), column] = _file_pixels(
+                        frame, settings
+                    )
+            file.write(joined(table.ravel()) + '\n')
+    notes = [f'cam{i} is fluoroscope {name}' for i, name in enumerate(cameras, 1)]
+    notes = [] if [f'cam{i}' for i in range(1, len(cameras) + 1)] == cameras else notes
+    if shift:
+        notes.append('exposure 0 is row 1, exposure 1 is row 2 and so on')
+    return Written((str(path),), tuple(notes))
+
+
+def _file_pixels(frame: Frame, settings: FileSettings) -> np.ndarray:
+    """Return pixels (n, 2) in the convention of the file."""
+    uv = np.array(frame.uv, dtype=float)
+    if settings.y_up:
+        uv[:, 1] = frame.image_size[1] - 1 - uv[:, 1]
+    return uv + 1.0 if settings.one_based else uv
+
+
+def camera_order(names: Sequence[str]) -> list[str]:
+    """Return fluoroscopes in the order of their numbers where they are numbered, else as given."""
+    found = [re.fullmatch(r'\D*(\d+)', name) for name in names]
+    numbers = [int(match[1]) for match in found if match is not None]
+    if len(numbers) < len(names) or len(set(numbers)) < len(numbers):
+        return list(names)
+    return [name for _, name in sorted(zip(numbers, names))]
+
+
+FORMAT = Format(
+    'xmalab2d',
+    'XMALab 2-D points',
+    parts=('observations',),
+    recognise=recognise,
+    read=read,
+    write=write,
+    looks_like='bead01_cam1_X,bead01_cam1_Y,bead01_cam2_X,bead01_cam2_Y',
+)

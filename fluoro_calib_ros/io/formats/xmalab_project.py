@@ -1,0 +1,381 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""XMALab project (.xma), read only: a ZIP file of project.xml and the files it names.
+
+The layout is that of `ProjectFileIO` of XMALab 2.2.7, project version 0.3. Read are the detected
+points of the calibration object (those that XMALab calls inliers), the markers of a trial, the
+frame specification, the cameras with their calibrated poses, and the points of the undistortion
+grids. Points are those of the observed, distorted image, pixel centres at integers from (0, 0), v
+downwards. A calibration image is the exposure of its number, counted from 1; a frame of a trial,
+too. The unit is that of the frame specification, which XMALab does not say: cm, as there.
+"""
+
+from __future__ import annotations
+
+import posixpath
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ...errors import DataError
+from ...exposures.frame import Frame, points_on_image
+from ...exposures.names import Names, number_names, safe_names, without_trivial
+from ...images.declared_size import check_size, declared_size
+from . import xmalab_frame
+from .camera_files import check_matrix, check_rotation
+from .content import Camera, Content, FileSettings, Format, Sample, Station
+from .frames_of_points import default_name, named_targets
+from .xmalab_archive import DOCUMENT, ProjectArchive
+
+_SEEN = 0  # a marker is seen where its status is above
+_INLIER = 1
+NO_POINT = -1.0
+
+
+def recognise(sample: Sample) -> bool:
+    """Return whether the file is a ZIP file with the suffix of a project."""
+    return sample.suffix == '.xma' and sample.head.startswith(b'PK')
+
+
+def read(path: Path, settings: FileSettings) -> Content:
+    """Read the wanted parts of a project. Raises DataError."""
+    with ProjectArchive(path) as archive:
+        return _content(_Project(archive, settings))
+
+
+def _content(project: _Project) -> Content:
+    """Return the wanted parts of an open project."""
+    settings = project.settings
+    wanted = settings.wanted
+    survey = project.survey()
+    names = Names(
+        survey.names.targets,
+        {},
+        {name: i for name, i in project.ids.items() if name != i},
+    )
+    found: dict[str, Any] = {'notes': survey.notes if 'survey' in wanted else ()}
+    if 'survey' in wanted:
+        found['survey'] = survey.survey
+    if 'observations' in wanted:
+        if settings.trial is None:
+            observations, exposures = _Observations(project, survey).of_phantom()
+            names = Names(names.targets, exposures, names.fluoroscopes)
+        else:
+            observations, targets = _Observations(project, survey).of_trial()
+            names = Names(targets, {}, names.fluoroscopes)
+        found['observations'] = observations
+    calibration = _Calibration(project)
+    if 'stations' in wanted or 'cameras' in wanted:
+        mm, notes = settings.unit_or('cm', str(project.archive.path))
+        stations = tuple(calibration.stations(mm))
+        found['stations'] = stations
+        found['cameras'] = tuple(calibration.cameras(stations))
+        found['notes'] += notes
+    if 'grids' in wanted:
+        found['grids'] = dict(calibration.grids())
+    return Content(names=names, **found)
+
+
+def _is_set(element: ElementTree.Element, name: str = 'isCalibrated') -> bool:
+    """Return whether a flag of an element is set."""
+    value = element.get(name, '0')
+    return value.isdigit() and int(value) > 0
+
+
+class _Project:
+    """Cameras, images and trials of an open project, with the names they have here."""
+
+    def __init__(self, archive: ProjectArchive, settings: FileSettings) -> None:
+        self.archive = archive
+        self.settings = settings
+        self.cameras = archive.root.findall('Camera')
+        if not self.cameras:
+            raise DataError(f'{archive.path}, {DOCUMENT}: the project has no cameras')
+        self._names = [archive.text(camera, 'Name') for camera in self.cameras]
+        known = settings.names.fluoroscopes
+        if len(settings.fluoroscopes) == len(self.cameras) and not set(
+            settings.fluoroscopes
+        ) & set(self._names):
+            known = dict(zip(self._names, settings.fluoroscopes))
+        self.ids = safe_names(self._names, known)
+
+    def named(self) -> Iterator[tuple[ElementTree.Element, str]]:
+        """Yield the cameras with the names they have here."""
+        for camera, name in zip(self.cameras, self._names):
+            yield camera, self.ids[name]
+
+    def survey(self) -> Content:
+        """Return the frame specification, an empty Content for a checkerboard or without one."""
+        element = self.archive.root.find('CalibrationObject')
+        name = '' if element is None else element.get('FrameSpecifications', '')
+        if not name:
+            return Content()
+        return xmalab_frame.content_of(
+            Path(f'{self.archive.path}, {name}'), self.archive.member_text(name), self.settings
+        )
+
+    def images(self, camera: ElementTree.Element) -> Iterator[tuple[int, ElementTree.Element]]:
+        """Yield the calibration images of a camera with their exposures."""
+        for number, image in enumerate(camera.findall('CalibrationImage'), 1):
+            yield (self.archive.whole(image, 'Frame') + 1 if image.get('Frame') else number), image
+
+    def image_size(self, camera: ElementTree.Element) -> tuple[int, int]:
+        """Return the image size of a camera, of its sequence or its first image."""
+        sequence = camera.find('CalibrationSequence')
+        if sequence is not None:
+            return self.archive.whole(sequence, 'Width'), self.archive.whole(sequence, 'Height')
+        for image in camera.findall('CalibrationImage'):
+            if image.get('Width'):
+                return self.archive.whole(image, 'Width'), self.archive.whole(image, 'Height')
+            name = self.archive.text(image, 'Filename')
+            size = declared_size(memoryview(self.archive.member(name)))
+            try:
+                check_size(*size)
+            except DataError as error:
+                raise error.at(f'{self.archive.path}: {name}') from None
+            if min(size) > 0:
+                return size
+        if self.settings.image_size is None:
+            raise DataError(
+                f'{self.archive.path}: the project does not contain the image size of '
+                f'{self.archive.text(camera, "Name")}, --image-size WxH is needed'
+            )
+        return self.settings.image_size
+
+    def trial(self) -> ElementTree.Element:
+        """Return the chosen trial. Raises DataError."""
+        trials = {trial.get('Name', ''): trial for trial in self.archive.root.findall('Trial')}
+        try:
+            return trials[self.settings.trial or '']
+        except KeyError:
+            raise DataError(
+                f'{self.archive.path}: there is no trial {self.settings.trial!r}, only '
+                f'{", ".join(trials) or "none"}'
+            ) from None
+
+
+class _Observations:
+    """Points of a project: those of its calibration object, or those of the markers of a trial."""
+
+    def __init__(self, project: _Project, survey: Content) -> None:
+        self._project = project
+        self._settings = project.settings
+        self._files = project.archive
+        self._path = project.archive.path
+        self._survey = survey
+
+    def of_phantom(self) -> tuple[dict[str, list[Frame]], dict[str, int]]:
+        """Return the frames of the calibration object, and the names of its exposures."""
+        frames: dict[str, list[Frame]] = {}
+        exposures: dict[str, int] = {}
+        for camera, name in self._project.named():
+            size = self._project.image_size(camera)
+            for number, image in self._project.images(camera):
+                file = posixpath.basename(image.get('Filename', '').replace('\\', '/'))
+                if file not in ('', 'external') and number not in exposures.values():
+                    exposures[file] = number
+                if _is_set(image):
+                    frame = self._calibration_frame(image, name, number, size)
+                    if len(frame.target_id):
+                        frames.setdefault(name, []).append(frame)
+        if not frames:
+            raise DataError(f'{self._path}: the project has no calibrated images with points')
+        return frames, without_trivial(exposures)
+
+    def _calibration_frame(
+        self,
+        image: ElementTree.Element,
+        name: str,
+        number: int,
+        size: tuple[int, int],
+    ) -> Frame:
+        """Return the points of a calibration image that XMALab used."""
+        file = self._files.file_of(image, 'PointsDetected')
+        uv = self._files.numbers(file)
+        inlier = self._files.numbers(self._files.file_of(image, 'Inlier'))
+        survey = self._survey.survey
+        count = len(uv) if survey is None else len(survey.target_id)
+        if uv.shape[1:] != (2,) or len(uv) != count or inlier.shape != (count, 1):
+            raise DataError(
+                f'{self._path}, {file}: {len(uv)} points and {len(inlier)} inliers, but the '
+                f'calibration object has {count} beads'
+            )
+        used = (inlier[:, 0] == _INLIER) & ~(uv == NO_POINT).all(axis=1)
+        return self._frame(file, name, number, (self._bead_ids(count)[used], uv[used]), size)
+
+    def _bead_ids(self, count: int) -> np.ndarray:
+        """Return the ids of the beads in the order of the frame specification."""
+        if self._survey.names.targets:
+            return np.array(list(self._survey.names.targets.values()), dtype=np.int64)
+        return np.arange(1, count + 1)
+
+    def _frame(
+        self,
+        file: str,
+        name: str,
+        number: int,
+        points: tuple[np.ndarray, np.ndarray],
+        size: tuple[int, int],
+    ) -> Frame:
+        ids, uv = points
+        on_image = points_on_image(uv, size)
+        if not on_image.all():
+            index = int(np.argmin(on_image))
+            raise DataError(
+                f'{self._path}, {file}: the point ({uv[index, 0]:g}, {uv[index, 1]:g}) is off the '
+                f'image of {size[0]} x {size[1]} px'
+            )
+        return Frame(name, number, ids, uv, size, frame_id=f'{name}_optical')
+
+    def of_trial(self) -> tuple[dict[str, list[Frame]], dict[str, int]]:
+        """Return the frames of the markers of a trial, and the names of the markers."""
+        trial = self._project.trial()
+        markers = trial.findall('Marker')
+        if not markers:
+            raise DataError(f'{self._path}: the trial {self._settings.trial!r} has no markers')
+        labels = [
+            marker.get('Description') or default_name(self._files.whole(marker, 'ID') + 1)
+            for marker in markers
+        ]
+        known = self._settings.names.targets or self._survey.names.targets
+        ids = number_names(labels, known)
+        if len(set(labels)) < len(labels):
+            double = next(name for name in labels if labels.count(name) > 1)
+            raise DataError(f'{self._path}: two markers of the trial are called {double!r}')
+        count = len(self._project.cameras)
+        tables = []
+        for marker in markers:
+            uv = self._files.numbers(self._files.text(marker, 'FilenamePoints2D'))
+            status = self._files.numbers(self._files.text(marker, 'FilenameStatus2D'))
+            if uv.shape != (len(status), 2 * count) or status.shape[1] != count:
+                raise DataError(
+                    f'{self._path}, {self._files.text(marker, "FilenamePoints2D")}: {uv.shape[1]} '
+                    f'columns, but there are {count} cameras'
+                )
+            uv = uv.reshape(len(uv), count, 2)
+            tables.append(np.where((status > _SEEN)[..., None], uv, np.nan))
+        if len({len(table) for table in tables}) > 1:
+            raise DataError(f'{self._path}: the markers of the trial have different frames')
+        target_id = np.array([ids[name] for name in labels], dtype=np.int64)
+        points = np.stack(tables, axis=2)  # frame, camera, marker
+        frames: dict[str, list[Frame]] = {}
+        for column, (camera, name) in enumerate(self._project.named()):
+            size = self._project.image_size(camera)
+            for number, uv in enumerate(points[:, column], 1):
+                seen = ~np.isnan(uv).any(axis=1)
+                if seen.any():
+                    frame = self._frame(
+                        f'trial {self._settings.trial}, frame {number}',
+                        name,
+                        number,
+                        (target_id[seen], uv[seen]),
+                        size,
+                    )
+                    frames.setdefault(name, []).append(frame)
+        return frames, named_targets(ids)
+
+
+class _Calibration:
+    """Calibrated cameras, their poses and undistortion grids of a project."""
+
+    def __init__(self, project: _Project) -> None:
+        self._project = project
+        self._settings = project.settings
+        self._files = project.archive
+        self._path = project.archive.path
+
+    def stations(self, mm: float) -> Iterator[Station]:
+        """Yield the pose of every calibrated image."""
+        for camera, name in self._project.named():
+            for number, image in self._project.images(camera):
+                if not _is_set(image):
+                    continue
+                file = self._files.file_of(image, 'RotationMatrix')
+                rotation = self._files.numbers(file)
+                translation = self._files.numbers(
+                    self._files.file_of(image, 'TranslationVector')
+                ).ravel()
+                if rotation.shape != (3, 3) or translation.shape != (3,):
+                    raise DataError(f'{self._path}, {file}: this is not a pose')
+                check_rotation(f'{self._path}, {file}', rotation)
+                yield Station(name, number, rotation, -rotation.T @ translation * mm)
+
+    def cameras(self, stations: tuple[Station, ...]) -> Iterator[Camera]:
+        """Yield the calibrated cameras in the frame of the calibration object.
+
+        The pose is that of the reference image of the chosen trial, else of the first one that all
+        cameras are calibrated in.
+        """
+        calibrated = [(camera, name) for camera, name in self._project.named() if _is_set(camera)]
+        reference = self._reference(stations, [name for _, name in calibrated])
+        for camera, name in calibrated:
+            file = self._files.text(camera, 'CameraMatrix')
+            matrix = self._files.numbers(file)
+            if matrix.shape != (3, 3):
+                raise DataError(f'{self._path}, {file}: this is not a camera matrix')
+            check_matrix(f'{self._path}, {file}', matrix)
+            distortion: tuple[float, ...] = ()
+            if camera.get('UndistortionParameter'):
+                distortion = tuple(
+                    self._files.numbers(self._files.text(camera, 'UndistortionParameter'))
+                    .ravel()
+                    .tolist()
+                )
+            size = self._project.image_size(camera)
+            for station in stations:
+                if (station.fluoroscope, station.exposure) == (name, reference):
+                    translation = -station.rotation @ station.position_mm
+                    yield Camera(
+                        name,
+                        matrix,
+                        image_size=size,
+                        rotation=station.rotation,
+                        translation_mm=translation,
+                        distortion=distortion,
+                    )
+                    break
+            else:
+                yield Camera(name, matrix, size, distortion=distortion)
+
+    def _reference(self, stations: tuple[Station, ...], names: list[str]) -> int | None:
+        """Return the exposure whose poses the cameras have."""
+        if self._settings.trial is not None:
+            return self._files.whole(self._project.trial(), 'referenceCalibration') + 1
+        by_exposure: dict[int, set[str]] = {}
+        for station in stations:
+            by_exposure.setdefault(station.exposure, set()).add(station.fluoroscope)
+        return min((e for e, of in by_exposure.items() if of >= set(names)), default=None)
+
+    def grids(self) -> Iterator[tuple[str, np.ndarray]]:
+        """Yield the points of the undistortion grids that XMALab used, observed and reference."""
+        for camera, name in self._project.named():
+            grid = camera.find('UndistortionGrid')
+            if grid is None or not _is_set(grid, 'isComputed'):
+                continue
+            observed = self._files.numbers(self._files.file_of(grid, 'GridPointsDistorted'))
+            reference = self._files.numbers(self._files.file_of(grid, 'GridPointsReferences'))
+            inlier = self._files.numbers(self._files.file_of(grid, 'GridPointsInlier'))
+            if not observed.shape == reference.shape == (len(inlier), 2):
+                label = self._files.text(camera, 'Name')
+                raise DataError(
+                    f'{self._path}: the undistortion grid of {label} has {len(observed)}, '
+                    f'{len(reference)} and {len(inlier)} points'
+                )
+            used = inlier[:, 0] == _INLIER
+            yield name, np.hstack([observed, reference])[used]
+
+
+FORMAT = Format(
+    'xma',
+    'XMALab project',
+    parts=('observations', 'survey', 'cameras', 'stations', 'grids'),
+    recognise=recognise,
+    read=read,
+    write=None,
+    looks_like='a ZIP file with project.xml',
+    says_units=False,
+)

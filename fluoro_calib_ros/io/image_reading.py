@@ -1,0 +1,333 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Reading image files, stacks and videos, image by image."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+import struct
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from os import PathLike
+from pathlib import Path
+from typing import IO
+
+import cv2
+import numpy as np
+from tifffile import TiffFile, TiffFileError, TiffWriter
+
+from ..errors import DataError
+from ..exposures.frame import MAX_ANGLE
+from ..images.codec import as_grey, decode
+from ..images.declared_size import check_size
+from .access import os_error_reason, read_bytes
+from .cine import read_cine_header, read_cine_images
+from .csv_table import read_blocks
+from .dicom import read_dicom_header, read_dicom_images
+
+# Angles of a C-arm in the images of a stack or video, as CSV: `image,angle_deg`.
+#
+# The first image has number 1. Rows may have any order; an image without an angle, or without a
+# row, gets the mean correction.
+
+COLUMNS = ('image', 'angle_deg')
+
+
+def read_image_angles(path: str | os.PathLike[str]) -> dict[int, float]:
+    """Return the angle [rad] of each image by its number, the first one being 1.
+
+    Raises DataError for a file that cannot be read, an image that is named twice or has no
+    possible number, and a value that is no angle. Images with an empty cell are left out.
+    """
+    angles: dict[int, float] = {}
+    rows: dict[int, int] = {}
+    for block in read_blocks(path, COLUMNS):
+        numbers = block.ids('image')
+        block.require('image', numbers > 0, 'the first image is 1')
+        degrees = block.floats_or_nan('angle_deg')
+        possible = np.isnan(degrees) | (np.abs(degrees) <= np.degrees(MAX_ANGLE))
+        block.require('angle_deg', possible, 'not an angle')
+        for index, (number, angle) in enumerate(zip(numbers.tolist(), np.radians(degrees))):
+            if number in rows:
+                block.fail(index, f'image {number} is in row {rows[number]}, too')
+            rows[number] = int(block.lines[index])
+            if not np.isnan(angle):
+                angles[number] = float(angle)
+    return angles
+
+
+# The formats of images, stacks and videos, by the suffix of a file name.
+
+STACK_SUFFIXES = ('.tif', '.tiff')
+IMAGE_SUFFIXES = ('.png', *STACK_SUFFIXES, '.jpg', '.jpeg', '.bmp', '.pgm')
+# Read, but not written: recordings of Phantom cameras, and DICOM.
+CINE_SUFFIXES = ('.cine',)
+DICOM_SUFFIXES = ('.dcm', '.dicom')
+LOSSLESS_CODEC = 'FFV1'
+SUPPORTS_16_BIT_VIDEOS = tuple(map(int, cv2.__version__.split('.')[:2])) >= (4, 7)
+# Codec by which videos are written. Players know MP4 with lossy codecs only.
+VIDEO_CODECS = {'.avi': LOSSLESS_CODEC, '.mkv': LOSSLESS_CODEC, '.mp4': 'mp4v'}
+
+# Files whose images follow each other in time.
+VIDEO_SUFFIXES = (*VIDEO_CODECS, *CINE_SUFFIXES, *DICOM_SUFFIXES)
+# Files with one image or more of which a folder may hold one for each exposure.
+EXPOSURE_SUFFIXES = (*IMAGE_SUFFIXES, *DICOM_SUFFIXES)
+READ_SUFFIXES = (*IMAGE_SUFFIXES, *VIDEO_CODECS, *CINE_SUFFIXES, *DICOM_SUFFIXES)
+
+
+def suffix_of(path: str | os.PathLike[str]) -> str:
+    """Suffix of a path in lower case, with its dot."""
+    return Path(path).suffix.lower()
+
+
+def is_image_source(path: str | os.PathLike[str]) -> bool:
+    """Whether a path is a folder, or a file with the suffix of an image or a video."""
+    return os.path.isdir(path) or suffix_of(path) in READ_SUFFIXES
+
+
+def listed(suffixes: Iterable[str]) -> str:
+    """Suffixes as a text, without their dots."""
+    return ', '.join(suffix[1:] for suffix in suffixes)
+
+
+# Stacks of grey images in TIFF files: written page by page, and checked before they are read.
+#
+# tifffile writes the pages and lists them; a stack needs no more memory than one page. If a file
+# is cut off, tifffile only logs it and goes on with the remaining pages: `count_pages` refuses
+# such a file.
+
+CLASSIC_BYTES = 4 * 10**9  # size from which a file needs 64-bit offsets, with some reserve
+PAGE_OVERHEAD = 1024  # bytes
+
+# tifffile logs what count_pages says in its one sentence.
+logging.getLogger('tifffile').addHandler(logging.NullHandler())
+
+
+class StackWriter:
+    """Writes uncompressed pages into a seekable binary file; to be used in a with statement.
+
+    Parameters
+    ----------
+    file : binary file
+    pages, page_bytes : int
+        Largest number of pages and the size of one; they decide the size of the offsets.
+    """
+
+    def __init__(self, file: IO[bytes], pages: int, page_bytes: int) -> None:
+        size = pages * (page_bytes + PAGE_OVERHEAD)
+        self._writer = TiffWriter(file, bigtiff=size > CLASSIC_BYTES, byteorder='<')
+
+    def write(self, image: np.ndarray) -> None:
+        """Add a page (h, w) of uint8 or uint16."""
+        self._writer.write(
+            image, photometric='minisblack', metadata=None, software=False, contiguous=False
+        )
+
+    def __enter__(self) -> StackWriter:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._writer.close()
+
+
+def count_pages(path: str | PathLike[str]) -> int:
+    """Number of pages of a TIFF file.
+
+    Raises DataError for a file that cannot be read, is no TIFF file, is cut off or is damaged, and
+    for pages that are too large.
+    """
+    try:
+        with TiffFile(path) as file:
+            count = len(file.pages)
+            complete = _ends_with_last_page(file)
+            size = max(
+                ((int(page.imagewidth), int(page.imagelength)) for page in file.pages),
+                key=math.prod,
+                default=(0, 0),
+            )
+    except OSError as error:
+        raise DataError(f'cannot be read ({os_error_reason(error)})', at=path) from None
+    except (TiffFileError, struct.error, ValueError, TypeError, LookupError, OverflowError):
+        count = 0
+        complete = False
+    if not count or not complete:
+        raise DataError('this is no TIFF file, or it is cut off or damaged', at=path)
+    try:
+        check_size(*size)
+    except DataError as error:
+        raise error.at(path) from None
+    return count
+
+
+def _ends_with_last_page(file: TiffFile) -> bool:
+    """Whether the last page that tifffile found is the last one by the file itself.
+
+    Its link to the next page is 0 then.
+    """
+    position = file.pages.next_page_offset
+    if position is None:
+        return False
+    file.filehandle.seek(position)
+    link = file.filehandle.read(file.tiff.offsetsize)
+    return link == bytes(file.tiff.offsetsize)
+
+
+VIDEO_SIZE = (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT)
+MAX_BATCH_BYTES = 64_000_000  # of pages that are read at once
+# Fraction of the frames by which the frame count of a video may be wrong; some containers only
+# hold an estimate.
+FRAME_COUNT_TOLERANCE = 0.01
+GREY_16 = b'Y1\0\x10'  # OpenCV's name of the pixel format of a video of 16 bits
+
+# Silence FFmpeg: errors are reported here, in one sentence.
+os.environ.setdefault('OPENCV_FFMPEG_LOGLEVEL', '-8')
+
+
+@dataclass(frozen=True)
+class ImageSource:
+    """Images of one file.
+
+    Attributes
+    ----------
+    kind : {'image', 'stack', 'video'}
+    count : int
+        Number of images; of a video as its header states it.
+    images : iterator
+        Place in words, for error messages, and image (h, w) of uint8 or uint16. It raises
+        DataError for an image that cannot be read.
+    frame_rate : float or None
+        Of a video [Hz].
+    """
+
+    kind: str
+    count: int
+    images: Iterator[tuple[str, np.ndarray]]
+    frame_rate: float | None = None
+
+
+def open_images(path: Path) -> ImageSource:
+    """Open an image file, a stack or a video. Raises DataError if it cannot be read."""
+    suffix = suffix_of(path)
+    if suffix in VIDEO_CODECS:
+        return _open_video(path)
+    if suffix in CINE_SUFFIXES:
+        header = read_cine_header(path)
+        images = read_cine_images(path, header)
+        return ImageSource('video', len(header.offsets), images, header.frame_rate)
+    if suffix in DICOM_SUFFIXES:
+        return _open_dicom(path)
+    if suffix not in IMAGE_SUFFIXES:
+        raise DataError(
+            f'the ending {suffix or "(none)"} is none of an image or a video '
+            f'({listed(READ_SUFFIXES)})',
+            at=path,
+        )
+    pages = count_pages(path) if suffix in STACK_SUFFIXES else 1
+    if pages > 1:
+        check_name(path)
+        return ImageSource('stack', pages, _read_pages(path, pages))
+    return ImageSource('image', 1, _read_image(path))
+
+
+def _open_dicom(path: Path) -> ImageSource:
+    header = read_dicom_header(path)
+    images = read_dicom_images(path, header)
+    if header.count == 1:
+        return ImageSource('image', 1, images)
+    kind = 'stack' if header.frame_rate is None else 'video'
+    return ImageSource(kind, header.count, images, header.frame_rate)
+
+
+def check_name(path: Path) -> None:
+    """Raise DataError for a name that is no UTF-8 text: OpenCV would end the process."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        raise DataError('the name is not UTF-8 text, rename it', at=path) from None
+
+
+def _read_image(path: Path) -> Iterator[tuple[str, np.ndarray]]:
+    content = read_bytes(path)
+    try:
+        image = decode(content)
+    except DataError as error:
+        raise error.at(path) from None
+    yield str(path), image
+
+
+def _read_pages(path: Path, pages: int) -> Iterator[tuple[str, np.ndarray]]:
+    """Read the pages of a stack in batches: OpenCV goes through the file anew for each."""
+    done = 0
+    batch = 1
+    while done < pages:
+        wanted = min(batch, pages - done)
+        try:
+            ok, images = cv2.imreadmulti(str(path), done, wanted, flags=cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            ok = False
+            images = ()
+        if not ok or len(images) != wanted:
+            raise DataError(
+                f'page {done + len(images) + 1} of {pages} is damaged or cut off', at=path
+            )
+        for image in images:
+            done += 1
+            where = f'{path}, page {done}'
+            try:
+                yield where, as_grey(image)
+            except DataError as error:
+                raise error.at(where) from None
+        batch = max(1, MAX_BATCH_BYTES // images[0].nbytes)
+
+
+def _open_video(path: Path) -> ImageSource:
+    if not os.path.isfile(path):
+        read_bytes(path)  # raises DataError with the reason
+    check_name(path)
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    if not video.isOpened():
+        raise DataError('this is no video that can be read, or it is damaged', at=path)
+    try:
+        check_size(*(int(video.get(key)) for key in VIDEO_SIZE))
+    except DataError as error:
+        raise error.at(path) from None
+    frame_rate = video.get(cv2.CAP_PROP_FPS)
+    count = max(0, round(video.get(cv2.CAP_PROP_FRAME_COUNT)))
+    if not 0 < frame_rate < 1e6:
+        raise DataError('the video does not state its frame rate', at=path)
+    # A damaged video may have none, which is -1.
+    code = int(video.get(cv2.CAP_PROP_CODEC_PIXEL_FORMAT)) % 2**32
+    pixel_format = code.to_bytes(4, 'little')
+    if pixel_format == GREY_16:
+        video.set(cv2.CAP_PROP_CONVERT_RGB, 0)
+    elif pixel_format[:3] == GREY_16[:3]:
+        raise DataError(
+            f'the video has grey values of {pixel_format[3]} bits, only 8 and 16 are read', at=path
+        )
+    return ImageSource('video', count, _read_frames(path, video, count), frame_rate)
+
+
+def _read_frames(
+    path: Path, video: cv2.VideoCapture, count: int
+) -> Iterator[tuple[str, np.ndarray]]:
+    number = 0
+    try:
+        while True:
+            ok, frame = video.read()
+            if not ok:
+                break
+            number += 1
+            # The colours of a grey video are equal except for rounding. Others are converted to
+            # grey by their luminance.
+            grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
+            yield f'{path}, frame {number}', grey
+    finally:
+        video.release()
+    if not number or number < count - 1 - FRAME_COUNT_TOLERANCE * count:
+        raise DataError(
+            f'only {number} of {count} frames can be read, the video is damaged or cut off',
+            at=path,
+        )

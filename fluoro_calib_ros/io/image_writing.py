@@ -1,0 +1,391 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Writing image files, stacks and videos, image by image.
+
+A file appears under its name only once it is complete.
+"""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import cast
+
+import cv2
+import numpy as np
+
+from ..errors import DataError
+from ..images.codec import encode
+from ..images.corrector import ImageCorrector
+from .access import make_folder, os_error_reason
+from .atomic import atomic_file, sync_folder, write_bytes
+from .image_reading import (
+    CINE_SUFFIXES,
+    DICOM_SUFFIXES,
+    IMAGE_SUFFIXES,
+    LOSSLESS_CODEC,
+    READ_SUFFIXES,
+    STACK_SUFFIXES,
+    SUPPORTS_16_BIT_VIDEOS,
+    VIDEO_CODECS,
+    ImageSource,
+    StackWriter,
+    check_name,
+    listed,
+    open_images,
+    suffix_of,
+)
+
+# Called with the number of images that are done, and their total.
+Progress = Callable[[int, int], None]
+
+
+def write_images(out: Path, source: ImageSource, progress: Progress) -> int:
+    """Write the images of a source to one file; returns their number.
+
+    progress is called after every image. Raises DataError if the file cannot be written, if its
+    format cannot hold the images, and as the source.
+    """
+    suffix = suffix_of(out)
+    if suffix in VIDEO_CODECS and source.kind == 'video':
+        return write_video(out, source, progress)
+    if suffix in STACK_SUFFIXES:
+        return _write_stack(out, source, progress)
+    if source.kind != 'image':
+        possible: tuple[str, ...] = STACK_SUFFIXES
+        if source.kind == 'video':
+            possible = (*STACK_SUFFIXES, *VIDEO_CODECS)
+        raise DataError(
+            f'{out}: a {source.kind} cannot be written as {suffix or "a file without ending"}, '
+            f'use {listed(possible)}'
+        )
+    if suffix not in IMAGE_SUFFIXES:
+        raise DataError(
+            f'{out}: the ending {suffix or "(none)"} is none of an image '
+            f'({listed(IMAGE_SUFFIXES)})'
+        )
+    _, image = next(source.images)
+    try:
+        content = encode(image, suffix)
+    except DataError as error:
+        raise error.at(out) from None
+    write_bytes(out, content)
+    progress(1, 1)
+    return 1
+
+
+def _write_stack(out: Path, source: ImageSource, progress: Progress) -> int:
+    """Write an uncompressed TIFF file; returns the number of pages."""
+    _, image = next(source.images)
+    with (
+        atomic_file(out) as file,
+        StackWriter(file, max(source.count, 1), image.nbytes) as writer,
+    ):
+        writer.write(image)
+        number = 1
+        progress(number, source.count)
+        for _, image in source.images:
+            writer.write(image)
+            number += 1
+            progress(number, source.count)
+    return number
+
+
+def write_video(out: Path, source: ImageSource, progress: Progress) -> int:
+    """Write a video; returns the number of frames. Raises as write_images."""
+    _, image = next(source.images)
+    with temporary_path(out) as temporary:
+        video = _open_video(out, temporary, image, cast(float, source.frame_rate))
+        number = 0
+        try:
+            video.write(image)
+            number += 1
+            progress(number, source.count)
+            for _, image in source.images:
+                video.write(image)
+                number += 1
+                progress(number, source.count)
+        finally:
+            video.release()
+        _check_written(out, temporary, number)
+        os.replace(temporary, out)
+        sync_folder(out.absolute().parent)
+    return number
+
+
+def _open_video(
+    out: Path, temporary: Path, image: np.ndarray, frame_rate: float
+) -> cv2.VideoWriter:
+    """Open a writer for images like this one."""
+    height, width = image.shape
+    is_16_bit = image.dtype == np.uint16
+    codec = VIDEO_CODECS[suffix_of(out)]
+    if width % 2 or height % 2:
+        raise DataError(
+            f'{out}: a video cannot have images of {width} x {height} px, both must be even'
+        )
+    if is_16_bit and codec != LOSSLESS_CODEC:
+        raise DataError(
+            f'{out}: grey values of 16 bits cannot be written as {suffix_of(out)[1:]}, '
+            'use avi or mkv'
+        )
+    check_name(out.absolute())
+    # OpenCV 4.6 knows no depth: it writes 8 bits.
+    depth = [cv2.VIDEOWRITER_PROP_DEPTH, cv2.CV_16U] if is_16_bit else []
+    video = cv2.VideoWriter(
+        str(temporary),
+        cv2.CAP_FFMPEG,
+        cv2.VideoWriter_fourcc(*codec),
+        frame_rate,
+        (width, height),
+        [cv2.VIDEOWRITER_PROP_IS_COLOR, 0, *depth],
+    )
+    if not video.isOpened() and is_16_bit and not SUPPORTS_16_BIT_VIDEOS:
+        raise DataError(
+            f'{out}: this version of OpenCV ({cv2.__version__}) cannot write videos of 16 bits, '
+            'write a TIFF stack'
+        )
+    if not video.isOpened():
+        raise DataError(f'{out}: cannot be written')
+    return video
+
+
+def _check_written(out: Path, path: Path, count: int) -> None:
+    """Raise DataError unless a video is complete: OpenCV does not report a full disk."""
+    video = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
+    complete = video.isOpened() and video.get(cv2.CAP_PROP_FRAME_COUNT) >= count - 1
+    video.release()
+    if not complete:
+        raise DataError(f'{out}: cannot be written (is the disk full?)')
+    with open(path, 'rb') as file:
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def temporary_path(out: Path) -> Iterator[Path]:
+    """Path next to a file or folder, with its suffix; whatever is there at the end is removed.
+
+    An OSError in the block becomes a DataError that names `out`.
+    """
+    path = out.absolute().parent / f'.{out.stem[:100]}.{secrets.token_hex(8)}.tmp{out.suffix}'
+    try:
+        yield path
+    except OSError as error:
+        raise DataError(f'{out}: cannot be written ({os_error_reason(error)})') from None
+    finally:
+        if path.is_dir():
+            shutil.rmtree(path, ignore_errors=True)
+        else:
+            with suppress(OSError):
+                path.unlink()
+
+
+# Correction of image files, stacks and videos.
+#
+# Images are grey and keep their 8 or 16 bits; if the new file cannot hold them, an error is
+# raised and nothing is written. Videos are written without loss (FFV1), except for MP4.
+
+
+@dataclass(frozen=True)
+class CorrectedImages:
+    """What was corrected.
+
+    Attributes
+    ----------
+    kind : {'image', 'stack', 'video', 'folder'}
+    images : int
+        Number of images, pages and frames.
+    files : int
+    passed_over : tuple of str
+        Names of the files of a folder that are no images.
+    failed : tuple of str
+        What is wrong with the files of a folder that could not be corrected.
+    """
+
+    kind: str
+    images: int
+    files: int = 1
+    passed_over: tuple[str, ...] = ()
+    failed: tuple[str, ...] = ()
+
+
+# Gives the corrector of an image from its number, the first being 1.
+Correctors = Callable[[int], ImageCorrector]
+
+
+def correct_images(
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    corrector: ImageCorrector | Correctors,
+    progress: Progress | None = None,
+) -> CorrectedImages:
+    """Correct an image file, a stack or a video.
+
+    Parameters
+    ----------
+    source, out : path
+    corrector : ImageCorrector or callable
+        Of all images, or that gives the one of each image from its number, the first being 1.
+    progress : callable, optional
+        Called after every image with the number of images that are done, and their total.
+
+    Returns
+    -------
+    CorrectedImages
+
+    Raises
+    ------
+    DataError
+        If the source cannot be read, is damaged, or is no grey image of the size of the
+        calibration; if `out` cannot be written, or its format cannot hold the images. `out` is
+        left as it was.
+    """
+    source = Path(source)
+    out = Path(out)
+    check_apart(source, out)
+    if out.is_dir():
+        raise DataError(f'this is a folder, but {source} is a file', at=out)
+    images = open_images(source)
+    correctors = (lambda number: corrector) if isinstance(corrector, ImageCorrector) else corrector
+    written = write_images(out, _corrected(images, correctors), progress or _no_progress)
+    return CorrectedImages(images.kind, written)
+
+
+def check_apart(source: Path, out: Path) -> None:
+    """Raise DataError where the output is the source, or has no folder to be in."""
+    if source.exists() and out.exists() and os.path.samefile(source, out):
+        raise DataError('this is the source itself, corrected images need another name', at=out)
+    if not out.absolute().parent.is_dir():
+        raise DataError(f'cannot be written, there is no folder {out.absolute().parent}', at=out)
+
+
+def _no_progress(done: int, total: int) -> None:
+    """Ignore the progress."""
+
+
+def _corrected(source: ImageSource, correctors: Correctors) -> ImageSource:
+    """A source of the corrected images of another."""
+    return replace(source, images=_corrected_images(source, correctors))
+
+
+def _corrected_images(
+    source: ImageSource, correctors: Correctors
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Corrected images, all in the same array."""
+    out = None
+    for number, (where, image) in enumerate(source.images, 1):
+        corrector = correctors(number)
+        try:
+            corrector.check(image)
+        except DataError as error:
+            raise error.at(where) from None
+        if out is None or out.dtype != image.dtype:
+            out = np.empty(corrector.shape, dtype=image.dtype)
+        yield where, corrector.correct(image, out)
+
+
+# Folders of images and videos, and new folders like them that appear as a whole.
+
+# Suffixes that images get where their own format is read but not written.
+_WRITTEN_AS = dict.fromkeys(CINE_SUFFIXES, '.avi') | dict.fromkeys(DICOM_SUFFIXES, '.tif')
+
+
+@dataclass(frozen=True)
+class ImageFolder:
+    """Files with images in a folder.
+
+    Attributes
+    ----------
+    path : Path
+    files : tuple of Path
+        Images and videos, relative to the folder, in the order of their names.
+    passed_over : tuple of str
+        Other files.
+    recursive : bool
+        Whether the folders in the folder belong to it.
+    """
+
+    path: Path
+    files: tuple[Path, ...]
+    passed_over: tuple[str, ...]
+    recursive: bool
+
+    @property
+    def written(self) -> tuple[Path, ...]:
+        """Names of new files for `files`."""
+        return tuple(
+            path.with_suffix(_WRITTEN_AS.get(suffix_of(path), path.suffix)) for path in self.files
+        )
+
+
+def list_images(folder: Path, recursive: bool = False) -> ImageFolder:
+    """Return the files with images in a folder, and in the folders in it if asked for.
+
+    Raises DataError where there are none, or two would be written under one name.
+    """
+    found = (path for path in folder.rglob('*')) if recursive else folder.iterdir()
+    files = sorted(path.relative_to(folder) for path in found if path.is_file())
+    images = tuple(path for path in files if suffix_of(path) in READ_SUFFIXES)
+    if not images:
+        raise DataError(
+            f'{folder}: there are no images in this folder ({listed(IMAGE_SUFFIXES)}), and no '
+            'videos'
+        )
+    others = tuple(str(path) for path in files if path not in set(images))
+    out = ImageFolder(folder, images, others, recursive)
+    by_name: dict[Path, Path] = {}
+    for path, name in zip(images, out.written):
+        if name in by_name:
+            raise DataError(
+                f'{folder}: {by_name[name]} and {path} would both be written as {name}, rename one'
+            )
+        by_name[name] = path
+    return out
+
+
+@contextmanager
+def folder_like(out: Path, source: ImageFolder) -> Iterator[Path]:
+    """A temporary folder with the folders of another one; at the end its files move to `out`.
+
+    Files of the same names in `out` are replaced, other ones stay. After an error, `out` is as it
+    was.
+
+    Raises
+    ------
+    DataError
+        Where `out` is a file, the source itself, or inside of it and would be read as a part of
+        it, and where a file would replace a folder.
+    """
+    check_apart(source.path, out)
+    if out.exists() and not out.is_dir():
+        raise DataError(f'{out}: this is a file, but {source.path} is a folder')
+    if source.path.resolve() in out.resolve().parents and source.recursive:
+        raise DataError(f'{out}: this is inside of {source.path}, which is read with its folders')
+    with temporary_path(out) as temporary:
+        make_folder(temporary)
+        folders = sorted({path.parent for path in source.files})
+        for folder in folders:
+            (temporary / folder).mkdir(parents=True, exist_ok=True)
+        yield temporary
+        _move(temporary, out, folders, source.written)
+
+
+def _move(temporary: Path, out: Path, folders: Sequence[Path], names: Sequence[Path]) -> None:
+    """Move the files that were written to their place, where all of them can be."""
+    names = [name for name in names if (temporary / name).exists()]
+    make_folder(out)
+    for name in names:  # before any file is moved: all or nothing
+        if (out / name).is_dir():
+            raise DataError(f'{out / name}: cannot be written, this is a folder')
+    for folder in folders:
+        (out / folder).mkdir(parents=True, exist_ok=True)
+    for name in names:
+        os.replace(temporary / name, out / name)
+    for folder in folders:
+        sync_folder(out / folder)

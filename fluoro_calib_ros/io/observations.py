@@ -1,0 +1,625 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Observations as CSV: `fluoroscope,exposure,target_id,u,v[,sigma][,angle_deg]`.
+
+u, v and sigma are in pixels; angle_deg is the angle of the C-arm in degrees, the same in all rows
+of an exposure of a fluoroscope, or empty.
+
+Files of a lab may have names instead of ids in the first three columns.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.base import CorrectionStatus
+from ..correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCalibration
+from ..errors import DataError
+from ..exposures.columns import first_repeated, is_positive
+from ..exposures.frame import MAX_ANGLE, Frame, angle_in_degrees, angles_of, points_on_image
+from ..exposures.names import Names, safe_names, without_trivial
+from ..exposures.strays import few
+from .access import PathLike, check_safe_name
+from .atomic import atomic_file
+from .csv_table import Block, NamedColumn, format_float, read_blocks, write_rows
+
+ANGLE = 'angle_deg'
+CORRECTED_BY = 'corrected_by'  # id of the calibration, of image points that are corrected already
+COLUMNS = ('fluoroscope', 'exposure', 'target_id', 'u', 'v')
+
+
+@dataclass(frozen=True)
+class _Rows:
+    """Rows of the file as arrays.
+
+    Attributes
+    ----------
+    code : (n,) ndarray of int
+        Index of the fluoroscope in the order of first occurrence.
+    exposure, target_id : (n,) ndarray of int
+    uv : (n, 2) ndarray
+        [px]
+    sigma : (n,) ndarray
+        [px], NaN where unknown.
+    angle : (n,) ndarray
+        Of the C-arm [degrees], NaN where unknown.
+    line : (n,) ndarray of int
+        Number of the row in the file.
+    """
+
+    code: NDArray[np.int64]
+    exposure: NDArray[np.int64]
+    target_id: NDArray[np.int64]
+    uv: NDArray[np.float64]
+    sigma: NDArray[np.float64]
+    angle: NDArray[np.float64]
+    line: NDArray[np.int64]
+
+    def __getitem__(self, rows: np.ndarray) -> _Rows:
+        return _Rows(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+
+def read_observations_csv(
+    path: PathLike, image_size: tuple[int, int] | None = None
+) -> dict[str, list[Frame]]:
+    """Read the frames of a CSV file, fluoroscopes by name and exposures by number.
+
+    The rows of a frame may be anywhere in the file. sigma is given for all targets of a frame or
+    for none.
+
+    Parameters
+    ----------
+    path : path-like
+    image_size : (int, int), optional
+        Width and height of the images of all fluoroscopes [px]; required, as the file does not
+        contain it.
+
+    Returns
+    -------
+    dict of str to list of Frame
+
+    Raises
+    ------
+    DataError
+        For text that is not a number, a point off the image, and a target that occurs twice in a
+        frame. The message names the row.
+    """
+    return _read(path, image_size, _Columns(None))[0]
+
+
+def read_named_observations(
+    path: PathLike, image_size: tuple[int, int] | None, known: Names
+) -> tuple[dict[str, list[Frame]], Names, str]:
+    """Read the frames of a CSV file in which fluoroscopes, exposures and targets may have names.
+
+    known are names whose ids are given. Returns the frames by id of the fluoroscope, the names of
+    the file, and a sentence about the few points that are off the image and left out, or ''.
+    Raises DataError as `read_observations_csv` does.
+    """
+    columns = _Columns(known)
+    frames, stray = _read(path, image_size, columns)
+    return frames, columns.names(), stray
+
+
+class _Columns:
+    """What was read of the columns with names; without known names they are ids."""
+
+    def __init__(self, known: Names | None) -> None:
+        self.codes: dict[str, int] = {}
+        self.known = known
+        self.exposure = NamedColumn('exposure', None if known is None else known.exposures)
+        self.target = NamedColumn('target_id', None if known is None else known.targets)
+
+    def fluoroscopes(self) -> list[str]:
+        """Return the ids of the fluoroscopes, in the order of their codes."""
+        if self.known is None:
+            return list(self.codes)
+        ids = safe_names(self.codes, self.known.fluoroscopes)
+        return [ids[name] for name in self.codes]
+
+    def names(self) -> Names:
+        """Return the names that are not ids themselves."""
+        pairs = zip(self.codes, self.fluoroscopes())
+        return Names(
+            without_trivial(self.target.ids()),
+            without_trivial(self.exposure.ids()),
+            {name: identity for name, identity in pairs if name != identity},
+        )
+
+
+def _read(
+    path: PathLike, image_size: tuple[int, int] | None, columns: _Columns
+) -> tuple[dict[str, list[Frame]], str]:
+    if image_size is None:
+        raise DataError(
+            f'{path}: a CSV file does not contain the image size, --image-size WxH is needed'
+        )
+    blocks = read_blocks(path, COLUMNS)
+    rows = _concatenate([_parse(block, columns) for block in blocks])
+    rows, stray = _on_image(path, rows, image_size, columns.known is not None)
+    rows = replace(
+        rows,
+        exposure=columns.exposure.numbers(rows.exposure),
+        target_id=columns.target.numbers(rows.target_id),
+    )
+    names = columns.fluoroscopes()
+    frames: dict[str, list[Frame]] = {name: [] for name in sorted(names)}
+    for of_frame in _by_frame(rows, names):
+        name = names[of_frame.code[0]]
+        frames[name].append(_frame(path, name, of_frame, image_size))
+    return {name: of_one for name, of_one in frames.items() if of_one}, stray
+
+
+def _on_image(
+    path: PathLike, rows: _Rows, image_size: tuple[int, int], leave_out: bool
+) -> tuple[_Rows, str]:
+    """Return the rows without a few that are off the image, and a sentence about these.
+
+    Raises DataError where they are many, or are not to be left out.
+    """
+    off = ~points_on_image(rows.uv, image_size)
+    if not off.any():
+        return rows, ''
+    first = int(np.argmax(off))
+    u, v = rows.uv[first]
+    sentence = (
+        f'{path}, row {rows.line[first]}: the point ({u:g}, {v:g}) is off the image of '
+        f'{image_size[0]} x {image_size[1]} px'
+    )
+    if not leave_out or not few(int(off.sum()), len(off)):
+        raise DataError(sentence)
+    more = f', and {off.sum() - 1} more' if off.sum() > 1 else ''
+    return rows[~off], f'not used: {sentence}{more}'
+
+
+def write_observations_csv(
+    path: PathLike,
+    frames: Mapping[str, Sequence[Frame]] | Iterable[Frame],
+    names: Names | None = None,
+    corrected_by: Mapping[str, str] | None = None,
+) -> None:
+    """Write frames, by fluoroscope or as a sequence, to a CSV file.
+
+    The file has a column sigma if any frame has sigma, and angle_deg if any has an angle. Names
+    are written instead of ids in a column whose ids all have one. corrected_by are the ids of the
+    calibrations that corrected the image points, a further column. Raises DataError where the file
+    cannot be written.
+    """
+    if isinstance(frames, Mapping):
+        frames = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
+    frames = list(frames)
+    with_sigma = any(frame.sigma is not None for frame in frames)
+    with_angle = any(frame.angle is not None for frame in frames)
+    labels = _labels(frames, names or Names())
+    with atomic_file(path, 'w') as file:
+        header = COLUMNS + ('sigma',) * with_sigma + (ANGLE,) * with_angle
+        write_rows(file, [header + (CORRECTED_BY,) * bool(corrected_by)])
+        for frame in frames:
+            check_safe_name(frame.fluoroscope, path)
+            last = [corrected_by.get(frame.fluoroscope, '')] if corrected_by else []
+            rows = _csv_rows(frame, with_sigma, with_angle, labels)
+            write_rows(file, ([*row, *last] for row in rows))
+
+
+def corrections_of(path: PathLike) -> dict[str, str]:
+    """Return by fluoroscope the ids of calibrations that corrected the points of a CSV file.
+
+    {} for points as they were observed. Raises DataError.
+    """
+    found: dict[str, str] = {}
+    for block in read_blocks(path, COLUMNS):
+        if CORRECTED_BY not in block:
+            return {}
+        found |= dict(zip(block.strings('fluoroscope'), block.strings(CORRECTED_BY)))
+    return {name: identity for name, identity in found.items() if identity}
+
+
+@dataclass(frozen=True)
+class _Labels:
+    """Names to write instead of ids, empty for a column that is written as ids."""
+
+    fluoroscopes: Mapping[str, str]
+    exposures: Mapping[int, str]
+    targets: Mapping[int, str]
+
+
+def _labels(frames: Sequence[Frame], names: Names) -> _Labels:
+    """Return the names of the columns whose ids all have one."""
+    exposures = names.exposure_names()
+    targets = names.target_names()
+    if not all(frame.number in exposures for frame in frames):
+        exposures = {}
+    if not all(int(i) in targets for frame in frames for i in frame.target_id):
+        targets = {}
+    return _Labels(names.fluoroscope_names(), exposures, targets)
+
+
+def _parse(block: Block, columns: _Columns) -> _Rows:
+    """Return a block of the file as arrays; new names are added to columns."""
+    names = block.strings('fluoroscope')
+    codes = columns.codes
+    for name in dict.fromkeys(names):
+        if name not in codes:
+            if columns.known is None or not name:
+                check_safe_name(name, f'{block.path}, row {block.lines[names.index(name)]}')
+            codes[name] = len(codes)
+    uv = np.column_stack([block.floats('u'), block.floats('v')])
+    sigma = np.full(len(uv), np.nan)
+    if 'sigma' in block:
+        sigma = block.floats_or_nan('sigma')
+        is_empty = np.array([cell == '' for cell in block.strings('sigma')])
+        block.require('sigma', is_empty | is_positive(sigma), 'not a finite number above 0')
+    angle = np.full(len(uv), np.nan)
+    if ANGLE in block:
+        angle = block.floats_or_nan(ANGLE)
+        block.require(
+            ANGLE, np.isnan(angle) | (np.abs(angle) <= np.degrees(MAX_ANGLE)), 'not an angle'
+        )
+    code = np.array([codes[name] for name in names])
+    exposure = columns.exposure.read(block)
+    return _Rows(
+        code,
+        exposure,
+        target_id=columns.target.read(block),
+        uv=uv,
+        sigma=sigma,
+        angle=angle,
+        line=block.lines,
+    )
+
+
+def _concatenate(parts: Sequence[_Rows]) -> _Rows:
+    return _Rows(
+        *(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(_Rows))
+    )
+
+
+def _by_frame(rows: _Rows, names: Sequence[str]) -> Iterator[_Rows]:
+    """Yield the rows of each frame, by name of the fluoroscope and number of the exposure.
+
+    Within a frame the order of the file is kept.
+    """
+    rank = np.argsort(np.argsort(names))[rows.code]
+    order = np.lexsort((rows.exposure, rank))
+    ordered = rows[order]
+    new_code = np.diff(ordered.code, prepend=-1)
+    new_exposure = np.diff(ordered.exposure, prepend=-1)
+    starts = np.flatnonzero(new_code | new_exposure)
+    for of_frame in np.split(order, starts[1:]):
+        yield rows[of_frame]
+
+
+def _frame(path: PathLike, name: str, rows: _Rows, image_size: tuple[int, int]) -> Frame:
+    """Return the frame of its rows. Raises DataError."""
+    where = f'of fluoroscope {name}, exposure {rows.exposure[0]}'
+    repeated = first_repeated(rows.target_id)
+    if repeated is not None:
+        first, second = repeated
+        raise DataError(
+            f'{path}, row {rows.line[second]}: target {rows.target_id[second]} {where} is already '
+            f'given in row {rows.line[first]}'
+        )
+    unknown = np.isnan(rows.sigma)
+    if unknown.any() and not unknown.all():
+        row = np.argmax(unknown)
+        raise DataError(
+            f'{path}, row {rows.line[row]}: sigma of target {rows.target_id[row]} {where} is '
+            f'empty, but other targets of this exposure have one'
+        )
+    width, height = image_size
+    return Frame(
+        name,
+        int(rows.exposure[0]),
+        target_id=rows.target_id,
+        uv=rows.uv,
+        image_size=(int(width), int(height)),
+        sigma=None if unknown.all() else rows.sigma,
+        frame_id=f'{name}_optical',
+        angle=_angle(path, where, rows),
+    )
+
+
+def _angle(path: PathLike, where: str, rows: _Rows) -> float | None:
+    """Return the angle [rad] of the rows of a frame, None without one. Raises DataError."""
+    differs = ~((rows.angle == rows.angle[0]) | np.isnan(rows.angle) & np.isnan(rows.angle[0]))
+    if differs.any():
+        row = np.argmax(differs)
+        raise DataError(
+            f'{path}, row {rows.line[row]}: {ANGLE} {where} is {rows.angle[row]:g}, '
+            f'but {rows.angle[0]:g} in row {rows.line[0]}'
+        )
+    return None if np.isnan(rows.angle[0]) else float(np.radians(rows.angle[0]))
+
+
+def _csv_rows(
+    frame: Frame, with_sigma: bool, with_angle: bool, labels: _Labels
+) -> Iterator[list[Any]]:
+    fluoroscope = labels.fluoroscopes.get(frame.fluoroscope, frame.fluoroscope)
+    exposure = labels.exposures.get(int(frame.number), int(frame.number))
+    columns: list[Iterable[Any]] = [
+        [labels.targets.get(i, i) for i in np.asarray(frame.target_id).tolist()],
+        *(map(repr, np.asarray(column, float).tolist()) for column in frame.uv.T),
+    ]
+    if with_sigma:
+        sigma = np.full(len(frame.target_id), np.nan) if frame.sigma is None else frame.sigma
+        columns.append(map(format_float, sigma))
+    if with_angle:
+        angle = np.nan if frame.angle is None else angle_in_degrees(frame.angle)
+        columns.append([format_float(angle)] * len(frame.target_id))
+    return ([fluoroscope, exposure, *cells] for cells in zip(*columns))
+
+
+# Observations of images as CSV: `fluoroscope,exposure,target_id,u,v,sigma,overlapped`.
+#
+# Markers that were followed have a further column `doubtful`, and images with the angle of a
+# C-arm have `angle_deg` as the last one.
+
+DECIMALS = 4  # of a pixel, and of its standard deviation
+
+
+def write_extracted(
+    path: str | os.PathLike[str],
+    frames: Iterable[tuple[Frame, np.ndarray]],
+    target_names: Mapping[int, str],
+) -> None:
+    """Write frames, each with its flags (n,) of overlapped beads, to a CSV file.
+
+    Beads with a name are written by it. Raises DataError where the file cannot be written.
+    """
+    flagged = [(frame, [overlapped]) for frame, overlapped in frames]
+    _write(path, flagged, ('overlapped',), target_names)
+
+
+def write_markers(
+    path: str | os.PathLike[str],
+    frames: Iterable[tuple[Frame, np.ndarray, np.ndarray]],
+    target_names: Mapping[int, str],
+) -> None:
+    """Write frames, with flags (n,) of overlapped markers and of doubtful ids, to a CSV file.
+
+    Markers with a name are written by it. Raises DataError where the file cannot be written.
+    """
+    flagged = [(frame, [overlapped, doubtful]) for frame, overlapped, doubtful in frames]
+    _write(path, flagged, ('overlapped', 'doubtful'), target_names)
+
+
+def _write(
+    path: str | os.PathLike[str],
+    frames: Sequence[tuple[Frame, Sequence[np.ndarray]]],
+    flags: tuple[str, ...],
+    target_names: Mapping[int, str],
+) -> None:
+    """Write frames with their flags, and with the angle if any frame has one."""
+    with_angle = any(frame.angle is not None for frame, _ in frames)
+    with atomic_file(path, 'w') as file:
+        write_rows(file, [(*COLUMNS, 'sigma', *flags, *(ANGLE,) * with_angle)])
+        for frame, values in frames:
+            angle = '' if frame.angle is None else format_float(angle_in_degrees(frame.angle))
+            rows = _rows(path, frame, values, target_names)
+            write_rows(file, ([*row, angle] if with_angle else row for row in rows))
+
+
+def _rows(
+    path: str | os.PathLike[str],
+    frame: Frame,
+    flags: Sequence[np.ndarray],
+    target_names: Mapping[int, str],
+) -> Iterator[list[object]]:
+    """Yield the rows of a frame, with flags (n,) as the last columns."""
+    check_safe_name(frame.fluoroscope, path)
+    assert frame.sigma is not None
+    numbers = np.round(np.column_stack([frame.uv, frame.sigma]), DECIMALS).tolist()
+    flagged = np.column_stack(flags).astype(int).tolist()
+    for target, row, flag in zip(frame.target_id.tolist(), numbers, flagged):
+        yield [frame.fluoroscope, frame.number, target_names.get(target, target), *row, *flag]
+
+
+# Image points in a CSV file, which are corrected and written with all their other columns.
+
+STATUS = tuple(status.name for status in CorrectionStatus)
+ADDED_COLUMNS = ('u_corrected', 'v_corrected', 'sigma', 'status')
+
+
+@dataclass(frozen=True)
+class PointsFile:
+    """Image points of a CSV file.
+
+    Attributes
+    ----------
+    path : path-like
+    header : list of str
+    rows : list of list of str
+        All cells as text.
+    lines : (n,) ndarray of int
+        Number of each row in the file.
+    uv : (n, 2) ndarray
+        [px], NaN where a cell is empty or nan.
+    sigma : (n,) ndarray or None
+        [px], NaN where a cell is empty; None without such a column.
+    fluoroscope : (n,) ndarray of str or None
+        None without such a column.
+    angle : (n,) ndarray or None
+        Of the C-arm [rad], NaN where a cell is empty; None without such a column.
+    """
+
+    path: PathLike
+    header: list[str]
+    rows: list[list[str]]
+    lines: NDArray[np.int64]
+    uv: NDArray[np.float64]
+    sigma: NDArray[np.float64] | None
+    fluoroscope: np.ndarray | None
+    angle: NDArray[np.float64] | None = None
+
+    @property
+    def added_columns(self) -> list[str]:
+        """Names of the columns that `write_points` adds."""
+        return [
+            f'{name}_corrected' if name == 'sigma' and name in self.header else name
+            for name in ADDED_COLUMNS
+        ]
+
+
+def points_of_frames(
+    path: PathLike, frames: Mapping[str, Sequence[Frame]], names: Names
+) -> PointsFile:
+    """Return the image points of frames as the rows of a CSV file; path is for messages.
+
+    Targets and exposures have their names where they have some.
+    """
+    exposures = names.exposure_names()
+    targets = names.target_names()
+    flat = [frame for of_fluoroscope in frames.values() for frame in of_fluoroscope]
+    if not flat:
+        raise DataError(f'{path}: the file has no image points')
+    rows = [
+        [
+            f.fluoroscope,
+            str(exposures.get(f.number, f.number)),
+            str(targets.get(i, i)),
+            *map(repr, uv),
+        ]
+        for f in flat
+        for i, uv in zip(f.target_id.tolist(), f.uv.tolist())
+    ]
+    return PointsFile(
+        path=path,
+        header=['fluoroscope', 'exposure', 'target_id', 'u', 'v'],
+        rows=rows,
+        lines=np.arange(2, len(rows) + 2),
+        uv=np.concatenate([f.uv for f in flat]),
+        sigma=None,
+        fluoroscope=np.array([row[0] for row in rows]),
+        angle=np.concatenate([np.repeat(a, len(f.uv)) for f, a in zip(flat, angles_of(flat))]),
+    )
+
+
+def read_points(path: PathLike, known: Mapping[str, str] | None = None) -> PointsFile:
+    """Read a CSV file with the columns u, v [px], optionally fluoroscope and sigma, and others.
+
+    A column angle_deg has the angle of the C-arm in degrees. u and v may be empty; such a point
+    will have the status INVALID. known are the ids of
+    fluoroscopes that have names. Raises DataError that names row and cause.
+    """
+    known = known or {}
+    blocks = list(read_blocks(path, ('u', 'v')))
+    header = blocks[0].header
+    points = PointsFile(
+        path=path,
+        header=header,
+        rows=[row for block in blocks for row in block.rows],
+        lines=np.concatenate([block.lines for block in blocks]),
+        uv=np.concatenate([_uv(block) for block in blocks]),
+        sigma=np.concatenate([_sigma(block) for block in blocks]) if 'sigma' in header else None,
+        fluoroscope=np.array(
+            [known.get(n, n) for block in blocks for n in block.strings('fluoroscope')]
+        )
+        if 'fluoroscope' in header
+        else None,
+        angle=np.concatenate([_image_angle(block) for block in blocks])
+        if ANGLE in header
+        else None,
+    )
+    if CORRECTED_BY in header:
+        raise DataError(
+            f'{path}: the image points are corrected already, as its column {CORRECTED_BY} says: '
+            'give the observed ones'
+        )
+    for name in points.added_columns:
+        if name in header:
+            raise DataError(
+                f'{path}: the file already has a column {name}, which would be written twice'
+            )
+    return points
+
+
+def _uv(block: Block) -> np.ndarray:
+    return np.column_stack([block.floats_or_nan('u'), block.floats_or_nan('v')])
+
+
+def _sigma(block: Block) -> np.ndarray:
+    sigma = block.floats_or_nan('sigma')
+    block.require('sigma', np.isnan(sigma) | is_positive(sigma), 'not a finite number above 0')
+    return sigma
+
+
+def _image_angle(block: Block) -> np.ndarray:
+    angle = np.radians(block.floats_or_nan(ANGLE))
+    block.require(ANGLE, np.isnan(angle) | (np.abs(angle) <= MAX_ANGLE), 'not an angle')
+    return angle
+
+
+def correct_points(
+    points: PointsFile,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    angle: float | None = None,
+) -> CorrectedPoints:
+    """Correct image points with the calibrations of their fluoroscopes.
+
+    A point without sigma has that of the calibration, one without an angle that of angle [rad].
+    Raises DataError for a fluoroscope without
+    calibration, and for a file without the column fluoroscope where there are several
+    calibrations.
+    """
+    names = points.fluoroscope
+    if names is None:
+        if len(calibrations) != 1:
+            raise DataError(
+                f'{points.path}: the file has no column fluoroscope, and there are calibrations '
+                f'of {", ".join(calibrations)}'
+            )
+        names = np.array([*calibrations] * len(points.uv))
+    unknown = np.flatnonzero(~np.isin(names, list(calibrations)))
+    if len(unknown):
+        first = unknown[0]
+        raise DataError(
+            f'{points.path}, row {points.lines[first]}: there is no calibration of fluoroscope '
+            f'{str(names[first])!r}, only of {", ".join(calibrations)}'
+        )
+    out = CorrectedPoints(
+        np.full(points.uv.shape, np.nan),
+        np.full(len(names), np.nan),
+        np.full(len(names), CorrectionStatus.INVALID, dtype=np.uint8),
+    )
+    for name in np.unique(names):
+        rows = np.flatnonzero(names == name)
+        calibration = calibrations[str(name)]
+        sigma = points.sigma
+        if sigma is not None:
+            sigma = np.where(
+                np.isnan(sigma[rows]), calibration.image_sd_at(points.uv[rows]), sigma[rows]
+            )
+        angles = np.full(len(rows), np.nan if points.angle is None else points.angle[rows])
+        if angle is not None:
+            angles[np.isnan(angles)] = angle
+        part = calibration.correct(points.uv[rows], sigma, angle=angles)
+        out.uv[rows] = part.uv
+        out.sigma[rows] = part.sigma
+        out.status[rows] = part.status
+    return out
+
+
+def write_points(path: PathLike, points: PointsFile, corrected: CorrectedPoints) -> None:
+    """Write the rows of a PointsFile with further columns.
+
+    These are u_corrected, v_corrected [px], sigma [px] (sigma_corrected where the file has a
+    sigma) and status. The cells of a point that is INVALID are empty. Raises DataError where the
+    file cannot be written.
+    """
+    numbers = np.column_stack([corrected.uv, corrected.sigma]).tolist()
+    with atomic_file(path, 'w') as file:
+        write_rows(file, [points.header + points.added_columns])
+        write_rows(
+            file,
+            (
+                [*row, *map(format_float, values), STATUS[status]]
+                for row, values, status in zip(points.rows, numbers, corrected.status.tolist())
+            ),
+        )

@@ -1,0 +1,136 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The file of the phantom: CSV `target_id,x,y,z,sd[,diameter]`, in millimetres.
+
+Files of a lab may have names of beads instead of ids. Points in motion have a further column
+`exposure`.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+
+from ..errors import DataError
+from ..exposures.columns import first_repeated
+from ..exposures.moving_points import MovingPoints
+from ..exposures.names import Names, without_trivial
+from ..exposures.phantom import Phantom
+from ..limits import read_limits
+from .atomic import atomic_file
+from .csv_table import NamedColumn, read_blocks, write_rows
+
+COLUMNS = ('target_id', 'x', 'y', 'z', 'sd')
+DIAMETER = 'diameter'  # of the beads, optional
+EXPOSURE = 'exposure'
+
+
+def read_phantom(path: str | os.PathLike[str]) -> Phantom:
+    """Read a Phantom from a CSV file with the columns target_id and x, y, z, sd [mm].
+
+    The columns may have any order. Raises DataError that names row and cause.
+    """
+    return _read(path, NamedColumn('target_id', None))
+
+
+def read_named_phantom(path: str | os.PathLike[str], known: Names) -> tuple[Phantom, Names]:
+    """Read a Phantom whose targets may have names, and the names. Raises DataError."""
+    column = NamedColumn('target_id', known.targets)
+    phantom = _read(path, column)
+    return phantom, Names(without_trivial(column.ids()))
+
+
+def _read(path: str | os.PathLike[str], column: NamedColumn) -> Phantom:
+    id_parts = []
+    number_parts = []
+    line_parts = []
+    diameter_parts = []
+    most = read_limits().max_targets
+    count = 0
+    for block in read_blocks(path, COLUMNS):
+        numbers = np.column_stack([block.floats(name) for name in COLUMNS[1:]])
+        id_parts.append(column.read(block))
+        count += len(numbers)
+        if count > most:
+            raise DataError(f'{path}: phantoms of more than {most} targets are not read')
+        block.require('sd', numbers[:, 3] > 0, 'not above 0')
+        number_parts.append(numbers)
+        line_parts.append(block.lines)
+        if DIAMETER in block:
+            diameter = block.floats(DIAMETER)
+            block.require(DIAMETER, diameter > 0, 'not above 0')
+            diameter_parts.append(diameter)
+    ids = column.numbers(np.concatenate(id_parts))
+    numbers = np.concatenate(number_parts)
+    repeated = first_repeated(ids)
+    if repeated is not None:
+        lines = np.concatenate(line_parts)
+        first, second = repeated
+        raise DataError(
+            f'{path}, row {lines[second]}: target {ids[second]} is already given in row '
+            f'{lines[first]}'
+        )
+    try:
+        diameters = np.concatenate(diameter_parts) if diameter_parts else None
+        return Phantom(ids, numbers[:, :3], numbers[:, 3], diameters)
+    except DataError as error:
+        raise error.at(path) from None
+
+
+def has_exposures(path: str | os.PathLike[str]) -> bool:
+    """Return whether a file holds coordinates by exposure; False for files of other programs."""
+    try:
+        return any(EXPOSURE in block for block in read_blocks(path, COLUMNS))
+    except DataError:
+        return False
+
+
+def read_moving_points(path: str | os.PathLike[str]) -> MovingPoints:
+    """Read MovingPoints from a CSV file with the columns exposure, target_id and x, y, z, sd [mm].
+
+    Raises DataError that names row and cause.
+    """
+    parts = []
+    lines = []
+    for block in read_blocks(path, (EXPOSURE, *COLUMNS)):
+        numbers = np.column_stack([block.floats(name) for name in COLUMNS[1:]])
+        block.require('sd', numbers[:, 3] > 0, 'not above 0')
+        parts.append((block.ids(EXPOSURE), block.ids('target_id'), numbers))
+        lines.append(block.lines)
+    exposure, target_id, numbers = (np.concatenate(column) for column in zip(*parts))
+    points = MovingPoints(exposure, target_id, numbers[:, :3], numbers[:, 3])
+    repeated = first_repeated(points.ids(exposure, target_id))
+    if repeated is not None:
+        first, second = (np.concatenate(lines)[row] for row in repeated)
+        raise DataError(
+            f'{path}, row {second}: target {target_id[repeated[1]]} of exposure '
+            f'{exposure[repeated[1]]} is already given in row {first}'
+        )
+    return points
+
+
+def write_phantom(
+    path: str | os.PathLike[str], phantom: Phantom, names: Names | None = None
+) -> None:
+    """Write a Phantom to a CSV file, from which the same values are read again.
+
+    Names are written instead of ids where all targets have one. Raises DataError where the file
+    cannot be written.
+    """
+    labels = (names or Names()).target_names()
+    if not all(target in labels for target in phantom.target_id.tolist()):
+        labels = {}
+    with atomic_file(path, 'w') as file:
+        numbers = [phantom.xyz_mm, phantom.sd_mm[:, None]]
+        if phantom.diameter_mm is not None:
+            numbers.append(phantom.diameter_mm[:, None])
+        write_rows(file, [(*COLUMNS, DIAMETER)[: sum(part.shape[1] for part in numbers) + 1]])
+        write_rows(
+            file,
+            (
+                [labels.get(int(target), int(target)), *map(repr, row)]
+                for target, row in zip(phantom.target_id, np.hstack(numbers).tolist())
+            ),
+        )

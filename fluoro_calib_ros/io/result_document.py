@@ -1,0 +1,301 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Results as JSON documents: result.json, validation.json and others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..checks.check import Check, Validation
+from ..checks.recording_watch import DriftVerdict
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..errors import DataError
+from ..estimation.constraints import RelativeOrientation
+from ..estimation.diagnostics import AdjustmentStatistics
+from ..estimation.result import CalibrationResult, FluoroscopeResult
+from ..estimation.rounds import Round
+from ..findings import Finding, Severity, sentences
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.rotations import quaternion_from_matrix
+from .access import PathLike, os_error_reason
+from .text_files import write_json
+
+# 1 had neither version, date, units nor adjustments; 2 no ids, no note on the rig and no digest.
+FORMAT_VERSION = 3
+UNITS = {'lengths': 'mm', 'image': 'px', 'angles': 'rad', 'seconds': 's'}
+
+
+def result_document(job: CalibrationResult) -> dict[str, Any]:
+    """Return a CalibrationResult as the dict of result.json.
+
+    Lengths are in mm, pixels in px and angles in rad, each with the unit in its name.
+    """
+    return {
+        'format_version': FORMAT_VERSION,
+        'created': job.created,
+        'units': UNITS,
+        'fluoroscopes': {
+            name: {
+                'calibration_id': job.calibrations[name].calibration_id,
+                **_fluoroscope(figures),
+                'noise_px': _noise(job.calibrations[name]),
+                **_angle(job.calibrations[name]),
+            }
+            for name, figures in job.fluoroscopes.items()
+        },
+        'targets': [
+            {'target_id': int(i), 'xyz_mm': xyz, 'sd_mm': sd}
+            for i, xyz, sd in zip(
+                job.targets.target_id,
+                job.targets.xyz_mm,
+                np.sqrt(np.diagonal(job.targets.covariance, axis1=1, axis2=2)),
+            )
+        ],
+        'relative_orientation': _relative(job.relative),
+        'outliers': {'image_points': list(job.outliers[0]), 'targets': list(job.outliers[1])},
+        'adjustments': [_statistics(one) for one in job.statistics],
+        'correlations': [
+            {'unknowns': [one, other], 'value': value} for one, other, value in job.correlations
+        ],
+        'history': _history(job.history),
+        'converged': job.converged,
+        'left_out': sentences(job.findings, Severity.NOTE),
+        'seconds': job.seconds,
+        'doubts': sentences(job.findings, Severity.ERROR),
+        'rig_note': '; '.join(sentences(job.findings, Severity.WARNING)),
+        'findings': [finding_document(found) for found in job.findings],
+    }
+
+
+def finding_document(found: Finding) -> dict[str, Any]:
+    """Return a finding for programs that decide by it."""
+    return {
+        'kind': found.kind.value,
+        'severity': found.severity.name.lower(),
+        'fluoroscopes': list(found.place.fluoroscopes),
+        'exposures': list(found.place.exposures),
+        'target_id': list(found.place.target_id),
+        'numbers': dict(found.numbers),
+        'sentence': found.sentence,
+    }
+
+
+def _statistics(statistics: AdjustmentStatistics) -> dict[str, Any]:
+    """Return the statistics of an adjustment and of its network."""
+    return {
+        'fluoroscopes': list(statistics.fluoroscopes),
+        'noise': {
+            'loss': statistics.loss,
+            'sigma0': statistics.sigma0,
+            'degrees_of_freedom': statistics.nu,
+        },
+        'variance_factor': statistics.variance_factor,
+        'observations': statistics.observations,
+        'unknowns': statistics.unknowns,
+        'degrees_of_freedom': statistics.degrees_of_freedom,
+        'network': {
+            'exposures': statistics.exposures,
+            'image_points': statistics.image_points,
+            'outliers': statistics.outliers,
+            'targets': statistics.targets,
+            'image_points_per_target': {
+                'least': statistics.least_rays,
+                'mean': statistics.mean_rays,
+            },
+            'redundancy': {
+                'least': statistics.least_redundancy,
+                'mean': statistics.mean_redundancy,
+            },
+        },
+    }
+
+
+def _relative(orientations: Sequence[RelativeOrientation]) -> Any:
+    """Return the relative orientation of two fluoroscopes, a list for more, None without any."""
+    out = [
+        {
+            'fluoroscopes': list(o.fluoroscopes),
+            'quaternion_wxyz': quaternion_from_matrix(o.pose.rotation),
+            'translation_mm': o.pose.translation_mm,
+            'sd_mm': o.sd_mm,
+            'sd_rad': o.sd_rad,
+            'scatter_mm': o.scatter_mm,
+            'scatter_rad': o.scatter_rad,
+            'exposures': o.exposures,
+            'constraint': o.constraint,
+        }
+        for o in orientations
+    ]
+    if not out:
+        return None
+    return out[0] if len(out) == 1 else out
+
+
+def _fluoroscope(figures: FluoroscopeResult) -> dict[str, Any]:
+    xp, yp, c = figures.interior
+    return {
+        'interior': {'xp': xp, 'yp': yp, 'c': c, 'sd': figures.interior_sd},
+        'image_size': list(figures.image_size),
+        'model': {'kind': figures.model_kind, 'k': figures.k},
+        'rmse_px': {'before': figures.rmse_before, 'after': figures.rmse_after},
+        'inliers': figures.inliers,
+        'observations': figures.observations,
+        'exposures': [
+            {
+                'exposure': e.exposure,
+                'position_mm': e.position_mm,
+                'quaternion_wxyz': e.quaternion_wxyz,
+                'sd_mm': e.sd_mm,
+                'sd_rad': e.sd_rad,
+            }
+            for e in figures.exposures
+        ],
+    }
+
+
+def _noise(calibration: FluoroscopeCalibration) -> dict[str, float]:
+    """Return the standard deviation of an image coordinate [px], also by place if it differs."""
+    profile = calibration.noise_profile
+    out = {'sd': calibration.image_sd}
+    if profile is not None:
+        factors = {'middle': profile.middle, 'rim': profile.rim}
+        out |= {name: calibration.image_sd * factor for name, factor in factors.items()}
+    return out
+
+
+def _angle(calibration: FluoroscopeCalibration) -> dict[str, Any]:
+    """Return the change of a correction with the angle of the C-arm, {} where there is none."""
+    field = calibration.angle_field
+    if field is None:
+        return {}
+    return {'angle': {'exposures_rad': field.angles, 'change_rms_px': field.size_px}}
+
+
+def _history(history: Mapping[str, Sequence[Round]]) -> list[dict[str, Any]]:
+    """Return all rounds in order, one calibration after the other."""
+    return [
+        {
+            'fluoroscopes': label.split('+'),
+            'iteration': r.iteration,
+            'F': r.F,
+            'G': r.G,
+            'k': r.k,
+            'rmse_px': r.rmse,
+            'change_px': r.change,
+        }
+        for label, rounds in history.items()
+        for r in rounds
+    ]
+
+
+def orientation_document(orientation: RigOrientation) -> dict[str, Any]:
+    """Return a RigOrientation as a dict: lengths in mm, pixels in px, angles in rad."""
+    return {
+        'orientation_id': orientation.orientation_id,
+        'frame_id': orientation.frame_id,
+        'source': orientation.source,
+        'exposures': orientation.exposures,
+        'fluoroscopes': {
+            name: {
+                'calibration_id': identity,
+                'position_mm': position,
+                'quaternion_wxyz': quaternion_from_matrix(rotation),
+                'sd_mm': sd_mm,
+                'sd_rad': sd_rad,
+            }
+            for name, identity, position, rotation, sd_mm, sd_rad in zip(
+                orientation.fluoroscopes,
+                orientation.calibration_ids,
+                orientation.position_mm,
+                orientation.rotation,
+                orientation.sd_mm,
+                orientation.sd_rad,
+            )
+        },
+    }
+
+
+def drift_document(verdict: DriftVerdict | None, begin_ns: int) -> dict[str, Any] | None:
+    """Return a DriftVerdict as a dict; times [s] count from the exposure at begin_ns."""
+    if verdict is None:
+        return None
+    out = {
+        'kind': verdict.finding.kind.value,
+        'level': verdict.level,
+        'message': verdict.message,
+        'level_at_end': verdict.level_at_end,
+        'watched_s': verdict.watched_s,
+    }
+    names = {
+        'fluoroscope': 'fluoroscope',
+        'place': 'place',
+        'area_px': 'area',
+        'size_px': 'size',
+        'sd_px': 'sd',
+        'direction': 'direction',
+        'against': 'against',
+        'source': 'source',
+        'evidence': 'evidence',
+        'threshold_warn': 'threshold_warn',
+        'threshold_error': 'threshold_error',
+        'observations': 'observations',
+    }
+    out.update(
+        {
+            key: getattr(verdict.state, name) if verdict.state else None
+            for key, name in names.items()
+        }
+    )
+    for key, stamp_ns in (('found', verdict.found_ns), ('began', verdict.began_ns)):
+        out[f'{key}_stamp_ns'] = stamp_ns
+        out[f'{key}_s'] = None if stamp_ns is None else (stamp_ns - begin_ns) / 1e9
+    return out
+
+
+VALIDATION_NAME = 'validation.json'  # the verdict, in the folder of the calibration
+
+
+def validation_document(validation: Validation) -> dict[str, Any]:
+    """Return a Validation as the dict of validation.json."""
+    return {
+        'verdict': validation.verdict,
+        'findings': sentences(validation.findings),
+        'checks': [_check_document(check) for check in validation.checks],
+        'calibration_id': dict(validation.calibration_id),
+        'achieved_sd_px': dict(validation.achieved_sd_px),
+        'notes': sentences(validation.notes),
+        'seconds': validation.seconds,
+    }
+
+
+def _check_document(check: Check) -> dict[str, Any]:
+    return {
+        **finding_document(check),
+        'name': check.name,
+        'fluoroscope': check.place.fluoroscope,
+        'value': check.value,
+        'limit': check.limit,
+        'unit': check.unit,
+        'passed': check.passed,
+        'place': check.place.pixel,
+        'advice': '' if check.passed else check.advice,
+    }
+
+
+def write_validation(directory: PathLike, validation: Validation) -> None:
+    """Write validation.json into a folder. Raises DataError."""
+    write_json(Path(directory) / VALIDATION_NAME, validation_document(validation))
+
+
+def delete_validation(directory: PathLike) -> None:
+    """Delete validation.json from a folder, if it exists. Raises DataError."""
+    path = Path(directory) / VALIDATION_NAME
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise DataError(f'{path}: cannot be deleted ({os_error_reason(error)})') from None

@@ -1,0 +1,111 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What a calibration node publishes: calibrations, orientation of the rig, status, coverage."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+
+from fluoro_calib_msgs.msg import CalibrationStatus, FluoroscopeCalibration, RigOrientation
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSProfile
+from sensor_msgs.msg import Image
+
+from ..correction import fluoroscope_calibration as calibration_result
+from ..images.coverage_picture import coverage_picture
+from ..photogrammetry import rig_orientation
+from .messages.fluoroscope_calibration import message_from_calibration
+from .messages.image import colour_message
+from .messages.rig_orientation import message_from_orientation
+from .messages.status import FluoroscopeProgress, message_from_progress
+from .runtime.lifecycle import StreamNode
+from .runtime.streams import latched_qos
+
+
+class CalibrationOutput:
+    """Publishers of a calibration node, what is in use, and what went wrong with the rest.
+
+    Attributes
+    ----------
+    orientation : RigOrientation or None
+        The one in use.
+    refused : dict of str to str
+        Why the last calibration of a fluoroscope was refused.
+    load_fault, save_fault : str
+        Why calibrations were not loaded at the start, or are not saved; '' where they are.
+    """
+
+    def __init__(self, node: StreamNode, names: Sequence[str]) -> None:
+        self.orientation: rig_orientation.RigOrientation | None = None
+        self.refused: dict[str, str] = {}
+        self.load_fault = ''
+        self.save_fault = ''
+        self._node = node
+        self._names = names
+        self._in_use: dict[str, calibration_result.FluoroscopeCalibration] = {}
+        self._since: dict[str, float] = {}
+        # The status first: by its publishers, receivers of calibrations recognise that two nodes
+        # serve the same fluoroscope.
+        self._status = self._publishers(CalibrationStatus, 'calibration_status', 10)
+        self._calibration = self._publishers(FluoroscopeCalibration, 'calibration', latched_qos())
+        self._coverage = self._publishers(Image, 'coverage', latched_qos())
+        self._orientation = self._publisher(RigOrientation, 'rig_orientation', latched_qos())
+
+    def _publishers(self, kind: type, topic: str, qos: QoSProfile | int) -> dict[str, Publisher]:
+        return {name: self._publisher(kind, f'{name}/{topic}', qos) for name in self._names}
+
+    def _publisher(self, kind: type, topic: str, qos: QoSProfile | int) -> Publisher:
+        """Return a publisher, also of the inactive node."""
+        publisher = self._node.create_publisher(kind, topic, qos)
+        return self._node.own(publisher, self._node.destroy_publisher, publisher)
+
+    @property
+    def calibrations(self) -> dict[str, calibration_result.FluoroscopeCalibration]:
+        """The calibrations in use, by fluoroscope."""
+        return {name: self._in_use[name] for name in self._names if name in self._in_use}
+
+    def publish(
+        self,
+        calibrations: Mapping[str, calibration_result.FluoroscopeCalibration],
+        orientation: rig_orientation.RigOrientation | None,
+    ) -> None:
+        """Use and publish calibrations, and the orientation that belongs to them, if any."""
+        # The orientation first, so that it is there when the first points come that are corrected
+        # with the new calibrations.
+        if orientation is not None:
+            self.publish_orientation(orientation)
+        for name, calibration in calibrations.items():
+            self._in_use[name] = calibration
+            self._since[name] = time.monotonic()
+            self.refused.pop(name, None)
+            self.load_fault = ''
+            self._calibration[name].publish(message_from_calibration(calibration))
+
+    def publish_orientation(self, orientation: rig_orientation.RigOrientation) -> None:
+        """Use and publish an orientation."""
+        self.orientation = orientation
+        self._orientation.publish(message_from_orientation(orientation))
+
+    def age_s(self, name: str) -> float:
+        """Return how long a calibration has been in use [s], NaN where there is none."""
+        return time.monotonic() - self._since.get(name, float('nan'))
+
+    def publish_status(self, progress: FluoroscopeProgress) -> None:
+        """Publish the progress of a fluoroscope, and a picture where somebody looks at it."""
+        stamp = self._node.get_clock().now().to_msg()
+        name = progress.fluoroscope
+        self._status[name].publish(message_from_progress(progress, stamp))
+        collected = progress.collected
+        if collected.covered is None or not self._coverage[name].get_subscription_count():
+            return
+        lines = (
+            f'{name}: {collected.exposures} exposures, {100 * collected.coverage:.0f} % covered',
+            collected.readiness.advice,
+        )
+        picture = coverage_picture(collected.covered, collected.image_size or (1, 1), lines)
+        self._coverage[name].publish(colour_message(picture, stamp, f'{name}_optical'))

@@ -1,0 +1,276 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""TargetObservations: image points of identified targets in one frame."""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Sequence
+from struct import Struct, error
+from typing import Any, NamedTuple
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
+from numpy.typing import ArrayLike
+from rclpy.serialization import deserialize_message
+from sensor_msgs.msg import JointState
+
+from ...errors import DataError
+from ...exposures.frame import Frame, stack_image_points
+from .cdr import (
+    TRUNCATED,
+    TWO_UINT32,
+    UINT32,
+    as_little_endian,
+    columns_bytes,
+    read_float64_sequence,
+    read_header,
+    read_string,
+    string_bytes,
+)
+
+# Fields that many messages have: stamps, and arrays of primitive numbers.
+
+NS_PER_S = 1_000_000_000
+
+
+def nanoseconds_from_stamp(stamp: Time) -> int:
+    """Return a Time message in nanoseconds."""
+    return stamp.sec * NS_PER_S + stamp.nanosec
+
+
+def stamp_from_nanoseconds(nanoseconds: int) -> Time:
+    """Return a Time message of a time in nanoseconds."""
+    return Time(sec=int(nanoseconds // NS_PER_S), nanosec=int(nanoseconds % NS_PER_S))
+
+
+def float64_field(values: ArrayLike) -> array[Any]:
+    """Return a float64[] field; an array of several dimensions is flattened."""
+    return array('d', np.ascontiguousarray(values, dtype=np.float64).tobytes())
+
+
+def uint32_field(values: ArrayLike) -> array[Any]:
+    """Return a uint32[] field; an array of several dimensions is flattened."""
+    return array('I', np.ascontiguousarray(values, dtype=np.uint32).tobytes())
+
+
+def uint8_field(values: ArrayLike) -> array[Any]:
+    """Return a uint8[] field; an array of several dimensions is flattened."""
+    return array('B', np.ascontiguousarray(values, dtype=np.uint8).tobytes())
+
+
+_IMAGE = Struct('<IIII')  # frame number, width, height, number of target ids
+
+
+class ObservedFrame(NamedTuple):
+    """A TargetObservations message, read from its bytes; nothing is validated.
+
+    Attributes
+    ----------
+    sec, nanosec : int
+        Stamp.
+    frame_id : str
+    frame_number : int
+    image_size : (int, int)
+        Width and height [px].
+    target_id : bytes
+        The ids as uint32.
+    u, v, sigma : np.ndarray
+        Image points and their standard deviations [px], of any lengths.
+    start : bytes
+        The message up to the frame number: so a CorrectedObservations message begins, too.
+    """
+
+    sec: int
+    nanosec: int
+    frame_id: str
+    frame_number: int
+    image_size: tuple[int, int]
+    target_id: bytes
+    u: np.ndarray
+    v: np.ndarray
+    sigma: np.ndarray
+    start: bytes
+
+
+def decode_target_observations(data: bytes) -> ObservedFrame:
+    """Read a TargetObservations message from its bytes. Raises ValueError for damaged ones."""
+    data = as_little_endian(data, TargetObservations)
+    try:
+        sec, nanosec, frame_id, at = read_header(data)
+        number, width, height, count = _IMAGE.unpack_from(data, at)
+        end = at + 16 + 4 * count
+        u, offset = read_float64_sequence(data, end)
+        v, offset = read_float64_sequence(data, offset)
+        sigma, _ = read_float64_sequence(data, offset)
+    except error as reason:  # beyond the end of the bytes
+        raise ValueError(str(reason)) from None
+    return ObservedFrame(
+        sec=sec,
+        nanosec=nanosec,
+        frame_id=frame_id,
+        frame_number=number,
+        image_size=(width, height),
+        target_id=data[at + 16 : end],
+        u=u,
+        v=v,
+        sigma=sigma,
+        start=data[: at + 4],
+    )
+
+
+def frame_from_observed(
+    observed: ObservedFrame, fluoroscope: str, angle: float | None = None
+) -> Frame:
+    """Return the Frame of a message; angle: of the C-arm [rad], None where it is unknown.
+
+    Raises DataError for arrays of different lengths.
+    """
+    try:
+        target_id, uv, sigma = stack_image_points(
+            np.frombuffer(observed.target_id, np.uint32), observed.u, observed.v, observed.sigma
+        )
+    except DataError as error:
+        raise DataError(
+            f'fluoroscope {fluoroscope}, frame {observed.frame_number}: {error}'
+        ) from None
+    return Frame(
+        fluoroscope,
+        observed.frame_number,
+        target_id,
+        uv,
+        observed.image_size,
+        sigma=sigma,
+        stamp_ns=NS_PER_S * observed.sec + observed.nanosec,
+        frame_id=observed.frame_id,
+        angle=angle,
+    )
+
+
+def message_from_frame(frame: Frame) -> TargetObservations:
+    """Return the message of a Frame."""
+    message = TargetObservations()
+    message.header.stamp = stamp_from_nanoseconds(frame.stamp_ns)
+    message.header.frame_id = frame.frame_id
+    message.frame_number = frame.number
+    message.image_width, message.image_height = frame.image_size
+    message.target_id = uint32_field(frame.target_id)
+    message.u = float64_field(frame.uv[:, 0])
+    message.v = float64_field(frame.uv[:, 1])
+    message.sigma = float64_field([] if frame.sigma is None else frame.sigma)
+    return message
+
+
+def set_number_and_stamp(message: TargetObservations, number: int, stamp_ns: int) -> None:
+    """Change frame number and stamp of a message that is published again."""
+    message.frame_number = number
+    message.header.stamp.sec, message.header.stamp.nanosec = divmod(stamp_ns, NS_PER_S)
+
+
+# CorrectedObservations: image points of one frame without distortion.
+
+
+class CorrectedFrame(NamedTuple):
+    """A CorrectedObservations message, read from its bytes; nothing is validated.
+
+    Attributes
+    ----------
+    sec, nanosec : int
+        Stamp.
+    frame_id : str
+    frame_number : int
+    calibration_id : str
+    target_id : np.ndarray
+        uint32.
+    u, v, sigma, correction_sd : np.ndarray
+        Corrected points and standard deviations [px], of any lengths.
+    status : np.ndarray
+        uint8, of any length.
+    """
+
+    sec: int
+    nanosec: int
+    frame_id: str
+    frame_number: int
+    calibration_id: str
+    target_id: np.ndarray
+    u: np.ndarray
+    v: np.ndarray
+    sigma: np.ndarray
+    correction_sd: np.ndarray
+    status: np.ndarray
+
+
+def decode_corrected_observations(data: bytes) -> CorrectedFrame:
+    """Read a CorrectedObservations message from its bytes. Raises ValueError for damaged ones."""
+    data = as_little_endian(data, CorrectedObservations)
+    try:
+        sec, nanosec, frame_id, at = read_header(data)
+        number, length = TWO_UINT32.unpack_from(data, at)
+        calibration_id, at = read_string(data, at + 8, length)
+        (count,) = UINT32.unpack_from(data, at)
+        at += 4
+        target_id = np.frombuffer(data[at : at + 4 * count], np.uint32)
+        at += 4 * count
+        u, at = read_float64_sequence(data, at)
+        v, at = read_float64_sequence(data, at)
+        sigma, at = read_float64_sequence(data, at)
+        correction_sd, at = read_float64_sequence(data, at)
+        (count,) = UINT32.unpack_from(data, at)
+    except error as reason:  # beyond the end of the bytes
+        raise ValueError(str(reason)) from None
+    if at + 4 + count > len(data):
+        raise ValueError(TRUNCATED)
+    return CorrectedFrame(
+        sec=sec,
+        nanosec=nanosec,
+        frame_id=frame_id,
+        frame_number=number,
+        calibration_id=calibration_id,
+        target_id=target_id,
+        u=u,
+        v=v,
+        sigma=sigma,
+        correction_sd=correction_sd,
+        status=np.frombuffer(data, np.uint8, count, at + 4),
+    )
+
+
+def encode_corrected_observations(
+    source: ObservedFrame, calibration_id: str, corrected: Sequence[np.ndarray]
+) -> bytes:
+    """Return the bytes of the CorrectedObservations message of a frame.
+
+    Parameters
+    ----------
+    source : ObservedFrame
+        The observed frame with n target ids.
+    calibration_id : str
+    corrected : sequence of np.ndarray
+        u, v, sigma, correction_sd (n,) float64 [px] and status (n,) uint8.
+    """
+    *columns, status = corrected
+    return columns_bytes(
+        source.start + string_bytes(calibration_id), source.target_id, columns, (status,)
+    )
+
+
+# JointState: positions of joints, of which one is the angle of a C-arm.
+
+
+class JointStates(NamedTuple):
+    """Stamp [ns], names and positions [rad] of joints; positions may be of any length."""
+
+    stamp_ns: int
+    names: Sequence[str]
+    positions: Sequence[float]
+
+
+def decode_joint_state(data: bytes) -> JointStates:
+    """Read a JointState message from its bytes. Raises one of DECODING_ERRORS."""
+    message = deserialize_message(data, JointState)
+    return JointStates(
+        nanoseconds_from_stamp(message.header.stamp), message.name, message.position
+    )

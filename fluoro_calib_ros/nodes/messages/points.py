@@ -1,0 +1,250 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""ReconstructedPoints: points in the rig frame with their covariance, in metres."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from fluoro_calib_msgs.msg import ReconstructedPoints
+from geometry_msgs.msg import Point
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import ColorRGBA
+from visualization_msgs.msg import Marker, MarkerArray
+
+from ...photogrammetry.rig_orientation import RigOrientation
+from ...photogrammetry.rotations import quaternion_from_matrix
+from ...reconstruction.intersection import IntersectedPoints
+from .cdr import ENCAPSULATION, TIME, UINT32, columns_bytes, string_bytes, string_sequence_bytes
+from .observations import (
+    NS_PER_S,
+    float64_field,
+    stamp_from_nanoseconds,
+    uint8_field,
+    uint32_field,
+)
+
+# Field of each term of the covariance, and its index in the flattened matrix.
+_COVARIANCE = {'cov_xx': 0, 'cov_xy': 1, 'cov_xz': 2, 'cov_yy': 4, 'cov_yz': 5, 'cov_zz': 8}
+_TERMS = list(_COVARIANCE.values())
+_SYMMETRIC = (
+    'cov_xx',
+    'cov_xy',
+    'cov_xz',
+    'cov_xy',
+    'cov_yy',
+    'cov_yz',
+    'cov_xz',
+    'cov_yz',
+    'cov_zz',
+)
+
+
+class PointsContent(NamedTuple):
+    """Content of a ReconstructedPoints message.
+
+    Attributes
+    ----------
+    stamp_ns, frame_number : int
+        Those of the exposure.
+    orientation_id : str
+    orientation : RigOrientation
+        Orientation with which the points were intersected.
+    target_id : np.ndarray
+        (n,)
+    points : IntersectedPoints
+        n points.
+    """
+
+    stamp_ns: int
+    frame_number: int
+    orientation_id: str
+    orientation: RigOrientation
+    target_id: np.ndarray
+    points: IntersectedPoints
+
+
+def message_from_points(content: PointsContent) -> ReconstructedPoints:
+    """Return the message of reconstructed points."""
+    orientation = content.orientation
+    points = content.points
+    message = ReconstructedPoints()
+    message.header.stamp = stamp_from_nanoseconds(content.stamp_ns)
+    message.header.frame_id = orientation.frame_id
+    message.frame_number = content.frame_number
+    message.target_id = uint32_field(content.target_id)
+    message.x, message.y, message.z = (float64_field(column) for column in points.xyz_mm.T / 1000)
+    terms = points.covariance.reshape(-1, 9).T * 1e-6
+    for name, row in _COVARIANCE.items():
+        setattr(message, name, float64_field(terms[row]))
+    message.residual = float64_field(points.residual)
+    message.rays = uint8_field(points.rays)
+    message.status = uint8_field(points.status)
+    message.orientation_id = content.orientation_id
+    message.calibration_id = list(orientation.calibration_ids)
+    return message
+
+
+def encode_reconstructed_points(content: PointsContent) -> bytes:
+    """Return the bytes of the message of reconstructed points."""
+    orientation = content.orientation
+    points = content.points
+    sec, nanosec = divmod(content.stamp_ns, NS_PER_S)
+    start = b''.join(
+        (
+            ENCAPSULATION,
+            TIME.pack(sec, nanosec),
+            string_bytes(orientation.frame_id),
+            UINT32.pack(content.frame_number),
+        )
+    )
+    columns = (
+        *np.divide(points.xyz_mm.T, 1000, order='C'),
+        *(points.covariance.reshape(-1, 9).T[_TERMS] * 1e-6),
+        points.residual,
+    )
+    octets = (points.rays.astype(np.uint8), points.status)
+    ids = string_bytes(content.orientation_id) + string_sequence_bytes(orientation.calibration_ids)
+    return columns_bytes(
+        start, content.target_id.astype(np.uint32).tobytes(), columns, octets, ids
+    )
+
+
+def covariance_of(message: ReconstructedPoints) -> np.ndarray:
+    """Return the covariance matrices (n, 3, 3) of a message [m^2]."""
+    columns = [np.asarray(getattr(message, name)) for name in _SYMMETRIC]
+    return np.stack(columns, axis=1).reshape(-1, 3, 3)
+
+
+class GoodPoints(NamedTuple):
+    """The intersected points of a ReconstructedPoints message.
+
+    Attributes
+    ----------
+    frame_number : int
+    total : int
+        Number of all points of the message, the ones that failed among them.
+    target_id : np.ndarray
+        (n,)
+    xyz_mm : np.ndarray
+        (n, 3)
+    covariance : np.ndarray
+        (n, 3, 3) [mm^2]
+    """
+
+    frame_number: int
+    total: int
+    target_id: np.ndarray
+    xyz_mm: np.ndarray
+    covariance: np.ndarray
+
+
+def good_points_of(message: ReconstructedPoints) -> GoodPoints:
+    """Return the points of a message that are OK or OUTSIDE."""
+    good = np.array(message.status) <= message.OUTSIDE
+    xyz = np.stack([message.x, message.y, message.z], axis=1)
+    return GoodPoints(
+        message.frame_number,
+        len(good),
+        np.array(message.target_id)[good],
+        1e3 * xyz[good],
+        1e6 * covariance_of(message)[good],
+    )
+
+
+# MarkerArray of reconstructed points: covariance ellipsoids for RViz.
+
+GREEN = ColorRGBA(r=0.2, g=0.9, b=0.3, a=0.8)
+YELLOW = ColorRGBA(r=1.0, g=0.8, b=0.1, a=0.8)
+LIFETIME_NS = 500_000_000  # after which RViz removes a marker that is no longer seen
+
+
+def ellipsoid_markers(
+    message: ReconstructedPoints, good: np.ndarray, sigmas: float
+) -> MarkerArray:
+    """Return the ellipsoids of the good points (indices) of a message.
+
+    sigmas: half axes in standard deviations.
+    """
+    values, axes = np.linalg.eigh(covariance_of(message)[good])
+    axes[:, :, 0] *= np.linalg.det(axes)[:, None]  # a rotation, not a reflection
+    attitudes = quaternion_from_matrix(axes).tolist()
+    scales = (2 * sigmas * np.sqrt(np.maximum(values, 0))).tolist()
+    out = MarkerArray()
+    for k, attitude, scale in zip(good.tolist(), attitudes, scales):
+        marker = Marker(
+            header=message.header, ns='targets', id=int(message.target_id[k]), type=Marker.SPHERE
+        )
+        position = marker.pose.position
+        position.x = message.x[k]
+        position.y = message.y[k]
+        position.z = message.z[k]
+        q = marker.pose.orientation
+        q.w, q.x, q.y, q.z = attitude
+        marker.scale.x, marker.scale.y, marker.scale.z = scale
+        marker.color = GREEN if message.status[k] == message.OK else YELLOW
+        marker.lifetime.nanosec = LIFETIME_NS
+        out.markers.append(marker)
+    return out
+
+
+# mocap4r2 Markers of reconstructed points, where mocap4r2_msgs is installed.
+
+try:
+    from mocap4r2_msgs import msg as mocap
+except ImportError:
+    mocap = None
+MOCAP_MARKERS = None if mocap is None else mocap.Markers
+
+
+def mocap_markers(message: ReconstructedPoints, good: np.ndarray) -> mocap.Markers:
+    """Return the good points (indices) of a message; the index of each is its target id."""
+    out = mocap.Markers(header=message.header, frame_number=message.frame_number)
+    for k in good.tolist():
+        out.markers.append(
+            mocap.Marker(
+                id_type=mocap.Marker.USE_INDEX,
+                marker_index=int(message.target_id[k]),
+                translation=Point(x=message.x[k], y=message.y[k], z=message.z[k]),
+            )
+        )
+    return out
+
+
+# PointCloud2 of reconstructed points.
+
+POINT_TYPE = np.dtype([('x', '<f4'), ('y', '<f4'), ('z', '<f4'), ('id', '<u4'), ('sigma', '<f4')])
+_FIELD_TYPES = {'f': PointField.FLOAT32, 'u': PointField.UINT32}
+
+
+def point_cloud(message: ReconstructedPoints, good: np.ndarray) -> PointCloud2:
+    """Return a cloud of the good points (indices) of a message: x, y, z, id, sigma [m]."""
+    points = np.empty(len(good), dtype=POINT_TYPE)
+    for name in 'xyz':
+        points[name] = np.asarray(getattr(message, name))[good]
+    points['id'] = np.asarray(message.target_id)[good]
+    variance = sum(
+        np.asarray(getattr(message, name))[good] for name in ('cov_xx', 'cov_yy', 'cov_zz')
+    )
+    points['sigma'] = np.sqrt(variance / 3)
+    cloud = PointCloud2(
+        header=message.header,
+        height=1,
+        width=len(good),
+        is_dense=True,
+        point_step=POINT_TYPE.itemsize,
+        row_step=POINT_TYPE.itemsize * len(good),
+    )
+    cloud.fields = [
+        PointField(
+            name=name,
+            offset=offset,
+            datatype=_FIELD_TYPES[kind.kind],
+            count=1,
+        )
+        for name, (kind, offset, *_) in (POINT_TYPE.fields or {}).items()
+    ]
+    cloud.data = uint8_field(points.view(np.uint8))
+    return cloud

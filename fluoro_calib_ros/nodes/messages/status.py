@@ -1,0 +1,150 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""CalibrationStatus: progress of collecting and calibrating, in plain scalars."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from fluoro_calib_msgs.msg import CalibrationStatus, DriftStatus
+
+from ...checks.drift_options import DriftState
+from ...correction.fluoroscope_calibration import FluoroscopeCalibration
+from ...estimation.rounds import Round
+from ...exposures.readiness import Readiness
+from ...photogrammetry.rig_orientation import RigOrientation
+from .observations import stamp_from_nanoseconds
+
+# DriftStatus: the state of the drift watch.
+
+ALARM = DriftStatus.ERROR
+
+
+def message_from_drift_state(
+    state: DriftState, stamp_ns: int, orientation: RigOrientation
+) -> DriftStatus:
+    """Return the message of a drift state at the stamp of an exposure [ns]."""
+    message = DriftStatus(
+        level=int(state.level),
+        fluoroscope=state.fluoroscope,
+        source=state.source,
+        message=state.message,
+        observations=int(state.observations),
+    )
+    message.header.stamp = stamp_from_nanoseconds(stamp_ns)
+    if state.fluoroscope in orientation.fluoroscopes:
+        message.header.frame_id = orientation.optical_frame_ids[
+            orientation.index(state.fluoroscope)
+        ]
+    for name in ('size', 'sd', 'evidence', 'threshold_warn', 'threshold_error'):
+        setattr(message, name, float(getattr(state, name)))
+    message.u0, message.v0, message.u1, message.v1 = (float(x) for x in state.area)
+    message.since = float(state.since_s)
+    return message
+
+
+@dataclass(frozen=True)
+class Collected:
+    """What is collected of one fluoroscope.
+
+    Attributes
+    ----------
+    received, rejected, unpaired : int
+        Number of frames.
+    exposures, observations : int
+        Collected exposures, and the image points in them.
+    coverage : float
+        Covered part of the image, 0 to 1.
+    covered : ndarray or None
+        Whether cells (rows, columns) of the image are covered; None before the first exposure.
+    image_size : tuple of int or None
+    readiness : Readiness
+    """
+
+    received: int
+    rejected: int
+    unpaired: int
+    exposures: int
+    observations: int
+    coverage: float
+    covered: np.ndarray | None
+    image_size: tuple[int, int] | None
+    readiness: Readiness
+
+    def values(self) -> dict[str, object]:
+        """Return the values for the diagnostics."""
+        return {
+            'exposures': self.exposures,
+            'coverage': f'{self.coverage:.2f}',
+            'ready': self.readiness.ready,
+            'next pose': self.readiness.advice,
+            'frames received': self.received,
+            'frames rejected': self.rejected,
+            'frames unpaired': self.unpaired,
+        }
+
+
+@dataclass(frozen=True)
+class FluoroscopeProgress:
+    """What the calibration node knows of one fluoroscope.
+
+    Attributes
+    ----------
+    fluoroscope : str
+    collected : Collected
+    is_calibrating : bool
+    last_round : Round or None
+        Last round of the running or last self-calibration.
+    calibration : FluoroscopeCalibration or None
+    calibration_age_s : float
+    """
+
+    fluoroscope: str
+    collected: Collected
+    is_calibrating: bool = False
+    last_round: Round | None = None
+    calibration: FluoroscopeCalibration | None = None
+    calibration_age_s: float = math.nan
+
+    @property
+    def calibration_id(self) -> str:
+        """Id of the calibration, empty without one."""
+        return self.calibration.calibration_id if self.calibration else ''
+
+
+def message_from_progress(progress: FluoroscopeProgress, stamp: Time) -> CalibrationStatus:
+    """Return the message of the progress of one fluoroscope."""
+    message = CalibrationStatus(
+        fluoroscope=progress.fluoroscope,
+        state=_state_of(progress),
+        frames_received=progress.collected.received,
+        frames_rejected=progress.collected.rejected,
+        frames_unpaired=progress.collected.unpaired,
+        exposures=progress.collected.exposures,
+        observations=progress.collected.observations,
+        coverage=progress.collected.coverage,
+        calibration_age=progress.calibration_age_s,
+        calibration_id=progress.calibration_id,
+    )
+    message.header.stamp = stamp
+    message.header.frame_id = f'{progress.fluoroscope}_optical'
+    last = progress.last_round
+    if last is not None:
+        message.iteration = last.iteration
+        message.k = last.k[progress.fluoroscope]
+        message.cost_adjustment = last.F
+        message.cost_regression = last.G
+        message.rmse_u, message.rmse_v = (float(x) for x in last.rmse[progress.fluoroscope])
+    return message
+
+
+def _state_of(progress: FluoroscopeProgress) -> int:
+    if progress.is_calibrating:
+        return CalibrationStatus.CALIBRATING
+    if progress.calibration is not None:
+        return CalibrationStatus.CALIBRATED
+    return CalibrationStatus.COLLECTING

@@ -1,0 +1,374 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Work in processes of their own: started, watched, limited and ended in one way.
+
+A `WorkerProcess` calls a function in another process, call after call; `run_module` runs a module
+as a program. Either ends with the process that has started it, however that ends. `Programs` run
+beside it, and are interrupted at its end.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import pickle
+import signal
+import subprocess
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import dataclass
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
+from pathlib import Path
+from typing import Any, NoReturn, TypeVar
+
+from .limits import ReadLimits, read_limits, use_read_limits
+
+Started = TypeVar('Started', bound='Programs')
+
+PARENT_POLL_S = 0.5  # interval at which a process looks whether its caller is alive
+CANCEL_POLL_S = 0.05  # interval at which a call may be cancelled
+END_S = 1.0  # in which a process that has closed its connection ends
+PROGRAM_END_S = 5  # in which a program ends that was interrupted
+
+
+@dataclass(frozen=True)
+class Resources:
+    """What a process may use of the machine.
+
+    Attributes
+    ----------
+    nice : int
+        By how much its priority is lowered.
+    one_core : bool
+        Whether its libraries use a single thread each.
+    """
+
+    nice: int = 0
+    one_core: bool = True
+
+
+OF_STREAM = Resources(nice=5)  # lower priority than the nodes, which must not wait for images
+OF_JOB = Resources(nice=10, one_core=False)  # lower than all that is live
+
+
+class ProcessEnded(RuntimeError):
+    """A process has ended during a call."""
+
+
+class WorkerProcess:
+    """Calls a function in another process, call after call.
+
+    One thread calls it, any may close it. After its process has ended, the next call starts a new
+    one. Interrupts from the keyboard do not reach the process.
+
+    Parameters
+    ----------
+    make : callable
+        Returns the function, in the process; it can be pickled.
+    what : str
+        What it is, for errors: 'the process of ...'.
+    resources : Resources
+    """
+
+    def __init__(
+        self,
+        make: Callable[[], Callable[..., Any]],
+        what: str,
+        resources: Resources = Resources(),
+    ) -> None:
+        self._make = make
+        self._what = what
+        self._resources = resources
+        self._lock = threading.Lock()
+        self._closed = False
+        self._process: SpawnProcess | None = None
+        self._connection: Connection | None = None
+
+    def start(self) -> None:
+        """Start the process, so that it is ready for the first call."""
+        with self._lock:
+            if self._process is not None or self._closed:
+                return
+            context = multiprocessing.get_context('spawn')  # a fork would copy locks of threads
+            self._connection, other = context.Pipe()
+            # Arguments arrive in their order: the watch before those that import modules.
+            arguments = (_ParentWatch(), read_limits(), self._resources, other, self._make)
+            self._process = context.Process(target=_serve, daemon=True, args=arguments)
+            with interrupts_blocked():
+                self._process.start()
+            other.close()
+
+    def __call__(
+        self,
+        *arguments: Any,
+        progress: Callable[..., None] | None = None,
+        raise_if_cancelled: Callable[[], None] | None = None,
+    ) -> Any:
+        """Return the result of a call.
+
+        Parameters
+        ----------
+        *arguments
+            Of the function; they can be pickled.
+        progress : callable, optional
+            Given to the function as such: what is called there is called here.
+        raise_if_cancelled : callable, optional
+            Called again and again; where it raises, the process is ended.
+
+        Raises
+        ------
+        ValueError, OSError
+            Where the function raises them: what a user can cause.
+        RuntimeError
+            Where the function fails otherwise; ProcessEnded where the process ends.
+        """
+        self.send(*arguments, progress=progress is not None)
+        return self.receive(progress, raise_if_cancelled)
+
+    def send(self, *arguments: Any, progress: bool = False) -> None:
+        """Begin a call; its result is received before the next one. Raises ProcessEnded."""
+        self.start()
+        try:
+            self._open_connection().send((arguments, progress))
+        except OSError:
+            self._raise_ended()
+
+    def receive(
+        self,
+        progress: Callable[..., None] | None = None,
+        raise_if_cancelled: Callable[[], None] | None = None,
+    ) -> Any:
+        """Return the result of the call that was begun; errors are those of a call."""
+        connection = self._open_connection()
+        try:
+            while True:
+                if raise_if_cancelled is not None:
+                    raise_if_cancelled()
+                    if not connection.poll(CANCEL_POLL_S):
+                        continue
+                message = self._received(connection)
+                if not isinstance(message, _Progress):
+                    break
+                if progress is not None:
+                    progress(*message.arguments)
+        except BaseException:  # cancelled, or interrupted: the process is still at work
+            self._end(0)
+            raise
+        if not isinstance(message, _Failure):
+            return message
+        if isinstance(message.error, (ValueError, OSError)):
+            raise message.error
+        trace = RuntimeError(message.trace)
+        raise RuntimeError(f'{self._what} failed: {message.error!r}') from trace
+
+    def _received(self, connection: Connection) -> Any:
+        """Return the next message of the process. Raises ProcessEnded."""
+        try:
+            return connection.recv()
+        except (EOFError, OSError):
+            self._raise_ended()
+
+    def close(self) -> None:
+        """End the process, also during a call, which then raises RuntimeError."""
+        self._closed = True
+        self._end(0)
+
+    def _open_connection(self) -> Connection:
+        connection = self._connection
+        if connection is None:
+            raise ProcessEnded(f'{self._what} was ended')
+        return connection
+
+    def _raise_ended(self) -> NoReturn:
+        """Clear up after a process that has ended by itself."""
+        status = self._end(END_S)
+        raise ProcessEnded(f'{self._what} ended with status {status}') from None
+
+    def _end(self, patience_s: float) -> int | None:
+        """End the process, by force where it does not end itself; returns its exit status."""
+        with self._lock:
+            process = self._process
+            self._process = None
+            self._connection = None
+        if process is None:
+            return None
+        process.join(patience_s)
+        process.terminate()
+        process.join()
+        return process.exitcode
+
+
+@dataclass(frozen=True)
+class _Progress:
+    """Arguments of a call of progress."""
+
+    arguments: tuple[Any, ...]
+
+
+@dataclass(frozen=True)
+class _Failure:
+    """What a function has raised, and where."""
+
+    error: BaseException
+    trace: str
+
+
+def _serve(
+    _: None,
+    limits: ReadLimits,
+    resources: Resources,
+    connection: Connection,
+    make: Callable[[], Callable[..., Any]],
+) -> None:
+    """Answer calls until the caller has closed the connection or has died."""
+    use_read_limits(limits)
+    os.nice(resources.nice)
+    with ExitStack() as stack:
+        stack.enter_context(suppress(EOFError, BrokenPipeError, ConnectionResetError))
+        if resources.one_core:
+            stack.enter_context(one_core())
+        function = make()
+        while True:
+            arguments, progress = connection.recv()
+            keywords = {'progress': lambda *a: connection.send(_Progress(a))} if progress else {}
+            connection.send(_answer(function, arguments, keywords))
+
+
+def _answer(
+    function: Callable[..., Any], arguments: tuple[Any, ...], keywords: dict[str, Any]
+) -> Any:
+    """Return the result of a function, or its _Failure: this call is lost, the next one is not."""
+    try:
+        return function(*arguments, **keywords)
+    except BrokenPipeError:
+        raise  # the caller has gone
+    except Exception as error:
+        trace = ''.join(traceback.format_exception(error))
+        try:
+            pickle.loads(pickle.dumps(error))
+        except Exception:  # an error with arguments of its own
+            return _Failure(RuntimeError(repr(error)), trace)
+        return _Failure(error, trace)
+
+
+@contextmanager
+def one_core() -> Iterator[None]:
+    """Let the libraries of this process use a single thread each: others work beside it."""
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    cv2.setNumThreads(1)
+    with threadpool_limits(1):
+        yield
+
+
+@contextmanager
+def interrupts_blocked() -> Iterator[None]:
+    """Keep interrupts from the keyboard from the processes that are started meanwhile.
+
+    They inherit the mask of the calling thread: an interrupt only reaches the caller, which ends
+    them.
+    """
+    resource_tracker.ensure_running()  # unblocks interrupts when it is started
+    masked = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, masked)
+
+
+class _ParentWatch:
+    """Argument of a process that begins to watch the parent where it arrives.
+
+    That is before the process imports the modules of the arguments behind it, which takes seconds
+    on a busy machine.
+    """
+
+    def __reduce__(self) -> tuple[Callable[[int], None], tuple[int]]:
+        return watch_parent, (os.getpid(),)
+
+
+def watch_parent(parent: int) -> None:
+    """End this process with its parent, from a thread of its own."""
+
+    def watch() -> None:
+        while os.getppid() == parent:
+            time.sleep(PARENT_POLL_S)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+class Programs:
+    """Modules that run as programs, and end together: a context manager.
+
+    Each has a session of its own: an interrupt from the keyboard reaches it from here, in order.
+    """
+
+    def __init__(self) -> None:
+        self._processes: list[subprocess.Popen[Any]] = []
+
+    def run(self, name: str, *arguments: str, log: Path) -> subprocess.Popen[Any]:
+        """Start a module, whose output is added to a file; returns its process."""
+        with open(log, 'ab') as out:
+            process = subprocess.Popen(
+                _command(name, arguments), stdout=out, stderr=out, start_new_session=True
+            )
+        self._processes.append(process)
+        return process
+
+    def failed(self) -> list[subprocess.Popen[Any]]:
+        """Return the processes that have ended with a fault."""
+        return [p for p in self._processes if p.poll() not in (None, 0)]
+
+    def __enter__(self: Started) -> Started:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        running = [p for p in self._processes if p.poll() is None]
+        for process in running:
+            process.send_signal(signal.SIGINT)
+        for process in running:
+            try:
+                process.wait(timeout=PROGRAM_END_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+
+
+def run_module(name: str, *arguments: str, timeout_s: float) -> subprocess.CompletedProcess[bytes]:
+    """Run a module of the package as a program, which does not import that of its caller.
+
+    The program calls watch_parent(). Raises TimeoutError.
+    """
+    root = str(Path(__file__).resolve().parents[1])
+    environment = {
+        **os.environ,
+        'OPENBLAS_NUM_THREADS': '1',  # each takes address space
+        'PYTHONPATH': os.pathsep.join(filter(None, [root, os.environ.get('PYTHONPATH')])),
+    }
+    try:
+        return subprocess.run(
+            _command(name, arguments),
+            capture_output=True,
+            timeout=timeout_s,
+            env=environment,
+            check=False,
+        )
+    except subprocess.TimeoutExpired:
+        raise TimeoutError(f'{name} takes longer than {timeout_s:g} s') from None
+
+
+def _command(name: str, arguments: Sequence[str]) -> list[str]:
+    """Return the command that runs a module."""
+    return [sys.executable, '-m', name, *arguments]

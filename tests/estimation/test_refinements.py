@@ -1,0 +1,96 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+"""Refinements of a collocation: when they are tried, and what they propose."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.correction.series import Functions
+from fluoro_calib_ros.estimation.fluoroscope_terms import SeriesEquations
+from fluoro_calib_ros.estimation.priors import Prior
+from fluoro_calib_ros.estimation.refinements import (
+    MAX_MODES,
+    MODE_CHANGES,
+    MorePlaces,
+    NumberOfSines,
+    Once,
+    ShortField,
+    Solution,
+)
+from fluoro_calib_ros.estimation.signal import Signal
+
+SIZE = (1024, 1024)
+
+
+def solution(reach=300.0, is_steady=True, level=1e2, own=None):
+    """A solution with 16 sines along the image and a field of a correlation length [px]."""
+    functions = Functions(SIZE, 3, 16)
+    prior = Prior(Signal(0.5, reach), np.zeros(14))
+    part = SimpleNamespace(number=0, functions=functions, prior=prior, own=own)
+    information = level * np.eye(2 * len(functions))
+    equations = SeriesEquations(information, np.zeros(len(information)))
+    return Solution([part], None, [equations], is_steady)
+
+
+def test_as_many_sines_as_the_image_points_can_tell():
+    """A shorter field and more image points need more of them."""
+    long, short = (NumberOfSines().propose(solution(reach)).modes[0] for reach in (400.0, 150.0))
+    assert long < short <= MAX_MODES
+    more = NumberOfSines().propose(solution(400.0, level=1e4)).modes[0]
+    assert long < more
+
+
+def test_the_number_of_sines_changes_a_few_times_and_anew_where_exposures_differ():
+    """What varies may have passed for a short signal."""
+    refinement = NumberOfSines()
+    found = [refinement.propose(solution(100.0)) for _ in range(MODE_CHANGES + 1)]
+    assert [change is not None for change in found] == [True] * MODE_CHANGES + [False]
+    assert refinement.propose(solution(100.0, own=object())) is not None
+
+
+def test_few_sines_less_are_not_worth_a_change():
+    """But the first number is only a start."""
+    reaches = np.arange(100.0, 900.0, 10.0)
+    first = {reach: NumberOfSines().propose(solution(reach)) for reach in reaches}
+    fewer = [reach for reach, change in first.items() if change and 12 <= change.modes[0] < 16]
+    assert fewer
+    for reach in fewer:
+        assert NumberOfSines(changes=1).propose(solution(reach)) is None
+
+
+def test_alternatives_are_tried_once_in_turn_at_steady_priors():
+    """The first that proposes a change ends the search."""
+    tried = []
+
+    def alternative(name, change):
+        def propose(_):
+            tried.append(name)
+            return change
+
+        return propose
+
+    once = Once(alternative('a', None), alternative('b', 'change'), alternative('c', 'other'))
+    assert once.propose(solution(is_steady=False)) is None
+    assert not tried
+    assert once.propose(solution()) == 'change'
+    assert tried == ['a', 'b']
+    assert once.propose(solution()) is None
+    assert tried == ['a', 'b']
+
+
+@pytest.mark.parametrize('refinement', [ShortField(0), MorePlaces(0), MorePlaces()])
+def test_a_prior_is_not_searched_where_that_is_done_or_nothing_is_there(refinement):
+    """A given prior was refined where it was estimated; places beside none are none."""
+    there = solution()
+    part = there.parts[0]
+    assert refinement.propose(part, there.equations[0], part.prior) is None
+
+
+def test_a_short_field_is_searched_only_where_the_prior_hardly_changes():
+    """A long field that is on its way may still become what a short one would be."""
+    there = solution()
+    part = there.parts[0]
+    changed = Prior(Signal(0.5, 100.0), np.zeros(14))
+    assert ShortField().propose(part, there.equations[0], changed) is None

@@ -1,0 +1,212 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Distortion that differs between exposures, and what a model cannot follow."""
+
+import numpy as np
+import pytest
+from scipy.special import j0
+
+from fluoro_calib_ros.correction.series import SD_GRID, Functions, Series
+from fluoro_calib_ros.estimation.exposure_terms import (
+    VARYING,
+    ExposureTerms,
+    exposure_functions,
+    variation,
+    without_exposure_terms,
+)
+from fluoro_calib_ros.estimation.gauge import gauge_basis
+from fluoro_calib_ros.estimation.lack_of_fit import (
+    FittedPoints,
+    LeftOut,
+    sd_of_rejected,
+    sd_with_lack_of_fit,
+)
+from fluoro_calib_ros.estimation.signal import Signal, spectral_density
+from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
+
+SIZE = (800, 600)
+INTERIOR = np.array([410.0, 290.0, 2900.0])
+EXPOSURES = 12
+NOISE = 0.25
+
+
+def image_points(seed=0, count=100):
+    """Pixels (n, 2) of some exposures, and their exposures (n,)."""
+    rng = np.random.default_rng(seed)
+    uv = rng.uniform(0, 1, (EXPOSURES * count, 2)) * SIZE
+    return uv, np.repeat(np.arange(EXPOSURES), count), rng
+
+
+def test_terms_are_orthogonal_to_each_other_and_to_the_gauge():
+    uv, _, _ = image_points()
+    functions = exposure_functions(uv, SIZE, INTERIOR).reshape(-1, 14)
+    np.testing.assert_allclose(functions.T @ functions / len(functions), np.eye(14), atol=1e-9)
+    gauge = gauge_basis(uv, INTERIOR).reshape(len(functions), -1)
+    np.testing.assert_allclose(gauge.T @ functions / len(functions), 0, atol=1e-9)
+
+
+@pytest.mark.parametrize('size_px', [0.0, 0.15, 0.5])
+def test_variation_is_found_with_its_size(size_px):
+    uv, exposure, rng = image_points(1)
+    functions = exposure_functions(uv, SIZE, INTERIOR)
+    coefficients = rng.normal(0, size_px / np.sqrt(14), (EXPOSURES, 14))
+    r = np.einsum('nak,nk->na', functions, coefficients[exposure])
+    found = variation(r + rng.normal(0, 0.8 * NOISE, r.shape), exposure, functions)
+    # Independent residuals have 1; those of an adjustment less, which the limit is for.
+    assert found.chi2_per_dof > 1.5 * VARYING if size_px else found.chi2_per_dof < 1.25
+    assert found.size_px == pytest.approx(np.sqrt(np.mean(r**2)), rel=0.25, abs=0.03)
+
+
+def test_variances_of_the_terms_are_found_and_vanish_where_nothing_differs():
+    uv, exposure, rng = image_points(2)
+    functions = exposure_functions(uv, SIZE, INTERIOR)
+    true = np.zeros(14)
+    true[[0, 5, 9]] = 0.3
+    coefficients = rng.normal(0, 1, (EXPOSURES, 14)) * true
+    values = np.einsum('nak,nk->na', functions, coefficients[exposure])
+    values += rng.normal(0, NOISE, values.shape)
+    terms = ExposureTerms(functions, exposure, 0.5)
+    parameters = AdditionalParameters(np.zeros((len(uv), 0)), np.zeros((0, 0)), terms.functions)
+    a = np.zeros((len(uv), 2, EXPOSURES, 14))
+    a[np.arange(len(uv)), :, exposure] = functions
+    a = a.reshape(2 * len(uv), -1)
+    information = parameters.normal_matrix(np.full(len(uv), NOISE**-2.0))
+    np.testing.assert_allclose(information, a.T @ a / NOISE**2, rtol=1e-9, atol=1e-6)
+    right = a.T @ values.ravel() / NOISE**2
+    for _ in range(40):
+        posterior = np.linalg.inv(information + np.diag(terms.precision))
+        terms.renew(posterior @ right, np.diagonal(posterior))
+    sd = np.sqrt(terms.variance)
+    np.testing.assert_allclose(sd[true > 0], coefficients[:, true > 0].std(axis=0), rtol=0.2)
+    assert (sd[true == 0] < 0.03).all()
+    assert terms.size_px == pytest.approx(np.sqrt(np.sum(terms.variance)))
+    reduced, rest = without_exposure_terms(information, right, terms.precision[14:], 14)
+    prior = np.append(np.zeros(14), terms.precision[14:])
+    everything = np.linalg.solve(information + np.diag(prior), right)
+    np.testing.assert_allclose(np.linalg.solve(reduced, rest), everything[:14], rtol=1e-8)
+
+
+def test_what_is_not_known_of_a_change_of_the_interior_is_as_large_as_other_terms():
+    rng = np.random.default_rng(5)
+    uv, exposure, _ = image_points(5)
+    functions = exposure_functions(uv, SIZE, INTERIOR, with_interior=True)
+    terms = ExposureTerms(functions, exposure, 0.5)
+    true = np.full(17, 0.2)
+    true[16] = 0.05
+    mean = rng.normal(0, 1, (EXPOSURES, 17)) * true
+    mean[:, 14] = 0  # not determined: the posterior is the prior
+    for _ in range(40):
+        posterior = np.full((EXPOSURES, 17), 0.01**2)
+        posterior[:, 14] = terms.variance[14]
+        terms.renew(mean.ravel(), posterior.ravel())
+    sd = np.sqrt(terms.variance)
+    assert 0.2 < sd[14] < 0.4
+    np.testing.assert_allclose(sd[:14], np.sqrt(np.mean(mean[:, :14] ** 2, axis=0)), rtol=0.01)
+    np.testing.assert_allclose(sd[15], 0.2, rtol=0.4)
+    assert sd[16] < 0.12
+
+
+def test_what_a_series_cannot_follow_is_part_of_its_standard_deviation():
+    """A dent in one place, and nothing where residuals are noise."""
+    uv, exposure, rng = image_points(3, 200)
+    functions = Functions(SIZE, 1)
+    series = Series(functions, np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
+    noise = rng.normal(0, NOISE, uv.shape)
+    flat = sd_with_lack_of_fit(FittedPoints(uv, noise, exposure), series)
+    assert (flat == 0.02).mean() > 0.98
+    dent = 1.5 * np.exp(-np.sum((uv - [600, 150]) ** 2, axis=1) / (2 * 50**2))
+    row = round(150 / SIZE[1] * (SD_GRID - 1))
+    column = round(600 / SIZE[0] * (SD_GRID - 1))
+    found = sd_with_lack_of_fit(FittedPoints(uv, noise + dent[:, None], exposure), series)
+    assert 0.7 < found[row, column] < 1.6
+    assert np.median(found) < 0.1
+    # Orientations and object points have absorbed half of noise and dent.
+    half = FittedPoints(uv, (noise + dent[:, None]) / 2, exposure, np.full(len(uv), 0.5))
+    np.testing.assert_allclose(sd_with_lack_of_fit(half, series), found, rtol=0.02)
+
+
+def test_residuals_bound_the_variance_beyond_a_series():
+    """A covariance function that expects too much is corrected, one that expects little is not."""
+    uv, exposure, rng = image_points(4, 200)
+    series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.zeros((SD_GRID, SD_GRID)))
+    noise = rng.normal(0, NOISE, uv.shape)
+    points = FittedPoints(uv, noise, exposure)
+
+    def smooth(sd_px):
+        return LeftOut(sd_px, np.ones_like)
+
+    assert np.median(sd_with_lack_of_fit(points, series, smooth(0.005))) == pytest.approx(
+        0.005, rel=0.2
+    )
+    assert np.median(sd_with_lack_of_fit(points, series, smooth(1.0))) < 0.2 * NOISE
+    ripples = 0.2 * np.sin(uv / 15)
+    rippled = FittedPoints(uv, noise + ripples, exposure)
+    shown = np.median(sd_with_lack_of_fit(rippled, series, smooth(1.0)))
+    assert 0.5 * 0.14 < shown < 1.5 * 0.14
+    # Also ripples that change much from one point to the next.
+    waves = 0.3 * np.sin(uv / 7)
+    found = np.median(sd_with_lack_of_fit(FittedPoints(uv, noise + waves, exposure), series))
+    assert 0.7 * 0.21 < found < 1.4 * 0.21
+    # Ripples too short for the distance of the points cannot be excluded.
+    short = LeftOut(0.5, np.zeros_like)
+    assert np.median(sd_with_lack_of_fit(points, series, short)) == pytest.approx(0.5)
+
+
+def test_correlation_of_what_a_series_leaves_out():
+    """It is that of random waves which the covariance function expects."""
+    signal = Signal(0.5, 100.0, 0.2, 30.0)
+    distance = np.array([0.0, 10.0, 30.0, 80.0])
+    found = signal.correlation_beyond(0.05, distance)
+    f = np.linspace(0.05, 3.0, 20000)
+    density = spectral_density(f, 0.5, 100.0) + spectral_density(f, 0.2, 30.0)
+    expected = [np.sum(density * f * j0(f * d)) / np.sum(density * f) for d in distance]
+    np.testing.assert_allclose(found, expected, atol=0.02)
+    assert found[0] == pytest.approx(1.0)
+
+
+def test_rejected_points_that_agree_are_an_error_of_the_correction():
+    """Those of a dent are, false matches are not."""
+    uv, exposure, rng = image_points(5, 200)
+    series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
+    inliers = FittedPoints(uv, rng.normal(0, NOISE, uv.shape), exposure)
+    false = rng.permutation(len(uv))[: len(uv) // 5]
+    wrong = rng.normal(0, 20.0, (len(false), 2))
+    nothing = sd_of_rejected(inliers, FittedPoints(uv[false], wrong, exposure[false]), series)
+    assert (nothing > 0).mean() < 0.02
+    # Many of so small ones agree by chance.
+    small = wrong / np.linalg.norm(wrong, axis=1)[:, None] * 5 * NOISE
+    nothing = sd_of_rejected(inliers, FittedPoints(uv[false], small, exposure[false]), series)
+    assert not nothing.any()
+    dent = np.flatnonzero(np.linalg.norm(uv - [600, 150], axis=1) < 40)
+    residuals = np.array([1.5, -1.0]) + rng.normal(0, NOISE, (len(dent), 2))
+    rejected = FittedPoints(uv[dent], residuals, exposure[dent])
+    rest = np.setdiff1d(np.arange(len(uv)), dent)
+    outside = FittedPoints(uv[rest], inliers.residuals[rest], exposure[rest])
+    found = sd_of_rejected(outside, rejected, series)
+    row = round(150 / SIZE[1] * (SD_GRID - 1))
+    column = round(600 / SIZE[0] * (SD_GRID - 1))
+    assert 1.0 < found[row, column] < 2.0
+    assert (found > 0).mean() < 0.05
+    # With as many inliers beside them, they are half of the variance there.
+    half = sd_of_rejected(inliers, rejected, series)
+    assert half[row, column] == pytest.approx(found[row, column] / np.sqrt(2), rel=0.1)
+
+
+def test_rejected_points_at_a_rim_that_one_exposure_shows_are_an_error_of_the_correction():
+    """Nothing contradicts them there; where other exposures have inliers, they do."""
+    uv, exposure, rng = image_points(5, 200)
+    series = Series(Functions(SIZE, 1), np.zeros((2, 3)), np.full((SD_GRID, SD_GRID), 0.02))
+    residuals = rng.normal(0, NOISE, uv.shape)
+    at_rim = uv[:, 0] > 0.92 * SIZE[0]
+    shown = (exposure == 2) & at_rim
+    growing = (uv[:, 0] - 0.92 * SIZE[0])[shown, None] * [0.05, 0.02] + [1.0, 0.5]
+    rejected = FittedPoints(uv[shown], growing, exposure[shown])
+
+    def found(others):
+        used = np.flatnonzero(others)
+        inliers = FittedPoints(uv[used], residuals[used], exposure[used])
+        return sd_of_rejected(inliers, rejected, series)[:, -2:]
+
+    assert np.count_nonzero(found(~at_rim) > 1.0) > 10
+    assert not found(~shown).any()

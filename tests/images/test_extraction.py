@@ -1,0 +1,338 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Beads of rendered radiographs: found, measured, matched; what is not the phantom is refused."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import cv2
+import numpy as np
+import pytest
+from rigs import refused
+from scipy.spatial import cKDTree
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.images.detection import detect_beads
+from fluoro_calib_ros.images.extraction import Extraction, extract_beads
+from fluoro_calib_ros.images.following import Far, follow, moved_on
+from fluoro_calib_ros.images.growth import Seen
+from fluoro_calib_ros.images.matching import PhantomModel, match
+from fluoro_calib_ros.images.measurement import estimate_noise, measure_beads
+from fluoro_calib_ros.images.shadow_profile import Profile
+from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, may_be_found
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.simulation.exposures import phantom_poses
+from fluoro_calib_ros.simulation.radiographs import HARD, Radiography
+from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+
+LENS = Lens((1024, 1024), 4000.0)
+
+
+@cache
+def rig() -> VirtualRig:
+    return virtual_rig(8)
+
+
+@cache
+def model() -> PhantomModel:
+    return PhantomModel.of(rig().phantom.xyz_mm)
+
+
+@cache
+def radiograph() -> tuple[np.ndarray, np.ndarray, Radiography]:
+    """A noisy image with clutter, and the true centres."""
+    radiography = Radiography(rig().fluoroscopes[0], HARD)
+    pose = phantom_poses(np.random.default_rng(4), 3)[1]
+    image = radiography.image(rig().true_mm, pose, seed=4)
+    return image, radiography.centres(rig().true_mm, pose), radiography
+
+
+@cache
+def extraction() -> Extraction:
+    return extract_beads(radiograph()[0], model(), LENS)
+
+
+def test_free_beads_are_found_and_no_match_is_false():
+    found = extraction()
+    _, true, radiography = radiograph()
+    error = found.uv - true[found.bead]
+    assert np.abs(error).max() < 1.0
+    free = radiography.in_field(true, 10) & (cKDTree(true).query(true, k=2)[0][:, 1] > 10)
+    assert free.sum() > 200
+    assert np.isin(np.flatnonzero(free), found.bead).mean() > 0.95
+
+
+def test_centres_are_as_precise_as_their_sigma_says():
+    found = extraction()
+    _, true, _ = radiograph()
+    free = ~found.overlapped
+    error = (found.uv - true[found.bead])[free]
+    assert np.median(np.abs(error)) / 0.6745 < 0.055
+    normalised = np.median(np.abs(error) / found.sigma[free, None]) / 0.6745
+    assert 0.8 < normalised < 1.25
+    assert np.all(np.abs(np.median(error, axis=0)) < 0.01)
+
+
+def test_bright_beads_are_the_same_beads():
+    image, _, _ = radiograph()
+    dark = detect_beads(image)
+    bright = detect_beads(255 - image)
+    assert bright.inverted and not dark.inverted
+    distance, _ = cKDTree(bright.uv).query(dark.uv)
+    assert np.mean(distance < 0.01) > 0.98
+    assert abs(len(bright.uv) - len(dark.uv)) < 0.02 * len(dark.uv)
+
+
+def test_each_refused_bead_has_a_reason():
+    found = extraction()
+    assert found.refused
+    assert all(refusal.finding.kind.value.startswith('bead_') for refusal in found.refused)
+    assert not set(found.bead.tolist()) & {refusal.bead for refusal in found.refused}
+
+
+def test_two_overlapping_beads_have_honest_sigmas():
+    profile = Profile(2.8, 0.9, 1.2, 0.0)
+    rng = np.random.default_rng(3)
+    true = np.array([[10.3, 11.8], [14.6, 12.4]])
+    # Attenuated on a fine grid, blurred, and read where the pixels are.
+    axis = np.arange(-10, 240) / 10
+    fine = np.stack(np.meshgrid(axis, axis), axis=-1)
+    light = 800.0 * np.ones(fine.shape[:2])
+    for centre in true:
+        squared = np.sum((fine - centre) ** 2, axis=2)
+        light *= np.exp(-1.2 * 2 * np.sqrt(np.maximum(2.8**2 - squared, 0)) / 2.8)
+    light = cv2.GaussianBlur(light, (0, 0), 10 * np.sqrt(0.9**2 + 1 / 12))[10::10, 10::10]
+    normalised = []
+    sigmas = []
+    for _ in range(30):
+        image = rng.poisson(light).astype(np.float32)
+        noise = replace(
+            estimate_noise(image, np.ones(image.shape, bool)),
+            constant=0.1,
+            gain=1.0,
+            correlation=np.ones((1, 1)),
+        )
+        start = true + rng.normal(0, 0.3, true.shape)
+        beads = measure_beads(image, np.ones(image.shape, bool), start, np.ones(2), profile, noise)
+        assert beads.overlapped.all()
+        normalised.append((beads.uv - true) / beads.sigma[:, None])
+        sigmas.append(beads.sigma)
+    assert 0.8 < np.sqrt(np.mean(np.square(normalised))) < 1.25
+    assert np.mean(sigmas) > 0.015
+
+
+def test_profile_is_the_convolution_of_the_sphere():
+    profile = Profile(3.0, 1.0, 0.8)
+    axis = np.arange(-120, 121) * 0.1
+    x, y = np.meshgrid(axis, axis)
+    chord = 2 * np.sqrt(np.maximum(9 - x * x - y * y, 0)) / 3
+    blurred = cv2.GaussianBlur(1 - np.exp(-0.8 * chord), (0, 0), 10 * np.sqrt(1 + 1 / 12))
+    distance = np.array([0.0, 1.3, 2.7, 4.2])
+    value, slope = profile.shadow(distance)
+    assert np.allclose(value, np.interp(distance, axis[120:], blurred[120, 120:]), atol=2e-3)
+    step = 0.05
+    ahead, behind = (profile.shadow(distance[1:] + side)[0] for side in (step, -step))
+    numeric = (ahead - behind) / (2 * step)
+    assert np.allclose(slope[1:], numeric, atol=2e-3)
+
+
+def test_a_view_is_fitted_to_its_own_projection():
+    rng = np.random.default_rng(0)
+    xyz = rng.uniform(-130, 130, (200, 3))
+    coefficients = rng.normal(0, 1, (2, len(exponents(5)))) * LENS.deviations(5)
+    true = View(LENS, np.eye(3), np.array([0, 0, -1500.0]), 4100.0, coefficients, 5)
+    start = replace(
+        true,
+        rotation=matrix_from_vector([0.01, -0.02, 0.03]),
+        position=np.array([5.0, -5, -1480]),
+        principal_distance_px=4000.0,
+        coefficients=0 * coefficients,
+    )
+    fitted, _ = fit_view(start, xyz, true.project(xyz), 12, 0.01)
+    assert np.abs(fitted.project(xyz) - true.project(xyz)).max() < 0.05
+
+
+def test_the_pose_of_a_regular_phantom_is_refused():
+    axis = np.arange(4) * 40.0 - 60
+    cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    view = View(
+        LENS, matrix_from_vector([0.4, 0.3, 0.2]), np.zeros(3), 4000.0, np.zeros((2, 2)), 1
+    )
+    view = replace(view, position=-view.rotation.T @ np.array([0, 0, 1500.0]))
+    field = np.ones((1024, 1024), bool)
+    uv = view.project(cube)
+    with refused(Kind.POSE_AMBIGUOUS):
+        match(Seen.of(uv, field, 3.0), PhantomModel.of(cube), LENS)
+    # A few beads off the grid make it unique.
+    rng = np.random.default_rng(1)
+    marked = cube + rng.uniform(-6, 6, cube.shape)
+    uv = view.project(marked)
+    found = match(Seen.of(uv, field, 3.0), PhantomModel.of(marked), LENS)
+    assert np.array_equal(found.bead, found.detection)
+    assert len(found.bead) > 60
+
+
+def regular_cube(large: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """64 beads in four layers, of 2 mm but for some of 3 mm."""
+    axis = np.arange(4) * 40.0 - 60
+    cube = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    diameter = np.full(64, 2.0)
+    diameter[large] = 3.0
+    return cube, diameter
+
+
+def test_reference_beads_of_another_size_tell_the_sides_of_a_regular_cube():
+    cube, diameter = regular_cube([0, 5, 23, 61])
+    radiography = Radiography(rig().fluoroscopes[0], replace(HARD, bits=16))
+    pose = (matrix_from_vector([0.5, 0.3, 0.2]), np.zeros(3))
+    image = radiography.image(cube, pose, 3, diameter)
+    found = extract_beads(image, PhantomModel.of(cube, diameter), LENS)
+    true = radiography.centres(cube, pose)
+    assert np.abs(found.uv - true[found.bead]).max() < 1.0
+    assert len(found.bead) > 50
+    with refused(Kind.POSE_AMBIGUOUS):
+        extract_beads(image, PhantomModel.of(cube), LENS)
+
+
+def small_phantom(seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-90, 90, (80, 3))
+
+
+def seen_of(xyz: np.ndarray) -> Seen:
+    """What is found of points in some pose."""
+    rotation = matrix_from_vector([0.3, -0.5, 0.2])
+    position = -rotation.T @ np.array([10.0, -5.0, 1500.0])
+    view = View(LENS, rotation, position, 4000.0, np.zeros((2, 2)), 1)
+    return Seen.of(view.project(xyz), np.ones((1024, 1024), bool), 3.0)
+
+
+def test_another_phantom_is_refused():
+    seen = seen_of(small_phantom(1))
+    assert len(match(seen, PhantomModel.of(small_phantom(1)), LENS).bead) == 80
+    with pytest.raises(DataError) as error:
+        match(seen, PhantomModel.of(small_phantom(2)), LENS)
+    assert may_be_found(error.value.finding)
+
+
+@pytest.mark.parametrize('shift_mm', [0.3, 12.0])
+def test_a_pose_nearby_is_followed(shift_mm):
+    xyz = small_phantom(1)
+    seen = seen_of(xyz)
+    model = PhantomModel.of(xyz)
+    found = match(seen, model, LENS)
+    turn = matrix_from_vector([0.003, -0.002, 0.004])
+    moved = replace(
+        found.view,
+        rotation=turn @ found.view.rotation,
+        position=found.view.position + shift_mm * found.view.rotation[0],
+    )
+    followed = follow(seen, model, moved, 0.1)
+    assert np.array_equal(np.sort(followed.bead), np.sort(found.bead))
+    assert np.allclose(followed.view.position, found.view.position, atol=0.1)
+
+
+@pytest.mark.parametrize('degrees', [8, 25])
+def test_a_pose_far_off_is_followed(degrees):
+    """As between exposures of a film of which most are left out."""
+    xyz = small_phantom(1)
+    seen = seen_of(xyz)
+    model = PhantomModel.of(xyz)
+    found = match(seen, model, LENS)
+    turn = matrix_from_vector(np.deg2rad(degrees) * np.array([0.6, 0.0, 0.8]))
+    rotation = turn @ found.view.rotation
+    position = rotation.T @ (found.view.rotation @ found.view.position) + [9.0, -4.0, 20.0]
+    moved = replace(found.view, rotation=rotation, position=position)
+    followed = follow(seen, model, moved, 0.1, Far())
+    assert np.array_equal(np.sort(followed.bead), np.sort(found.bead))
+    assert np.allclose(followed.view.position, found.view.position, atol=0.1)
+
+
+def test_a_motion_goes_on():
+    """A phantom that turns and moves evenly is where it is expected to be."""
+    turn = np.array([0.02, -0.03, 0.01])
+    centre = np.array([5.0, 6.0, 7.0])
+
+    def view(number: int) -> View:
+        rotation = matrix_from_vector(number * turn) @ matrix_from_vector([0.3, 0.2, 0.1])
+        sensor = np.array([10.0, -20.0, 1000.0]) + number * np.array([2.0, 1.0, -3.0])
+        return View(LENS, rotation, centre - rotation.T @ sensor, 4000.0, np.zeros((2, 2)), 1)
+
+    ahead = moved_on(view(0), view(2), centre, 2.5)
+    assert np.allclose(ahead.rotation, view(7).rotation)
+    assert np.allclose(ahead.position, view(7).position)
+    assert moved_on(view(0), view(2), centre, 30.0) is None  # too far to be trusted
+
+
+def test_a_grid_is_not_followed_by_a_step_of_its_pattern():
+    """A regular grid looks alike in several places: none of them is guessed."""
+    side = np.arange(15) * 10.0 - 70
+    xyz = np.stack(np.meshgrid(side, side, [0.0]), axis=-1).reshape(-1, 3)
+    rotation = matrix_from_vector([0.1, 0.2, 0.0])
+    view = View(LENS, rotation, -rotation.T @ [0.0, 0.0, 800.0], 4000.0, np.zeros((2, 2)), 1)
+    uv = view.project(xyz)
+    seen = Seen.of(uv, np.ones((1024, 1024), bool), 3.0)
+    step = replace(view, position=view.position + rotation.T @ [14.0, 0.0, 0.0])
+    followed = follow(seen, PhantomModel.of(xyz), step, 0.1, Far())
+    assert followed is None or np.allclose(
+        view.project(xyz[followed.bead]), uv[followed.detection]
+    )
+
+
+def test_another_phantom_is_not_followed():
+    found = match(seen_of(small_phantom(1)), PhantomModel.of(small_phantom(1)), LENS)
+    assert (
+        follow(seen_of(small_phantom(2)), PhantomModel.of(small_phantom(1)), found.view, 1) is None
+    )
+
+
+def test_an_image_followed_has_the_observations_of_one_searched():
+    image, true, _ = radiograph()
+    first = extraction()
+    followed = extract_beads(image, model(), LENS, first.nearby)
+    both = np.intersect1d(first.bead, followed.bead)
+    assert len(both) > 0.98 * len(first.bead)
+    searched, error = (np.abs(one.uv - true[one.bead]) for one in (first, followed))
+    assert error.max() < 1.0
+    assert np.median(error) < 1.05 * np.median(searched)
+
+
+def test_a_survey_with_wrong_beads_gives_no_wrong_observation():
+    _, true, _ = radiograph()
+    xyz = rig().phantom.xyz_mm.copy()
+    rng = np.random.default_rng(2)
+    wrong = rng.permutation(len(xyz))[:40]
+    xyz[wrong] += rng.normal(0, 6, (40, 3))
+    seen_of = extraction().detections
+    seen = Seen.of(seen_of.uv, seen_of.field, seen_of.radius_px)
+    found = match(seen, PhantomModel.of(xyz), Lens((1024, 1024), 4400.0))
+    error = np.linalg.norm(seen.uv[found.detection] - true[found.bead], axis=1)
+    right = ~np.isin(found.bead, wrong)
+    assert np.mean(error[right] < 1.5) > 0.98
+    assert right.sum() > 300
+
+
+@pytest.mark.parametrize(
+    ('image', 'kind'),
+    [
+        (np.zeros((1, 1), np.uint8), Kind.DATA),
+        (np.zeros((200, 200), np.uint16), Kind.IMAGE_EMPTY),
+        (np.full((200, 200), 255, np.uint8), Kind.IMAGE_EMPTY),
+        (
+            np.where(np.arange(40000) % 3, 255, 90).reshape(200, 200).astype(np.uint8),
+            Kind.IMAGE_EMPTY,
+        ),
+        (np.zeros((64, 64, 3), np.uint8), Kind.DATA),
+        (
+            np.random.default_rng(0).poisson(200, (300, 300)).astype(np.uint16),
+            Kind.FEW_BEADS,
+        ),
+    ],
+)
+def test_an_image_without_beads_is_refused(image, kind):
+    with refused(kind) as error:
+        extract_beads(image, model(), LENS)
+    assert not may_be_found(error.value.finding)

@@ -1,0 +1,87 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Flat grids in images: numbered along rows and columns, also where they are bent."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from rigs import refused
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.images.growth import Seen
+from fluoro_calib_ros.images.lattice import number_lattice
+from fluoro_calib_ros.images.matching import PhantomModel, match
+from fluoro_calib_ros.images.view import Lens
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+
+LENS = Lens((1024, 1024), 4000.0)
+SQUARE = np.array([[10.0, 0.0], [0.0, 10.0]])
+HEXAGONAL = np.array([[10.0, 0.0], [5.0, 8.66]])
+
+
+def grid(steps: np.ndarray, count: int = 15, missing: int = 0) -> np.ndarray:
+    place = np.array([(i, j) for i in range(count) for j in range(count)]) - count // 2
+    xyz = np.column_stack([place @ steps, np.zeros(len(place))])
+    kept = np.random.default_rng(1).permutation(len(xyz))[: len(xyz) - missing]
+    return xyz[np.sort(kept)]
+
+
+def pixels(xyz: np.ndarray, tilt: tuple[float, float, float]) -> np.ndarray:
+    """Pixels with a pincushion of 30 px at the rim; NaN outside of the image."""
+    x = xyz @ matrix_from_vector(tilt).T + (4.0, -6.0, 1000.0)
+    ideal = 4000 * x[:, :2] / x[:, 2:]
+    uv = ideal * (1 + 0.06 * np.sum((ideal / 512) ** 2, axis=1, keepdims=True)) + 511.5
+    inside = ((uv > 0) & (uv < 1023)).all(axis=1)
+    return np.where(inside[:, None], uv, np.nan)
+
+
+def seen_of(uv: np.ndarray, extra: int = 0) -> Seen:
+    rng = np.random.default_rng(3)
+    there = uv[np.isfinite(uv[:, 0])]
+    points = np.concatenate(
+        [there + rng.normal(0, 0.1, there.shape), rng.uniform(0, 1023, (extra, 2))]
+    )
+    return Seen.of(points, np.ones((1024, 1024), bool), 3.0)
+
+
+@pytest.mark.parametrize('steps', [SQUARE, HEXAGONAL])
+@pytest.mark.parametrize('tilt', [(0.0, 0.0, 0.3), (0.3, -0.4, 2.0), (-0.5, 0.1, 4.0)])
+def test_a_grid_with_missing_beads_is_told_from_its_symmetries(steps, tilt):
+    xyz = grid(steps, missing=15)
+    true = pixels(xyz, tilt)
+    seen = seen_of(true, extra=20)
+    found = match(seen, PhantomModel.of(xyz), LENS)
+    away = np.linalg.norm(seen.uv[found.detection] - true[found.bead], axis=1)
+    assert np.mean(away < 1) > 0.97
+    assert len(found.bead) > 0.9 * np.isfinite(true[:, 0]).sum()
+
+
+def test_a_regular_grid_is_ambiguous_unless_any_place_will_do():
+    xyz = grid(SQUARE, 27)  # reaches beyond the image
+    seen = seen_of(pixels(xyz, (0.2, 0.1, 0.5)))
+    with refused(Kind.POSE_AMBIGUOUS):
+        match(seen, PhantomModel.of(xyz), LENS)
+    found = match(seen, PhantomModel.of(xyz, regular=True), LENS)
+    assert len(found.bead) > 0.97 * len(seen.uv)
+    # Whichever place it is: beads that are neighbours in the image are so in the grid.
+    _, near = seen.tree.query(seen.uv[found.detection], k=2)
+    row = np.full(len(seen.uv), -1)
+    row[found.detection] = found.bead
+    pairs = row[near]
+    pairs = pairs[(pairs >= 0).all(axis=1)]
+    assert np.allclose(np.linalg.norm(xyz[pairs[:, 0]] - xyz[pairs[:, 1]], axis=1), 10.0)
+
+
+def test_a_phantom_in_space_is_no_regular_grid():
+    xyz = np.random.default_rng(2).uniform(-50, 50, (60, 3))
+    with pytest.raises(DataError, match='no flat grid'):
+        PhantomModel.of(xyz, regular=True)
+
+
+def test_scattered_points_have_no_lattice():
+    points = np.random.default_rng(4).uniform(0, 100, (200, 2))
+    assert number_lattice(points) is None
+    assert number_lattice(points[:5]) is None

@@ -1,0 +1,45 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The file names.csv of a result folder."""
+
+import pytest
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.names import Names
+from fluoro_calib_ros.io.csv_table import read_names, write_names
+
+NAMES = Names({'tib, lat': 4, 'fem "a"': 2}, {'trial 3.tif': 3}, {'Röntgen 1': 'R_ntgen_1'})
+
+
+def test_names_return(tmp_path):
+    """Also those with commas and quotes; without names there is no file."""
+    write_names(tmp_path, NAMES)
+    assert read_names(tmp_path) == NAMES
+    write_names(tmp_path, Names())
+    assert not (tmp_path / 'names.csv').exists()
+    assert read_names(tmp_path) == Names()
+
+
+@pytest.mark.parametrize(
+    ('row', 'sentence'),
+    [
+        ('bead,1,a', "row 2: kind is 'bead', not target, exposure, fluoroscope"),
+        ('target,x,a', "row 2: id is 'x', not a whole number"),
+        ('target,-1,a', "row 2: id is '-1', not a whole number"),
+        ('fluoroscope,../a,a', "row 2: the fluoroscope is called '../a'"),
+        ('target,1,a\ntarget,1,b', "row 3: the target 'b', id 1, is given twice"),
+        ('target,1,a\ntarget,2,a', "row 3: the target 'a', id 2, is given twice"),
+    ],
+)
+def test_wrong_names_name_the_row(tmp_path, row, sentence):
+    path = tmp_path / 'names.csv'
+    path.write_text(f'kind,id,name\n{row}\n')
+    with pytest.raises(DataError) as caught:
+        read_names(tmp_path)
+    assert str(caught.value).startswith(f'{path}, {sentence}')
+
+
+def test_name_with_two_ids_is_refused():
+    with pytest.raises(DataError, match="target 'a' has the id 1, and the id 2"):
+        Names({'a': 1}).merged(Names({'a': 2}))

@@ -1,0 +1,534 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Formats of image points, phantoms, points in space and poses: written, read, refused."""
+
+import csv
+import json
+import os
+import pathlib
+import subprocess
+import sys
+
+import ezc3d
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.exposures.frame import Frame
+from fluoro_calib_ros.exposures.names import Names, number_names, safe_names
+from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.io.formats import registry
+from fluoro_calib_ros.io.formats.content import (
+    Bodies,
+    Camera,
+    Content,
+    FileSettings,
+    Points,
+    Station,
+    points_without_precision,
+)
+from fluoro_calib_ros.jobs.sources import read_source
+
+SIZE = (1024, 768)
+SETTINGS = FileSettings(image_size=SIZE, units='mm')
+
+
+def frames(sigma=False, numbers=(1, 3)):
+    """Two fluoroscopes, some targets not seen, an exposure left out."""
+    rng = np.random.default_rng(5)
+    out = {}
+    for name, seen in (('cam1', [7, 8, 9]), ('cam2', [8, 9, 12])):
+        out[name] = [
+            Frame(
+                name,
+                number,
+                np.array(seen[: 2 + index]),
+                rng.uniform(0, 767, (2 + index, 2)),
+                SIZE,
+                rng.uniform(0.1, 0.3, 2 + index) if sigma else None,
+            )
+            for index, number in enumerate(numbers)
+        ]
+    return out
+
+
+def assert_same_frames(found, expected, atol=0.0):
+    assert sorted(found) == sorted(expected)
+    for name, of_fluoroscope in expected.items():
+        assert [f.number for f in found[name]] == [f.number for f in of_fluoroscope]
+        for one, other in zip(found[name], of_fluoroscope):
+            assert one.image_size == other.image_size
+            np.testing.assert_array_equal(one.target_id, other.target_id)
+            np.testing.assert_allclose(one.uv, other.uv, rtol=0, atol=atol)
+
+
+def phantom():
+    rng = np.random.default_rng(2)
+    xyz = np.round(rng.uniform(-100, 100, (6, 3)), 5)
+    return Phantom(np.array([7, 8, 9, 10, 11, 12]), xyz, np.full(6, 0.1))
+
+
+def refused(path, settings=SETTINGS, kind=None):
+    with pytest.raises(DataError) as caught:
+        registry.read(path, settings, kind)
+    assert '\n' not in str(caught.value)
+    return str(caught.value)
+
+
+# ---- names
+
+
+def test_names_numbered_alike_have_their_numbers():
+    """So that a phantom and a recording agree that do not know of each other."""
+    assert number_names(['bead12', 'bead03']) == {'bead12': 12, 'bead03': 3}
+    assert number_names(['cam1_0017.tif', 'cam1_0004.tif']) == {
+        'cam1_0017.tif': 17,
+        'cam1_0004.tif': 4,
+    }
+
+
+def test_other_names_are_counted_after_the_known_ones():
+    known = {'left': 1, 'right': 2}
+    assert number_names(['top', 'right', 'low'], known) == {**known, 'top': 3, 'low': 4}
+    assert number_names(['m01', 'm1']) == {'m01': 1, 'm1': 2}
+    assert number_names(['x1', 'x2'], {'a': 2}) == {'a': 2, 'x1': 3, 'x2': 4}
+
+
+def test_fluoroscopes_get_names_that_files_and_topics_may_have():
+    assert safe_names(['cam 1', 'cam_1', 'Röntgen/2']) == {
+        'cam 1': 'cam_1',
+        'cam_1': 'cam_1_2',
+        'Röntgen/2': 'R_ntgen_2',
+    }
+
+
+# ---- XMALab 2-D points
+
+
+@pytest.mark.parametrize('one_based', [False, True])
+@pytest.mark.parametrize('y_up', [False, True])
+def test_xmalab_points_return(tmp_path, one_based, y_up):
+    """In all variants of XMALab's dialogue."""
+    path = tmp_path / 'points.csv'
+    settings = FileSettings(image_size=SIZE, one_based=one_based, y_up=y_up)
+    registry.write(path, 'xmalab2d', Content(observations=frames()), settings)
+    rows = list(csv.DictReader(path.open()))
+    assert len(rows) == 3  # exposure 2 was not seen
+    assert set(rows[1].values()) == {'NaN'}
+    frame = frames()['cam1'][0]
+    u, v = frame.uv[0]
+    expected = (u + one_based, (SIZE[1] - 1 - v if y_up else v) + one_based)
+    cells = (rows[0]['marker007_cam1_X'], rows[0]['marker007_cam1_Y'])
+    np.testing.assert_allclose([float(c) for c in cells], expected, atol=1e-12)
+    content = registry.read(path, settings)
+    assert_same_frames(content.observations, frames(), atol=2e-13 if one_based or y_up else 0)
+    assert not content.names
+
+
+def test_names_of_markers_return(tmp_path):
+    names = Names({'tib lat': 7, 'tib med': 8, 'fem': 9, 'pat': 12})
+    path = tmp_path / 'points.csv'
+    content = Content(observations=frames(), names=names)
+    registry.write(path, 'xmalab2d', content, SETTINGS)
+    assert path.read_text().startswith('tib lat_cam1_X,tib lat_cam1_Y,tib lat_cam2_X')
+    again = registry.read(path, FileSettings(image_size=SIZE, names=names))
+    assert again.names == names
+    assert_same_frames(again.observations, frames())
+    assert registry.read(path, SETTINGS).names.targets == {
+        'tib lat': 1,
+        'tib med': 2,
+        'fem': 3,
+        'pat': 4,
+    }
+
+
+def test_offset_columns_of_xmalab_are_read(tmp_path):
+    """XMALab does not separate them in the header; other programs do."""
+    path = tmp_path / 'points.csv'
+    for header in (
+        'cam0_offsetcam1_offsetm1_cam1_X,m1_cam1_Y,m1_cam2_X,m1_cam2_Y',
+        'cam0_offset,cam1_offset,m1_cam1_X,m1_cam1_Y,m1_cam2_X,m1_cam2_Y',
+    ):
+        path.write_text(f'{header}\n0,0,1.5,2.5,NaN,NaN\n')
+        (frame,) = registry.read(path, SETTINGS).observations['cam1']
+        np.testing.assert_array_equal(frame.uv, [[1.5, 2.5]])
+        path.write_text(f'{header}\n0,3,1.5,2.5,NaN,NaN\n')
+        assert 'row 2: the cameras are offset against each other in time' in refused(path)
+
+
+def test_semicolons_with_decimal_commas_are_recognised(tmp_path):
+    """As a spreadsheet writes a table in many countries."""
+    path = tmp_path / 'points.csv'
+    path.write_text('Frame;m1_cam1_X;m1_cam1_Y\n4;1,5;2,25\n9;nan;nan\n')
+    (frame,) = registry.read(path, SETTINGS).observations['cam1']
+    assert frame.number == 4
+    np.testing.assert_array_equal(frame.uv, [[1.5, 2.25]])
+    path.write_text(
+        'fluoroscope;exposure;target_id;u;v;sigma\ncam 1;trial 3.tif;bead01;1,5;2;0,25\n'
+    )
+    content = registry.read(path, SETTINGS)
+    assert content.names == Names({'bead01': 1}, {'trial 3.tif': 3}, {'cam 1': 'cam_1'})
+    (frame,) = content.observations['cam_1']
+    assert (frame.number, frame.sigma.tolist()) == (3, [0.25])
+    np.testing.assert_array_equal(frame.uv, [[1.5, 2.0]])
+    path.write_text(
+        'target_id;x;y;z;sd\n' + ''.join(f'b{i};{i},5;0;{i * i},1;0,1\n' for i in range(5))
+    )
+    survey = registry.read(path, SETTINGS).survey
+    assert survey.xyz_mm[4].tolist() == [4.5, 0, 16.1]
+
+
+@pytest.mark.parametrize(
+    ('text', 'sentence'),
+    [
+        ('m_cam1_X,m_cam1_Y\n1,x\n', "row 2: column 2 is 'x', not a number"),
+        ('m_cam1_X,m_cam1_Y\n1,2,3\n', 'row 2: 3 columns, but the header has 2'),
+        ('m_cam1_X,m_cam2_Y\n1,2\n', 'row 1: the column m_cam1_X is not followed by m_cam1_Y'),
+        ('m_cam1_X,m_cam1_Y\n1,900\n', 'row 2: the point (1, 900) of m in cam1 is off the image'),
+        ('m_cam1_X,m_cam1_Y,m_cam1_X,m_cam1_Y\n1,2,1,2\n', 'row 1: m_cam1 is given twice'),
+        ('m_cam1_X,m_cam1_Y\n', 'the file has a header, but no rows'),
+    ],
+)
+def test_wrong_xmalab_points_name_the_row(tmp_path, text, sentence):
+    path = tmp_path / 'points.csv'
+    path.write_text(text)
+    assert sentence in refused(path)
+
+
+def test_columns_mixing_ids_and_names_are_refused(tmp_path):
+    path = tmp_path / 'points.csv'
+    path.write_text('fluoroscope,exposure,target_id,u,v\na,1,3,5,5\na,1,bead4,6,6\n')
+    assert refused(path) == f"{path}, row 3: target_id is 'bead4', not a whole number"
+
+
+# ---- phantoms
+
+
+@pytest.mark.parametrize('units', ['cm', 'mm', 'm'])
+def test_frame_specification_returns(tmp_path, units):
+    path = tmp_path / 'frame.csv'
+    settings = FileSettings(units=units)
+    names = Names({f'bead {i}': i for i in range(7, 13)})
+    registry.write(path, 'framespec', Content(survey=phantom(), names=names), settings)
+    content = registry.read(path, settings)
+    np.testing.assert_array_equal(content.survey.xyz_mm, phantom().xyz_mm)
+    np.testing.assert_array_equal(content.survey.target_id, phantom().target_id)
+    assert content.names == names
+
+
+def test_frame_specification_of_a_lab_is_read(tmp_path):
+    """In cm unless told otherwise; factors, white beads, rows without names."""
+    path = tmp_path / 'frame.csv'
+    beads = '0,0,1.5\n1,0,0\n0,1,0\n1,1,1\n'
+    for header, factor in (('x y z', 10), ('white', 10), ('s2,s2,s2,x', 20), ('x,y,z', 10)):
+        path.write_text(f'{header}\n{beads}')
+        content = registry.read(path, FileSettings())
+        assert content.survey.target_id.tolist() == [1, 2, 3, 4]
+        assert content.survey.xyz_mm[0].tolist() == [0, 0, 1.5 * factor]
+        assert 'lengths in cm' in content.notes[0]
+    path.write_text('x y z\n0,0,1.5\n1,0\n')
+    assert 'row 3: 2 columns, but a bead has x,y,z' in refused(path)
+    path.write_text('x y z\n0,0,1.5,a\n1,0,2,a\n')
+    assert "row 3: the bead 'a' is given twice" in refused(path)
+
+
+# ---- the program of Chow et al.
+
+
+def stations():
+    rng = np.random.default_rng(8)
+    out = []
+    for name in ('cam1', 'cam2'):
+        for exposure in (1, 3):
+            rotation = Rotation.random(random_state=rng).as_matrix()
+            out.append(Station(name, exposure, rotation, rng.uniform(-900, 900, 3)))
+    return tuple(out)
+
+
+def chow_content():
+    matrices = [np.array([[c, 0, 500.5], [0, c, 380.25], [0, 0, 1]]) for c in (4000.0, 4100.0)]
+    cameras = tuple(Camera(f'cam{i}', m, SIZE) for i, m in enumerate(matrices, 1))
+    return Content(
+        observations=frames(sigma=True), survey=phantom(), cameras=cameras, stations=stations()
+    )
+
+
+def test_files_of_chow_et_al_return(tmp_path):
+    content = chow_content()
+    registry.write(tmp_path, 'bundle', content, SETTINGS)
+    assert sorted(p.name for p in tmp_path.iterdir()) == [
+        f'bundle.{s}' for s in ('eop', 'iop', 'pho', 'xyz')
+    ]
+    again = registry.read(tmp_path / 'bundle.pho', FileSettings(units='mm'))
+    assert_same_frames(again.observations, content.observations)
+    for one, other in zip(again.cameras, content.cameras):
+        assert (one.name, one.image_size) == (other.name, SIZE)
+        np.testing.assert_array_equal(one.matrix, other.matrix)
+    for one, other in zip(again.stations, content.stations):
+        assert (one.fluoroscope, one.exposure) == (other.fluoroscope, other.exposure)
+        np.testing.assert_allclose(one.rotation, other.rotation, atol=1e-12)
+        np.testing.assert_array_equal(one.position_mm, other.position_mm)
+    np.testing.assert_array_equal(again.survey.xyz_mm, phantom().xyz_mm)
+
+
+def test_files_of_chow_et_al_satisfy_its_collinearity_equations(tmp_path):
+    """Of its source, x = xp - c X/Z and y = yp - c Y/Z, with omega, phi, kappa."""
+    registry.write(tmp_path, 'bundle', chow_content(), SETTINGS)
+    iop = np.loadtxt(tmp_path / 'bundle.iop')
+    eop = np.loadtxt(tmp_path / 'bundle.eop')
+    assert iop.shape == (2, 25) and (iop[:, 1] == 1).all()
+    for row, station in zip(eop, stations()):
+        w, p, k = np.radians(row[5:])
+        sw, sp, sk = np.sin([w, p, k])
+        cw, cp, ck = np.cos([w, p, k])
+        turn = np.array(
+            [
+                [cp * ck, cw * sk + sw * sp * ck, sw * sk - cw * sp * ck],
+                [-cp * sk, cw * ck - sw * sp * sk, sw * ck + cw * sp * sk],
+                [sp, -sw * cp, cw * cp],
+            ]
+        )
+        point = station.position_mm + station.rotation.T @ [30.0, -20.0, 1000.0]
+        x, y, z = turn @ (point - row[2:5])
+        _, _, _, _, _, _, xp, yp, c = iop[int(row[1]) - 1, :9]
+        image = np.array([xp - c * x / z, yp - c * y / z])
+        f = chow_content().cameras[int(row[1]) - 1].matrix
+        expected = f[0, 2] + f[0, 0] * 0.03, f[1, 2] - f[0, 0] * 0.02
+        np.testing.assert_allclose([image[0], -image[1]], expected, atol=1e-8)
+
+
+def test_wrong_files_of_chow_et_al_name_the_row(tmp_path):
+    registry.write(tmp_path, 'bundle', chow_content(), SETTINGS)
+    path = tmp_path / 'bundle.pho'
+    lines = path.read_text().splitlines()
+    path.write_text('\n'.join([*lines[:3], lines[3].replace('-', '', 1)]))
+    assert 'row 4: the point is off the image of 1024 x 768 px; y is negative' in refused(path)
+    path.write_text('\n'.join([lines[0], lines[0]]))
+    assert 'row 2: target 7 of this station is already given in row 1' in refused(path)
+    path.write_text('1 2 3\n')
+    assert 'row 1: 3 columns, but a .pho file has 8' in refused(path)
+
+
+# ---- points in space
+
+
+def points(rate=200.0):
+    rng = np.random.default_rng(4)
+    xyz = np.round(rng.uniform(-50, 50, (5, 3, 3)), 4)
+    xyz[1, 2] = np.nan
+    xyz[3] = np.nan
+    sd = np.where(np.isnan(xyz[..., 0]), np.nan, rng.uniform(0.01, 0.09, (5, 3)))
+    return Points(np.array([11, 12, 13, 14, 15]), np.array([1, 2, 5]), xyz, sd, sd, rate)
+
+
+NAMED = Names({'tib lat': 1, 'tib med': 2, 'fem': 5})
+
+
+def test_c3d_is_read_by_ezc3d(tmp_path):
+    """Names, unit, rate, first frame, coordinates, residual; a gap is a residual of -1."""
+    path = tmp_path / 'points.c3d'
+    registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
+    file = ezc3d.c3d(str(path))
+    parameters = file['parameters']['POINT']
+    assert parameters['LABELS']['value'] == ['tib lat', 'tib med', 'fem']
+    assert parameters['UNITS']['value'] == ['mm']
+    assert file['header']['points']['frame_rate'] == 200
+    assert file['header']['points']['first_frame'] == 10  # ezc3d counts from 0
+    xyz = file['data']['points'][:3].transpose(2, 1, 0)
+    seen = ~np.isnan(points().xyz_mm)
+    np.testing.assert_array_equal(xyz[seen], points().xyz_mm[seen].astype(np.float32))
+    residual = file['data']['meta_points']['residuals'][0].T
+    assert (residual[~seen[..., 0]] == -1).all()
+    np.testing.assert_allclose(residual[seen[..., 0]], points().sd_mm[seen[..., 0]], atol=2e-4)
+
+
+def test_damaged_c3d_is_refused(tmp_path):
+    """A truncated file, and one whose parameters make ezc3d fail."""
+    path = tmp_path / 'points.c3d'
+    registry.write(path, 'c3d', Content(points=points(), names=NAMED), FileSettings())
+    whole = path.read_bytes()
+    for length in (100, 700, len(whole) - 512):
+        path.write_bytes(whole[:length])
+        assert 'this C3D file is truncated' in refused(path)
+    place = whole.index(b'LABELS')
+    path.write_bytes(whole[:place] + b'LOBELS' + whole[place + 6 :])
+    assert refused(path) == f'{path}: 3 points, but 0 different names'
+
+
+@pytest.mark.parametrize('kind', ['c3d', 'trc', 'xmalab3d', 'points'])
+def test_points_in_space_return(tmp_path, kind):
+    path = tmp_path / f'out.{kind if kind in ("c3d", "trc") else "csv"}'
+    registry.write(path, kind, Content(points=points(), names=NAMED), SETTINGS)
+    content = registry.read(path, FileSettings(units='mm', names=NAMED))
+    expected = points().xyz_mm.astype(np.float32) if kind == 'c3d' else points().xyz_mm
+    found = content.points.xyz_mm
+    if kind == 'points':  # it has no rows for frames without points
+        expected = expected[[0, 1, 2, 4]]
+    np.testing.assert_array_equal(found, expected)
+    assert content.points.frame[0] == 11
+    assert content.points.target_id.tolist() == [1, 2, 5]
+    assert content.names == NAMED
+    assert content.points.rate_hz == (None if kind == 'xmalab3d' else 200)
+
+
+# opensim changes the environment of its process, so that no ROS process starts from it any more.
+READ_BY_OPENSIM = """
+import json, sys
+import opensim
+opensim.Logger.setLevelString('Off')
+table = opensim.TimeSeriesTableVec3(sys.argv[1])
+rows = range(table.getNumRows())
+columns = [table.getDependentColumn(name) for name in table.getColumnLabels()]
+json.dump({
+    'labels': list(table.getColumnLabels()),
+    'unit': table.getTableMetaDataAsString('Units'),
+    'rate': float(table.getTableMetaDataAsString('DataRate')),
+    'times': list(table.getIndependentColumn()),
+    'xyz': [[[column[row].get(axis) for axis in range(3)] for column in columns] for row in rows],
+}, sys.stdout)
+"""
+
+
+def test_trc_is_read_by_opensim(tmp_path):
+    """Labels, unit, rate, times and coordinates; a gap is NaN there."""
+    if sys.version_info < (3, 11):
+        pytest.skip('opensim has no wheel for Python 3.10')
+    path = tmp_path / 'points.trc'
+    registry.write(path, 'trc', Content(points=points(), names=NAMED), FileSettings())
+    done = subprocess.run(
+        [sys.executable, '-c', READ_BY_OPENSIM, path], capture_output=True, text=True, check=True
+    )
+    table = json.loads(done.stdout)
+    assert table['labels'] == ['tib lat', 'tib med', 'fem']
+    assert (table['unit'], table['rate']) == ('mm', 200)
+    np.testing.assert_allclose(table['times'], np.arange(5) / 200, atol=1e-12)
+    np.testing.assert_array_equal(np.array(table['xyz'], float), points().xyz_mm)
+
+
+def test_frames_left_out_are_gaps_at_a_constant_rate(tmp_path):
+    sparse = points_without_precision(
+        np.array([1, 4]), np.array([1]), np.array([[[1.0, 2, 3]], [[4.0, 5, 6]]])
+    )
+    path = tmp_path / 'points.trc'
+    with pytest.raises(DataError, match='does not contain the frame rate, --rate HZ is needed'):
+        registry.write(path, 'trc', Content(points=sparse), FileSettings())
+    registry.write(path, 'trc', Content(points=sparse), FileSettings(rate_hz=100.0))
+    found = registry.read(path, FileSettings()).points
+    assert found.frame.tolist() == [1, 2, 3, 4]
+    assert np.isnan(found.xyz_mm[1:3]).all() and found.xyz_mm[3, 0].tolist() == [4, 5, 6]
+
+
+def test_xmalab_3d_points_of_a_lab_are_read(tmp_path):
+    """Without the column Frame, NaN where a marker is not seen, and no unit."""
+    path = tmp_path / 'points.csv'
+    path.write_text('m1_X,m1_Y,m1_Z,m2_X,m2_Y,m2_Z\n1,2,3,NaN,NaN,NaN\n4,5,6,7,8,9\n')
+    found = registry.read(path, FileSettings(units='cm')).points
+    assert found.frame.tolist() == [1, 2]
+    assert found.xyz_mm[1, 1].tolist() == [70, 80, 90] and np.isnan(found.xyz_mm[0, 1]).all()
+    assert 'does not say the unit' in refused(path, FileSettings())
+
+
+# ---- rigid bodies
+
+
+def test_rigid_bodies_return(tmp_path):
+    turn = Rotation.random(3, random_state=np.random.default_rng(1)).as_matrix()
+    shift = np.round(np.random.default_rng(2).uniform(-9, 9, (3, 1, 3)), 6)
+    turn = turn[:, None]
+    turn[1] = shift[1] = np.nan
+    bodies = Bodies(('femur',), np.array([1, 2, 3]), turn, shift)
+    path = tmp_path / 'bodies.csv'
+    registry.write(path, 'rigidbody', Content(bodies=bodies), FileSettings(units='cm'))
+    found = registry.read(path, FileSettings(units='cm')).bodies
+    assert found.names == ('femur',)
+    np.testing.assert_array_equal(found.rotation, turn)
+    np.testing.assert_array_equal(found.translation_mm, shift)
+    # The first four numbers are the first column of the matrix that moves the bone: Maya's row.
+    row = [float(cell) for cell in path.read_text().splitlines()[1].split(',')]
+    matrix = np.array(row[1:]).reshape(4, 4)
+    moved = np.array([1.0, 2, 3, 1]) @ matrix
+    np.testing.assert_allclose(moved[:3], (turn[0, 0] @ [10.0, 20, 30] + shift[0, 0]) / 10)
+
+
+def test_matrix_that_is_no_rotation_is_refused(tmp_path):
+    path = tmp_path / 'bodies.csv'
+    bodies = Bodies(('b',), np.array([1]), np.eye(3)[None, None] * 2, np.zeros((1, 1, 3)))
+    registry.write(path, 'rigidbody', Content(bodies=bodies), SETTINGS)
+    assert 'row 2: the matrix of b is not a rotation' in refused(path)
+
+
+# ---- lookup tables
+
+
+def test_lookup_table_returns(tmp_path):
+    """Every float32 to the last bit; -1 is a pixel without support."""
+    maps = np.random.default_rng(1).uniform(-3, 70, (2, 48, 64)).astype(np.float32)
+    maps[:, 3, 5] = np.nan
+    registry.write(tmp_path, 'lut', Content(lookups={'a': maps}), FileSettings())
+    path = tmp_path / 'a_LUT.csv'
+    rows = path.read_text().splitlines()
+    assert len(rows) == 96 and rows[3].split(', ')[5] == rows[51].split(', ')[5] == '-1'
+    np.testing.assert_array_equal(registry.read(path, FileSettings()).lookups['a'], maps)
+    path.write_text('\n'.join(rows[:95]))
+    assert '95 rows, but a lookup table has as many for the rows' in refused(path, FileSettings())
+
+
+# ---- damage
+
+
+def test_pipe_is_refused(tmp_path):
+    """Reading it would never end."""
+    for name in ('points.csv', 'points.pho', 'points.dat'):
+        os.mkfifo(tmp_path / name)
+        assert 'this is a pipe, device or socket' in refused(tmp_path / name)
+        with pytest.raises(DataError, match='this is a pipe'):
+            read_source(tmp_path / name, image_size=SIZE)
+
+
+@pytest.mark.filterwarnings('error')
+@pytest.mark.parametrize(
+    'kind', registry.kinds(lambda f: f.write and f.kind not in ('c3d', 'lut'))
+)
+def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind):
+    """Truncated, with rows left out or doubled, or with other bytes: no other exception."""
+    matrix = np.array([[4000.0, 0, 500], [0, 4000, 380], [0, 0, 1]])
+    camera = Camera('cam1', matrix, SIZE, np.eye(3), np.zeros(3))
+    bodies = Bodies(('f',), np.array([1]), np.eye(3)[None, None], np.ones((1, 1, 3)))
+    shifted = Camera('cam1', matrix, SIZE, np.eye(3), np.array([0.0, 0, 1000]))
+    content = Content(
+        observations={'cam1': frames(sigma=True)['cam1']},
+        survey=phantom(),
+        cameras=(shifted if kind == 'dlt' else camera,),
+        stations=stations()[:2],
+        points=points(),
+        bodies=bodies,
+        grids={'a': np.arange(8.0).reshape(2, 4)},
+    )
+    out = tmp_path / {'anipose': 'a.toml', 'trc': 'a.trc'}.get(kind, 'a.csv')
+    written = registry.write(out, kind, content, SETTINGS)
+    rng = np.random.default_rng(7)
+    for path in map(pathlib.Path, written.paths):
+        whole = path.read_bytes()
+        for _ in range(8):
+            for damaged in _damaged(whole, rng):
+                path.write_bytes(damaged)
+                for as_kind in (None, kind):
+                    try:
+                        registry.read(path, SETTINGS, as_kind)
+                    except DataError as error:
+                        assert '\n' not in str(error)
+        path.write_bytes(whole)
+
+
+def _damaged(whole, rng):
+    """The content of a file, damaged in three ways."""
+    yield whole[: rng.integers(len(whole))]
+    content = bytearray(whole)
+    for _ in range(3):
+        content[rng.integers(len(whole))] = rng.integers(256)
+    yield bytes(content)
+    lines = whole.split(b'\n')
+    lines[rng.integers(len(lines))] = lines[rng.integers(len(lines))]
+    yield b'\n'.join(lines)

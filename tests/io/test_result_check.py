@@ -1,0 +1,116 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A result folder whose files do not belong together says so."""
+
+import json
+import shutil
+
+import pytest
+from rigs import calibrated, exposures, rig, run
+
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
+from fluoro_calib_ros.io.calibration import load_calibrations
+from fluoro_calib_ros.io.calibration_request import write_request
+from fluoro_calib_ros.io.result_check import disagreements
+from fluoro_calib_ros.jobs.result_folder import save_result
+from fluoro_calib_ros.report import html as html_report
+
+OPTIONS = {'model': 'parametric', 'max_iterations': 3}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Result folder of fluoroscope a; figures of the report are not drawn."""
+    monkeypatch.setattr(html_report, '_base64', lambda figure: '')
+    save_result(tmp_path / 'result', calibrated('a', 6, **OPTIONS))
+    request = CalibrationRequest(
+        {'a': exposures()['a'][:6]}, rig().phantom, CalibrationOptions(**OPTIONS)
+    )
+    write_request(tmp_path / 'result', request)
+    (tmp_path / 'points.csv').write_text('fluoroscope,u,v\na,100,200\n')
+    return tmp_path / 'result'
+
+
+def exchange(folder):
+    """Put the calibration of another run with the same exposures into the folder."""
+    other = folder.parent / 'other'
+    save_result(other, calibrated('a', 6, model='none'))
+    shutil.copy(other / 'a.calibration.npz', folder)
+
+
+def edit(folder, change):
+    path = folder / 'result.json'
+    document = json.loads(path.read_text())
+    change(document)
+    path.write_text(json.dumps(document))
+
+
+def correct(folder):
+    out = folder.parent / 'corrected.csv'
+    return run('correct', folder.parent / 'points.csv', '--calibration', folder, '--out', out)
+
+
+def improve(document):
+    document['fluoroscopes']['a']['rmse_px']['after'] = [0.01, 0.01]
+
+
+def test_a_folder_as_it_was_written_passes_without_a_word(folder, capsys):
+    assert disagreements(folder, load_calibrations(folder)) == []
+    edit(folder, lambda document: None)  # another layout of the same values
+    assert disagreements(folder, load_calibrations(folder)) == []
+    assert correct(folder) == 0
+    assert run('report', folder) == 0
+    assert capsys.readouterr().err == ''
+    assert 'changed after' not in (folder / 'report.html').read_text()
+
+
+def test_an_exchanged_calibration_is_named(folder, capsys):
+    exchange(folder)
+    sentence = (
+        f'{folder}: the calibration file of a and result.json are of different calibrations: one '
+        'of them was exchanged'
+    )
+    assert correct(folder) == 0
+    assert capsys.readouterr().err.startswith(sentence)
+    for command in ('report', 'validate'):
+        assert run(command, folder) == 1
+        assert sentence in capsys.readouterr().err
+    assert not (folder / 'report.html').exists()
+
+
+def test_an_edited_result_is_named(folder, capsys):
+    edit(folder, improve)
+    sentence = f'{folder / "result.json"}: the file was changed after it was written'
+    assert correct(folder) == 0
+    assert capsys.readouterr().err.startswith(sentence)
+    assert run('report', folder) == 0
+    assert sentence in (folder / 'report.html').read_text()
+    run('validate', folder)
+    assert 'the file was changed after it was written' in capsys.readouterr().out.replace(
+        '\n  ', ' '
+    )
+
+
+def test_results_of_earlier_versions_are_read_as_before(folder, capsys):
+    def to_earlier(document):
+        document['format_version'] = 2
+        del document['digest'], document['rig_note']
+        del document['fluoroscopes']['a']['calibration_id']
+        improve(document)
+
+    edit(folder, to_earlier)
+    exchange(folder)
+    assert correct(folder) == 0
+    assert run('report', folder) == 0
+    assert capsys.readouterr().err == ''
+
+
+@pytest.mark.parametrize('text', ['[', '{"fluoroscopes": []}', '{"fluoroscopes": {"a": 1}}', '7'])
+def test_a_damaged_result_does_not_prevent_a_correction(folder, text, capsys):
+    (folder / 'result.json').write_text(text)
+    assert correct(folder) == 0
+    assert 'Traceback' not in capsys.readouterr().err
+    (folder / 'result.json').unlink()
+    assert correct(folder) == 0
+    assert capsys.readouterr().err == ''

@@ -1,0 +1,125 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Processes of their own: results, errors, progress, cancellation and end."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+
+import cv2
+import pytest
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.limits import ReadLimits, read_limits, use_read_limits
+from fluoro_calib_ros.processes import ProcessEnded, Resources, WorkerProcess, run_module
+
+
+class OwnError(Exception):
+    """An error that cannot be read back from its pickle."""
+
+    def __init__(self, one: int, other: int) -> None:
+        super().__init__(f'{one} and {other}')
+
+
+class Work:
+    """A function with a memory, which does what it is told."""
+
+    def __init__(self) -> None:
+        self.calls = 0
+
+    def __call__(self, what: str, progress=None):
+        self.calls += 1
+        if what == 'data':
+            raise DataError('a.csv: row 3 is damaged')
+        if what == 'disk':
+            raise OSError(28, 'no space left')
+        if what == 'bug':
+            raise ZeroDivisionError('by zero')
+        if what == 'own':
+            raise OwnError(1, 2)
+        if what == 'exit':
+            os._exit(3)
+        if what == 'wait':
+            threading.Event().wait()
+        if what == 'rounds':
+            for number in range(3):
+                progress('a', number)
+        if what == 'state':
+            threads = cv2.getNumThreads()
+            return os.nice(0), threads, read_limits().max_file_mb
+        return self.calls
+
+
+@pytest.fixture
+def process():
+    worker = WorkerProcess(Work, 'the process of the work', Resources(nice=3))
+    yield worker
+    worker.close()
+    assert not multiprocessing.active_children()
+
+
+def test_errors_of_users_arrive_as_they_are_and_others_are_named(process):
+    with pytest.raises(DataError, match=r'^a\.csv: row 3 is damaged$'):
+        process('data')
+    with pytest.raises(OSError, match='no space left') as caught:
+        process('disk')
+    assert caught.value.errno == 28
+    with pytest.raises(RuntimeError, match=r'the process of the work failed: .*by zero') as failed:
+        process('bug')
+    assert 'ZeroDivisionError' in str(failed.value.__cause__)
+    with pytest.raises(RuntimeError, match=r'the process of the work failed: .*1 and 2'):
+        process('own')
+    assert process('count') == 5  # the same process, with its memory
+
+
+def test_progress_is_called_here_in_order(process):
+    rounds = []
+    assert process('rounds', progress=lambda *content: rounds.append(content)) == 1
+    assert rounds == [('a', 0), ('a', 1), ('a', 2)]
+
+
+@pytest.mark.parametrize('when', ['cancel', 'progress'])
+def test_an_exception_of_the_caller_ends_the_process(process, when):
+    process.start()
+
+    def cancel(*_):
+        raise InterruptedError('enough')
+
+    if when == 'cancel':
+        with pytest.raises(InterruptedError):
+            process('wait', raise_if_cancelled=cancel)
+    else:
+        with pytest.raises(InterruptedError):
+            process('rounds', progress=cancel)
+    assert not multiprocessing.active_children()
+    assert process('count') == 1  # in a new one
+
+
+def test_a_process_that_ends_is_told_and_replaced(process):
+    with pytest.raises(ProcessEnded, match='the process of the work ended with status 3'):
+        process('exit')
+    assert process('count') == 1
+    (child,) = multiprocessing.active_children()
+    os.kill(child.pid, signal.SIGKILL)
+    with pytest.raises(ProcessEnded, match='ended with status -9'):
+        process('count')
+
+
+def test_a_process_has_the_limits_of_its_caller_and_one_core(process):
+    use_read_limits(ReadLimits(max_file_mb=7))
+    try:
+        nice, threads, megabytes = process('state')
+    finally:
+        use_read_limits(ReadLimits())
+    assert nice == min(os.nice(0) + 3, 19) and threads == 1 and megabytes == 7
+
+
+def test_a_module_that_takes_too_long_is_ended():
+    with pytest.raises(TimeoutError, match=r'longer than 0\.2 s'):
+        run_module('http.server', '0', timeout_s=0.2)
+    done = run_module('fluoro_calib_ros.io.formats.c3d_process', '/nothing.c3d', timeout_s=60)
+    assert done.returncode == 1 and done.stderr

@@ -1,0 +1,145 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Diagnostics as lists of conditions, and services that are guarded."""
+
+import asyncio
+from types import SimpleNamespace
+
+import pytest
+from fluoro_calib_msgs.srv import Reset
+
+from fluoro_calib_ros.nodes import calibration_health, correcting_node, image_stream
+from fluoro_calib_ros.nodes import reconstruction_health as reconstruction
+from fluoro_calib_ros.nodes.runtime.diagnostics import (
+    ERROR,
+    OK,
+    WARN,
+    Health,
+    RefusalLog,
+    Refused,
+    fault,
+    health_of,
+)
+from fluoro_calib_ros.nodes.runtime.logging import RateLimitedLogger
+from fluoro_calib_ros.nodes.runtime.services import Requests, ServiceEntry, create_services
+from fluoro_calib_ros.nodes.runtime.stream import Stream, stream_faults
+
+LOGGER = SimpleNamespace(warning=lambda text: None, error=lambda text: None)
+
+
+def refusals():
+    return RefusalLog('frame', RateLimitedLogger(LOGGER))
+
+
+def test_the_first_condition_that_holds_is_told_and_the_rest_is_not_asked():
+    asked = []
+
+    def condition(name, health):
+        def holds(state):
+            asked.append((name, state))
+            return health
+
+        return holds
+
+    conditions = [
+        condition('a', None),
+        condition('b', Health(WARN, 'b')),
+        condition('c', Health(OK, 'c')),
+    ]
+    assert health_of(7, conditions) == (WARN, 'b')
+    assert asked == [('a', 7), ('b', 7)]
+    assert fault('') is None and fault('x') == (ERROR, 'x')
+
+
+@pytest.mark.parametrize(
+    'conditions',
+    [
+        calibration_health.CONDITIONS,
+        correcting_node.CONDITIONS,
+        image_stream.CONDITIONS,
+        reconstruction.CONDITIONS,
+    ],
+)
+def test_lost_messages_come_first_and_the_last_condition_always_holds(conditions):
+    lost = refusals()
+    lost.fail('a/topic', IndexError('thirteen'))
+    level, message = health_of(SimpleNamespace(refusals=lost), conditions)
+    assert level == ERROR and message.endswith('topic a/topic: IndexError: thirteen')
+    state = SimpleNamespace(progress=SimpleNamespace(is_calibrating=False, calibration=None))
+    assert conditions[-1](state).level == OK
+
+
+def reconstruction_state(stalled, **changes):
+    streams = {name: SimpleNamespace(stalled=lambda text=text: text) for name, text in stalled}
+    values = {
+        'node': SimpleNamespace(readers=['active'], has_publisher=lambda topic: True),
+        'topics': tuple(f'{name}/corrected_observations' for name in streams),
+        'refusals': refusals(),
+        'incompatible': {},
+        'streams': streams,
+        'rigs': SimpleNamespace(newest='a rig'),
+        'pairer': SimpleNamespace(
+            stamps=SimpleNamespace(disagreement=lambda: ''),
+            silent=frozenset(),
+            unpaired={},
+            incomplete=0,
+        ),
+        'misses': SimpleNamespace(message=lambda: ''),
+        'without_orientation': 0,
+    }
+    return reconstruction.ReconstructionState(**{**values, **changes})
+
+
+def test_stopped_streams_stand_before_what_else_is_wrong():
+    well = reconstruction_state([('a', ''), ('b', '')])
+    assert health_of(well, reconstruction.CONDITIONS) == (OK, 'reconstructing')
+    stopped = reconstruction_state([('a', 'no frame for 2 s'), ('b', '')])
+    assert health_of(stopped, reconstruction.CONDITIONS) == (WARN, 'a: no frame for 2 s')
+    wrong = SimpleNamespace(message=lambda: 'the rays miss each other')
+    both = reconstruction_state([('a', 'no frame for 2 s'), ('b', '')], misses=wrong)
+    found = health_of(both, reconstruction.CONDITIONS)
+    assert found == (ERROR, 'a: no frame for 2 s; the rays miss each other')
+
+
+def test_faults_are_counted_in_the_stream_of_their_topic():
+    streams = {name: Stream(name, refusals()) for name in 'ab'}
+    faults = stream_faults(streams, print)
+    faults.undecodable('a/target_observations')
+    faults.too_large('a/target_observations', 10**9)
+    faults.callback_error('b/target_observations', IndexError('x'))
+    a, b = streams.values()
+    assert (a.received, a.refusals.total, b.received, b.refusals.failures) == (2, 2, 0, 1)
+    assert 'max_points' in a.refusals.last_fault
+    a.refusals.refuse(Refused('sigma', 'no'))
+    assert a.refusals.values(['sigma', 'too large'])['refused: too large'] == 1
+
+
+def test_a_handler_that_raises_answers_why():
+    def plain(request, response):
+        raise IndexError('a bug')
+
+    async def awaiting(request, response):
+        raise KeyError('another')
+
+    made = []
+
+    def create_service(kind, name, handler, **_):
+        made.append(SimpleNamespace(callback=handler, srv_name=f'/rig/{name}'))
+        return made[-1]
+
+    node = SimpleNamespace(create_service=create_service, get_logger=lambda: LOGGER)
+    table = [ServiceEntry('plain', Reset, plain), ServiceEntry('awaiting', Reset, awaiting)]
+    assert create_services(node, table) == made
+    answer = made[0].callback(Reset.Request(), Reset.Response(success=True))
+    assert not answer.success and answer.message == 'a bug'
+    answer = asyncio.run(made[1].callback(Reset.Request(), Reset.Response(success=True)))
+    assert not answer.success and 'another' in answer.message
+
+
+def test_requests_that_wait_are_counted_until_they_fail():
+    requests = Requests()
+    with pytest.raises(KeyError), requests.one():
+        assert requests.waiting == 1
+        raise KeyError
+    assert requests.waiting == 0

@@ -1,0 +1,763 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The sentence of every kind of finding, once: all other tests assert kinds and numbers.
+
+# stands for a number.
+"""
+
+import functools
+import pickle
+import re
+from dataclasses import replace
+from types import SimpleNamespace as Fake
+from unittest import mock
+
+import numpy as np
+import pytest
+from rigs import calibrated, exposures, rig, small_network, true_calibrations, true_orientation
+
+from fluoro_calib_ros.checks import given_interior, inputs, mixed_units
+from fluoro_calib_ros.checks import held_out as held_fit
+from fluoro_calib_ros.checks import inputs as plausibility
+from fluoro_calib_ros.checks.drift_evidence import DriftEstimate
+from fluoro_calib_ros.checks.drift_options import ERROR, WARN
+from fluoro_calib_ros.checks.drift_watch import DriftWatch
+from fluoro_calib_ros.checks.recording_watch import RecordingDriftWatch
+from fluoro_calib_ros.checks.rigidity import doubtful
+from fluoro_calib_ros.checks.verdict import validate, validate_or_report
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.constraints import _without_targets_of_few_rays
+from fluoro_calib_ros.estimation.diagnostics import (
+    exposures_that_do_not_fit,
+    undetermined_unknowns,
+)
+from fluoro_calib_ros.estimation.initial_network import measured_network
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
+from fluoro_calib_ros.estimation.start_orientation import UNTILTED
+from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.exposures.strays import without_strays
+from fluoro_calib_ros.findings import Finding, Kind, Place
+from fluoro_calib_ros.images import detection, extraction, matching
+from fluoro_calib_ros.images.codec import as_grey
+from fluoro_calib_ros.images.growth import Seen
+from fluoro_calib_ros.images.marker_doubts import doubt_in
+from fluoro_calib_ros.io.formats import registry
+from fluoro_calib_ros.io.formats.content import FileSettings
+from fluoro_calib_ros.io.result_check import edited, exchanged
+from fluoro_calib_ros.jobs import calibration as calibrating
+from fluoro_calib_ros.jobs import orientation as orienting
+from fluoro_calib_ros.jobs import reconstruction as reconstructing
+from fluoro_calib_ros.jobs import report as comparing
+from fluoro_calib_ros.jobs import result_folder
+from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
+from fluoro_calib_ros.jobs.live_markers import MarkerFollower, _wrong_start
+from fluoro_calib_ros.jobs.sources import read_content
+from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
+from fluoro_calib_ros.reconstruction import mismatch
+
+PHANTOM = rig().phantom
+SIZES = {'a': (1024, 1024), 'b': (1024, 1024)}
+FAST = CalibrationOptions(model='parametric', max_iterations=2)
+NUMBER = r'(?:-?[\d.]+(?:e[+-]?\d+)?|nan)'
+
+
+def frames(count=4):
+    return list(exposures()['a'][:count])
+
+
+@functools.cache
+def checks():
+    """The checks of a verdict by kind, failed."""
+    request = CalibrationRequest({'a': frames(8)}, PHANTOM, FAST)
+    job = calibrated('a', 8, model='parametric', max_iterations=2)
+    found = validate(request, job.calibrations).checks
+    return {check.kind: replace(check, limit=-1.0) for check in found}
+
+
+def other_view_missing():
+    follower = Fake(_begun=False, _trackers={'a': None, 'b': None})
+    image = np.zeros((4, 4), np.uint8)
+    return MarkerFollower._results(follower, {'a': image}, 1, (), None)['a'].finding
+
+
+def wrong_given_interior():
+    calibration = calibrated('a', 5, model='parametric').calibrations['a']
+    held = replace(calibration, rmse_after=np.array([3.0, 3.0]))
+    evidence = Fake(
+        calibrations={'a': held}, request=Fake(options=Fake(interior_sd=(1.0, 1.0, 1.0)))
+    )
+    return given_interior._check(evidence, 'a', calibration, 3000.0)
+
+
+def no_validation():
+    few = [replace(f, target_id=f.target_id[:5], uv=f.uv[:5]) for f in frames()]
+    calibrations = calibrated('a', 5, model='parametric').calibrations
+    return validate_or_report(CalibrationRequest({'a': few}, PHANTOM), calibrations).checks[0]
+
+
+def excluded(kind, spoil):
+    """The finding of a kind on the first exposure, spoilt."""
+    first, *others = frames(5)
+    found = measured_network({'a': [spoil(first), *others]}, PHANTOM).excluded
+    return next(one for one in found if one.kind is kind)
+
+
+def false_matches():
+    network = Fake(exposure=np.repeat([0, 1, 2], 10), n_exposures=3, fluoroscope=np.zeros(3, int))
+    fits = np.arange(30) >= 7
+    run = Fake(
+        measured=Fake(network=network, frames=frames(3)),
+        after=Fake(noise=Fake(inliers=lambda q: fits), q=None),
+    )
+    return exposures_that_do_not_fit(run)['a', 1]
+
+
+def undetermined():
+    network, truth = small_network(exposures=4, targets=30, seen=1.0)
+    keep = (network.exposure != 1) | (network.point < 2)
+    network = replace(
+        network,
+        **{name: getattr(network, name)[keep] for name in ('uv', 'sigma', 'exposure', 'point')},
+    )
+    return undetermined_unknowns(
+        Fake(network=network, start=truth, fluoroscopes=('a',), frames=frames(4))
+    )
+
+
+def raised(call, *arguments):
+    with pytest.raises(DataError) as error:
+        call(*arguments)
+    return error.value.finding
+
+
+def phantom_with(count, place):
+    """The phantom with the targets that are seen first at another place."""
+    xyz = PHANTOM.xyz_mm.copy()
+    xyz[PHANTOM.index(np.unique(frames()[0].target_id)[:count])] = place
+    return Phantom(PHANTOM.target_id, xyz, PHANTOM.sd_mm)
+
+
+def pairs(**changes):
+    """How pairs of exposures scatter."""
+    k = 8
+    return Fake(
+        **{
+            'fluoroscopes': ('a', 'b'),
+            'exposures': np.arange(1, k + 1),
+            'off_px': np.full(k, 1.0),
+            'used': np.ones(k, bool),
+            'unexplained': 1.0,
+            'angle_px': 0.0,
+            'columns': np.ones((k, 1)),
+            'corrected': False,
+            'turn': np.tile(np.eye(3), (k, 1, 1)),
+            'shift_mm': np.tile([1000.0, 0, 0], (k, 1))
+            + np.random.default_rng(1).normal(0, 5, (k, 3)),
+            **changes,
+        }
+    )
+
+
+def about_pairs(**changes):
+    return doubtful(pairs(**changes), 1024)[1][0]
+
+
+def orientation():
+    return true_orientation(rig().fluoroscopes, true_calibrations(rig().fluoroscopes))
+
+
+def moved_rig():
+    present = orientation()
+    shifted = present.position_mm + np.array([[0.0, 0, 0], [20.0, 0, 0]])
+    return orienting._change(present, replace(present, position_mm=shifted))
+
+
+def trial(kind):
+    """What a trial of the reconstruction says is confused."""
+    both = {name: list(of_one[:2]) for name, of_one in exposures().items()}
+    found = [why for why, _ in mismatch._trials(both, 'ab', {1, 2})]
+    return mismatch._missing(0.9, next(one for one in found if one.kind is kind))
+
+
+def bead(**changes):
+    """Why a predicted bead is not observed."""
+    beads = {'uv': 0.0, 'depth': 1.0, 'measured': True, 'misfit': 0.0, 'sigma': 0.1, **changes}
+    beads = Fake(**{name: np.array([value]) for name, value in beads.items()})
+    beads.uv = np.full((1, 2), beads.uv[0])
+    return extraction._reasons(beads, np.zeros((1, 2)))[0]
+
+
+def not_measured(n=20):
+    found = Fake(view=None, predicted=np.zeros((n, 2)), bead=np.arange(n), detection=np.arange(n))
+    seen = Fake(uv=np.zeros((n, 2)), in_field=lambda uv: np.ones(n, bool))
+    imaging = extraction._Imaging(None, profile=object())
+    with mock.patch.multiple(
+        extraction,
+        _starts=mock.DEFAULT,
+        _relative_radius=lambda *_: np.ones(n),
+        measure_beads=mock.DEFAULT,
+        _reasons=lambda *_: [extraction.LOST] * n,
+    ):
+        return raised(
+            extraction._measured, Fake(light=None, field=None), seen, found, None, imaging
+        )
+
+
+def unsure_bead(n=10):
+    sigma = np.where(np.arange(n) == 3, 1.0, 0.1)
+    beads = Fake(uv=np.zeros((n, 2)), sigma=sigma, overlapped=np.zeros(n, bool))
+    measured = (np.arange(n), beads, [None] * n, np.zeros((n, 2)))
+    imaging = extraction._Imaging(None, profile=object())
+    return extraction._checked(None, None, None, measured, imaging).refused[0].finding
+
+
+def drift(source, confirmed, level=ERROR):
+    estimate = DriftEstimate(
+        ('a',), 0, 0.5, 0.05, np.array([1.0, 0.0]), 'start', source, confirmed, 0
+    )
+    return DriftWatch(SIZES)._drift_state(level, estimate, 9.0).finding
+
+
+def state(observations, learned):
+    watch = DriftWatch(SIZES)
+    watch._observations = observations
+    watch._learned_blocks = [learned]
+    return watch._present_state().finding
+
+
+def no_pose():
+    seen = Seen.of(np.random.default_rng(0).uniform(0, 900, (60, 2)), np.ones((1024, 1024)), 3.0)
+    with mock.patch.object(matching, '_candidates', lambda *_: ()):
+        return raised(matching.match, seen, None, None)
+
+
+def principal_distance():
+    calibration = calibrated('a', 5, model='parametric').calibrations['a']
+    with mock.patch.object(plausibility, '_interior_about_middle', lambda _: (0, 0, 9000.0)):
+        return plausibility._wrong_given_distance(calibration)
+
+
+def principal_point():
+    calibration = true_calibrations(rig().fluoroscopes)['a']
+    interior = np.array([4000.0, 500.0, 4000.0])
+    figures = Fake(interior=interior, interior_sd=np.ones(3), image_size=(1024, 1024))
+    return plausibility._wrong_interior(figures, replace(calibration, interior=interior))
+
+
+def wrong_known_orientation():
+    one = rig().fluoroscopes[0]
+    known = {'a': KnownOrientation(one.interior, one.rotation, one.position_mm + 500.0)}
+    return inputs.find_wrong_orientation({'a': frames()}, PHANTOM, known)[0]
+
+
+def in_one_folder_only():
+    with mock.patch.multiple(
+        comparing,
+        load_calibrations=mock.Mock(side_effect=[{'a': None, 'b': None}, {'a': None}]),
+        compare_calibrations=mock.DEFAULT,
+        _distances=lambda _: {},
+    ):
+        return comparing.compare_folders('one', 'two').findings[0]
+
+
+def no_orientation():
+    request = Fake(frames={'a': (), 'b': ()}, known_orientations={}, phantom=None)
+    result = Fake(calibrations={'a': None, 'b': None}, fluoroscopes={}, starts=None)
+    error = DataError('fluoroscopes a and b: no exposures have the same number')
+    with mock.patch.object(calibrating, 'orientation_and_scatter', side_effect=error):
+        return calibrating._orientation(request, result, calibrating.Rig())[1][0]
+
+
+def saved_note():
+    with mock.patch.multiple(
+        result_folder,
+        read_result=lambda _: {'rig_note': 'orientation of the rig: not from exposure 5'},
+        saved_orientation=lambda _: None,
+    ):
+        return result_folder.saved_rig_note('result')
+
+
+def ambiguous():
+    first, rival = (Fake(score=50.0, scale_px=1.0, bead=range(n)) for n in (60, 59))
+    with mock.patch.multiple(
+        matching,
+        _climbed=lambda *_: (first, [rival]),
+        _same=lambda *_: False,
+        _best_by_size=lambda *_: None,
+    ):
+        return raised(matching.unambiguous, first, None, Fake(regular=False))
+
+
+def wrong_format():
+    with mock.patch.object(registry, 'recognised', return_value=registry.FORMATS['mayacam2']):
+        return raised(read_content, 'cam.csv', FileSettings(), 'survey', 'phantom')
+
+
+MAKERS = {
+    Kind.DATA: lambda: DataError('the file is empty', at='phantom.csv').finding,
+    **{
+        kind: functools.partial(lambda kind: checks()[kind], kind)
+        for kind in (
+            Kind.BEADS,
+            Kind.DISTANCES,
+            Kind.DRIFT,
+            Kind.EXPOSURES,
+            Kind.HALVES,
+            Kind.HELD_OUT,
+            Kind.PRECISION,
+            Kind.VARIATION,
+            Kind.WHITENESS,
+            Kind.WORST_AREA,
+        )
+    },
+    Kind.GIVEN_INTERIOR: wrong_given_interior,
+    Kind.VALIDATION: no_validation,
+    Kind.COPIED_EXPOSURE: lambda: _without_copies(
+        {'a': [*frames(), replace(frames()[0], number=9)]}, ()
+    )[1][0],
+    Kind.FALSE_MATCHES: false_matches,
+    Kind.FEW_RAYS: lambda: _without_targets_of_few_rays(
+        measured_network({'a': frames(5)}, PHANTOM)
+    ).excluded[0],
+    Kind.FEW_TARGETS: lambda: excluded(
+        Kind.FEW_TARGETS, lambda f: replace(f, target_id=f.target_id[:5], uv=f.uv[:5])
+    ),
+    Kind.NOT_ORIENTED: lambda: excluded(
+        Kind.NOT_ORIENTED, lambda f: replace(f, uv=f.uv * [1, 0] + [0, 500])
+    ),
+    Kind.POOR_FIT: lambda: excluded(
+        Kind.POOR_FIT, lambda f: replace(f, uv=np.random.default_rng(1).permutation(f.uv))
+    ),
+    Kind.SHARED_EXPOSURE: lambda: _without_shared(
+        {
+            'a': frames(),
+            'b': [replace(frames(5)[4], fluoroscope='b', number=n) for n in range(9)]
+            + [replace(frames()[0], fluoroscope='b', number=20)],
+        }
+    )[1][0],
+    Kind.STRAY_POINTS: lambda: without_strays(
+        replace(frames()[0], target_id=np.append(frames()[0].target_id[1:], 9999)), PHANTOM
+    )[1],
+    Kind.FEW_EXPOSURES: lambda: raised(measured_network, {'a': frames(2)}, PHANTOM),
+    Kind.ONE_POSE: lambda: raised(
+        measured_network, {'a': [replace(frames()[0], number=n) for n in range(3)]}, PHANTOM
+    ),
+    Kind.UNDETERMINED: undetermined,
+    Kind.UNTILTED_TARGETS: lambda: replace(UNTILTED, place=Place(('a',))),
+    Kind.DUPLICATE_NAME: lambda: raised(inputs.validate_names, ('a', 'A')),
+    Kind.FRAMES_SHIFTED: lambda: trial(Kind.FRAMES_SHIFTED),
+    Kind.IDS_REVERSED: lambda: inputs.CONFUSIONS[2][0],
+    Kind.IDS_SHIFTED: lambda: inputs.CONFUSIONS[0][0],
+    Kind.IMAGE_MIRRORED: lambda: inputs._MIRRORED,
+    Kind.IMAGE_TRANSPOSED: lambda: trial(Kind.IMAGE_TRANSPOSED),
+    Kind.IMPLAUSIBLE_NUMBER: lambda: raised(
+        inputs.validate_magnitudes,
+        {'a': [replace(f, sigma=np.full(len(f.uv), 1e-9)) for f in frames()]},
+        PHANTOM,
+    ),
+    Kind.MIXED_UNITS: lambda: mixed_units._finding(np.arange(1, 9), 10.0),
+    Kind.OTHER_PHANTOM: lambda: replace(inputs._OTHER_PHANTOM, place=Place(('a',))),
+    Kind.REMOTE_TARGETS: lambda: inputs.find_wrong_phantom({'a': frames()}, phantom_with(1, 9999))[
+        0
+    ],
+    Kind.REPEATED_COORDINATES: lambda: inputs.find_wrong_phantom(
+        {'a': frames()}, phantom_with(2, [1, 2, 3])
+    )[0],
+    Kind.SOURCE_TOO_NEAR: lambda: inputs.wrong_unit(90.0, PHANTOM),
+    Kind.WRONG_IMAGE_SIZE: lambda: inputs.wrong_image_size(
+        [replace(f, image_size=(4096, 4096)) for f in frames()]
+    ),
+    Kind.WRONG_KNOWN_ORIENTATION: wrong_known_orientation,
+    Kind.WRONG_UNIT: lambda: inputs.wrong_unit(1.5e6, PHANTOM),
+    Kind.FEW_INLIERS: lambda: plausibility._few_inliers(Fake(inliers=1, observations=4)),
+    Kind.FLUOROSCOPES_INTERCHANGED: lambda: trial(Kind.FLUOROSCOPES_INTERCHANGED),
+    Kind.INTERIOR_UNDETERMINED: lambda: plausibility._wrong_interior(
+        Fake(
+            interior=np.array([500, 500, 4000.0]),
+            interior_sd=np.array([9, 9, 900.0]),
+            image_size=(1024, 1024),
+        ),
+        None,
+    ),
+    Kind.LARGE_RESIDUALS: lambda: plausibility._large_residuals(
+        Fake(rmse_after=(9.0, 9.0), image_size=(1024, 1024)), []
+    ),
+    Kind.PRINCIPAL_POINT_OFF: principal_point,
+    Kind.WRONG_PRINCIPAL_DISTANCE: principal_distance,
+    Kind.CORRECTED_ALREADY: lambda: held_fit.corrected_already(
+        Fake(fluoroscopes={'a': Fake(rmse_after=(2.0, 2.0))}),
+        Fake(fluoroscopes={'a': Fake(rmse_after=(0.2, 0.2))}),
+        {'a': Fake(image_sd=0.25)},
+    ),
+    Kind.POOR_CALIBRATION_FIT: lambda: held_fit.poor_fits(
+        Fake(fluoroscopes={'a': Fake(rmse_after=(2.0, 2.0), rmse_before=(2.0, 2.0))}),
+        {'a': Fake(image_sd=0.25)},
+    )[0],
+    Kind.NO_COMMON_TARGETS: lambda: mismatch.UNMATCHED,
+    Kind.PAIRS_CONTRADICT: lambda: about_pairs(unexplained=20.0),
+    Kind.PAIRS_EXCLUDED: lambda: about_pairs(used=np.arange(8) != 4),
+    Kind.RAYS_DO_NOT_MEET: lambda: mismatch._missing(0.9, mismatch.UNKNOWN),
+    Kind.RIG_DEPENDS_ON_ANGLE: lambda: about_pairs(angle_px=1.5),
+    Kind.RIG_MOVED: moved_rig,
+    Kind.RIG_NOTE: saved_note,
+    Kind.RIG_NOT_ORIENTED: no_orientation,
+    Kind.POSE_AMBIGUOUS: ambiguous,
+    Kind.MARKER_FOUND_AGAIN: lambda: doubt_in(Kind.MARKER_FOUND_AGAIN, 7, 3, images=4),
+    Kind.MARKER_MOVES_ALONE: lambda: doubt_in(Kind.MARKER_MOVES_ALONE, 7, 3),
+    Kind.OTHER_SHADOW: lambda: doubt_in(Kind.OTHER_SHADOW, 7, 3),
+    Kind.SHADOWS_MET: lambda: doubt_in(Kind.SHADOWS_MET, 7, 3, 4),
+    Kind.NOT_IN_BOTH: in_one_folder_only,
+    Kind.WRONG_FORMAT: wrong_format,
+    Kind.FEW_BEADS: lambda: raised(
+        matching.match, Seen.of(np.zeros((3, 2)), np.ones((9, 9)), 3.0), None, None
+    ),
+    Kind.IMAGE_ENCODING: lambda: raised(as_grey, np.zeros((9, 9))),
+    Kind.IMAGE_EMPTY: lambda: raised(detection._check, np.zeros((200, 200), np.uint8)),
+    Kind.NO_POSE: no_pose,
+    Kind.POSE_UNSURE: lambda: raised(
+        matching._check_evidence,
+        Fake(explained=0.01, expected=90, found=0.9, bead=np.arange(60)),
+    ),
+    Kind.BEAD_ALONE: lambda: extraction.ALONE,
+    Kind.BEAD_AWAY: lambda: bead(uv=9.0),
+    Kind.BEAD_CONTRAST: lambda: bead(depth=0.1),
+    Kind.BEAD_DISTURBED: lambda: bead(misfit=99.0),
+    Kind.BEAD_HIDDEN: lambda: bead(sigma=9.0),
+    Kind.BEAD_UNSURE: unsure_bead,
+    Kind.BEADS_NOT_MEASURED: not_measured,
+    Kind.BEAD_LOST: lambda: bead(measured=False),
+    Kind.EDITED_RESULT: lambda: edited('result', {'digest': 'x'}),
+    Kind.EXCHANGED_CALIBRATION: lambda: exchanged(
+        'result', {'fluoroscopes': {'a': {'calibration_id': 'x'}}}, {'a': Fake(calibration_id='y')}
+    ),
+    Kind.CLUSTER_CHANGE: lambda: drift('cluster bone', False, WARN),
+    Kind.IMAGE_DRIFT: lambda: drift('epipolar', True),
+    Kind.LEARNING: lambda: state(1, 1),
+    Kind.NO_DRIFT: lambda: state(1, 1000),
+    Kind.FEW_MARKERS: lambda: _wrong_start(Fake(finding=None, target_id=[4, 5]), 8),
+    Kind.NO_MARKERS: lambda: state(0, 0),
+    Kind.OTHER_VIEW_MISSING: other_view_missing,
+    Kind.NOT_WATCHED: lambda: (
+        reconstructing._drift_watch(
+            None, None, reconstructing.ReconstructionOptions(has_stamps=False)
+        )[1].finding
+    ),
+    Kind.SHORT_RECORDING: lambda: RecordingDriftWatch(orientation(), SIZES).verdict().finding,
+}
+SENTENCES = {
+    Kind.DATA: 'phantom.csv: the file is empty',
+    Kind.BEADS: (
+        'bead # lies # mm from its survey, the worst of #: survey again, or give a larger sd, '
+        'and calibrate again'
+    ),
+    Kind.DISTANCES: (
+        'distances between beads differ from the survey by # mm, # mm are expected (scale #, '
+        'sd #): the survey is less precise than its sd says, or the calibration is wrong if '
+        'other checks fail too; survey the phantom again, or give a larger sd'
+    ),
+    Kind.DRIFT: (
+        'fluoroscope a: earlier and later exposures differ by # px, most at the @ of the image '
+        '(about u #, v #) by # px: the distortion has changed between the exposures; take all '
+        'of them again in one session, with nothing switched, moved or warming up'
+    ),
+    Kind.EXPOSURES: (
+        'fluoroscope a: exposure # fits the calibration of the others worst, with # times the '
+        'expected residuals: inspect it (phantom or fluoroscope moved, wrong ids), exclude '
+        'it and calibrate again'
+    ),
+    Kind.HALVES: (
+        'fluoroscope a: two halves of the exposures give corrections that differ by # px, '
+        'where # px is predicted, most at the @ of the image (about u #, v #): take # more '
+        'exposures (there are #) that show beads there, and see that phantom and fluoroscope '
+        'stand still in each'
+    ),
+    Kind.HELD_OUT: (
+        'fluoroscope a: residuals of exposures held out are # px, # px are expected: the '
+        'calibration does not hold for exposures it has not used; take # more exposures (there '
+        'are #) in other poses'
+    ),
+    Kind.PRECISION: (
+        'fluoroscope a: the correction has a standard deviation of # px, at an image noise of '
+        '# px: it makes the errors of corrected points # % larger: choose another model '
+        '(--model auto), or take # more exposures (there are #), or a phantom with more beads'
+    ),
+    Kind.VARIATION: (
+        'fluoroscope a: the distortion differs between exposures by # px (chi2/dof #, constant '
+        'up to #): a C-arm at another angle, a lens that was focused or zoomed, a source or '
+        'detector that is not rigid, or a phantom that moved, was bent or is surveyed wrongly; '
+        'take # more exposures (there are #) at the angle and setting that are used, or '
+        'calibrate each; or give the angle of the C-arm with each exposure (angle_deg, or '
+        'joint_states)'
+    ),
+    Kind.WHITENESS: (
+        'fluoroscope a: the residuals have a trend of # px, most at the @ of the image (about '
+        'u #, v #): the correction model parametric does not follow the distortion there; take '
+        '# more exposures (there are #) that show beads there, or choose another model '
+        '(--model auto)'
+    ),
+    Kind.WORST_AREA: (
+        'fluoroscope a: the worst mean residual of an area, # px, is at the @ of the image '
+        '(about u #, v #): take # more exposures (there are #) that show beads there, or '
+        'choose another model'
+    ),
+    Kind.GIVEN_INTERIOR: (
+        'fluoroscope a: the given interior orientation, c = # (sd #), xp = # (sd #), yp = # '
+        '(sd #) px, contradicts the exposures, which show c = # (sd #), xp = # (sd #), yp = # '
+        '(sd #) px: the residuals are # px with what was given and # px without: give the '
+        'right value, a larger --interior-sd, or none'
+    ),
+    Kind.VALIDATION: (
+        'the validation could not be made: fluoroscope a: # exposures are too few, # are '
+        'needed, # more have too few targets'
+    ),
+    Kind.COPIED_EXPOSURE: ('fluoroscope a, exposure #: the image points are those of exposure #'),
+    Kind.FALSE_MATCHES: (
+        'fluoroscope a, exposure #: only # % of the image points fit, the others are false matches'
+    ),
+    Kind.FEW_RAYS: (
+        '# targets are seen in fewer than # exposures, which do not determine them safely '
+        'without surveyed coordinates: #, #, #, #, #, #, #, #, #, # and more'
+    ),
+    Kind.FEW_TARGETS: 'fluoroscope a, exposure #: # targets are too few, # are needed',
+    Kind.NOT_ORIENTED: (
+        'fluoroscope a, exposure #: all image points lie on one line or in one place'
+    ),
+    Kind.POOR_FIT: (
+        'fluoroscope a, exposure #: the image points do not fit the phantom, their residuals '
+        'are about # px'
+    ),
+    Kind.SHARED_EXPOSURE: (
+        'fluoroscopes a and b, exposures # and #: both have the same image points'
+    ),
+    Kind.STRAY_POINTS: ('fluoroscope a, exposure #: # image point, target # not on the phantom'),
+    Kind.FEW_EXPOSURES: 'fluoroscope a: # exposures are too few, # are needed',
+    Kind.ONE_POSE: (
+        'fluoroscope a: all # exposures show the phantom in one pose (turned by at most # '
+        'degrees); turn and move it between the exposures'
+    ),
+    Kind.UNDETERMINED: (
+        'the exposures do not determine the unknowns: the orientation of exposure # of a is '
+        'left open; add exposures with the phantom turned and moved, with more targets'
+    ),
+    Kind.UNTILTED_TARGETS: (
+        'fluoroscope a: the targets are flat and not tilted, so that the principal distance '
+        'cannot be found: tilt the target by # degrees and more, or give the principal distance'
+    ),
+    Kind.DUPLICATE_NAME: (
+        'fluoroscopes a and A differ in capital letters only: this is one fluoroscope, or name '
+        'them otherwise'
+    ),
+    Kind.FRAMES_SHIFTED: (
+        '# % of the rays miss each other: the frame numbers of fluoroscope b are too small by #'
+    ),
+    Kind.IDS_REVERSED: (
+        'the target ids run in the opposite order: with the right ones the image points fit '
+        'the phantom'
+    ),
+    Kind.IDS_SHIFTED: (
+        'the target ids are too large by #: with the right ones the image points fit the phantom'
+    ),
+    Kind.IMAGE_MIRRORED: (
+        'the image is mirrored: v must run down and u to the right, and neither they nor the '
+        'axes of the phantom may be interchanged'
+    ),
+    Kind.IMAGE_TRANSPOSED: '# % of the rays miss each other: u and v are interchanged',
+    Kind.IMPLAUSIBLE_NUMBER: (
+        'fluoroscope a, exposure #: sigma of target # is # px, between # and # px are plausible'
+    ),
+    Kind.MIXED_UNITS: (
+        'phantom: # targets, #, #, #, #, # ..., are in another unit than the others: they fit '
+        'when their coordinates are multiplied by # (cm in place of mm)'
+    ),
+    Kind.OTHER_PHANTOM: (
+        'fluoroscope a: the image points do not fit the phantom: this is another phantom, or '
+        'the target ids are wrong'
+    ),
+    Kind.REMOTE_TARGETS: (
+        'phantom: target # is # mm from the middle of the others, most of which are within # '
+        'mm: a wrong coordinate, another unit, or a fill value for targets that are not '
+        'surveyed'
+    ),
+    Kind.REPEATED_COORDINATES: (
+        'phantom: targets #, # are all at (#, #, #) mm: a repeated row, or a fill value for '
+        'targets that are not surveyed'
+    ),
+    Kind.SOURCE_TOO_NEAR: (
+        'the source would be # mm from a phantom that is # mm large, nearer than that of a '
+        'fluoroscope: the principal distance is wrong, or the images are those of a wide-angle '
+        'camera'
+    ),
+    Kind.WRONG_IMAGE_SIZE: (
+        'the image points reach only to u = #, v = # of an image of # x # px: the image size '
+        'is wrong, or the phantom covers one corner only'
+    ),
+    Kind.WRONG_KNOWN_ORIENTATION: (
+        'fluoroscope a: the known orientation does not fit, image points are # px off in the '
+        'median: check the unit and the frame of the lab, that R and t lead from the lab to '
+        'the sensor, and that v runs down'
+    ),
+    Kind.WRONG_UNIT: (
+        'the coordinates of the phantom are not in mm: it would be # mm large and # mm from '
+        'the source'
+    ),
+    Kind.FEW_INLIERS: (
+        'only # % of the image points fit, at least # % are needed; the others are false matches'
+    ),
+    Kind.FLUOROSCOPES_INTERCHANGED: (
+        '# % of the rays miss each other: fluoroscopes a and b are interchanged'
+    ),
+    Kind.INTERIOR_UNDETERMINED: (
+        'the interior orientation is not determined: principal distance # px with a standard '
+        'deviation of # px, principal point within # px'
+    ),
+    Kind.LARGE_RESIDUALS: (
+        'the residuals are too large: RMSE # px after the correction, at most # px are '
+        'plausible; false matches, another phantom, or the distortion changed between the '
+        'exposures'
+    ),
+    Kind.PRINCIPAL_POINT_OFF: (
+        'the principal point (#, #) is # px from the middle of the image: wrong target ids, a '
+        'wrong image size, or another phantom'
+    ),
+    Kind.WRONG_PRINCIPAL_DISTANCE: (
+        'the principal distance is fixed at # px, but the exposures show about # px: it has to '
+        'be given in pixels'
+    ),
+    Kind.CORRECTED_ALREADY: (
+        'fluoroscope a: the image points are corrected already, their RMSE is # px with the '
+        'correction and # px without: give the observed ones'
+    ),
+    Kind.POOR_CALIBRATION_FIT: (
+        'fluoroscope a: RMSE # px with the calibration fixed, # times the noise with which it '
+        'was determined: the image has changed, or the calibration is that of another '
+        'fluoroscope'
+    ),
+    Kind.NO_COMMON_TARGETS: (
+        'no target is seen by two fluoroscopes in one exposure: the target ids of the '
+        'fluoroscopes, or the numbers of their frames, do not belong together'
+    ),
+    Kind.PAIRS_CONTRADICT: (
+        'orientation of the rig: the exposures contradict each other: the relative orientation '
+        'of fluoroscopes a and b differs between them by # px, # times its standard deviation; '
+        'frames with the same number are not of the same exposure, the phantom moved between '
+        'them, the fluoroscopes or their images do not stand still, or the corrections do not '
+        'hold in all of them'
+    ),
+    Kind.PAIRS_EXCLUDED: (
+        'orientation of the rig: not from exposure #, in which fluoroscopes a and b stand '
+        'otherwise to each other by # px: the frames are not of one exposure, or the phantom '
+        'moved between them'
+    ),
+    Kind.RAYS_DO_NOT_MEET: (
+        '# % of the rays miss each other: the frames, target ids or image coordinates do not '
+        'belong together, the fluoroscopes are interchanged, or one was moved since its '
+        'orientation was determined'
+    ),
+    Kind.RIG_DEPENDS_ON_ANGLE: (
+        'orientation of the rig: the relative orientation of fluoroscopes a and b changes with '
+        'the angle of the C-arm, by # px: it is that of the mean angle; orient the rig from a '
+        'capture at the angle that is used'
+    ),
+    Kind.RIG_MOVED: (
+        'fluoroscopes a and b stand otherwise to each other than in the orientation before, by '
+        '# mm and # degrees (distance of the sources # times): one of them was moved since, '
+        'the frames are not of one exposure, or this is another phantom'
+    ),
+    Kind.RIG_NOTE: 'orientation of the rig: not from exposure #',
+    Kind.RIG_NOT_ORIENTED: (
+        'no orientation of the rig: fluoroscopes a and b: no exposures have the same number'
+    ),
+    Kind.POSE_AMBIGUOUS: (
+        'the pose is ambiguous: the phantom fits nearly as well in another one (# beads '
+        'instead of #); mark it by beads that break its symmetry'
+    ),
+    Kind.MARKER_FOUND_AGAIN: 'found again after # images',
+    Kind.MARKER_MOVES_ALONE: 'it moves unlike the markers that it moved with',
+    Kind.OTHER_SHADOW: 'another shadow was as near to where it was expected',
+    Kind.SHADOWS_MET: 'their shadows met and parted',
+    Kind.NOT_IN_BOTH: 'fluoroscope b is in one only',
+    Kind.WRONG_FORMAT: (
+        'cam.csv: this looks like MayaCam # (mayacam2), which has cameras, but a phantom is needed'
+    ),
+    Kind.FEW_BEADS: 'only # beads are found in the image, at least # are needed',
+    Kind.IMAGE_ENCODING: 'the image has pixels of float64, not of # or # bits',
+    Kind.IMAGE_EMPTY: 'the image is empty: every pixel has the grey value #',
+    Kind.NO_POSE: 'no pose of the phantom fits the beads in the image',
+    Kind.POSE_UNSURE: ('the best pose of the phantom explains only #% of the beads in the image'),
+    Kind.BEAD_ALONE: 'its neighbours are not found',
+    Kind.BEAD_AWAY: '# px from its prediction',
+    Kind.BEAD_CONTRAST: 'a shadow of #% of that of a bead',
+    Kind.BEAD_DISTURBED: 'something else is beside it',
+    Kind.BEAD_HIDDEN: 'hidden by another bead',
+    Kind.BEAD_UNSURE: 'sigma # px, that of most is # px',
+    Kind.BEADS_NOT_MEASURED: (
+        'the phantom is found with # beads, of which only # can be measured'
+    ),
+    Kind.BEAD_LOST: 'cut off, or lost while it was measured',
+    Kind.EDITED_RESULT: (
+        'result/result.json: the file was changed after it was written, its figures need not '
+        'be those of the calibration: restore it, or calibrate again'
+    ),
+    Kind.EXCHANGED_CALIBRATION: (
+        'result: the calibration file of a and result.json are of different calibrations: one '
+        'of them was exchanged; restore the files of one calibration, or calibrate again'
+    ),
+    Kind.CLUSTER_CHANGE: (
+        'WARN: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper '
+        'left quarter, about (#, #) px, for # s, held against the start; seen in cluster '
+        'bone, in which a bead may have moved, as no other cluster shows it'
+    ),
+    Kind.IMAGE_DRIFT: (
+        'ERROR: the image of fluoroscope a has drifted by # px (sd #) towards (#, #), upper '
+        'left quarter, about (#, #) px, for # s, held against the start; seen in the '
+        'epipolar residuals'
+    ),
+    Kind.LEARNING: 'the start is being learned',
+    Kind.NO_DRIFT: 'no drift is seen',
+    Kind.FEW_MARKERS: 'only # of # markers are where they are said to be at first',
+    Kind.NO_MARKERS: 'no markers were seen',
+    Kind.OTHER_VIEW_MISSING: 'the other view is missing',
+    Kind.NOT_WATCHED: (
+        'the file does not contain the times of its exposures, a drift cannot be detected'
+    ),
+    Kind.SHORT_RECORDING: (
+        'the recording is too short to detect a drift: it has # s, of which the first # s are '
+        'learned'
+    ),
+}
+
+
+def pattern(sentence):
+    """Regular expression of a sentence, with numbers and places of an image."""
+    return re.escape(sentence).replace(r'\#', NUMBER).replace('@', '[a-z ]+')
+
+
+@pytest.mark.parametrize('kind', MAKERS, ids=lambda kind: kind.value)
+def test_sentence_of_a_kind(kind):
+    found = MAKERS[kind]()
+    assert found.kind is kind
+    assert re.fullmatch(pattern(SENTENCES[kind]), found.sentence), found.sentence
+
+
+def test_every_kind_has_its_sentence():
+    assert set(Kind) == set(MAKERS) == set(SENTENCES)
+
+
+def test_places_in_a_sentence():
+    assert str(Place(('a', 'b', 'c'), (3,))) == 'fluoroscopes a, b and c, exposure 3'
+    assert str(Place(('a',), (3, 5))) == 'fluoroscope a, exposures 3 and 5'
+    assert str(Place(('a',), name='')) == str(Place()) == ''
+    found = Finding(Kind.POOR_FIT, 'cause', Place(('a',)), 'advice')
+    assert found.sentence == str(found) == 'fluoroscope a: cause: advice'
+    assert found.at('x.csv').sentence == 'x.csv: fluoroscope a: cause: advice'
+
+
+def test_an_error_keeps_its_findings_on_its_way():
+    """Through a process, and with a place in front."""
+    given = Finding(Kind.POOR_FIT, 'cause', Place(('a',)), numbers={'residual_px': 9.0})
+    error = pickle.loads(pickle.dumps(DataError(given, 'line\nend')))
+    assert error.findings[0] == given and error.findings[1].kind is Kind.DATA
+    assert str(error) == 'fluoroscope a: cause. line\\nend'
+    assert error.at('x').finding.numbers == given.numbers
+    assert str(error.at('x')) == 'x: fluoroscope a: cause. x: line\\nend'

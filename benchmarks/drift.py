@@ -23,18 +23,17 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
-from fluoro_calib_ros.calibration.rig_orientation import (
+from fluoro_calib_ros.checks.cluster_watch import Cluster
+from fluoro_calib_ros.checks.drift_observations import EpipolarObservations, PointObservations
+from fluoro_calib_ros.checks.drift_options import ERROR, OK, WARN, DriftOptions, DriftState
+from fluoro_calib_ros.checks.drift_watch import DriftWatch
+from fluoro_calib_ros.correction.base import CorrectionStatus
+from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.rig_orientation import (
     orientation_of_capture,
     orientation_of_exposures,
 )
-from fluoro_calib_ros.distortion.status import CorrectionStatus
-from fluoro_calib_ros.drift.clusters import Cluster
-from fluoro_calib_ros.drift.observations import EpipolarObservations, PointObservations
-from fluoro_calib_ros.drift.options import DriftOptions
-from fluoro_calib_ros.drift.state import ERROR, OK, WARN, DriftState
-from fluoro_calib_ros.drift.watch import DriftWatch
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry
@@ -373,7 +372,7 @@ def detection(
         'direction': drift.direction,
         'warn': np.inf,
         'error': np.inf,
-        'message': '',
+        'kind': '',
     }
 
     def shift(name: str, uv: np.ndarray, time_s: float) -> np.ndarray:
@@ -401,7 +400,7 @@ def _reported(state: DriftState, drift: Drift, delay: float) -> Result:
     if ' or ' in state.fluoroscope:  # down in one is up in the other
         along = abs(along)
     return {
-        'message': state.message,
+        'kind': state.finding.kind.value,
         'named': state.fluoroscope,
         'place': right_place(state, drift.quarter),
         'source': state.source,

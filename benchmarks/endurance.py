@@ -29,8 +29,8 @@ from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.msg import TargetObservations
 
 from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
-from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
-from fluoro_calib_ros.nodes.runtime.qos import OBSERVATION_DEPTH, observations_qos
+from fluoro_calib_ros.nodes.messages.observations import message_from_frame
+from fluoro_calib_ros.nodes.runtime.streams import OBSERVATION_DEPTH, observations_qos
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.simulation.tracking import simulate_tracking
 
@@ -41,7 +41,7 @@ AHEAD = OBSERVATION_DEPTH // 4
 PAGE_MB = os.sysconf('SC_PAGE_SIZE') / 2**20
 
 
-def resident_mb(process: subprocess.Popen) -> float:
+def resident_mb(process: subprocess.Popen[Any]) -> float:
     """Resident memory [MB] of a process."""
     return int(Path(f'/proc/{process.pid}/statm').read_text().split()[1]) * PAGE_MB
 

@@ -20,22 +20,20 @@ import numpy as np
 from scipy.spatial import ConvexHull
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.calibrate import CalibrationResult, calibrate
-from fluoro_calib_ros.calibration.held_calibration import (
-    held_corrections,
-    too_few_rays_for_noise,
-)
-from fluoro_calib_ros.calibration.initial_network import (
+from fluoro_calib_ros.correction.base import CorrectionModel
+from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
+from fluoro_calib_ros.correction.registry import selectable_models
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.fixed_calibration import fixed_corrections, too_few_rays_for_noise
+from fluoro_calib_ros.estimation.initial_network import (
     KnownSensor,
     Measured,
     network_of_known_sensors,
+    start_noise,
 )
-from fluoro_calib_ros.calibration.options import AUTO, CalibrationOptions
-from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
-from fluoro_calib_ros.calibration.robust_adjustment import start_noise
-from fluoro_calib_ros.distortion.base import CorrectionModel
-from fluoro_calib_ros.distortion.registry import selectable_models
-from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.options import AUTO, CalibrationOptions
+from fluoro_calib_ros.estimation.result import CalibrationResult
 from fluoro_calib_ros.exposures.frame import Frame, points_on_image
 from fluoro_calib_ros.photogrammetry.adjustment import SolverOptions, adjust
 from fluoro_calib_ros.photogrammetry.noise import Noise
@@ -394,7 +392,7 @@ def errors_of_test(
     the adjustment before the correction, which are not needed here: a third of the time.
     """
     measured = scene.test_network(case.fluoroscopes, case.variant == KNOWN)
-    correction, network = held_corrections(measured, calibrations)
+    correction, network = fixed_corrections(measured, calibrations)
     start = with_interior(
         measured, np.array([calibrations[n].interior for n in case.fluoroscopes])
     )

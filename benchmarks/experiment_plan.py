@@ -15,7 +15,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from typing import Any
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.estimation.options import CalibrationOptions
 
 from .experiment import (
     BEFORE,
@@ -174,7 +174,7 @@ class Plan:
 
 
 def full_plan() -> Plan:
-    """The experiment of docs/accuracy.md."""
+    """The experiment of docs/how_good/accuracy.md."""
     return Plan(
         available_models(),
         CalibrationOptions().model,

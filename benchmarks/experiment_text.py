@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Text of docs/accuracy.md: the experiment, its results, and the shortcomings they show."""
+"""Text of docs/how_good/accuracy.md: experiment, results, and the shortcomings they show."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ the complete experiment of Chow et al. (2018), with their figures next to ours, 
 comparisons. All our figures are from virtual rigs with known ground truth: two fluoroscopes, a
 phantom of 503 beads surveyed to 0.1 mm, {exposures} exposures per fluoroscope with 130 to 160
 detected beads each, image noise {noise} px, 1 % false matches, and a distortion of 15 px along the
-rim of the image and 26 to 35 px in its corners. Every {every}th exposure ({trained} in total) is used
-for the calibration. The other {tested} are adjusted with that calibration held fixed (out of sample).
+border of the image and 26 to 35 px in its corners. Every {every}th exposure ({trained} in total) is used
+for the calibration. The other {tested} are adjusted with that calibration fixed (out of sample).
 Errors are root mean squares (RMSE) of the differences from the truth.
 
 | name | meaning |
@@ -190,7 +190,7 @@ def curve_section(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) 
                 'curves',
                 document,
                 'Object points and source: 3-D errors after an adjustment of the test exposures '
-                'with the calibration held fixed. Third panel: the correction compared with the '
+                'with the calibration fixed. Third panel: the correction compared with the '
                 'true distortion.',
             ),
             '3-D RMSE of the object points [mm]:\n',
@@ -412,7 +412,7 @@ def _named(case: Case) -> str:
 
 
 def document_text(plan: Plan, outcomes: Outcomes, paths: Paths, document: Path) -> str:
-    """The whole text of docs/accuracy.md."""
+    """The whole text of docs/how_good/accuracy.md."""
     comparisons = [Comparison(plan, outcomes, setting) for setting in plan.settings]
     models = ''.join(
         f'| `{m}` | {ABOUT.get(m, "a model of this package")} |\n'

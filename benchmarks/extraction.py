@@ -4,7 +4,7 @@
 """Extraction of beads from radiographs: found, precise, honest, never wrong.
 
     python -m benchmarks.extraction --images 100        both sets of images, printed as tables of
-                                                        docs/extraction.md
+                                                        docs/how_good.md
     python -m benchmarks.extraction --points 500        poses from points alone
     python -m benchmarks.extraction --calibration 12    calibration from images and true centres
     python -m benchmarks.extraction --picture PATH      an image with its overlay
@@ -28,18 +28,16 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame, points_on_image
 from fluoro_calib_ros.exposures.phantom import Phantom
-from fluoro_calib_ros.jobs.adjustment import adjust
-from fluoro_calib_ros.jobs.calibration import run_calibration
-from fluoro_calib_ros.radiographs.extraction import Extraction, extract_beads
-from fluoro_calib_ros.radiographs.growth import Seen
-from fluoro_calib_ros.radiographs.matching import PhantomModel, match
-from fluoro_calib_ros.radiographs.overlay import draw_overlay
-from fluoro_calib_ros.radiographs.view import Lens
+from fluoro_calib_ros.images.extraction import Extraction, extract_beads
+from fluoro_calib_ros.images.growth import Seen
+from fluoro_calib_ros.images.matching import PhantomModel, match
+from fluoro_calib_ros.images.overlay import draw_overlay
+from fluoro_calib_ros.images.view import Lens
+from fluoro_calib_ros.jobs.calibration import adjust, run_calibration
 from fluoro_calib_ros.simulation.exposures import phantom_poses
 from fluoro_calib_ros.simulation.radiographs import CLEAN, HARD, RadiographSettings, Radiography
 from fluoro_calib_ros.simulation.rig import Pose, VirtualFluoroscope, VirtualRig, virtual_rig

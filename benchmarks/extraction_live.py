@@ -34,19 +34,18 @@ from rclpy.node import Node
 from sensor_msgs.msg import Image
 from std_msgs.msg import Header
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.request import CalibrationRequest
 from fluoro_calib_ros.demo.node_processes import NodeProcesses, isolate_ros_graph
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.files.observations import write_observations_csv
-from fluoro_calib_ros.files.phantom import write_phantom
 from fluoro_calib_ros.images.codec import encode
+from fluoro_calib_ros.io.observations import write_observations_csv
+from fluoro_calib_ros.io.phantom import write_phantom
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
-from fluoro_calib_ros.jobs.rendering import SETTINGS, RenderedScene, Renderers
-from fluoro_calib_ros.nodes.messages.fields import stamp_from_nanoseconds
+from fluoro_calib_ros.jobs.simulation import SETTINGS, RenderedScene, Renderers
 from fluoro_calib_ros.nodes.messages.image import message_from_image
-from fluoro_calib_ros.nodes.runtime.qos import images_qos, latched_qos, observations_qos
+from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
+from fluoro_calib_ros.nodes.runtime.streams import images_qos, latched_qos, observations_qos
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.exposures import phantom_poses
 from fluoro_calib_ros.simulation.marker_images import (

@@ -25,12 +25,15 @@ from rclpy.node import Node
 from rclpy.serialization import serialize_message
 from sensor_msgs.msg import Image
 
-from fluoro_calib_ros.nodes.runtime.discovery import wait_for_readers, wait_until_acknowledged
 from fluoro_calib_ros.nodes.runtime.lifecycle import ManagedNode
 from fluoro_calib_ros.nodes.runtime.main import run
 from fluoro_calib_ros.nodes.runtime.parameters import ParameterGroup
-from fluoro_calib_ros.nodes.runtime.qos import images_qos
-from fluoro_calib_ros.nodes.runtime.stream_reader import StreamReader
+from fluoro_calib_ros.nodes.runtime.streams import (
+    StreamReader,
+    images_qos,
+    wait_for_readers,
+    wait_until_acknowledged,
+)
 from fluoro_calib_ros.options import option
 from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.exposures import simulate_exposures

@@ -4,7 +4,7 @@
 """Corrected images: the speed of one core, and of the live node compared with a plain relay.
 
     python -m benchmarks.images [--seconds 10] [--only NAME]      printed as the tables of
-    docs/images.md
+    docs/how_good/speed.md
     python -m benchmarks.images --picture docs/images/corrected_image.png
 
 Camera, node and the reader (this process, or one of its own for another transport) share the
@@ -35,18 +35,19 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from scipy.ndimage import map_coordinates
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
+from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
+from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
+from tools.sections import show_section
 
 from .timing import table, timed
 
 if TYPE_CHECKING:
-    from fluoro_calib_ros.nodes.runtime.stream_reader import StreamReader
+    from fluoro_calib_ros.nodes.runtime.streams import StreamReader
 
 TICK = os.sysconf('SC_CLK_TCK')
 WIDE = """<?xml version="1.0" encoding="UTF-8"?>
@@ -135,7 +136,7 @@ class Reader:
         from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
             message_from_calibration,
         )
-        from fluoro_calib_ros.nodes.runtime.qos import latched_qos
+        from fluoro_calib_ros.nodes.runtime.streams import latched_qos
 
         self.node = rclpy.create_node('reader')
         self._latched = self.node.create_publisher(
@@ -149,8 +150,7 @@ class Reader:
         """Collect (stamp, latency) [ns] of a topic, without decoding the images."""
         from sensor_msgs.msg import Image
 
-        from fluoro_calib_ros.nodes.runtime.qos import images_qos
-        from fluoro_calib_ros.nodes.runtime.stream_reader import StreamReader
+        from fluoro_calib_ros.nodes.runtime.streams import StreamReader, images_qos
 
         from .online import logged
 
@@ -182,13 +182,13 @@ def wait(condition: Callable[[], Any], seconds: float, what: str) -> None:
         time.sleep(0.02)
 
 
-def _cpu(process: subprocess.Popen) -> float:
+def _cpu(process: subprocess.Popen[Any]) -> float:
     """CPU time [s] that a process has used, all its threads together."""
     fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / TICK
 
 
-def _start(*command: str, log: IO[bytes], **parameters: Any) -> subprocess.Popen:
+def _start(*command: str, log: IO[bytes], **parameters: Any) -> subprocess.Popen[Any]:
     arguments = [word for key, value in parameters.items() for word in ('-p', f'{key}:={value}')]
     return subprocess.Popen(
         [sys.executable, '-m', *command, '--ros-args', '-p', 'fluoroscopes:=[a]', *arguments],
@@ -368,8 +368,8 @@ def _in_corner(uv: np.ndarray) -> np.ndarray:
     return np.all((uv > (left, top)) & (uv < (left + side, top + side)), axis=1)
 
 
-def text_of(core: Sequence[dict[str, Any]], cases: dict[str, dict[str, Any]]) -> str:
-    """The tables."""
+def text_of(core: Sequence[dict[str, Any]], cases: dict[str, dict[str, Any]]) -> tuple[str, str]:
+    """Tables of one core and of the live cases."""
     rows = [
         [
             f'mono{f["depth"]} {f["interpolation"]}',
@@ -402,14 +402,10 @@ def text_of(core: Sequence[dict[str, Any]], cases: dict[str, dict[str, Any]]) ->
         ]
         for case, f in cases.items()
     ]
-    return (
-        first
-        + '\n\n'
-        + table(
-            ['live', 'images', 'lost', 'p50 [ms]', 'p99 [ms]', 'max [ms]', 'CPU per image [ms]'],
-            rows,
-        )
+    second = table(
+        ['live', 'images', 'lost', 'p50 [ms]', 'p99 [ms]', 'max [ms]', 'CPU per image [ms]'], rows
     )
+    return first, second
 
 
 if __name__ == '__main__':
@@ -420,10 +416,13 @@ if __name__ == '__main__':
     parser.add_argument(
         '--picture', metavar='FILE', help='only draw docs/images/corrected_image.png'
     )
+    parser.add_argument('--out', type=Path, help='page with the tables, docs/how_good/speed.md')
     options = parser.parse_args()
     if options.picture:
         draw(options.picture)
     elif options.live:
         print(json.dumps(live(calibration_of_the_rig()[0], options.seconds, options.only)))
     else:
-        print(text_of(*run(options.seconds, options.only)))
+        first, second = text_of(*run(options.seconds, options.only))
+        show_section(first, options.out, 'images, one core')
+        show_section(second, options.out, 'images, live')

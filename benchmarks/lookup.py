@@ -21,10 +21,10 @@ import numpy as np
 from sklearn.neighbors import KNeighborsRegressor
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.distortion.grid import CorrectionGrid
-from fluoro_calib_ros.distortion.registry import selectable_models
+from fluoro_calib_ros.correction.grid import CorrectionGrid
+from fluoro_calib_ros.correction.registry import selectable_models
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.simulation.exposures import Detection, simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
 

@@ -4,7 +4,7 @@
 """Following of markers in two views: ids, precision and speed.
 
     python -m benchmarks.markers --frames 500           all settings, as the table of
-                                                        docs/extraction.md
+                                                        docs/how_good.md
     python -m benchmarks.markers --speed                seconds of a core, and where they go
     python -m benchmarks.markers --picture PATH         an image with its overlay
 
@@ -31,17 +31,13 @@ from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.api import calibrate
-from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
-from fluoro_calib_ros.drift.clusters import Cluster
+from fluoro_calib_ros.checks.cluster_watch import Cluster
+from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
+from fluoro_calib_ros.images.marker_decisions import revise
+from fluoro_calib_ros.images.marker_pair import MarkerPair
+from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
+from fluoro_calib_ros.images.overlay import draw_markers
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
-from fluoro_calib_ros.radiographs.marker_overlay import draw_markers
-from fluoro_calib_ros.radiographs.marker_pair import MarkerPair, revise
-from fluoro_calib_ros.radiographs.markers import (
-    FirstMarkers,
-    MarkerFrame,
-    MarkerOptions,
-    MarkerTracker,
-)
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.marker_images import (
     HARD_MARKER_SETTINGS,

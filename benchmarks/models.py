@@ -3,7 +3,7 @@
 
 """Correction models and regressors of scikit-learn compared out of sample on virtual rigs.
 
-python -m benchmarks.models            the table of docs/models.md
+python -m benchmarks.models            the table of docs/how_good.md
 python -m benchmarks.models --rigs 3   on more rigs
 """
 
@@ -13,6 +13,7 @@ import argparse
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,18 +22,16 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.svm import SVR
 
-from fluoro_calib_ros.calibration.calibrate import (
-    CalibrationResult,
-    adjust_with_calibrations,
-    calibrate,
-)
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.distortion.gauge import gauge_basis, gauge_coefficients
-from fluoro_calib_ros.distortion.knn import KnnModel
+from fluoro_calib_ros.correction.neighbours import KnnModel
+from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
+from fluoro_calib_ros.estimation.gauge import gauge_basis, gauge_coefficients
+from fluoro_calib_ros.estimation.options import CalibrationOptions
+from fluoro_calib_ros.estimation.result import CalibrationResult
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.simulation.exposures import SimulatedExposures, simulate_exposures
 from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
 from fluoro_calib_ros.simulation.streams import StreamStart
+from tools.sections import write_section
 
 from .timing import section, timed
 
@@ -78,7 +77,7 @@ class Scene:
 class Figures:
     """What was measured of a model on one rig.
 
-    points_mm: 3-D RMSE of the object points of test exposures, adjusted with the calibration held;
+    points_mm: 3-D RMSE of the points of test exposures, adjusted with the calibration fixed;
     ratio to that of known distortion; correction_px: RMS difference of a coordinate from the true
     distortion over the calibrated area, without the gauge; rounds; converged; seconds of the
     calibration.
@@ -183,10 +182,11 @@ def models_section(rigs: int = 2) -> str:
         rows.append(row(name, [measure(scene, error, options) for scene, error in pairs]))
         sys.stderr.write(f'{" | ".join(rows[-1])}\n')
     return section(
-        'Comparison of the models, out of sample',
-        f'Means over {rigs} virtual rigs, one fluoroscope: {TRAIN_EXPOSURES} exposures to '
-        f'calibrate, {TEST_EXPOSURES} others to test. Object points: 3-D RMSE of the test '
-        'exposures, adjusted with the calibration held; with the distortion known exactly it is '
+        'Correction models',
+        f'`python -m benchmarks.models`: means over {rigs} virtual rigs, one fluoroscope: '
+        f'{TRAIN_EXPOSURES} exposures to calibrate, {TEST_EXPOSURES} others to test. Object '
+        'points: 3-D RMSE of the test exposures, adjusted with the calibration fixed; with '
+        'the distortion known exactly it is '
         f'{np.mean(known):.4f} mm. '
         'Correction: RMS difference of a coordinate from the true distortion over the calibrated '
         'area, without what interior and exterior orientation take up. The regressors of '
@@ -197,12 +197,18 @@ def models_section(rigs: int = 2) -> str:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Print the table."""
+    """Print the section, or write it into a page."""
     parser = argparse.ArgumentParser(
         prog='python -m benchmarks.models', description=(__doc__ or '').splitlines()[0]
     )
     parser.add_argument('--rigs', type=int, default=2, help='number of rigs (default: 2)')
-    sys.stdout.write(models_section(parser.parse_args(arguments).rigs) + '\n')
+    parser.add_argument('--out', type=Path, help='page with the section, docs/how_good.md')
+    options = parser.parse_args(arguments)
+    text = models_section(options.rigs)
+    if options.out:
+        write_section(options.out, 'models', text)
+    else:
+        sys.stdout.write(f'{text}\n')
 
 
 if __name__ == '__main__':

@@ -42,17 +42,24 @@ from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.result import FluoroscopeCalibration as Calibration
-from fluoro_calib_ros.calibration.rig_orientation import orientation_of_exposures
+from fluoro_calib_ros.correction.fluoroscope_calibration import (
+    FluoroscopeCalibration as Calibration,
+)
 from fluoro_calib_ros.demo.node_processes import isolate_ros_graph
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.rig_orientation import orientation_of_exposures
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.rig_orientation import message_from_orientation
-from fluoro_calib_ros.nodes.runtime.qos import latched_qos, observations_qos
-from fluoro_calib_ros.nodes.runtime.stream_reader import FaultHandlers, StreamReader
+from fluoro_calib_ros.nodes.runtime.streams import (
+    FaultHandlers,
+    StreamReader,
+    latched_qos,
+    observations_qos,
+)
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation as Orientation
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
+from tools.sections import show_section
 
 from .timing import table
 
@@ -195,7 +202,7 @@ def _number_and_latency(data: bytes, info: dict[str, int]) -> tuple[int, int]:
     ] - seconds * 10**9 - nanoseconds
 
 
-def _cpu(process: subprocess.Popen) -> float:
+def _cpu(process: subprocess.Popen[Any]) -> float:
     """CPU time [s] that a process has used, all its threads together."""
     fields = Path(f'/proc/{process.pid}/stat').read_text().rpartition(')')[2].split()
     return (int(fields[11]) + int(fields[12])) / TICK
@@ -386,5 +393,6 @@ if __name__ == '__main__':
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument('--seconds', type=float, default=60.0)
     parser.add_argument('--only', default='', help='cases whose name contains this')
+    parser.add_argument('--out', type=Path, help='page with the table, docs/how_good/speed.md')
     options = parser.parse_args()
-    print(text_of(run(options.seconds, options.only)))
+    show_section(text_of(run(options.seconds, options.only)), options.out, 'nodes')

@@ -17,8 +17,8 @@ from typing import TextIO
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.calibrate import adjust_with_calibrations, calibrate
-from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
+from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.exposures import SimulatedExposures, simulate_exposures
 from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig

@@ -12,6 +12,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable
+from typing import Any
 
 from fluoro_calib_msgs.msg import TargetObservations
 
@@ -23,8 +24,7 @@ from fluoro_calib_ros.nodes.runtime.diagnostics import (
 )
 from fluoro_calib_ros.nodes.runtime.lifecycle import ManagedNode
 from fluoro_calib_ros.nodes.runtime.main import run
-from fluoro_calib_ros.nodes.runtime.qos import observations_qos
-from fluoro_calib_ros.nodes.runtime.stream_reader import FaultHandlers, StreamReader
+from fluoro_calib_ros.nodes.runtime.streams import FaultHandlers, StreamReader, observations_qos
 
 
 class Relay(ManagedNode):
@@ -62,13 +62,13 @@ class Relay(ManagedNode):
             ),
         )
 
-    def _relay(self, name: str) -> Callable[[TargetObservations, dict], None]:
+    def _relay(self, name: str) -> Callable[[TargetObservations, dict[str, Any]], None]:
         publisher = self.create_publisher(
             TargetObservations, f'{name}/relayed_{self._kind}', observations_qos()
         )
         latencies = self._latencies[name]
 
-        def relay(message: TargetObservations, info: dict) -> None:
+        def relay(message: TargetObservations, info: dict[str, Any]) -> None:
             publisher.publish(message)
             latencies.add(time.time_ns() - info['received_timestamp'])
 

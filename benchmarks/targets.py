@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Accuracy with flat targets, and with a known orientation: docs/flat_targets.md has the results.
+"""Accuracy with flat targets, and with a known orientation: docs/how_good.md has the results.
 
     python -m benchmarks.targets [--seeds 5] [--case NAME]
 
@@ -21,11 +21,14 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from fluoro_calib_ros.calibration.calibrate import calibrate_request
-from fluoro_calib_ros.calibration.initial_network import KnownSensor, network_of_known_sensors
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.request import CalibrationRequest
-from fluoro_calib_ros.calibration.robust_adjustment import adjusted_with_precision, start_noise
+from fluoro_calib_ros.estimation.calibrate import calibrate_request
+from fluoro_calib_ros.estimation.initial_network import (
+    KnownSensor,
+    adjusted_with_precision,
+    network_of_known_sensors,
+    start_noise,
+)
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame, points_on_image
 from fluoro_calib_ros.exposures.moving_points import MovingPoints
 from fluoro_calib_ros.exposures.phantom import Phantom

@@ -4,7 +4,7 @@
 """Corrected images while a C-arm turns, beside the same images at a constant angle.
 
     python -m benchmarks.turning_images [--seconds 10] [--only NAME]     printed as the tables of
-    docs/images.md
+    docs/how_good/speed.md
 
 Camera, image node and the reader (this process) share the machine. Cases at 30 Hz have one or two
 fluoroscopes; in cases `fast` the camera sends an image as soon as one of three in flight is
@@ -35,13 +35,14 @@ from typing import IO, Any
 import cv2
 import numpy as np
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.result import FluoroscopeCalibration
+from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
+from fluoro_calib_ros.estimation.calibrate import calibrate
 from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.jobs.image_correction import ImageCorrectionRequest, run_image_correction
 from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
+from tools.sections import show_section
 
 from .images import WIDE, _cpu, _stream_figures, wait
 from .timing import table
@@ -218,10 +219,14 @@ def camera(show: _Show) -> None:
     from rclpy.serialization import serialize_message
     from sensor_msgs.msg import CameraInfo, Image, JointState
 
-    from fluoro_calib_ros.nodes.messages.fields import stamp_from_nanoseconds
-    from fluoro_calib_ros.nodes.runtime.discovery import wait_for_readers, wait_until_acknowledged
-    from fluoro_calib_ros.nodes.runtime.qos import images_qos, observations_qos
-    from fluoro_calib_ros.nodes.runtime.stream_reader import StreamReader
+    from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
+    from fluoro_calib_ros.nodes.runtime.streams import (
+        StreamReader,
+        images_qos,
+        observations_qos,
+        wait_for_readers,
+        wait_until_acknowledged,
+    )
 
     from .online import logged
 
@@ -316,7 +321,7 @@ class _Reader:
         from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
             message_from_calibration,
         )
-        from fluoro_calib_ros.nodes.runtime.qos import latched_qos
+        from fluoro_calib_ros.nodes.runtime.streams import latched_qos
 
         self.node = rclpy.create_node('reader')
         self._latched = []
@@ -333,8 +338,7 @@ class _Reader:
         from rclpy.qos import QoSProfile
         from sensor_msgs.msg import Image
 
-        from fluoro_calib_ros.nodes.runtime.qos import images_qos
-        from fluoro_calib_ros.nodes.runtime.stream_reader import StreamReader
+        from fluoro_calib_ros.nodes.runtime.streams import StreamReader, images_qos
 
         from .online import logged
 
@@ -446,8 +450,8 @@ def live(
 
 def text_of(
     cases: dict[str, dict[str, Any]], files: dict[str, dict[str, float]], maps: dict[str, float]
-) -> str:
-    """The tables."""
+) -> tuple[str, str, str]:
+    """Tables of the live cases and of files, and the accuracy of the maps."""
     rows = [
         [
             case,
@@ -474,7 +478,7 @@ def text_of(
     first = table(head, rows)
     rows = [[case, f'{f["ms"]:.1f}', f'{f["cpu_ms"]:.1f}'] for case, f in files.items()]
     second = table(['`correct`', 'per image [ms]', 'CPU per image [ms]'], rows)
-    return '\n\n'.join([first, second, '\n'.join(f'{k}: {v:.4f}' for k, v in maps.items())])
+    return first, second, '\n'.join(f'{k}: {v:.4f}' for k, v in maps.items())
 
 
 if __name__ == '__main__':
@@ -482,13 +486,15 @@ if __name__ == '__main__':
     parser.add_argument('--seconds', type=float, default=10.0)
     parser.add_argument('--only', default='', help='live cases whose name contains this')
     parser.add_argument('--camera', default='', help='be the camera: what it shows, as JSON')
+    parser.add_argument('--out', type=Path, help='page with the tables, docs/how_good/speed.md')
     options = parser.parse_args()
     if options.camera:
         camera(_Show(**json.loads(options.camera)))
     else:
         rig = calibrations_of_a_turning_rig()
-        print(
-            text_of(
-                live(rig, options.seconds, options.only), on_files(rig['a']), accuracy(rig['a'])
-            )
+        first, second, maps = text_of(
+            live(rig, options.seconds, options.only), on_files(rig['a']), accuracy(rig['a'])
         )
+        show_section(first, options.out, 'turning images, live')
+        show_section(second, options.out, 'turning images, files')
+        print(maps)

@@ -3,8 +3,8 @@
 
 """The experiment of Chow et al. on the virtual rig, and further comparisons: `make validation`.
 
-Writes docs/accuracy.md and its pictures; experiment_plan lists the cases, experiment_text has the
-text.
+Writes docs/how_good/accuracy.md and its pictures; experiment_plan lists the cases, experiment_text
+has the text.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         '--out',
         type=Path,
-        default=Path('docs/accuracy.md'),
-        help='file to write, pictures go into images/ beside it (default: docs/accuracy.md)',
+        default=Path('docs/how_good/accuracy.md'),
+        help='file to write, pictures go into images/ beside it',
     )
     options = parser.parse_args(arguments)
     outcomes = make(quick_plan() if options.quick else full_plan(), options.out)

@@ -5,7 +5,7 @@
 
 Every case simulates rigs with one fluoroscope, calibrates it and validates the calibration. The
 results are kept in a file, so that an interrupted run continues where it stopped. Prints the table
-of docs/verdict.md.
+of docs/how_good.md.
 """
 
 from __future__ import annotations
@@ -20,15 +20,15 @@ from typing import Any
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.checks.verdict import validate
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.report.tables import markdown_table
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 from fluoro_calib_ros.simulation.rig import virtual_rig
-from fluoro_calib_ros.validation.verdict import validate
+from tools.sections import write_section
 
 FIRST_SEED = 5018  # rigs that were not used to set a limit
 RIPPLE_PX = 80.0  # width of the local ripple that appears in the middle of the exposures
@@ -134,7 +134,7 @@ def measure(name: str, seed: int, model: str) -> dict[str, Any]:
         'model': model,
         'kind': calibrations['a'].model.kind,
         'verdict': found.verdict,
-        'findings': found.findings,
+        'findings': list(map(str, found.findings)),
         'checks': {c.name: [c.value, c.limit, c.passed] for c in found.checks},
     }
 
@@ -178,6 +178,7 @@ def main() -> None:
         help='file of the results (default: %(default)s)',
     )
     parser.add_argument('--cases', help='prefix of the cases (default: all)', default='')
+    parser.add_argument('--out', type=Path, help='page with the table, docs/how_good.md')
     options = parser.parse_args()
     rows = []
     if options.rows.exists():
@@ -190,7 +191,10 @@ def main() -> None:
         with open(options.rows, 'a', encoding='utf-8') as file:
             file.write(json.dumps(row) + '\n')
         print(name, seed, row['verdict'], *row['findings'], sep=' | ', file=sys.stderr)
-    print(table(rows))
+    if options.out:
+        write_section(options.out, 'error rates of the verdict', table(rows))
+    else:
+        print(table(rows))
 
 
 if __name__ == '__main__':

@@ -11,26 +11,27 @@ frames of a stream at 250 Hz with other work in between. Median of the repetitio
 
 from __future__ import annotations
 
+import argparse
 import time
 from array import array
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from fluoro_calib_msgs.msg import CorrectedObservations, TargetObservations
 from rclpy.serialization import deserialize_message, serialize_message
 
-from fluoro_calib_ros.bags.definitions import message_class, typestore
 from fluoro_calib_ros.exposures.frame import Frame
-from fluoro_calib_ros.nodes.messages.corrected_observations import (
+from fluoro_calib_ros.io.bags.definitions import message_class, typestore
+from fluoro_calib_ros.nodes.messages.observations import (
     decode_corrected_observations,
-    encode_corrected_observations,
-)
-from fluoro_calib_ros.nodes.messages.fields import float64_field
-from fluoro_calib_ros.nodes.messages.target_observations import (
     decode_target_observations,
+    encode_corrected_observations,
+    float64_field,
     message_from_frame,
 )
+from tools.sections import show_section
 
 from .timing import table
 
@@ -132,12 +133,12 @@ def run() -> str:
             warm = [f'{t[0]:.1f}' for t in times]
             cold = [f'{t[1]:.0f}' for t in times]
             rows.append([f'{task}, {count} points', *warm, *cold])
-    head = [
-        '',
-        *(f'{k} {lib} [us]' for k in ('warm', 'cold') for lib in ('ours', 'rosbags', 'rclpy')),
-    ]
+    libraries = ('own code', 'rosbags', 'rclpy')
+    head = ['', *(f'{k}, {lib} [us]' for k in ('warm', 'cold') for lib in libraries)]
     return table(head, rows)
 
 
 if __name__ == '__main__':
-    print(run())
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument('--out', type=Path, help='page with the table, docs/how_good/speed.md')
+    show_section(run(), parser.parse_args().out, 'messages')

@@ -17,8 +17,8 @@ from fluoro_calib_msgs.srv import Calibrate
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.qos import QoSProfile
 
-from fluoro_calib_ros.bags.reader import read_frames
-from fluoro_calib_ros.nodes.messages.target_observations import message_from_frame
+from fluoro_calib_ros.io.bags.reader import read_frames
+from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 
 from .processes import Process
 

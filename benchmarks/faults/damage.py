@@ -12,13 +12,17 @@ from pathlib import Path
 
 from mcap.reader import make_reader
 
-from fluoro_calib_ros.bags.definitions import TARGET_OBSERVATIONS, known_definition, to_cdr
-from fluoro_calib_ros.bags.frames import message_from_frame
-from fluoro_calib_ros.bags.qos import profile
-from fluoro_calib_ros.bags.reader import iterate_messages
-from fluoro_calib_ros.bags.recording import Recording, RecordingOptions, TopicToRecord
-from fluoro_calib_ros.bags.recovery import recover_bag
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.io.bags.definitions import (
+    TARGET_OBSERVATIONS,
+    known_definition,
+    message_from_frame,
+    to_cdr,
+)
+from fluoro_calib_ros.io.bags.metadata import profile
+from fluoro_calib_ros.io.bags.reader import iterate_messages
+from fluoro_calib_ros.io.bags.recording import Recording, RecordingOptions, TopicToRecord
+from fluoro_calib_ros.io.bags.salvage import recover_bag
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.simulation.streams import StreamStart
 from fluoro_calib_ros.simulation.tracking import simulate_tracking

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-from fluoro_calib_ros.jobs.dataset import write_bag
+from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.simulation.rig import virtual_rig
 from fluoro_calib_ros.simulation.streams import StreamStart
 from fluoro_calib_ros.simulation.tracking import simulate_tracking

@@ -19,13 +19,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from fluoro_calib_ros.bags.reader import iterate_messages
-from fluoro_calib_ros.bags.recovery import recover_bag
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.files.calibration import load_calibrations
-from fluoro_calib_ros.files.calibration_request import read_request
+from fluoro_calib_ros.io.bags.reader import iterate_messages
+from fluoro_calib_ros.io.bags.salvage import recover_bag
+from fluoro_calib_ros.io.calibration import load_calibrations
+from fluoro_calib_ros.io.calibration_request import read_request
 from fluoro_calib_ros.jobs.simulation import SimulationOptions, simulate
-from fluoro_calib_ros.nodes.messages.target_observations import decode_target_observations
+from fluoro_calib_ros.nodes.messages.observations import decode_target_observations
 
 from ..timing import section
 from .calibrating import JobClient

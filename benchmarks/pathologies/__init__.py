@@ -6,5 +6,5 @@
 The generator shares no code with `fluoro_calib_ros.simulation`: `fields` has its own family of
 distortions, `phantoms` its own geometries, `scene` its own cameras, poses, noise and false
 matches. `cases` declares the pathologies, `oracle` and `measure` compare a calibration with one
-that knows the distortion, `run` is the program and `page` writes docs/pathologies.md.
+that knows the distortion, `run` is the program and `page` writes docs/how_good/pathologies.md.
 """

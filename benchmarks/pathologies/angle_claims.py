@@ -25,13 +25,14 @@ from pathlib import Path
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.distortion import collocation
-from fluoro_calib_ros.distortion.angle_field import HARMONICS, harmonics
-from fluoro_calib_ros.distortion.angle_fit import field_of
-from fluoro_calib_ros.distortion.exposure_terms import TERMS, TREND_DEGREE
-from fluoro_calib_ros.distortion.series import Functions
+from fluoro_calib_ros.correction.angle_field import HARMONICS, harmonics
+from fluoro_calib_ros.correction.series import Functions
+from fluoro_calib_ros.correction.terms import CUBIC
+from fluoro_calib_ros.estimation import fluoroscope_terms
+from fluoro_calib_ros.estimation.angle_fit import field_of
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.exposure_terms import TERMS
+from fluoro_calib_ros.estimation.options import CalibrationOptions
 
 from .angle_errors import errors_at_angles
 from .cases import CASES
@@ -66,7 +67,7 @@ class Errors:
 @contextmanager
 def recorded_fits():
     """List of (estimated, angles, fit) of the fits to angles within the context."""
-    original = collocation.fit_angles
+    original = fluoroscope_terms.fit_angles
     fits = []
 
     def fit_angles(estimated, angles):
@@ -74,11 +75,11 @@ def recorded_fits():
         fits.append((estimated, angles, fit))
         return fit
 
-    collocation.fit_angles = fit_angles
+    fluoroscope_terms.fit_angles = fit_angles
     try:
         yield fits
     finally:
-        collocation.fit_angles = original
+        fluoroscope_terms.fit_angles = original
 
 
 def without_interior(estimated, angles, fit):
@@ -95,7 +96,7 @@ def without_interior(estimated, angles, fit):
 
 def terms_of(estimated):
     """Function of pixels (n, 2) with the values (n, 2, t) of the terms of exposures."""
-    cubic = Functions(estimated.functions.image_size, TREND_DEGREE)
+    cubic = Functions(estimated.functions.image_size, CUBIC)
     values = cubic(estimated.uv)
     of_terms = estimated.terms.functions.values
     # Terms are cubic polynomials: this solution is exact.

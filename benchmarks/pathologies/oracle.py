@@ -5,8 +5,8 @@
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.calibrate import calibrate
-from fluoro_calib_ros.calibration.options import CalibrationOptions
+from fluoro_calib_ros.estimation.calibrate import calibrate
+from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.exposures.frame import Frame
 
 from .scene import NAMES

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page docs/pathologies.md from the results."""
+"""The page docs/how_good/pathologies.md from the results."""
 
 import numpy as np
 from scipy.stats import chi2
@@ -31,7 +31,8 @@ with a standard deviation of 0.1 mm. Model: {model}.
 - **NSE**: mean of (error / claimed standard deviation)^2 of the correction (grid within the
   calibrated area, in the gauge of the calibration), the object points and the sources of
   fluoroscope a; 1 is honest. At the angles of a C-arm, the interior orientation
-  is held: see c_arm_angle.md. A calibration has few independent errors, so that its NSE scatters:
+  is fixed: see [how good it is](../how_good.md#a-c-arm-that-turns).
+  A calibration has few independent errors, so that its NSE scatters:
   that of the sources by about 0.7, that of the correction as chi squared over its degrees of
   freedom, which follow from the claimed covariance (Box 1954).
 - **cover**: share [%] of errors within the claimed 95 % interval, in the same order.

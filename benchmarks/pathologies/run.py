@@ -10,11 +10,10 @@ import sys
 import time
 from pathlib import Path
 
-from fluoro_calib_ros.calibration.options import CalibrationOptions
-from fluoro_calib_ros.calibration.request import CalibrationRequest
+from fluoro_calib_ros.checks.verdict import validate_or_report
 from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.jobs.calibration import run_calibration
-from fluoro_calib_ros.validation.verdict import validate_or_report
 
 from .cases import CASES
 from .measure import claims, ratios
@@ -23,7 +22,7 @@ from .page import page
 from .scene import NAMES, draw
 
 RESULTS = Path('.build/pathologies.jsonl')
-PAGE = Path('docs/pathologies.md')
+PAGE = Path('docs/how_good/pathologies.md')
 
 
 def measured(case, seed, model=None, verdict=True):
@@ -59,7 +58,7 @@ def _verdict(case, scene, request, outcome):
     return {
         'verdict': found.verdict,
         'failed': [check.name for check in found.checks if check.passed is False],
-        'findings': list(found.findings),
+        'findings': list(map(str, found.findings)),
         'seconds_verdict': time.process_time() - began,
     }
 

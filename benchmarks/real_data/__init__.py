@@ -5,5 +5,7 @@
 
 python -m benchmarks.real_data --list                     sources and licences
 python -m benchmarks.real_data --download                 fetch them into real_data/
-python -m benchmarks.real_data --data FOLDER [--mrcal PYTHON]   docs/real_data.md from data there
+python -m benchmarks.real_data --data FOLDER [--mrcal PYTHON]   the page, from data there
+
+The page is docs/how_good/real_data.md.
 """

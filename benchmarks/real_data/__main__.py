@@ -19,7 +19,7 @@ from .sets import READERS
 from .sources import download, text_of_sources
 
 DATA = Path('real_data')
-PAGE = Path('docs/real_data.md')
+PAGE = Path('docs/how_good/real_data.md')
 
 
 def main(argv: Sequence[str] | None = None) -> int:

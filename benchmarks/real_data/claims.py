@@ -17,10 +17,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from fluoro_calib_ros.calibration.joint_precision import SolvedNetwork
-from fluoro_calib_ros.calibration.rounds import SelfCalibration
-from fluoro_calib_ros.distortion.collocation import RINGS, TREND_DEGREE
-from fluoro_calib_ros.distortion.series import Functions, without_absent_bands
+from fluoro_calib_ros.correction.series import Functions, without_absent_bands
+from fluoro_calib_ros.correction.terms import CUBIC
+from fluoro_calib_ros.estimation.fixed_calibration import SolvedNetwork
+from fluoro_calib_ros.estimation.fluoroscope_terms import RINGS
+from fluoro_calib_ros.estimation.rounds import SelfCalibration
 from fluoro_calib_ros.photogrammetry.additional_parameters import AdditionalParameters
 from fluoro_calib_ros.photogrammetry.collinearity import project_with_jacobian
 
@@ -117,7 +118,7 @@ def _functions(run: SelfCalibration) -> Functions:
     if model.series is None:
         raise ValueError('the model is not collocation')
     functions, _ = without_absent_bands(model.series.functions, model.series.coefficients)
-    return replace(functions, degree=TREND_DEGREE, rings=RINGS if functions.modes else 0)
+    return replace(functions, degree=CUBIC, rings=RINGS if functions.modes else 0)
 
 
 def _additional(run: SelfCalibration) -> AdditionalParameters:
@@ -142,7 +143,7 @@ def _variation(
     if additional.own is None:
         return np.zeros((2 * len(rows), 0)), 0.0
     own = additional.own.values
-    polynomials = Functions(run.measured.image_size[0], TREND_DEGREE)
+    polynomials = Functions(run.measured.image_size[0], CUBIC)
     of_training = polynomials(run.measured.network.uv)
     of_tested = polynomials(network.uv[rows])
     sd = 1 / np.sqrt(np.diagonal(additional.prior)[count:][: own.shape[2]])

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 import fluoro_calib_ros as fc
-from fluoro_calib_ros.distortion.collocation import CollocationModel
+from fluoro_calib_ros.correction.models import CollocationModel
 from fluoro_calib_ros.exposures.frame import Frame
 
 from .claims import expected_square
@@ -176,7 +176,7 @@ def measure_fold(
             if validated:
                 validation = fc.validate(outcome.request, outcome.result.calibrations)
                 fold.verdict = validation.verdict
-                fold.findings = list(validation.findings)
+                fold.findings = list(map(str, validation.findings))
     fold.warnings = sorted({f'{w.category.__name__}: {w.message}' for w in caught})
     return fold
 

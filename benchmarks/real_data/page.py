@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The page docs/real_data.md."""
+"""The page docs/how_good/real_data.md."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ are not part of this project; `--download` fetches them.
 - **this package**: `fc.calibrate` with the survey of the set, model auto. **OpenCV**:
   `cv2.calibrateCamera` with five coefficients (Brown), the rational model, and the rational model
   with thin prism and tilt; it starts from our interior orientation. **mrcal**: lens models OPENCV8
-  and splined stereographic (11 x 8 knots), with its own outlier rejection. OpenCV and mrcal hold
+  and splined stereographic (11 x 8 knots), with its own outlier rejection. OpenCV and mrcal fix
   the targets at their survey.
-- The camera is held, and the poses of the unseen exposures are estimated with a robust loss, for
-  all cameras with the same code. Surveys have errors, and a camera calibrated with held targets
+- The camera is fixed, and the poses of the unseen exposures are estimated with a robust loss, for
+  all cameras with the same code. Surveys have errors, and a camera calibrated with fixed targets
   learns a part of them: targets are therefore estimated too, with their surveyed coordinates as
-  observations. A table below has the residuals with the survey held.
+  observations. A table below has the residuals with the survey fixed.
 - Residuals are those of a coordinate [px] of the observed image: RMS over the image points,
   without those that no camera explains (8 robust standard deviations for each). **inside**: in the
   convex hull of the image points of the calibration. **outside**: beyond it.
@@ -55,7 +55,7 @@ are not part of this project; `--download` fetches them.
   image point, as with exom. Both are given for each half, and for the set as their geometric mean:
   a ratio of variances is symmetrical in its logarithm, and where exposures differ, one half has
   too much where the other has too little. **thirds**: NSE of the third of the image points that is
-  nearest to the middle of the image, of the next, and of that at the rim.
+  nearest to the middle of the image, of the next, and of that at the border.
   **rejected**: share of the image points that `fc.adjust` takes as gross errors, of those that
   some camera explains.
 - A dash stands for a calibration that failed: its residuals are not finite, or their median is
@@ -91,9 +91,9 @@ are not part of this project; `--download` fetches them.
   exposures are uncertain, and Brown's model has no shear: over twelve random halves (seeds 1 to 6,
   e150512) the ratio inside is 1.05 +- 0.03 for canon40d and 0.98 +- 0.03 for camcal. It is the
   same within 0.01 with variances of the terms of exposures from points that are once, three or ten
-  times as free as the survey says, and with terms of the interior orientation beside them. Without
+  times as free as the survey says, and with terms of the interior orientation besides. Without
   terms of exposures it is 1.05 and 1.03, but with NSE of 1.5 and 2.0. With the common affinity and
-  shear held at zero (0cc82c7) it is 1.02 for canon40d, but 1.07 for camcal; image intensifiers
+  shear fixed at zero (0cc82c7) it is 1.02 for canon40d, but 1.07 for camcal; image intensifiers
   need them, so they stay.
 - The halves of one seed scatter: over those twelve, NSE and NSE correlated are 0.99 and 1.13 for
   camcal, 1.00 and 1.12 for canon40d, 0.95 and 1.04 for canon7d, 0.57 and 0.81 for exom, 0.74 and
@@ -111,7 +111,7 @@ to OpenCV with Brown's model.
 
 {outside}
 
-## Inside, with the survey held
+## Inside, with the survey fixed
 
 {held}
 
@@ -238,7 +238,7 @@ def _halves(result: Result, figure: str) -> str:
 
 
 def _thirds(result: Result) -> str:
-    """NSE in the middle, about it and at the rim, geometric means of both splits."""
+    """NSE in the middle, about it and at the border, geometric means of both splits."""
     values = [fold['nse_thirds'] for fold in result['folds'] if fold.get('nse_thirds')]
     if not values:
         return '-'

@@ -42,9 +42,8 @@ from fluoro_calib_ros.photogrammetry.precision import geometric_redundancy
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.photogrammetry.unknowns import Parameters
 from fluoro_calib_ros.report.cost_figure import relative_costs
-from fluoro_calib_ros.simulation.distortion import DistortionField
 from fluoro_calib_ros.simulation.exposures import Detection, SimulatedExposures, simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import DistortionField, virtual_rig
 
 NOISE_PX = 0.25
 BEFORE = 'before'

@@ -23,7 +23,7 @@ from fluoro_calib_ros.checks import inputs as plausibility
 from fluoro_calib_ros.checks.drift_evidence import DriftEstimate
 from fluoro_calib_ros.checks.drift_options import ERROR, WARN
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
-from fluoro_calib_ros.checks.recording_watch import RecordingDriftWatch
+from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch
 from fluoro_calib_ros.checks.rigidity import doubtful
 from fluoro_calib_ros.checks.verdict import validate, validate_or_report
 from fluoro_calib_ros.errors import DataError
@@ -41,7 +41,7 @@ from fluoro_calib_ros.findings import Finding, Kind, Place
 from fluoro_calib_ros.images import detection, extraction, matching
 from fluoro_calib_ros.images.codec import as_grey
 from fluoro_calib_ros.images.growth import Seen
-from fluoro_calib_ros.images.marker_doubts import doubt_in
+from fluoro_calib_ros.images.marker_watch import doubt_in
 from fluoro_calib_ros.io.formats import registry
 from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.io.result_check import edited, exchanged

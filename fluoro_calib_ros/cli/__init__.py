@@ -63,7 +63,7 @@ class _Version(argparse.Action):
     """Prints the versions, which are looked up only then."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any, **__: Any) -> None:
-        from ..report.versions import versions
+        from ..report.html import versions
 
         found = versions()
         own = found.pop('fluoro_calib_ros')

@@ -70,7 +70,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..jobs.orientation import orient
     from ..jobs.result_folder import belongs_to, saved_orientation
     from ..jobs.sources import read_calibrated_source, read_survey
-    from ..report.orientation import orientation_text
+    from ..report.tables import orientation_text
 
     known = read_names(arguments.calibration)
     survey = read_survey(arguments.phantom, file_settings(arguments, names=known))

@@ -16,7 +16,7 @@ import numpy as np
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.rotations import matrix_from_quaternion
-from ..simulation.distortion import DistortionField
+from ..simulation.rig import DistortionField
 
 # Frames and source timestamps [ns] by (fluoroscope, frame number); frames have target_id, u and v.
 Frames = Mapping[tuple[str, int], tuple[Any, int]]

@@ -2,7 +2,7 @@
 # SPDX-License-Identifier: Apache-2.0
 
 """Collect exposures from streams of frames: pair the frames, and wait until the phantom stands
-still.
+still. Whether there are enough.
 """
 
 from __future__ import annotations
@@ -249,3 +249,42 @@ def _is_stream(frames: Sequence[Frame], still: StillOptions) -> bool:
         return False
     gaps = np.diff(sorted(f.stamp_ns for f in frames))
     return bool(0 < np.median(gaps) <= still.still_time_s * 1e9)
+
+
+RECOMMENDED_EXPOSURES = 15  # docs/usage.md; accuracy by number: docs/how_good/accuracy.md
+RECOMMENDED_COVERAGE = 0.9
+MAX_AREAS = 2  # named at once
+
+
+@dataclass(frozen=True)
+class Readiness:
+    """What is still missing before a calibration is worthwhile.
+
+    Attributes
+    ----------
+    ready : bool
+        Whether there are enough exposures and enough of the image is covered.
+    advice : str
+        What the next pose should show, or that it is time to calibrate.
+    """
+
+    ready: bool
+    advice: str
+
+
+def readiness(exposures: int, coverage: Coverage | None) -> Readiness:
+    """Return what is missing to a calibration of one fluoroscope.
+
+    exposures: number of collected ones; coverage: None before the first one.
+    """
+    if coverage is None or not exposures:
+        return Readiness(False, 'show the phantom and keep it still')
+    missing = coverage.missing_areas[:MAX_AREAS]
+    covered = coverage.fraction >= RECOMMENDED_COVERAGE
+    if exposures >= RECOMMENDED_EXPOSURES and covered:
+        return Readiness(True, 'ready to calibrate')
+    further = RECOMMENDED_EXPOSURES - exposures
+    count = f'{further} more, ' if further > 0 else ''
+    if not missing:
+        return Readiness(False, f'{count}with the phantom turned and tilted')
+    return Readiness(False, f'{count}with beads {" and ".join(missing)} of the image')

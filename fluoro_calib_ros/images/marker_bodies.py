@@ -10,8 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..checks.cluster_watch import Cluster
-from .marker_geometry import fitted_pose
 from .marker_ids import ClusterShape
+from .marker_rays import fitted_pose
 
 RIGID_MM = 0.1  # what a marker may move in its cluster, a standard deviation
 RIGID_SIGMAS = 5.0

@@ -20,14 +20,11 @@ from numpy.typing import NDArray
 from ..errors import DataError
 from ..findings import Finding, Kind
 from ..options import option, validate_options
-from .marker_company import follow_beside, shift_together
-from .marker_doubts import MarkerDoubts
 from .marker_intensity import LightWindows, MarkerLook, check_image
 from .marker_measurement import MarkerMeasurement
-from .marker_search import MarkerSearch
-from .marker_start import learn_start
+from .marker_start import MarkerSearch, learn_start
 from .marker_states import MarkerStates, MeasuredMarkers
-from .marker_watch import MarkerWatch
+from .marker_watch import MarkerDoubts, MarkerWatch, follow_beside, shift_together
 from .shadow_profile import Profile
 
 

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import DataError
-from ..images.declared_size import check_size
+from ..images.codec import check_size
 from .access import check_regular_file, os_error_reason
 
 SIGNATURE = b'CI'

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import DataError
-from ..images.declared_size import check_size
+from ..images.codec import check_size
 from .access import check_regular_file
 
 # Transfer syntaxes (PS3.5, annex A) that are read: implicit and explicit little endian, explicit

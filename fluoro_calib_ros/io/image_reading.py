@@ -21,8 +21,7 @@ from tifffile import TiffFile, TiffFileError, TiffWriter
 
 from ..errors import DataError
 from ..exposures.frame import MAX_ANGLE
-from ..images.codec import as_grey, decode
-from ..images.declared_size import check_size
+from ..images.codec import as_grey, check_size, decode
 from .access import os_error_reason, read_bytes
 from .cine import read_cine_header, read_cine_images
 from .csv_table import read_blocks

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..checks.check import Check, Validation
-from ..checks.recording_watch import DriftVerdict
+from ..checks.rig_watch import DriftVerdict
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..estimation.constraints import RelativeOrientation

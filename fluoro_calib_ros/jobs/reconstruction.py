@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..checks.cluster_watch import Cluster
-from ..checks.recording_watch import DriftVerdict, RecordingDriftWatch
+from ..checks.rig_watch import DriftVerdict, RecordingDriftWatch
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame

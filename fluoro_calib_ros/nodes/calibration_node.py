@@ -12,8 +12,8 @@ process of its own. rclpy's MultiThreadedExecutor is no alternative: it schedule
 and again until it has started, which on a busy machine costs so much time that frames are lost.
 
 The parts: parameters and rig (calibration_settings), exposures (exposure_input), what is published
-(calibration_output), and the services that collect (collect_services), calibrate
-(self_calibration), orient the rig (orientation_service), save and load (calibration_files).
+(calibration_output), and the services that collect and orient the rig
+(calibration_services), calibrate (self_calibration), save and load (calibration_files).
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ from .angle_input import AngleInput
 from .calibration_files import CalibrationFiles
 from .calibration_health import CONDITIONS, FluoroscopeState
 from .calibration_output import CalibrationOutput
+from .calibration_services import CollectServices, OrientationService
 from .calibration_settings import (
     PARAMETERS,
     CalibrationSettings,
@@ -38,11 +39,9 @@ from .calibration_settings import (
     follow_settings,
     read_rig,
 )
-from .collect_services import CollectServices
 from .exposure_input import ExposureInput
 from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
-from .orientation_service import OrientationService
 from .runtime.diagnostics import Status, health_of
 from .runtime.lifecycle import StreamNode
 from .runtime.main import run

@@ -17,7 +17,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import Image
 
 from ..correction import fluoroscope_calibration as calibration_result
-from ..images.coverage_picture import coverage_picture
+from ..images.overlay import coverage_picture
 from ..photogrammetry import rig_orientation
 from .messages.fluoroscope_calibration import message_from_calibration
 from .messages.image import colour_message

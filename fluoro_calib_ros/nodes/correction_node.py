@@ -20,7 +20,7 @@ from ..exposures.angles import AngleOptions
 from ..limits import StreamLimits
 from .correcting_node import CorrectedStream, CorrectingNode
 from .frame_validation import OBSERVED_REFUSALS, FrameValidator
-from .messages.camera_info import message_of_corrected_stream
+from .messages.fluoroscope_calibration import message_of_corrected_stream
 from .messages.observations import (
     NS_PER_S,
     ObservedFrame,

@@ -14,11 +14,10 @@ from rclpy.task import Future
 
 from ..errors import DataError
 from ..estimation.initial_network import MIN_TARGETS_OF_EXPOSURE
-from ..exposures.collector import ExposureCollector
+from ..exposures.collector import ExposureCollector, readiness
 from ..exposures.frame import Frame, validate_frame
 from ..exposures.pairing import CompletePairer
 from ..exposures.phantom import Phantom
-from ..exposures.readiness import readiness
 from .calibration_settings import CalibrationSettings
 from .messages.observations import ObservedFrame, frame_from_observed
 from .messages.status import Collected

@@ -26,7 +26,7 @@ from ..images.corrector import INTERPOLATIONS
 from ..options import option
 from .angle_input import AngleInput
 from .correcting_node import CorrectedStream, CorrectingNode
-from .messages.camera_info import message_of_corrected_stream
+from .messages.fluoroscope_calibration import message_of_corrected_stream
 from .messages.image import (
     COMPRESSIONS,
     IMAGE_REFUSALS,

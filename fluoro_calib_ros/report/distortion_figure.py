@@ -16,7 +16,7 @@ from matplotlib.patches import Rectangle
 
 from ..correction.base import Correction, CorrectionModel
 from .style import BLACK, new_figure
-from .text import model_text
+from .tables import model_text
 
 # Along the longer side of the image.
 FIELD_CELLS = 160

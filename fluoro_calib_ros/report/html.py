@@ -6,8 +6,10 @@
 from __future__ import annotations
 
 import base64
+import platform
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
@@ -34,8 +36,7 @@ from .report_figures import (
 )
 from .residuals import Residuals, residuals_of
 from .style import STYLE, png_bytes
-from .text import model_text
-from .versions import versions
+from .tables import model_text
 
 TEMPLATES = Path(__file__).parent / 'templates'
 VERDICTS = {
@@ -319,3 +320,18 @@ def _text(value: Any, digits: int = 3) -> str:
     if value is None or (isinstance(value, float) and not np.isfinite(value)):
         return '–'
     return f'{float(value):.{digits}f}'
+
+
+PACKAGES = ('fluoro_calib_ros', 'numpy', 'scipy')
+FROM_SOURCE = 'from source'
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python, this package and its numerical libraries, by name."""
+    out = {'Python': platform.python_version()}
+    for package in PACKAGES:
+        try:
+            out[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            out[package] = FROM_SOURCE
+    return out

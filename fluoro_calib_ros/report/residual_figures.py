@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ..estimation.rounds import SelfCalibration
 from ..photogrammetry.adjustment import Adjustment
 from .style import AFTER, BEFORE, BLACK, GREY, new_figure
-from .text import model_text
+from .tables import model_text
 
 MIN_HISTOGRAM_SD = 5.0  # standard deviations to either side
 MAX_HISTOGRAM_SD = 15.0

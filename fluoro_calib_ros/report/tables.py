@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,10 +13,11 @@ from typing import Any
 import numpy as np
 
 from ..correction.angle_field import AngleField
+from ..correction.base import CorrectionModel
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..estimation.result import CalibrationResult, FluoroscopeResult
 from ..findings import Severity, sentences
-from .text import TERMINAL_WIDTH, number_text
+from ..photogrammetry.rig_orientation import RigOrientation
 
 # Widths of the columns of quantities and of fluoroscopes.
 LABEL_WIDTH = 36
@@ -167,3 +169,39 @@ def _is_number(cell: str) -> bool:
     except ValueError:
         return cell in ('-', '')
     return True
+
+
+TERMINAL_WIDTH = 100  # columns
+
+
+def model_text(model: CorrectionModel) -> str:
+    """A correction model in words."""
+    if not model.corrects:
+        return 'no correction model'
+    return f'{model.kind}, k = {model.k}' if model.k else model.kind
+
+
+def number_text(value: float, digits: int = 3) -> str:
+    """A number with so many decimals, or a dash if it is not finite."""
+    return f'{value:.{digits}f}' if math.isfinite(value) else '-'
+
+
+def orientation_text(orientation: RigOrientation) -> str:
+    """Return a RigOrientation as text: a line, then a line a fluoroscope."""
+    lines = [
+        f'orientation of the rig {orientation.orientation_id} in frame {orientation.frame_id}, '
+        f'from a {orientation.source} (exposures: {orientation.exposures})'
+    ]
+    for name, position, sd, sd_rad in zip(
+        orientation.fluoroscopes, orientation.position_mm, orientation.sd_mm, orientation.sd_rad
+    ):
+        rotation_sd = np.rad2deg(np.sqrt(np.mean(sd_rad**2)))
+        lines.append(
+            f'{name}: source at {_numbers(position)} mm (sd {_numbers(sd)}), '
+            f'rotation sd {rotation_sd:.4f} degrees'
+        )
+    return '\n'.join(lines)
+
+
+def _numbers(values: np.ndarray) -> str:
+    return ', '.join(f'{value:.2f}' for value in values)

@@ -9,7 +9,7 @@ import textwrap
 
 from ..checks.check import Validation
 from ..findings import sentences
-from .text import TERMINAL_WIDTH, number_text
+from .tables import TERMINAL_WIDTH, number_text
 
 HEADER = ('check', 'fluoroscope', 'value', 'limit', 'unit', '')
 PASSED_TEXT = {True: 'passed', False: 'FAILED', None: 'not made'}

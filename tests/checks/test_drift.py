@@ -14,10 +14,10 @@ import pytest
 
 from fluoro_calib_ros.checks.charts import CusumCharts, ImageAreas
 from fluoro_calib_ros.checks.cluster_watch import Cluster
-from fluoro_calib_ros.checks.drift_field import SystematicErrorField
 from fluoro_calib_ros.checks.drift_observations import EpipolarObservations, PointObservations
 from fluoro_calib_ros.checks.drift_options import ERROR, OK, WARN, DriftOptions
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
+from fluoro_calib_ros.checks.pair_watch import SystematicErrorField
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.reconstruction.epipolar import EpipolarGeometry

@@ -88,9 +88,8 @@ from fluoro_calib_ros.photogrammetry.precision import (
     solved_additional,
     variance_of_projection,
 )
-from fluoro_calib_ros.simulation.distortion import DistortionField
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
-from fluoro_calib_ros.simulation.rig import virtual_rig
+from fluoro_calib_ros.simulation.rig import DistortionField, virtual_rig
 from fluoro_calib_ros.simulation.streams import StreamStart
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed

@@ -12,8 +12,7 @@ import pytest
 import tifffile
 
 from fluoro_calib_ros.errors import DataError
-from fluoro_calib_ros.images.codec import decode
-from fluoro_calib_ros.images.declared_size import declared_size
+from fluoro_calib_ros.images.codec import declared_size, decode
 from fluoro_calib_ros.io.image_reading import open_images
 
 SIZE = (37, 23)

@@ -26,9 +26,9 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_decisions import Decision, revise
-from fluoro_calib_ros.images.marker_geometry import project_observed
 from fluoro_calib_ros.images.marker_ids import ClusterShape, identify_markers
 from fluoro_calib_ros.images.marker_pair import MarkerPair, PairFrame
+from fluoro_calib_ros.images.marker_rays import project_observed
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from fluoro_calib_ros.images.overlay import draw_markers
 from fluoro_calib_ros.io.bags.definitions import message_class
@@ -39,7 +39,6 @@ from fluoro_calib_ros.io.phantom import write_phantom
 from fluoro_calib_ros.io.rig_orientation import save_orientation
 from fluoro_calib_ros.jobs.live_markers import MarkerSettings
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
-from fluoro_calib_ros.simulation.distortion import DistortionField
 from fluoro_calib_ros.simulation.marker_images import (
     MARKER_SETTINGS,
     MarkerImage,
@@ -47,7 +46,7 @@ from fluoro_calib_ros.simulation.marker_images import (
     MarkerSequence,
     MovingMarkers,
 )
-from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
+from fluoro_calib_ros.simulation.rig import DistortionField, VirtualRig, virtual_rig
 
 SIZE = 288
 FRAMES = 30

@@ -21,14 +21,14 @@ from sensor_msgs.msg import Image
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.images.corrector import ImageCorrector
-from fluoro_calib_ros.nodes import orientation_service
+from fluoro_calib_ros.nodes import calibration_services
 from fluoro_calib_ros.nodes.calibration_input import CalibrationInput
+from fluoro_calib_ros.nodes.calibration_services import OrientationService
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
     calibration_from_message,
     message_from_calibration,
 )
 from fluoro_calib_ros.nodes.messages.image import ImageConverter
-from fluoro_calib_ros.nodes.orientation_service import OrientationService
 from fluoro_calib_ros.nodes.runtime.diagnostics import Refused
 from fluoro_calib_ros.nodes.runtime.logging import one_line
 from fluoro_calib_ros.nodes.runtime.parameters import check_timeout, expand_path
@@ -209,7 +209,7 @@ def test_orientation_of_outdated_calibrations_is_rejected(monkeypatch):
         output.calibrations.update(new)
         return outcome
 
-    monkeypatch.setattr(orientation_service, 'in_thread', lambda *_: (recalibrated(), None))
+    monkeypatch.setattr(calibration_services, 'in_thread', lambda *_: (recalibrated(), None))
     capture = service._orient(SimpleNamespace(timeout_sec=1.0, frames=1))
     capture.send(None)  # it waits for its frames
     service.add({name: SimpleNamespace(fluoroscope=name) for name in 'ab'})

@@ -14,8 +14,7 @@ from rigs import run, true_calibrations, true_orientation
 
 from fluoro_calib_ros.checks.cluster_watch import parse_clusters
 from fluoro_calib_ros.checks.drift_options import ERROR, DriftOptions
-from fluoro_calib_ros.checks.recording_watch import RecordingDriftWatch
-from fluoro_calib_ros.checks.rig_watch import RigDriftWatch
+from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.findings import Kind, Severity
 from fluoro_calib_ros.io.calibration import save_calibration
 from fluoro_calib_ros.io.observations import write_observations_csv

@@ -15,7 +15,7 @@ from PIL import Image
 
 from fluoro_calib_ros.correction.models import no_correction
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
-from fluoro_calib_ros.simulation.distortion import random_field
+from fluoro_calib_ros.simulation.rig import random_field
 
 sys.path.append(str(Path(__file__).resolve().parents[2]))  # benchmarks are not installed
 from benchmarks import validation

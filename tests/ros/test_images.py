@@ -20,8 +20,10 @@ from fluoro_calib_ros.correction.models import no_correction
 from fluoro_calib_ros.images.codec import decode, encode
 from fluoro_calib_ros.images.corrector import ImageCorrector
 from fluoro_calib_ros.io.calibration import load_calibrations
-from fluoro_calib_ros.nodes.messages.camera_info import message_of_corrected_stream
-from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
+from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import (
+    message_from_calibration,
+    message_of_corrected_stream,
+)
 from fluoro_calib_ros.nodes.messages.observations import stamp_from_nanoseconds
 from fluoro_calib_ros.nodes.runtime.streams import images_qos, latched_qos
 from fluoro_calib_ros.simulation.bead_images import bead_image

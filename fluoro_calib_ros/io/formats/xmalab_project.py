@@ -24,7 +24,7 @@ import numpy as np
 from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names, safe_names, without_trivial
-from ...images.declared_size import check_size, declared_size
+from ...images.codec import check_size, declared_size
 from . import xmalab_frame
 from .camera_files import check_matrix, check_rotation
 from .content import Camera, Content, FileSettings, Format, Sample, Station

@@ -15,7 +15,7 @@ from fluoro_calib_msgs.msg import CalibrationStatus, DriftStatus
 from ...checks.drift_options import DriftState
 from ...correction.fluoroscope_calibration import FluoroscopeCalibration
 from ...estimation.rounds import Round
-from ...exposures.readiness import Readiness
+from ...exposures.collector import Readiness
 from ...photogrammetry.rig_orientation import RigOrientation
 from .observations import stamp_from_nanoseconds
 

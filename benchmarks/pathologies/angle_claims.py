@@ -25,7 +25,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fluoro_calib_ros.correction.angle_field import HARMONICS, harmonics
+from fluoro_calib_ros.correction.angle_field import harmonics
+from fluoro_calib_ros.correction.calibration_record import HARMONICS
 from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.correction.terms import CUBIC
 from fluoro_calib_ros.estimation import fluoroscope_terms

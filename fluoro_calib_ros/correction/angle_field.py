@@ -20,15 +20,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
-from .series import SD_GRID, Functions, Series, sd_grid_pixels
+from .calibration_record import HARMONICS, ORDERS, SD_GRID, TERMS, VARIANCES
+from .series import Functions, Series, sd_grid_pixels
 from .terms import CUBIC
 
-ORDERS = 2  # harmonics of the angle
-HARMONICS = 2 * ORDERS
 PAIRS = [(j, k) for j in range(HARMONICS) for k in range(j, HARMONICS)]
-VARIANCES = HARMONICS + len(PAIRS)
 MAX_DISTANCE = np.deg2rad(15)  # of an angle from the next one that was calibrated
-TERMS = (CUBIC + 1) * (CUBIC + 2) // 2  # of a polynomial of two variables
 # Of the arrays that `packed_angles` gives; None: as many as there are exposures.
 PACKED_SHAPES = (None, (HARMONICS, 2, TERMS), (VARIANCES, SD_GRID, SD_GRID))
 

@@ -22,10 +22,16 @@ from ..limits import (
     MAX_PX,
 )
 from ..records import Field
-from .angle_field import HARMONICS, TERMS, VARIANCES
-from .series import MAX_DEGREE, MAX_MODES, SD_GRID
+from .terms import CUBIC
 
 VERSION = 4  # of the file
+MAX_DEGREE = 15  # of a series that is read
+MAX_MODES = 100
+SD_GRID = 33  # nodes of the standard deviation along each side of the image
+ORDERS = 2  # harmonics of the angle
+HARMONICS = 2 * ORDERS
+TERMS = (CUBIC + 1) * (CUBIC + 2) // 2  # of a polynomial of two variables
+VARIANCES = HARMONICS + HARMONICS * (HARMONICS + 1) // 2  # with the series and of each pair
 
 _correction = partial(Field, identity='correction')
 _detail = partial(Field, identity='detail')

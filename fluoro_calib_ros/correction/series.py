@@ -22,13 +22,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import map_coordinates
 
+from .calibration_record import MAX_DEGREE, MAX_MODES, SD_GRID
 from .terms import CUBIC, ring_coefficients
 
 MARGIN = 1.3  # size of the rectangle of the sines, which vanish at its border, over the image
 RING_DEGREE = CUBIC + 2  # of the first radial polynomial beyond a cubic trend
-MAX_DEGREE = 15  # of a series that is read
-MAX_MODES = 100
-SD_GRID = 33  # nodes of the standard deviation along each side of the image
 PREDICTION_CHUNK = 20_000  # pixels for which a series is evaluated at once
 PREDICTION_VALUES = 20_000_000  # of functions at these pixels, to bound the memory
 

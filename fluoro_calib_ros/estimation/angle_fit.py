@@ -18,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from ..correction.angle_field import HARMONICS, ORDERS, PAIRS, VARIANCES, AngleField, harmonics
-from ..correction.series import SD_GRID, Functions, sd_grid_pixels
+from ..correction.angle_field import PAIRS, AngleField, harmonics
+from ..correction.calibration_record import HARMONICS, ORDERS, SD_GRID, VARIANCES
+from ..correction.series import Functions, sd_grid_pixels
 from ..correction.terms import ABSENT_VARIANCE, CUBIC
 from .exposure_terms import ExposureTerms
 

@@ -25,7 +25,8 @@ from scipy.spatial import cKDTree
 from scipy.special import log_ndtr
 from scipy.stats import binom
 
-from ..correction.series import SD_GRID, Series, sd_grid_pixels
+from ..correction.calibration_record import SD_GRID
+from ..correction.series import Series, sd_grid_pixels
 
 NEIGHBOURS = 5  # of an image point, those of its own exposure not counted
 POINTS = 60  # image points about a node of the grid

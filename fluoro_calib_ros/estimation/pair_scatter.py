@@ -20,7 +20,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..correction.angle_field import HARMONICS, harmonics
+from ..correction.angle_field import harmonics
+from ..correction.calibration_record import HARMONICS
 from ..photogrammetry.collinearity import project
 from ..photogrammetry.network import Network
 from ..photogrammetry.relative_orientation import discrepancies, mean_pose

@@ -10,15 +10,10 @@ import pytest
 from rigs import calibrated, exposures, rig
 from turning_rig import CHANGE_PX, recording, turned, turning
 
-from fluoro_calib_ros.correction.angle_field import (
-    HARMONICS,
-    MAX_DISTANCE,
-    VARIANCES,
-    AngleField,
-    harmonics,
-)
+from fluoro_calib_ros.correction.angle_field import MAX_DISTANCE, AngleField, harmonics
 from fluoro_calib_ros.correction.base import CorrectionStatus
-from fluoro_calib_ros.correction.series import SD_GRID, Functions
+from fluoro_calib_ros.correction.calibration_record import HARMONICS, SD_GRID, VARIANCES
+from fluoro_calib_ros.correction.series import Functions
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.angle_fit import can_be_fitted
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate

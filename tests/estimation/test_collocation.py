@@ -16,9 +16,9 @@ from scipy.spatial.distance import cdist
 from scipy.special import gamma, kv
 from threadpoolctl import threadpool_limits
 
+from fluoro_calib_ros.correction.calibration_record import SD_GRID
 from fluoro_calib_ros.correction.registry import MODELS, create_model
 from fluoro_calib_ros.correction.series import (
-    SD_GRID,
     Functions,
     Series,
     packed,

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.special import j0
 
-from fluoro_calib_ros.correction.series import SD_GRID, Functions, Series
+from fluoro_calib_ros.correction.calibration_record import SD_GRID
+from fluoro_calib_ros.correction.series import Functions, Series
 from fluoro_calib_ros.estimation.exposure_terms import (
     VARYING,
     ExposureTerms,

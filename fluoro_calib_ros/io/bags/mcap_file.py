@@ -13,7 +13,7 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
 import yaml
 import zstandard
@@ -22,13 +22,15 @@ from mcap.reader import SeekingReader
 from mcap.records import Channel, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader
 from mcap.summary import Summary
-from rosbags.rosbag2 import Reader
 
 from ...errors import DataError
 from ...limits import MAX_CHUNK, MAX_TOPICS
 from ..access import check_regular_file, os_error_reason, read_text
 from ..text_files import parse_yaml
 from .metadata import to_yaml
+
+if TYPE_CHECKING:
+    from rosbags.rosbag2 import Reader
 
 MAGIC = b'\x89MCAP0\r\n'
 FOOTER_SIZE = 1 + 8 + 8 + 8 + 4  # bytes: opcode, length, two offsets, CRC
@@ -395,6 +397,8 @@ def _plain(profiles: object) -> list[object]:
 @contextmanager
 def _opened(source: PathLike) -> Iterator[Reader]:
     """Open a bag; every error of the library becomes a DataError."""
+    from rosbags.rosbag2 import Reader  # with SQLite, which a recorder does not need
+
     check_regular_file(source)
     for name in os.listdir(source) if os.path.isdir(source) else ():
         check_regular_file(os.path.join(source, name))

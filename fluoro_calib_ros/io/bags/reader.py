@@ -17,7 +17,6 @@ from ...errors import DataError
 from ...exposures.angles import AngleOptions, JointAngles
 from ...exposures.frame import Frame, validate_frame
 from ...exposures.strays import without_strays
-from ...images.codec import decode
 from ...limits import MAX_OBSERVATIONS
 from ..access import check_safe_name
 from .definitions import (
@@ -297,6 +296,8 @@ def image_topics(source: PathLike) -> dict[str, str]:
 
 def images_of_topic(source: PathLike, topic: str) -> Iterator[BagImage]:
     """Yield the images of a topic. Raises DataError for a damaged bag."""
+    from ...images.codec import decode  # with OpenCV, which a player does not need
+
     kind = topics_of(source)[topic].type
     for number, message in enumerate(iterate_messages(source, [topic]), 1):
         stamp_ns = None

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -14,10 +15,12 @@ from fluoro_calib_msgs.msg import CalibrationStatus, DriftStatus
 
 from ...checks.drift_options import DriftState
 from ...correction.fluoroscope_calibration import FluoroscopeCalibration
-from ...estimation.rounds import Round
-from ...exposures.collector import Readiness
 from ...photogrammetry.rig_orientation import RigOrientation
 from .observations import stamp_from_nanoseconds
+
+if TYPE_CHECKING:  # the reconstruction node has neither
+    from ...estimation.rounds import Round
+    from ...exposures.collector import Readiness
 
 # DriftStatus: the state of the drift watch.
 

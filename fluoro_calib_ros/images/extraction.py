@@ -16,9 +16,10 @@ from ..findings import Finding, Kind
 from .detection import Detections, detect_beads
 from .following import Far, follow
 from .growth import Match, Seen, smoothed, supported
+from .image_noise import Noise, estimate_noise
 from .matching import PhantomModel, match
-from .measurement import FIRST_STEPS, STEPS, estimate_noise, estimate_profile, measure_beads
-from .shadow_fit import Beads, Noise
+from .measurement import FIRST_STEPS, STEPS, estimate_profile, measure_beads
+from .shadow_fit import Beads
 from .shadow_profile import Profile
 from .view import Lens, View, fit_view
 
@@ -151,7 +152,7 @@ def extract_beads(
         followed = _followed(image, model, near)
         if followed is not None:
             return followed
-    detections = detect_beads(image)
+    detections = detect_beads(image, len(model.xyz))
     seen = _seen(detections)
     found = match(seen, model, lens)
     noise = estimate_noise(detections.light, detections.field)
@@ -161,7 +162,7 @@ def extract_beads(
 def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extraction | None:
     """Return the extraction from an exposure nearby, None where it does not lead to the pose."""
     try:
-        detections = detect_beads(image, near.radius_px, near.inverted)
+        detections = detect_beads(image, len(model.xyz), near.radius_px, near.inverted)
         if image.shape != near.view.lens.image_size[::-1]:
             return None
         seen = _seen(detections)

@@ -8,11 +8,12 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.distance import cdist
 
+from .image_noise import Noise
 from .marker_fit import MarkerGuess, fit_markers
 from .marker_intensity import LightWindows, Shadows
 from .marker_motion import Motion, assign
 from .marker_states import SHADOW_SD_PX, MarkerStates, MeasuredMarkers
-from .shadow_fit import Beads, Noise
+from .shadow_fit import Beads
 from .shadow_profile import Profile
 
 LOST_SD_PX = 25.0  # of a prediction, from which only markers that move together are found again

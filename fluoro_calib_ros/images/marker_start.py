@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import DataError
+from .image_noise import Noise, estimate_noise
 from .marker_intensity import (
     LightWindows,
     MarkerLook,
@@ -20,8 +21,7 @@ from .marker_intensity import (
 )
 from .marker_motion import Motion, assign
 from .marker_states import MarkerStates
-from .measurement import estimate_noise, estimate_profile
-from .shadow_fit import Noise
+from .measurement import estimate_profile
 from .shadow_profile import Profile
 
 FIRST_SD_PX = 1.5  # of a given place of the first frame

@@ -9,23 +9,20 @@ beads is attenuated by both.
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import nnls
 from scipy.spatial import cKDTree
 
+from .image_noise import Noise
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
     MARGIN_PX,
     MIN_PASSED,
-    MIN_VARIANCE,
     TERMS,
     Beads,
     FineGrid,
     FitSettings,
-    Noise,
     NormalEquations,
     ShadowFit,
 )
@@ -46,76 +43,13 @@ SETTINGS = FitSettings(
 STEPS = SETTINGS.steps
 FIRST_STEPS = 4  # that only have to tell beads from other things
 PROFILE_STEPS = 3
-NOISE_BLOCK = 16  # [px]
 PROFILE_BEADS = 150
 PROFILE_ROUNDS = 3
 START_BLUR_PX = 0.9
 START_ATTENUATION = 1.5
 START_SCATTER = 0.1
 MAX_SHIFT_PX = 4.0  # of a centre, beyond which the fit has lost its bead
-MIN_CORRELATION = 0.08  # that is told from slow changes of the light
-LAGS = 4  # pixels over which noise is correlated
 HELD = 1e12  # weight of a term that stays zero
-
-
-def estimate_noise(light: np.ndarray, field: np.ndarray) -> Noise:
-    """Estimate the noise of an image (h, w) from what a plane does not explain.
-
-    The second differences of Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, by
-    blocks, robustly, against the mean grey value.
-    """
-    kernel = np.outer([1, -2, 1], [1, -2, 1]) / 6.0
-    high = cv2.filter2D(light, cv2.CV_32F, kernel)
-    height, width = (size // NOISE_BLOCK * NOISE_BLOCK for size in light.shape)
-
-    def blocks(values: np.ndarray) -> np.ndarray:
-        cut = values[:height, :width].reshape(
-            height // NOISE_BLOCK, NOISE_BLOCK, width // NOISE_BLOCK, NOISE_BLOCK
-        )
-        return cut.swapaxes(1, 2).reshape(-1, NOISE_BLOCK**2)
-
-    used = np.asarray(blocks(field).all(axis=1))
-    if not used.any():
-        used = np.ones(len(used), dtype=bool)
-    mean = np.median(blocks(light)[used], axis=1)
-    variance = (1.4826 * np.median(np.abs(blocks(high)[used]), axis=1)) ** 2
-    variance = np.maximum(variance, MIN_VARIANCE)
-    weight = 1 / variance
-    gain = constant = 0.0
-    for _ in range(3):
-        rows = np.column_stack([np.ones_like(mean), mean]) * weight[:, None]
-        (constant, gain), _ = nnls(rows, variance * weight)
-        weight = 1 / np.maximum(constant + gain * mean, MIN_VARIANCE)
-    return Noise(max(constant, MIN_VARIANCE), gain, _correlation(light, field))
-
-
-def _correlation(light: np.ndarray, field: np.ndarray) -> np.ndarray:
-    """Correlation of the noise, from the background less its blur, clipped at beads."""
-    height, width = light.shape
-    middle = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
-    light = light[middle]
-    field = field[middle]
-    rest = light - cv2.GaussianBlur(light, (0, 0), 3 * LAGS)
-    limit = 3 * 1.4826 * float(np.median(np.abs(rest[field]))) if field.any() else np.inf
-    valid = (field & (np.abs(rest) < limit)).astype(np.float32)
-    valid = cv2.erode(valid, np.ones((3, 3), np.uint8))
-    rest = rest * valid
-    out = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
-    total = float(np.sum(rest * rest)) / max(float(valid.sum()), 1.0)
-    height, width = rest.shape
-    for row in range(LAGS + 1):
-        for column in range(-LAGS, LAGS + 1):
-            a = np.s_[: height - row, max(0, -column) : width - max(0, column)]
-            b = np.s_[row:, max(0, column) : width + min(0, column)]
-            pairs = max(float(np.sum(valid[a] * valid[b])), 1.0)
-            value = float(np.sum(rest[a] * rest[b])) / pairs / max(total, 1e-12)
-            out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = value
-    # What is left of slow changes of the light is no noise.
-    edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
-    out = np.maximum(out - edge, 0) / max(1 - edge, 1e-6)
-    out[out < MIN_CORRELATION] = 0
-    out[LAGS, LAGS] = 1
-    return out
 
 
 def estimate_profile(

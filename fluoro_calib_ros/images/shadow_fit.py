@@ -17,6 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from .image_noise import Noise
 from .shadow_profile import Profile
 
 MARGIN_PX = 2.0  # of background around the shadow
@@ -28,7 +29,6 @@ DEPTH_SD = 1.0  # of the depth of a shadow, 1 for the profile
 DEPTHS = (0.05, 3.0)  # bounds; a shadow takes light away
 MIN_PASSED = 0.02  # of the light, behind a bead: derivatives are divided by it
 MIN_PIXELS = 0.6  # of a window that lie in the field
-MIN_VARIANCE = 1 / 12  # of rounding
 FINE = 3  # points across a pixel of the grid on which shadows that touch are blurred
 OVERLAP = 0.85  # times both reaches; shadows that are nearer overlap
 DISTURBED = 1.6  # lack of fit from which pixels with large residuals count less
@@ -36,26 +36,6 @@ ROBUST = 2.5  # residual of half weight [standard deviations of the noise]
 
 # Rows of beads (g,) and of their neighbours (g, k), -1 for none.
 Group = tuple[np.ndarray, np.ndarray]
-
-
-@dataclass(frozen=True)
-class Noise:
-    """Variance of a grey value: constant + gain * grey value; and its correlation.
-
-    Attributes
-    ----------
-    constant, gain : float
-    correlation : (2 LAGS + 1, 2 LAGS + 1) ndarray
-        Of the noise of pixels at lags (row, column), 1 in the middle.
-    """
-
-    constant: float
-    gain: float
-    correlation: NDArray[np.float64]
-
-    def variance(self, light: np.ndarray) -> np.ndarray:
-        """Variance of grey values of an expected light."""
-        return np.maximum(self.constant + self.gain * np.maximum(light, 0), MIN_VARIANCE)
 
 
 @dataclass(frozen=True)

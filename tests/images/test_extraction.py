@@ -20,8 +20,9 @@ from fluoro_calib_ros.images.detection import detect_beads
 from fluoro_calib_ros.images.extraction import Extraction, extract_beads
 from fluoro_calib_ros.images.following import Far, follow, moved_on
 from fluoro_calib_ros.images.growth import Seen
+from fluoro_calib_ros.images.image_noise import estimate_noise
 from fluoro_calib_ros.images.matching import PhantomModel, match
-from fluoro_calib_ros.images.measurement import estimate_noise, measure_beads
+from fluoro_calib_ros.images.measurement import measure_beads
 from fluoro_calib_ros.images.shadow_profile import Profile
 from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, may_be_found
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector

@@ -1,0 +1,431 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Extraction from renderings of usual phantoms.
+
+    python -m benchmarks.renderings --images 20                 all rows, printed as a table
+    python -m benchmarks.renderings --rows cube-24 --pictures DIR
+
+The renderer shares no code with the package. A ray from the source to each of 3 x 3 points of a
+pixel is attenuated along its chords through spheres and plates (Beer and Lambert). Light is
+scattered, blurred by focus and detector, counted
+(Poisson) and digitised. Distances of found centres from projected centres count, so the shift of
+a shadow against its centre (an ellipse) is part of the error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.images.extraction import Extraction, extract_beads
+from fluoro_calib_ros.images.matching import PhantomModel
+from fluoro_calib_ros.images.overlay import draw_overlay
+from fluoro_calib_ros.images.view import Lens
+
+SIZE = 1024  # [px]
+PRINCIPAL_PX = 4500.0
+DISTANCE_MM = 900.0
+STEEL_PER_MM = 0.55  # attenuation at some 70 keV
+ACRYLIC_PER_MM = 0.022
+BONE_PER_MM = 0.05
+SUB = 3  # points of a pixel in each direction
+WRONG_PX = 3.0  # an observation farther from its bead is that of another
+FOUND = 0.5  # share of the visible beads from which an image counts as found
+
+
+@dataclass(frozen=True)
+class Target:
+    """A phantom: beads (n, 3) [mm] and their diameters (n,) [mm]; empty for no phantom."""
+
+    xyz: NDArray[np.float64]
+    diameter: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Row:
+    """A row of the table: a phantom by a seed, and what the image suffers.
+
+    Attributes
+    ----------
+    target : callable
+        Takes a random generator, returns a Target.
+    photons : float
+        A pixel, where nothing absorbs.
+    gain : float
+        Grey values of the unattenuated light; above 255 the background is clipped.
+    plates : int
+        Acrylic plates, seen from the edge in some poses.
+    jpeg : int
+        Quality, 0 for none.
+    unsharp : float
+        Strength of an unsharp mask.
+    bone : bool
+    told : bool
+        Diameters are known to the extraction.
+    distortion_px : float
+    tilt_deg : float
+        Largest angle between the axis of the target and that of the fluoroscope; 180: any.
+    """
+
+    target: Callable[[np.random.Generator], Target]
+    photons: float = 1500.0
+    gain: float = 200.0
+    plates: int = 0
+    jpeg: int = 0
+    unsharp: float = 0.0
+    bone: bool = False
+    told: bool = False
+    distortion_px: float = 8.0
+    tilt_deg: float = 180.0
+
+
+def cube(beads: int, side: float = 60.0, diameter: float = 3.0) -> Callable[..., Target]:
+    """Beads in four layers of a cube, each in a place of its own."""
+
+    def drawn(rng: np.random.Generator) -> Target:
+        layer = np.arange(beads) % 4
+        xyz = np.empty((0, 3))
+        while len(xyz) < beads:
+            place = rng.uniform(-side / 2, side / 2, 2)
+            z = (layer[len(xyz)] / 3 - 0.5) * side
+            new = np.append(place, z)
+            if not len(xyz) or np.linalg.norm(xyz - new, axis=1).min() > 2.5 * diameter:
+                xyz = np.vstack([xyz, new])
+        return Target(xyz, np.full(beads, diameter))
+
+    return drawn
+
+
+def lego(beads: int, diameter: float = 3.2) -> Callable[..., Target]:
+    """Beads on studs of bricks: 8 mm apart, at heights of 9.6 mm."""
+
+    def drawn(rng: np.random.Generator) -> Target:
+        studs = np.array([(x, y, z) for x in range(9) for y in range(9) for z in range(6)])
+        chosen = rng.permutation(len(studs))[:beads]
+        xyz = (studs[chosen] - (4, 4, 2.5)) * (8.0, 8.0, 9.6)
+        return Target(xyz, np.full(beads, diameter))
+
+    return drawn
+
+
+def three_sizes(beads: int) -> Callable[..., Target]:
+    """A cube with beads of 2, 3 and 4 mm."""
+
+    def drawn(rng: np.random.Generator) -> Target:
+        one = cube(beads, 80.0, 4.0)(rng)
+        return Target(one.xyz, rng.choice([2.0, 3.0, 4.0], beads))
+
+    return drawn
+
+
+def sheet(count: int, pitch: float, hexagonal: bool, marks: int) -> Callable[..., Target]:
+    """A perforated sheet; the place of a hole is that of a bright disc in the image."""
+
+    def drawn(rng: np.random.Generator) -> Target:
+        i, j = np.mgrid[:count, :count].reshape(2, -1) - (count - 1) / 2
+        x = pitch * (i + 0.5 * (j % 2)) if hexagonal else pitch * i
+        y = pitch * j * (np.sqrt(3) / 2 if hexagonal else 1.0)
+        kept = np.ones(count**2, dtype=bool)
+        near = np.flatnonzero(np.hypot(x, y) < 0.3 * count * pitch)
+        kept[rng.permutation(near)[:marks]] = False
+        xyz = np.column_stack([x, y, np.zeros_like(x)])[kept]
+        return Target(xyz, np.full(len(xyz), 0.45 * pitch))
+
+    return drawn
+
+
+def nothing(_: np.random.Generator) -> Target:
+    """No phantom."""
+    return Target(np.empty((0, 3)), np.empty(0))
+
+
+ROWS: dict[str, Row] = {
+    **{f'cube-{n}': Row(cube(n)) for n in (24, 36, 48, 52, 56, 64)},
+    **{f'lego-{n}': Row(lego(n)) for n in (24, 36, 48, 64)},
+    'cube-36 small beads': Row(cube(36, diameter=1.5)),
+    'cube-48 large beads': Row(cube(48, 90.0, 7.0)),
+    'cube-36 clipped': Row(cube(36), gain=420.0),
+    'cube-36 3 % dose': Row(cube(36), photons=45.0),
+    'cube-36 JPEG 15': Row(cube(36), jpeg=15),
+    'cube-36 unsharp': Row(cube(36), unsharp=1.5),
+    'cube-36 plates': Row(cube(36), plates=5),
+    'cube-36 bone': Row(cube(36), bone=True),
+    'cube-48 three sizes': Row(three_sizes(48), told=True),
+    'cube-48 three sizes, not told': Row(three_sizes(48)),
+    'grid-20': Row(sheet(20, 5.0, False, 0), tilt_deg=15.0),
+    'nothing': Row(nothing),
+    'nothing, bone': Row(nothing, bone=True),
+}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """An image with what is true of it: projected centres (n, 2) and what can be seen (n,)."""
+
+    image: NDArray[np.uint8]
+    target: Target
+    uv: NDArray[np.float64]
+    visible: NDArray[np.bool_]
+
+
+def render(row: Row, rng: np.random.Generator) -> Scene:
+    """Render an image of a row."""
+    target = row.target(rng)
+    rotation, source = _pose(rng, row.tilt_deg)
+    bend = _Distortion(rng, row.distortion_px)
+    depth = np.zeros((SIZE, SIZE))
+    hit = np.zeros((SIZE, SIZE))
+    light = np.ones((SIZE, SIZE))
+    centres = (target.xyz - source) @ rotation.T
+    uv = bend.observed(PRINCIPAL_PX * centres[:, :2] / centres[:, 2:] + (SIZE - 1) / 2)
+    for centre, place, diameter in zip(centres, uv, target.diameter):
+        _add_sphere(light, hit, bend, centre, (place, diameter / 2))
+    for _ in range(row.plates):
+        depth += ACRYLIC_PER_MM * _plate(bend, rotation, source, rng)
+    if row.bone:
+        depth += BONE_PER_MM * _bone(rng)
+    light = light * np.exp(-depth) * _vignetting(rng)
+    grey = _detected(light, row, rng)
+    inside = ((uv > 15) & (uv < SIZE - 16)).all(axis=1)
+    return Scene(grey, target, uv, inside & (_overlap(uv, target, centres) > 1.0))
+
+
+def _pose(rng: np.random.Generator, tilt_deg: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation (3, 3) of the target to the sensor, and the place of the source (3,) [mm]."""
+    if tilt_deg >= 180:
+        rotation = Rotation.random(random_state=int(rng.integers(2**31))).as_matrix()
+    else:
+        angle = np.deg2rad(rng.uniform(-tilt_deg, tilt_deg, 2))
+        turn = Rotation.from_euler('zxy', [rng.uniform(0, 2 * np.pi), *angle])
+        rotation = turn.as_matrix()
+    shift = np.array([*rng.uniform(-12, 12, 2), DISTANCE_MM + rng.uniform(-80, 80)])
+    return rotation, -rotation.T @ shift
+
+
+class _Distortion:
+    """Pincushion, S shape and a smooth rest; undistorted = observed - duv."""
+
+    def __init__(self, rng: np.random.Generator, size_px: float) -> None:
+        self.factor = size_px * rng.uniform(0.5, 1.0, 2) * rng.choice([-1, 1], 2)
+        self.wave = rng.normal(0, 0.15 * size_px, (2, 3, 3))
+
+    def undistorted(self, uv: np.ndarray) -> np.ndarray:
+        xy = (uv - (SIZE - 1) / 2) / (SIZE / 2)
+        r2 = np.sum(xy * xy, axis=-1, keepdims=True)
+        duv = self.factor[0] * xy * r2
+        duv = duv + self.factor[1] * np.stack([-xy[..., 1], xy[..., 0]], -1) * r2
+        for i in range(3):
+            for j in range(3):
+                wave = np.cos(i * 2.1 * xy[..., 0] + j) * np.cos(j * 2.3 * xy[..., 1] + i)
+                duv = duv + wave[..., None] * self.wave[:, i, j]
+        return uv - duv
+
+    def observed(self, uv: np.ndarray) -> np.ndarray:
+        out = uv.copy()
+        for _ in range(30):
+            out = out + uv - self.undistorted(out)
+        return out
+
+
+def _rays(bend: _Distortion, left: int, top: int, shape: tuple[int, int]) -> np.ndarray:
+    """Unit vectors (h, w, SUB * SUB, 3) of rays through the points of pixels."""
+    step = (np.arange(SUB) + 0.5) / SUB - 0.5
+    height, width = shape
+    v, u, b, a = np.meshgrid(
+        top + np.arange(height), left + np.arange(width), step, step, indexing='ij'
+    )
+    uv = np.stack([u + a, v + b], -1).reshape(height, width, SUB * SUB, 2)
+    xy = (bend.undistorted(uv) - (SIZE - 1) / 2) / PRINCIPAL_PX
+    ray = np.concatenate([xy, np.ones((*xy.shape[:-1], 1))], -1)
+    return ray / np.linalg.norm(ray, axis=-1, keepdims=True)
+
+
+def _add_sphere(
+    light: np.ndarray,
+    hit: np.ndarray,
+    bend: _Distortion,
+    centre: np.ndarray,
+    disc: tuple[np.ndarray, float],
+) -> None:
+    """Attenuate light by a sphere: disc is its place [px] and its radius [mm]."""
+    place, radius = disc
+    reach = int(np.ceil(PRINCIPAL_PX * radius / centre[2])) + 4
+    left, top = (int(x) for x in np.maximum(np.floor(place) - reach, 0))
+    right, bottom = (int(x) for x in np.minimum(np.floor(place) + reach + 1, SIZE))
+    if right <= left or bottom <= top:
+        return
+    ray = _rays(bend, left, top, (bottom - top, right - left))
+    along = ray @ centre
+    chord = 2 * np.sqrt(np.maximum(radius**2 - (centre @ centre - along**2), 0))
+    passed = np.exp(-STEEL_PER_MM * chord)
+    light[top:bottom, left:right] *= passed.mean(axis=-1)
+    hit[top:bottom, left:right] += (chord > 0).any(axis=-1)
+
+
+def _plate(
+    bend: _Distortion, rotation: np.ndarray, source: np.ndarray, rng: np.random.Generator
+) -> np.ndarray:
+    """Lengths (h, w) [mm] of rays in a plate of the phantom."""
+    axis = int(rng.integers(3))
+    half = np.full(3, 32.0)
+    half[axis] = rng.uniform(2, 4)
+    middle = np.zeros(3)
+    middle[axis] = rng.uniform(-30, 30)
+    v, u = np.mgrid[:SIZE, :SIZE]
+    xy = (bend.undistorted(np.stack([u, v], -1).astype(float)) - (SIZE - 1) / 2) / PRINCIPAL_PX
+    ray = np.concatenate([xy, np.ones((SIZE, SIZE, 1))], -1) @ rotation
+    ray /= np.linalg.norm(ray, axis=-1, keepdims=True)
+    with np.errstate(divide='ignore', invalid='ignore'):
+        first = (middle - half - source) / ray
+        second = (middle + half - source) / ray
+    enter = np.minimum(first, second).max(axis=-1)
+    leave = np.maximum(first, second).min(axis=-1)
+    return np.maximum(leave - enter, 0)
+
+
+def _bone(rng: np.random.Generator) -> np.ndarray:
+    """Lengths (h, w) [mm] of rays in a shaft of bone with a spongy texture."""
+    v, u = np.mgrid[:SIZE, :SIZE]
+    angle = rng.uniform(0, np.pi)
+    across = (u - SIZE / 2) * np.cos(angle) + (v - SIZE / 2) * np.sin(angle)
+    shaft = 2 * np.sqrt(np.maximum(110.0**2 - across**2, 0)) / 15
+    hollow = 2 * np.sqrt(np.maximum(70.0**2 - across**2, 0)) / 15
+    texture = np.zeros((SIZE, SIZE))
+    for blur in (2.5, 6.0, 14.0):
+        noise = cv2.GaussianBlur(rng.normal(size=(SIZE, SIZE)), (0, 0), blur)
+        texture += noise / noise.std()
+    return shaft - 0.7 * hollow + 0.5 * texture * (shaft > 0)
+
+
+def _vignetting(rng: np.random.Generator) -> np.ndarray:
+    v, u = np.mgrid[:SIZE, :SIZE] / SIZE - 0.5
+    return 1 - rng.uniform(0.1, 0.4) * (u * u + v * v)
+
+
+def _detected(light: np.ndarray, row: Row, rng: np.random.Generator) -> NDArray[np.uint8]:
+    """Grey values of light (h, w): scattered, blurred, counted, amplified, digitised."""
+    scattered = 0.9 * light + 0.1 * cv2.GaussianBlur(light, (0, 0), 80)
+    blurred = cv2.GaussianBlur(scattered, (0, 0), rng.uniform(0.8, 1.4))
+    counted = rng.poisson(row.photons * blurred) / row.photons
+    grey = row.gain * cv2.GaussianBlur(counted, (0, 0), 0.5)
+    if row.unsharp:
+        grey = grey + row.unsharp * (grey - cv2.GaussianBlur(grey, (0, 0), 3))
+    image = np.clip(np.rint(grey), 0, 255).astype(np.uint8)
+    if row.jpeg:
+        _, data = cv2.imencode('.jpg', image, [cv2.IMWRITE_JPEG_QUALITY, row.jpeg])
+        image = np.asarray(cv2.imdecode(data, cv2.IMREAD_GRAYSCALE), dtype=np.uint8)
+    return image
+
+
+def _overlap(uv: np.ndarray, target: Target, centres: np.ndarray) -> np.ndarray:
+    """Distances (n,) of shadows from the next one, 1 where they touch."""
+    if len(uv) < 2:
+        return np.full(len(uv), np.inf)
+    radius = PRINCIPAL_PX * target.diameter / 2 / centres[:, 2]
+    apart = np.linalg.norm(uv[:, None] - uv, axis=2) / (radius[:, None] + radius + 3.0)
+    np.fill_diagonal(apart, np.inf)
+    return apart.min(axis=1)
+
+
+@dataclass
+class Tally:
+    """What became of the images of a row."""
+
+    images: int = 0
+    found: int = 0
+    beads: int = 0
+    visible: int = 0
+    wrong: int = 0
+    largest_px: float = 0.0
+    normalised: float = 0.0
+    seconds: float = 0.0
+    refusals: tuple[str, ...] = ()
+
+    def add(self, scene: Scene, result: Extraction | DataError, seconds: float) -> None:
+        self.images += 1
+        self.seconds += seconds
+        self.visible += int(scene.visible.sum())
+        if isinstance(result, DataError):
+            self.refusals += (result.finding.kind.value,)
+            return
+        error = result.uv - scene.uv[result.bead]
+        off = np.linalg.norm(error, axis=1)
+        right = off < WRONG_PX
+        self.found += bool(right.sum() >= FOUND * scene.visible.sum())
+        self.beads += int(np.isin(result.bead[right], np.flatnonzero(scene.visible)).sum())
+        self.wrong += int((~right).sum())
+        self.largest_px = max(self.largest_px, float(off[right].max(initial=0)))
+        squared = (error[right] / result.sigma[right, None]) ** 2
+        self.normalised += float(np.sqrt(squared.mean())) if len(squared) else 0.0
+
+    def text(self, name: str) -> str:
+        done = self.images - len(self.refusals)
+        causes = {cause: self.refusals.count(cause) for cause in sorted(set(self.refusals))}
+        return (
+            f'| {name} | {self.found}/{self.images} | {self.beads}/{self.visible} | {self.wrong} '
+            f'| {self.largest_px:.2f} | {self.normalised / max(done, 1):.2f} '
+            f'| {self.seconds / self.images:.1f} | {causes or ""} |'
+        )
+
+
+def scenes(name: str, images: int, first: int) -> Iterator[Scene]:
+    """Yield the scenes of a row, by seeds from the first on."""
+    for number in range(first, first + images):
+        yield render(ROWS[name], np.random.default_rng([number, *name.encode()]))
+
+
+def other_phantom(rng: np.random.Generator) -> Target:
+    """Return what is looked for in images without a phantom."""
+    return cube(36)(rng)
+
+
+def main() -> None:
+    """Entry point."""
+    parser = argparse.ArgumentParser(prog='python -m benchmarks.renderings')
+    parser.add_argument('--images', type=int, default=20, help='of each row')
+    parser.add_argument('--first', type=int, default=1, help='first seed')
+    parser.add_argument('--rows', default='', help='names, comma separated')
+    parser.add_argument('--pictures', type=Path, help='folder for overlays')
+    options = parser.parse_args()
+    names = [name.strip() for name in options.rows.split(',') if name.strip()] or list(ROWS)
+    print(
+        '| target | found | beads seen | wrong ids | error up to [px] | normalised | s | refused |'
+    )
+    print('| --- | --- | --- | --- | --- | --- | --- | --- |')
+    lens = Lens((SIZE, SIZE), PRINCIPAL_PX * 1.05)
+    for name in names:
+        tally = Tally()
+        for number, scene in enumerate(scenes(name, options.images, options.first)):
+            wanted = scene.target
+            if not len(wanted.xyz):
+                wanted = other_phantom(np.random.default_rng(number))
+            told = wanted.diameter if ROWS[name].told else None
+            model = PhantomModel.of(wanted.xyz, told)
+            began = time.process_time()
+            try:
+                result: Extraction | DataError = extract_beads(scene.image, model, lens)
+            except DataError as error:
+                result = error
+            tally.add(scene, result, time.process_time() - began)
+            if options.pictures:
+                options.pictures.mkdir(parents=True, exist_ok=True)
+                said = isinstance(result, DataError)
+                picture = draw_overlay(
+                    scene.image, None if said else result, str(result) if said else ''
+                )
+                cv2.imwrite(str(options.pictures / f'{name}-{number}.png'), picture)
+        print(tally.text(name), flush=True)
+
+
+if __name__ == '__main__':
+    main()

@@ -1,0 +1,120 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Noise of an image, from the image itself: its variance by grey value, and its correlation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import nnls
+
+MIN_VARIANCE = 1 / 12  # of rounding
+NOISE_BLOCK = 16  # [px]
+MIN_CORRELATION = 0.08  # that is told from slow changes of the light
+LAGS = 4  # pixels over which noise is correlated
+SECOND = np.array([1.0, -2.0, 1.0])  # differences
+MIN_SEEN = 0.1  # of the variance: what second differences see of noise blurred by a pixel
+MIN_PIXELS = 1000  # whose correlation is computed
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Variance of a grey value: constant + gain * grey value; and its correlation.
+
+    Attributes
+    ----------
+    constant, gain : float
+    correlation : (2 LAGS + 1, 2 LAGS + 1) ndarray
+        Of the noise of pixels at lags (row, column), 1 in the middle.
+    """
+
+    constant: float
+    gain: float
+    correlation: NDArray[np.float64]
+
+    def variance(self, light: np.ndarray) -> np.ndarray:
+        """Variance of grey values of an expected light."""
+        return np.maximum(self.constant + self.gain * np.maximum(light, 0), MIN_VARIANCE)
+
+
+def estimate_noise(light: np.ndarray, usable: NDArray[np.bool_]) -> Noise:
+    """Estimate the noise of an image (h, w) from what a plane does not explain.
+
+    The second differences of Immerkaer, "Fast noise variance estimation", CVIU 64, 1996, by
+    blocks of usable pixels, robustly, against the mean grey value. They see less of a noise that
+    is correlated, by a factor that follows from the correlation. Where no block is usable, there
+    is the noise of rounding.
+    """
+    correlation = _correlation(light, usable)
+    kernel = np.outer(SECOND, SECOND) / float(np.sum(SECOND**2))
+    high = cv2.filter2D(light, cv2.CV_32F, kernel)
+    height, width = (size // NOISE_BLOCK * NOISE_BLOCK for size in light.shape)
+
+    def blocks(values: np.ndarray) -> np.ndarray:
+        cut = values[:height, :width].reshape(
+            height // NOISE_BLOCK, NOISE_BLOCK, width // NOISE_BLOCK, NOISE_BLOCK
+        )
+        return cut.swapaxes(1, 2).reshape(-1, NOISE_BLOCK**2)
+
+    used = np.asarray(blocks(usable).all(axis=1))
+    if not used.any():
+        return Noise(MIN_VARIANCE, 0.0, correlation)
+    mean = np.median(blocks(light)[used], axis=1)
+    variance = (1.4826 * np.median(np.abs(blocks(high)[used]), axis=1)) ** 2
+    variance = np.maximum(variance / _seen_by(SECOND, correlation), MIN_VARIANCE)
+    weight = 1 / variance
+    gain = constant = 0.0
+    for _ in range(3):
+        rows = np.column_stack([np.ones_like(mean), mean]) * weight[:, None]
+        (constant, gain), _ = nnls(rows, variance * weight)
+        weight = 1 / np.maximum(constant + gain * mean, MIN_VARIANCE)
+    return Noise(max(constant, MIN_VARIANCE), gain, correlation)
+
+
+def _seen_by(kernel: np.ndarray, correlation: np.ndarray) -> float:
+    """Variance that a kernel in both directions leaves of correlated noise, over that of white."""
+    lags = len(correlation) // 2
+    padded = np.pad(kernel, lags)
+    own = np.array([padded @ np.roll(padded, lag) for lag in range(-lags, lags + 1)])
+    own = own / own[lags]
+    return max(float(np.sum(correlation * np.outer(own, own))), MIN_SEEN)
+
+
+def _correlation(light: np.ndarray, field: NDArray[np.bool_]) -> np.ndarray:
+    """Correlation of the noise, from the background less its blur, clipped at beads."""
+    height, width = light.shape
+    middle = np.s_[height // 4 : height - height // 4, width // 4 : width - width // 4]
+    light = light[middle]
+    field = field[middle]
+    rest = light - cv2.GaussianBlur(light, (0, 0), 3 * LAGS)
+    out = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
+    out[LAGS, LAGS] = 1
+    if np.count_nonzero(field) < MIN_PIXELS:
+        return out
+    limit = 3 * 1.4826 * float(np.median(np.abs(rest[field])))
+    valid = (field & (np.abs(rest) < limit)).astype(np.float32)
+    valid = cv2.erode(valid, np.ones((3, 3), np.uint8))
+    rest = rest * valid
+    if valid.sum() < MIN_PIXELS:
+        return out
+    total = float(np.sum(rest * rest)) / float(valid.sum())
+    if total < MIN_VARIANCE:
+        return out
+    height, width = rest.shape
+    for row in range(LAGS + 1):
+        for column in range(-LAGS, LAGS + 1):
+            a = np.s_[: height - row, max(0, -column) : width - max(0, column)]
+            b = np.s_[row:, max(0, column) : width + min(0, column)]
+            pairs = max(float(np.sum(valid[a] * valid[b])), 1.0)
+            value = float(np.sum(rest[a] * rest[b])) / pairs / total
+            out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = value
+    # What is left of slow changes of the light is no noise.
+    edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
+    out = np.maximum(out - edge, 0) / max(1 - edge, 1e-6)
+    out[out < MIN_CORRELATION] = 0
+    out[LAGS, LAGS] = 1
+    return out

@@ -161,10 +161,10 @@ ROWS: dict[str, Row] = {
     'cube-36 plates': Row(cube(36), plates=5),
     'cube-36 bone': Row(cube(36), bone=True),
     'cube-48 three sizes': Row(three_sizes(48), told=True),
-    'cube-48 three sizes, not told': Row(three_sizes(48)),
+    'cube-48 three sizes untold': Row(three_sizes(48)),
     'grid-20': Row(sheet(20, 5.0, False, 0), tilt_deg=15.0),
     'nothing': Row(nothing),
-    'nothing, bone': Row(nothing, bone=True),
+    'bone without phantom': Row(nothing, bone=True),
 }
 
 
@@ -419,10 +419,8 @@ def main() -> None:
             tally.add(scene, result, time.process_time() - began)
             if options.pictures:
                 options.pictures.mkdir(parents=True, exist_ok=True)
-                said = isinstance(result, DataError)
-                picture = draw_overlay(
-                    scene.image, None if said else result, str(result) if said else ''
-                )
+                found = None if isinstance(result, DataError) else result
+                picture = draw_overlay(scene.image, found, '' if found else str(result))
                 cv2.imwrite(str(options.pictures / f'{name}-{number}.png'), picture)
         print(tally.text(name), flush=True)
 

@@ -261,7 +261,7 @@ def _calibrations_of_run(
             name=name,
             digest=digest_of_sources(frames[name], phantom),
             seconds=seconds,
-            noise=_image_noise(run, f, name),
+            noise=_light(run, f, name),
         )
         for f, name in enumerate(run.measured.fluoroscopes)
     }
@@ -484,7 +484,7 @@ class _ImageNoise:
     profile: NoiseProfile | None
 
 
-def _image_noise(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
+def _light(run: SelfCalibration, f: int, name: str) -> _ImageNoise:
     """Noise of an image coordinate of fluoroscope number f.
 
     It is that of the inlier residuals, which are smaller than the noise by the root of their

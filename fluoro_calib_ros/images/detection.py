@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -21,10 +22,10 @@ from numpy.typing import NDArray
 
 from ..errors import DataError
 from ..findings import Kind
-from .image_noise import Noise, estimate_noise
+from .light import Light, Noise, clipped_at, estimate_noise
 
 MIN_SIZE = 32  # of an image [px]
-SCALES = (1.1, 1.5, 2.1, 3.0, 4.2, 6.0, 8.5)  # standard deviations of the blur [px]
+SCALES = (1.1, 1.5, 2.1, 3.0, 4.2, 6.0, 8.5, 12.0, 17.0)  # standard deviations of the blur [px]
 BLOB_RADIUS = 1.25  # radius of a blurred disc over the scale at which its response is largest
 FINE_SCALE = 2.9  # from which half the resolution tells scales apart as well
 # Factors on the scale: the noise of a response decreases with the scale, but beads merge.
@@ -36,7 +37,11 @@ MIN_SNR = 4.0
 MIN_SHARE = 0.3  # of the response of a typical bead
 MOST_TYPICAL = 40  # strongest blobs that choose polarity and scale, at most
 LEAST_TYPICAL = 2
+MAX_LIKELY = 3  # sizes and polarities that are tried
+MANY = 4 * MOST_TYPICAL  # beads, of which the middle quarter of an image shows enough
 SEEN_SHARE = 0.5  # of the beads of a phantom that every image is expected to show
+BACKGROUND = 8.0  # blur of the light around a bead, over its scale
+COARSE_BLUR = 4.0  # at which a coarser image has the same blur within 1 %
 FIELD_BLUR_PX = 4.0
 FIELD_LEVEL = 0.18  # of the light in the field below which there is no field
 MIN_CONTRAST = 0.05  # of a bead, as a fraction of the light around it
@@ -48,10 +53,10 @@ class Detections:
 
     Attributes
     ----------
-    light : (h, w) ndarray of float32
+    light : Light
         Grey values, turned round where beads are bright, so that beads are dark.
-    field : (h, w) ndarray of bool
-        The field of view.
+    noise : Noise
+        Of the light.
     uv : (n, 2) ndarray
         Centres [px], to some 0.1 px.
     strength : (n,) ndarray
@@ -62,8 +67,8 @@ class Detections:
         Beads are bright in the image.
     """
 
-    light: np.ndarray
-    field: NDArray[np.bool_]
+    light: Light
+    noise: Noise
     uv: NDArray[np.float64]
     strength: NDArray[np.float64]
     radius_px: float
@@ -79,35 +84,104 @@ def detect_beads(
     """Find the beads of an image (h, w) of uint8 or uint16.
 
     beads is the number of beads of the phantom, radius_px the radius of a typical one, and
-    inverted whether they are bright; both are estimated by default. Raises DataError, in one
-    sentence, for an image without beads.
+    inverted whether they are bright; where these are not known, the likeliest are taken. Raises
+    DataError, in one sentence, for an image without beads.
     """
-    _check(image)
-    grey = image.astype(np.float32)
-    noise = estimate_noise(grey, (image > image.min()) & (image < image.max()))
-    typical = int(np.clip(SEEN_SHARE * beads, LEAST_TYPICAL, MOST_TYPICAL))
     if radius_px is None or inverted is None:
-        given = None if radius_px is None else max(radius_px / BLOB_RADIUS, 1.0)
-        scale, inverted = _scale_and_polarity(grey, noise, typical, given)
-    else:
-        scale = max(radius_px / BLOB_RADIUS, 1.0)
-    light = float(grey.max()) - grey if inverted else grey
-    field = field_of_view(light, scale)
-    for wider in WIDER:
-        dark, bright = _blobs(grey, noise, wider * scale)
-        uv = _beads(bright if inverted else dark, field, typical)
-        if len(uv):
-            break
-    else:
+        return next(likely_detections(image, beads))
+    sight = _Sight.of(image, beads)
+    found = sight.detections(max(radius_px / BLOB_RADIUS, 1.0), inverted)
+    if found is None:
         raise _nothing(image)
-    return Detections(
-        light,
-        field,
-        uv=uv,
-        strength=_strengths(light, uv, scale),
-        radius_px=scale * BLOB_RADIUS,
-        inverted=inverted,
-    )
+    return found
+
+
+def likely_detections(image: np.ndarray, beads: int) -> Iterator[Detections]:
+    """Yield what is found with the likeliest sizes and polarities of the beads, in this order.
+
+    Letters and screws may look more like beads than the beads do: the pose decides. Raises
+    DataError where nothing is found with any.
+    """
+    sight = _Sight.of(image, beads)
+    number = 0
+    looks = sight.likely(sight.middle()) if beads >= MANY else []
+    for _, scale, inverted in sorted(looks or sight.likely(sight.grey), reverse=True):
+        found = sight.detections(scale, inverted)
+        if found is not None:
+            number += 1
+            yield found
+        if number == MAX_LIKELY:
+            return
+    if not number:
+        raise _nothing(image)
+
+
+@dataclass(frozen=True)
+class _Sight:
+    """An image (h, w) with its noise, and the number of beads that choose their size."""
+
+    grey: np.ndarray
+    noise: Noise
+    typical: int
+
+    @classmethod
+    def of(cls, image: np.ndarray, beads: int) -> _Sight:
+        """Return what is needed to find so many beads in an image. Raises DataError."""
+        _check(image)
+        grey = image.astype(np.float32)
+        noise = estimate_noise(grey, (image > image.min()) & (image < image.max()))
+        typical = int(np.clip(SEEN_SHARE * beads, LEAST_TYPICAL, MOST_TYPICAL))
+        return cls(grey, noise, typical)
+
+    def middle(self) -> np.ndarray:
+        """Return the middle quarter of the image, which is a quarter of the work."""
+        height, width = self.grey.shape
+        return self.grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
+
+    def likely(self, grey: np.ndarray) -> list[tuple[float, float, bool]]:
+        """Return strength, scale and polarity of the strongest blobs of the image or a part.
+
+        For either polarity, those scales at which they are stronger than at the next ones.
+        """
+        strengths = np.zeros((2, len(SCALES) + 2))
+        fields: dict[int, tuple[np.ndarray, np.ndarray]] = {}
+        for column, (scale, part, factor) in enumerate(_resolutions(grey), 1):
+            if factor not in fields:
+                turned = float(part.max()) - part
+                fields[factor] = (
+                    field_of_view(part, FINE_SCALE),
+                    field_of_view(turned, FINE_SCALE),
+                )
+            both = _blobs(part, self.noise, scale / factor, factor)
+            for row, blobs in enumerate(both):
+                inside = _inside(blobs.uv, fields[factor][row], factor)
+                strengths[row, column] = _typical(blobs.response[inside], self.typical)
+        middle = strengths[:, 1:-1]
+        peaks = (middle > 0) & (middle >= strengths[:, :-2]) & (middle >= strengths[:, 2:])
+        return [
+            (float(middle[row, column]), SCALES[column], bool(row))
+            for row, column in np.argwhere(peaks)
+        ]
+
+    def detections(self, scale: float, inverted: bool) -> Detections | None:
+        """Return what is found with a scale and a polarity, None for nothing."""
+        grey = self.grey
+        light = float(grey.max()) - grey if inverted else grey
+        low, high = clipped_at(light)
+        field = field_of_view(light, scale)
+        for wider in WIDER:
+            blobs = next(islice(_blobs(grey, self.noise, wider * scale), inverted, None))
+            uv = _beads(blobs, field, self.typical)
+            if len(uv):
+                return Detections(
+                    Light(light, field, low, high),
+                    estimate_noise(light, field) if inverted else self.noise,
+                    uv=uv,
+                    strength=_strengths(light, uv, scale),
+                    radius_px=scale * BLOB_RADIUS,
+                    inverted=inverted,
+                )
+        return None
 
 
 def field_of_view(light: np.ndarray, scale: float) -> np.ndarray:
@@ -154,26 +228,10 @@ def _typical(values: np.ndarray, count: int) -> float:
     return float(np.median(np.sort(values)[::-1][:count]))
 
 
-def _scale_and_polarity(
-    grey: np.ndarray, noise: Noise, count: int, given: float | None
-) -> tuple[float, bool]:
-    """Return the scale with the strongest blobs, and whether they are bright. Raises DataError."""
-    best: tuple[float, float, bool] | None = None
-    for scale, part, factor in _resolutions(grey, given):
-        # Noise of neighbouring pixels that is correlated remains so in their mean.
-        for inverted, blobs in zip((False, True), _blobs(part, noise, scale / factor, factor)):
-            strength = _typical(blobs.response, count)
-            if strength > 0 and (best is None or strength > best[0]):
-                best = (strength, scale, inverted)
-    if best is None:
-        raise _nothing(grey)
-    return best[1], best[2]
-
-
-def _resolutions(grey: np.ndarray, given: float | None) -> Iterator[tuple[float, np.ndarray, int]]:
+def _resolutions(grey: np.ndarray) -> Iterator[tuple[float, np.ndarray, int]]:
     """Yield scales, the image (h, w) in which they are tried, and how much smaller it is."""
     factor = 1
-    for scale in SCALES if given is None else (given,):
+    for scale in SCALES:
         while scale / factor >= FINE_SCALE and min(grey.shape) > 2 * MIN_SIZE:
             height, width = (size // 2 * 2 for size in grey.shape)
             grey = cv2.resize(
@@ -181,6 +239,12 @@ def _resolutions(grey: np.ndarray, given: float | None) -> Iterator[tuple[float,
             )
             factor *= 2
         yield scale, grey, factor
+
+
+def _inside(uv: np.ndarray, field: NDArray[np.bool_], factor: int = 1) -> NDArray[np.bool_]:
+    """Return (n,) whether pixels (n, 2) are in a field that is reduced by a factor."""
+    column, row = np.rint((uv + 0.5) / factor - 0.5).astype(int).T
+    return field[row, column]
 
 
 def _nothing(image: np.ndarray) -> DataError:
@@ -215,17 +279,26 @@ def _check(image: np.ndarray) -> None:
         )
 
 
-def _blobs(grey: np.ndarray, noise: Noise, scale: float, factor: int = 1) -> tuple[_Blobs, _Blobs]:
-    """Return the dark and the bright blobs of an image (h, w), reduced by a factor."""
-    background = cv2.GaussianBlur(grey, (0, 0), 8 * scale)
+def _blobs(grey: np.ndarray, noise: Noise, scale: float, factor: int = 1) -> Iterator[_Blobs]:
+    """Yield the dark, then the bright blobs of an image (h, w) that is reduced by a factor."""
+    background = _background(grey, scale)
     sd = np.sqrt(noise.variance(background)) * (_noise_of_response(noise, scale * factor))
     dark, bright = _responses(grey, scale)
     top = float(grey.max())
     floor = 1e-3 * top
-    return (
-        _found(dark, sd, np.maximum(background, floor), scale, factor),
-        _found(bright, sd, np.maximum(top - background, floor), scale, factor),
-    )
+    yield _found(dark, sd, np.maximum(background, floor), scale, factor)
+    yield _found(bright, sd, np.maximum(top - background, floor), scale, factor)
+
+
+def _background(grey: np.ndarray, scale: float) -> np.ndarray:
+    """Blur of an image (h, w) over many beads of a scale, from a coarser image."""
+    blur = BACKGROUND * scale
+    factor = max(1, int(blur / COARSE_BLUR))
+    height, width = grey.shape
+    size = (max(1, width // factor), max(1, height // factor))
+    coarse = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    smooth = cv2.GaussianBlur(coarse, (0, 0), blur / factor)
+    return cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR)
 
 
 def _noise_of_response(noise: Noise, scale: float) -> float:
@@ -243,7 +316,9 @@ def _noise_of_response(noise: Noise, scale: float) -> float:
         np.array([values @ np.roll(values, lag) for lag in range(-lags, lags + 1)])
         for values in (second, gauss)
     )
-    return float(np.sqrt(np.sum(noise.correlation * np.outer(across, along))))
+    # A correlation with gaps in it need not be that of any noise.
+    variance = np.sum(noise.correlation * np.outer(across, along))
+    return float(np.sqrt(max(variance, along[lags] * across[lags])))
 
 
 def _responses(grey: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
@@ -286,8 +361,7 @@ def _found(
 
 def _beads(blobs: _Blobs, field: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
     """Centres (n, 2) of beads in the field, none where they are too weak."""
-    column, row = np.rint(blobs.uv).astype(int).T
-    inside = field[row, column]
+    inside = _inside(blobs.uv, field)
     uv = blobs.uv[inside]
     values = blobs.relative[inside]
     typical = _typical(values, min(count, max(len(values), 1)))
@@ -302,7 +376,7 @@ def _strengths(light: np.ndarray, uv: NDArray[np.float64], scale: float) -> NDAr
     There they increase with the size of a bead; at its own scale they hardly do.
     """
     column, row = np.rint(uv).astype(int).T
-    background = cv2.GaussianBlur(light, (0, 0), 8 * scale)
+    background = _background(light, scale)
     response, _ = _responses(light, WIDER[-1] * scale)
     relative = response[row, column] / np.maximum(background[row, column], 1e-3 * light.max())
     return np.asarray(relative / max(float(np.median(relative)), 1e-9), dtype=float)

@@ -13,10 +13,10 @@ from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Finding, Kind
-from .detection import Detections, detect_beads
+from .detection import Detections, detect_beads, likely_detections
 from .following import Far, follow
 from .growth import Match, Seen, smoothed, supported
-from .image_noise import Noise, estimate_noise
+from .light import Noise
 from .matching import PhantomModel, match
 from .measurement import FIRST_STEPS, STEPS, estimate_profile, measure_beads
 from .shadow_fit import Beads
@@ -152,11 +152,18 @@ def extract_beads(
         followed = _followed(image, model, near)
         if followed is not None:
             return followed
-    detections = detect_beads(image, len(model.xyz))
-    seen = _seen(detections)
-    found = match(seen, model, lens)
-    noise = estimate_noise(detections.light, detections.field)
-    return _measured(detections, seen, found, model, _Imaging(noise))
+    first: DataError | None = None
+    for detections in likely_detections(image, len(model.xyz)):
+        seen = _seen(detections)
+        try:
+            found = match(seen, model, lens)
+            return _measured(detections, seen, found, model, _Imaging(detections.noise))
+        except DataError as error:
+            first = first or error
+            if error.finding.kind is Kind.POSE_AMBIGUOUS:
+                break
+    assert first is not None
+    raise first
 
 
 def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extraction | None:
@@ -179,7 +186,9 @@ def _followed(image: np.ndarray, model: PhantomModel, near: Nearby) -> Extractio
 
 
 def _seen(detections: Detections) -> Seen:
-    return Seen.of(detections.uv, detections.field, detections.radius_px, detections.strength)
+    return Seen.of(
+        detections.uv, detections.light.field, detections.radius_px, detections.strength
+    )
 
 
 @dataclass(frozen=True)
@@ -212,12 +221,9 @@ def _measured(
         radius = _relative_radius(view, model)
         if profile is None:
             known = np.isin(rows, bead)
-            profile = estimate_profile(
-                light, detections.field, start[known], radius[rows[known]], seen.radius_px
-            )
+            profile = estimate_profile(light, start[known], radius[rows[known]], seen.radius_px)
         beads = measure_beads(
             light,
-            detections.field,
             uv=start,
             relative_radius=radius[rows],
             profile=profile,

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
-from .image_noise import Noise
+from .light import Noise
 from .marker_intensity import LightWindows
 from .shadow_fit import (
     DEPTH_SD,

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from .image_noise import Noise
+from .light import Noise
 from .marker_fit import MarkerGuess, fit_markers
 from .marker_intensity import LightWindows, Shadows
 from .marker_motion import Motion, assign

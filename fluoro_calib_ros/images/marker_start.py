@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import DataError
-from .image_noise import Noise, estimate_noise
+from .light import Light, Noise, estimate_noise
 from .marker_intensity import (
     LightWindows,
     MarkerLook,
@@ -83,7 +83,9 @@ def learn_start(image: np.ndarray, target_id: np.ndarray, uv: np.ndarray) -> Mar
     return MarkerStart(
         MarkerStates.start(Motion.start(place, FIRST_SD_PX), unseen),
         look,
-        profile=estimate_profile(light, look.field, seen, np.ones(len(seen)), look.radius_px),
+        profile=estimate_profile(
+            Light(light, look.field), seen, np.ones(len(seen)), look.radius_px
+        ),
         noise=estimate_noise(light, look.field),
         size=(width, height),
         density=max((len(found.uv) - len(row)) / max(look.field.sum(), 1), MIN_DENSITY),

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from .image_noise import Noise
+from .light import Light, Noise
 from .shadow_fit import (
     DEPTH_SD,
     DISTURBED,
@@ -53,8 +53,7 @@ HELD = 1e12  # weight of a term that stays zero
 
 
 def estimate_profile(
-    light: np.ndarray,
-    field: NDArray[np.bool_],
+    light: Light,
     uv: NDArray[np.float64],
     relative_radius: NDArray[np.float64],
     radius_px: float,
@@ -63,9 +62,7 @@ def estimate_profile(
 
     Parameters
     ----------
-    light : (h, w) ndarray
-        Grey values, beads dark.
-    field : (h, w) ndarray of bool
+    light : Light
     uv : (n, 2) ndarray
         Beads [px].
     relative_radius : (n,) ndarray
@@ -80,7 +77,6 @@ def estimate_profile(
     for _ in range(PROFILE_ROUNDS):
         fit = _BeadFit(
             light,
-            field,
             uv=uv[alone],
             relative_radius=relative_radius[alone],
             profile=profile,
@@ -94,8 +90,7 @@ def estimate_profile(
 
 
 def measure_beads(
-    light: np.ndarray,
-    field: np.ndarray,
+    light: Light,
     uv: np.ndarray,
     relative_radius: np.ndarray,
     profile: Profile,
@@ -106,9 +101,7 @@ def measure_beads(
 
     The other arguments are those of `estimate_profile` and what was estimated.
     """
-    fit = _BeadFit(
-        light, field, uv=uv, relative_radius=relative_radius, profile=profile, noise=noise
-    )
+    fit = _BeadFit(light, uv=uv, relative_radius=relative_radius, profile=profile, noise=noise)
     fit.run(steps)
     return fit.result()
 
@@ -118,8 +111,7 @@ class _BeadFit(ShadowFit):
 
     def __init__(
         self,
-        light: np.ndarray,
-        field: np.ndarray,
+        light: Light,
         uv: np.ndarray,
         relative_radius: np.ndarray,
         profile: Profile,
@@ -136,7 +128,7 @@ class _BeadFit(ShadowFit):
         self.inflation: float | None = None
         self.plane_only = False
         self._set_groups(self._near(window + reach))
-        self._read(light, field)
+        self._read(light)
 
     def _near(self, together: float) -> np.ndarray:
         """Neighbours (n, k) of the beads, -1 for none; notes the distances of the nearest."""
@@ -152,15 +144,17 @@ class _BeadFit(ShadowFit):
         self.distance = np.where(other, distance, np.inf).min(axis=1)
         return near[:, : count - 1]
 
-    def _read(self, light: np.ndarray, field: np.ndarray) -> None:
+    def _read(self, light: Light) -> None:
         """Read the windows (n, m) around the beads."""
-        height, width = light.shape
+        height, width = light.grey.shape
         places = self.middle[:, None] + self.offset
         inside = ((places >= 0) & (places < (width, height))).all(axis=2)
         column = np.clip(places[..., 0], 0, width - 1)
         row = np.clip(places[..., 1], 0, height - 1)
-        valid = inside & field[row, column]
-        grey = light[row, column].astype(np.float32)
+        valid = inside & light.field[row, column]
+        grey = light.grey[row, column].astype(np.float32)
+        self.low = light.low
+        self.high = light.high
         self._set_windows(grey, valid, bright=np.where(valid, grey, 0.0))
 
     def run(self, steps: int) -> None:
@@ -285,7 +279,8 @@ class _BeadFit(ShadowFit):
         plane = self._plane(np.arange(len(self.uv)))
         away = self.middle[:, None] + self.offset - self.uv[:, None]
         distance = np.hypot(away[..., 0], away[..., 1]) / self.radius[:, None]
-        good = self.valid & (self.measured & (self.misfit < 4 * np.median(self.misfit)))[:, None]
+        known = self.valid & (self.grey > self.low) & (self.grey < self.high)
+        good = known & (self.measured & (self.misfit < 4 * np.median(self.misfit)))[:, None]
         weight = plane / np.maximum(np.median(plane), 1e-9)
         return distance[good], (1 - self.grey / plane)[good], weight[good]
 

@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from .image_noise import Noise
+from .light import Noise
 from .shadow_profile import Profile
 
 MARGIN_PX = 2.0  # of background around the shadow
@@ -203,6 +203,8 @@ class ShadowFit(ABC):
         self.sigma = np.full(n, np.inf)
         self.misfit = np.full(n, np.inf)
         self.distance = np.full(n, np.inf)  # of the nearest bead
+        self.low = -np.inf  # at which grey values are clipped
+        self.high = np.inf
         self.crossing: np.ndarray | None = None
         self.groups: list[Group] = []
 
@@ -287,8 +289,9 @@ class ShadowFit(ABC):
         """Return the normal equations of some beads, and note their lack of fit."""
         light, jacobian = self._model(rows, near)
         dtype = self.settings.dtype
-        residual = self.grey[rows] - light
-        valid = self.valid[rows]
+        grey = self.grey[rows]
+        residual = grey - light
+        valid = self.valid[rows] & ~self._says_nothing(grey, light)
         weight = valid / self.noise.variance(light)
         squared = residual * residual * weight
         self.misfit[rows] = squared.sum(axis=1) / np.maximum(valid.sum(axis=1) - OWN, 1)
@@ -305,6 +308,10 @@ class ShadowFit(ABC):
         expected = self.expected_depth[rows]
         right[:, TERMS + 2] -= prior[:, TERMS + 2] * (self.depth[rows] - expected)
         return NormalEquations(normal, right, weighted)
+
+    def _says_nothing(self, grey: np.ndarray, light: np.ndarray) -> NDArray[np.bool_]:
+        """Return (g, m) where a clipped grey value agrees with the light that is expected."""
+        return ((grey >= self.high) & (light > grey)) | ((grey <= self.low) & (light < grey))
 
     def _prior(self, rows: np.ndarray, near: np.ndarray) -> np.ndarray:
         """Weights (g, OWN + 3 k) of what is expected of the unknowns."""

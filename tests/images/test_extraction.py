@@ -20,7 +20,7 @@ from fluoro_calib_ros.images.detection import detect_beads
 from fluoro_calib_ros.images.extraction import Extraction, extract_beads
 from fluoro_calib_ros.images.following import Far, follow, moved_on
 from fluoro_calib_ros.images.growth import Seen
-from fluoro_calib_ros.images.image_noise import estimate_noise
+from fluoro_calib_ros.images.light import Light, estimate_noise
 from fluoro_calib_ros.images.matching import PhantomModel, match
 from fluoro_calib_ros.images.measurement import measure_beads
 from fluoro_calib_ros.images.shadow_profile import Profile
@@ -118,7 +118,9 @@ def test_two_overlapping_beads_have_honest_sigmas():
             correlation=np.ones((1, 1)),
         )
         start = true + rng.normal(0, 0.3, true.shape)
-        beads = measure_beads(image, np.ones(image.shape, bool), start, np.ones(2), profile, noise)
+        beads = measure_beads(
+            Light(image, np.ones(image.shape, bool)), start, np.ones(2), profile, noise
+        )
         assert beads.overlapped.all()
         normalised.append((beads.uv - true) / beads.sigma[:, None])
         sigmas.append(beads.sigma)

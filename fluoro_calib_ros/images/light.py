@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Noise of an image, from the image itself: its variance by grey value, and its correlation."""
+"""Light of an image: grey values, where they are clipped, and their noise."""
 
 from __future__ import annotations
 
@@ -18,7 +18,46 @@ MIN_CORRELATION = 0.08  # that is told from slow changes of the light
 LAGS = 4  # pixels over which noise is correlated
 SECOND = np.array([1.0, -2.0, 1.0])  # differences
 MIN_SEEN = 0.1  # of the variance: what second differences see of noise blurred by a pixel
+MIN_CLIPPED = 10  # pixels
 MIN_PIXELS = 1000  # whose correlation is computed
+MAX_SLOW = 0.9  # share of slow changes, beyond which there is no noise to see
+
+
+@dataclass(frozen=True)
+class Light:
+    """Grey values of an image that has dark beads.
+
+    Attributes
+    ----------
+    grey : (h, w) ndarray of float32
+    field : (h, w) ndarray of bool
+        The field of view.
+    low, high : float
+        Values at which grey values are clipped: there is no less, or more, light than they say.
+    """
+
+    grey: np.ndarray
+    field: NDArray[np.bool_]
+    low: float = -np.inf
+    high: float = np.inf
+
+
+def clipped_at(grey: np.ndarray) -> tuple[float, float]:
+    """Return the values at which an image (h, w) is clipped, infinite where it is not.
+
+    Noise alone makes the outermost value rarer than the next one.
+    """
+    least = float(grey.min())
+    most = float(grey.max())
+    low = least if _is_clipped(grey, least, least + 1) else -np.inf
+    high = most if _is_clipped(grey, most, most - 1) else np.inf
+    return low, high
+
+
+def _is_clipped(grey: np.ndarray, outermost: float, beside: float) -> bool:
+    """Return whether an outermost value is more frequent than the one beside it."""
+    count = int(np.count_nonzero(grey == outermost))
+    return count > max(int(np.count_nonzero(grey == beside)), MIN_CLIPPED)
 
 
 @dataclass(frozen=True)
@@ -91,19 +130,20 @@ def _correlation(light: np.ndarray, field: NDArray[np.bool_]) -> np.ndarray:
     light = light[middle]
     field = field[middle]
     rest = light - cv2.GaussianBlur(light, (0, 0), 3 * LAGS)
-    out = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
-    out[LAGS, LAGS] = 1
+    white = np.zeros((2 * LAGS + 1, 2 * LAGS + 1))
+    white[LAGS, LAGS] = 1
     if np.count_nonzero(field) < MIN_PIXELS:
-        return out
+        return white
     limit = 3 * 1.4826 * float(np.median(np.abs(rest[field])))
     valid = (field & (np.abs(rest) < limit)).astype(np.float32)
     valid = cv2.erode(valid, np.ones((3, 3), np.uint8))
     rest = rest * valid
     if valid.sum() < MIN_PIXELS:
-        return out
+        return white
     total = float(np.sum(rest * rest)) / float(valid.sum())
     if total < MIN_VARIANCE:
-        return out
+        return white
+    out = white.copy()
     height, width = rest.shape
     for row in range(LAGS + 1):
         for column in range(-LAGS, LAGS + 1):
@@ -114,7 +154,9 @@ def _correlation(light: np.ndarray, field: NDArray[np.bool_]) -> np.ndarray:
             out[LAGS + row, LAGS + column] = out[LAGS - row, LAGS - column] = value
     # What is left of slow changes of the light is no noise.
     edge = float(np.median(np.concatenate([out[0], out[-1], out[:, 0], out[:, -1]])))
-    out = np.maximum(out - edge, 0) / max(1 - edge, 1e-6)
+    if edge > MAX_SLOW:
+        return white
+    out = np.clip((out - edge) / (1 - edge), 0, 1)
     out[out < MIN_CORRELATION] = 0
     out[LAGS, LAGS] = 1
     return out

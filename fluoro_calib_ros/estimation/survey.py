@@ -120,12 +120,16 @@ def surveyed_beads(
     row = given.index(targets.target_id)
     given_mm = given.xyz_mm[row]
     given_sd = given.sd_mm[row]
+    network = solved.measured.network
+    in_datum = slice(None) if network.in_datum is None else network.in_datum
+    centre = targets.xyz_mm[in_datum].mean(axis=0)
     if distances:
         scaled = scaled_by_distances(
             targets.xyz_mm,
             targets.covariance,
             solved.covariance_of_points(),
             _rows(distances, targets.target_id),
+            centre,
         )
         xyz = scaled.xyz_mm
         covariance = scaled.covariance
@@ -135,10 +139,10 @@ def surveyed_beads(
         scaled = None
         xyz = targets.xyz_mm
         scale = 1.0
-        scale_sd = _scale_sd(given_mm, given_sd)
-        arm = xyz - xyz.mean(axis=0)
+        scale_sd = _scale_sd(given_mm[in_datum], given_sd[in_datum])
+        arm = xyz - centre
         covariance = targets.covariance + scale_sd**2 * arm[:, :, None] * arm[:, None, :]
-    rays, angle = _rays(solved.measured.network, solved.adjustment)
+    rays, angle = _rays(network, solved.adjustment)
     return SurveyedBeads(
         target_id=targets.target_id,
         xyz_mm=xyz,

@@ -9,12 +9,13 @@ centimetres for a phantom of some decimetres. The self-calibration does the rest
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..checks.check import Check, verdict_of
+from ..checks.check import Check, Validation, verdict_of
 from ..checks.survey import (
     check_survey,
     check_survey_halves,
@@ -33,6 +34,9 @@ from ..exposures.frame import Frame
 from ..exposures.phantom import MIN_TARGETS, Phantom
 from ..findings import Finding, Kind, Severity
 from .calibration import run_calibration
+
+EXACT_SD_MM = 1e-6  # of coordinates that count as known
+DECIMALS = 6  # of mm in the file
 
 
 @dataclass(frozen=True)
@@ -84,7 +88,8 @@ class SurveyOutcome:
     phantom : Phantom
     beads : SurveyedBeads
         Those that were surveyed.
-    checks : tuple of Check
+    validation : Validation
+        Verdict on the survey.
     findings : tuple of Finding
         What was excluded, and where the given coordinates are wrong.
     result : CalibrationResult
@@ -93,14 +98,9 @@ class SurveyOutcome:
 
     phantom: Phantom
     beads: SurveyedBeads
-    checks: tuple[Check, ...]
+    validation: Validation
     findings: tuple[Finding, ...]
     result: CalibrationResult
-
-    @property
-    def verdict(self) -> str:
-        """Return 'pass', 'fail' or 'cannot tell'."""
-        return verdict_of(self.checks)
 
 
 def survey(
@@ -128,6 +128,7 @@ def survey(
         For exposures that do not determine coordinates, interior orientation and distortion, that
         cannot be of the phantom, or that show too few beads well.
     """
+    began = time.perf_counter()
     _require_known(request)
     result = _free_network(request, progress, raise_if_cancelled)
     if not result.converged:
@@ -153,7 +154,7 @@ def survey(
     return SurveyOutcome(
         _phantom(request, beads),
         beads,
-        tuple(checks),
+        Validation(verdict_of(checks), tuple(checks), {}, time.perf_counter() - began),
         (*result.findings, *left_out, *([] if moved is None else [moved])),
         result,
     )
@@ -196,11 +197,16 @@ def _free_network(
         refused = error
     try:
         rough = adjusted(request.given, force=True)
-        xyz = request.given.xyz_mm.copy()
-        xyz[request.given.index(rough.targets.target_id)] = rough.targets.xyz_mm
-        return adjusted(replace(request.given, xyz_mm=xyz), force=False)
+        return adjusted(_with_found(request.given, rough), force=False)
     except DataError:
         raise refused from None
+
+
+def _with_found(given: Phantom, result: CalibrationResult) -> Phantom:
+    """Return given coordinates with those that an adjustment found in their place."""
+    xyz = given.xyz_mm.copy()
+    xyz[given.index(result.targets.target_id)] = result.targets.xyz_mm
+    return replace(given, xyz_mm=xyz)
 
 
 def _halves(
@@ -215,11 +221,11 @@ def _halves(
         return halves_not_compared(
             f'{fewest} exposures are too few for two halves of {MIN_EXPOSURES} or more'
         )
-    # The coordinates found so far are the better start values.
-    targets = result.targets
-    xyz = request.given.xyz_mm.copy()
-    xyz[request.given.index(targets.target_id)] = targets.xyz_mm
-    start = replace(request.given, xyz_mm=xyz)
+    # The coordinates found so far are the better start values. The scale is not compared, so that
+    # its uncertainty does not count.
+    start = replace(
+        _with_found(request.given, result), sd_mm=np.full(len(request.given.sd_mm), EXACT_SD_MM)
+    )
     parts = []
     for half in (set(numbers[::2]), set(numbers[1::2])):
         frames = {
@@ -242,13 +248,15 @@ def _phantom(request: SurveyRequest, beads: SurveyedBeads) -> Phantom:
     """Return the phantom with the coordinates that were found."""
     given = request.given
     row = given.index(beads.target_id)
+    found_mm = np.round(beads.xyz_mm, DECIMALS)
+    found_sd = np.maximum(np.round(beads.sd_mm, DECIMALS), EXACT_SD_MM)
     if not request.keep_given:
         diameter = None if given.diameter_mm is None else given.diameter_mm[row]
-        return Phantom(beads.target_id, beads.xyz_mm, beads.sd_mm, diameter)
+        return Phantom(beads.target_id, found_mm, found_sd, diameter)
     # They are as far off as those that were surveyed, if not further by their sd.
     off = float(np.sqrt(np.mean(beads.off_mm**2) / 3))
     xyz = given.xyz_mm.copy()
     sd = np.maximum(given.sd_mm, off)
-    xyz[row] = beads.xyz_mm
-    sd[row] = beads.sd_mm
+    xyz[row] = found_mm
+    sd[row] = found_sd
     return replace(given, xyz_mm=xyz, sd_mm=sd)

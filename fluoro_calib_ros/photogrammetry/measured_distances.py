@@ -22,6 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+CHECKED = 1e-9  # least redundancy of a distance, above rounding
+
 # Blocks (k, 3, 3) of object points p (k,) with object points q (k,).
 Between = Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]
 
@@ -53,10 +55,11 @@ class Scaled:
         [mm^2]
     scale, scale_sd : float
         Factor on the network, and its standard deviation.
-    misclosure_mm : (k,) ndarray
-        Measured - adjusted distances.
+    error_mm : (k,) ndarray
+        Measured distances less those that the images and the other distances give; 0 where
+        nothing checks a distance.
     normalised : (k,) ndarray
-        The same over their standard deviations (Baarda's test); 0 where nothing checks a distance.
+        The same over their standard deviations (Baarda's test).
     chi2 : float
         Weighted square sum; expected: `freedom`.
     freedom : int
@@ -66,7 +69,7 @@ class Scaled:
     covariance: NDArray[np.float64]
     scale: float
     scale_sd: float
-    misclosure_mm: NDArray[np.float64]
+    error_mm: NDArray[np.float64]
     normalised: NDArray[np.float64]
     chi2: float
     freedom: int
@@ -77,6 +80,7 @@ def scaled_by_distances(
     covariance: NDArray[np.float64],
     between: Between,
     distances: Distances,
+    centre_mm: NDArray[np.float64],
 ) -> Scaled:
     """Return object points of a free network at the scale of one or more distances.
 
@@ -88,6 +92,8 @@ def scaled_by_distances(
     between : callable
         Their covariances with each other.
     distances : Distances
+    centre_mm : (3,) ndarray
+        Centre of the datum, which the scale leaves in place.
 
     Returns
     -------
@@ -111,13 +117,14 @@ def scaled_by_distances(
     change = variance * float(weight @ difference)
     left = difference - change * length
     gain = mixed @ inverse
-    moved = gain @ left
-    arm = xyz_mm - xyz_mm.mean(axis=0)
+    moved = mixed @ (inverse @ left)
+    arm = xyz_mm - centre_mm
     along = arm - gain @ length
-    misclosure = distances.sd_mm**2 * (inverse @ left)
-    of_left = inverse - variance * np.outer(weight, weight)
-    checked = distances.sd_mm**2 * np.sqrt(np.maximum(np.diagonal(of_left), 0))
-    is_checked = checked > 1e-6 * distances.sd_mm
+    pull = inverse @ left
+    # Of the pulls; zero for what no other distance checks.
+    variance_of_pull = np.diagonal(inverse - variance * np.outer(weight, weight))
+    is_checked = variance_of_pull > CHECKED * np.diagonal(inverse)
+    variance_of_pull = np.where(is_checked, variance_of_pull, np.inf)
     return Scaled(
         xyz_mm + change * arm + moved,
         covariance
@@ -125,8 +132,8 @@ def scaled_by_distances(
         + variance * along[:, :, None] * along[:, None, :],
         1 + change,
         float(np.sqrt(variance)),
-        misclosure_mm=misclosure,
-        normalised=np.where(is_checked, misclosure / np.where(is_checked, checked, 1), 0.0),
-        chi2=float(left @ inverse @ left),
+        error_mm=pull / variance_of_pull,
+        normalised=pull / np.sqrt(variance_of_pull),
+        chi2=float(left @ pull),
         freedom=k - 1,
     )

@@ -74,9 +74,7 @@ class Drawing:
         for place in self.blocked:
             row, column, layer = (*place, 1)[:3] if len(place) in (2, 3) else (0, 0, 0)
             if not (
-                1 <= row <= self.rows
-                and 1 <= column <= self.columns
-                and 1 <= layer <= self.layers
+                1 <= row <= self.rows and 1 <= column <= self.columns and 1 <= layer <= self.layers
             ):
                 raise DataError(
                     f'the blocked place {",".join(map(str, place))} is not on the drawing of '

@@ -33,6 +33,8 @@ _SAME = {
     **dict.fromkeys(('sigma', 'std', 'accuracy', 'precision'), 'sd'),
     'd': 'diameter',
 }
+# Columns of other files of coordinates, whose own readers say what they lack.
+_OTHERS = {'target_id', 'frame', 'exposure'}
 _KNOWN = ('id', 'x', 'y', 'z', 'sd', 'diameter')
 MOST_CELLS = 12  # of a header that may be one of beads
 
@@ -55,7 +57,9 @@ def recognise(sample: Sample) -> bool:
     header = _header(rows[0])
     if header is not None:
         return len(rows[0]) <= MOST_CELLS
-    return all(_without_header(row) == _without_header(rows[0]) != () for row in rows[1:-1] or rows)
+    return all(
+        _without_header(row) == _without_header(rows[0]) != () for row in rows[1:-1] or rows
+    )
 
 
 def read(path: Path, settings: FileSettings) -> Content:
@@ -114,7 +118,7 @@ def _header(cells: Sequence[str]) -> _Layout | None:
         columns[name] = number
         if found[2] and name in ('x', 'y', 'z'):
             units.add(found[2])
-    if not {'x', 'y', 'z'} <= set(columns) or {'frame', 'exposure'} & set(columns):
+    if not {'x', 'y', 'z'} <= set(columns) or _OTHERS & {cell.lower() for cell in cells}:
         return None
     known = {name: columns[name] for name in _KNOWN if name in columns}
     return _Layout(known, ''.join(units) if len(units) == 1 else None)

@@ -103,7 +103,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar='FILE',
         help='picture with ids, .svg or .png, to hold against the part (default: OUT.svg)',
     )
-    parser.add_argument('out', type=Path, metavar='OUT.csv', help='phantom file to write')
+    parser.add_argument(
+        'file', type=Path, nargs='?', metavar='OUT.csv', help='phantom file to write'
+    )
+    parser.add_argument(
+        '--out', type=Path, metavar='OUT.csv', help='the same, as other commands name it'
+    )
+
+
+def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+    """Call error with a sentence unless there is one file to write."""
+    if (arguments.file is None) == (arguments.out is None):
+        error('one file to write is needed: OUT.csv')
+    arguments.out = arguments.out or arguments.file
 
 
 def run(arguments: argparse.Namespace) -> None:

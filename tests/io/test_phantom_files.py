@@ -81,6 +81,7 @@ def test_the_columns_of_a_header_may_have_any_order(tmp_path):
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0\n3,0,9,0\n', 'row 3: 3 columns'),
         ('id,x_mm,y_mm,z_mm,sd\n1,0,0,0,0\n2,9,0,0,1\n', 'row 2: sd is not above 0'),
         ('id,x_mm,y_mm,z_mm\n1,0,0,0\n2,9,0,0\n3,0,9,0\n', '3 targets are too few'),
+        ('1 0 0 0\n99999999999999999999 9 0 0\n3 0 9 0\n4 0 0 9\n', 'row 2: id is'),
         ('1 0 0 0\n2 9 0 0\n3 0 9 0\n4 0 0 9\n', '--units mm|cm|m is needed'),
         ('target_id,x,y,z\n1,0,0,0\n2,9,0,0\n', 'no column sd'),
     ],
@@ -89,9 +90,15 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, text, cause):
     path = tmp_path / 'bad.csv'
     path.write_text(text)
     with rigs.refused(Kind.DATA) as caught:
-        read_survey(path)
+        read_survey(path, FileSettings(units='mm' if 'id is' in cause else None))
     assert str(path) in str(caught.value)
     assert cause in str(caught.value)
+
+
+def test_decimal_commas_are_read(tmp_path):
+    rows = [[cell.replace('.', ',') for cell in row] for row in rows_of()]
+    path = written(tmp_path / 'a.csv', rows, ';')
+    np.testing.assert_array_equal(read_survey(path, FileSettings(units='mm')).phantom.xyz_mm, XYZ)
 
 
 def test_header_and_user_must_not_contradict_each_other(tmp_path):
@@ -172,10 +179,11 @@ def test_the_command_writes_file_and_picture(tmp_path, capsys):
     picture = (tmp_path / 'sheet.svg').read_text()
     assert '>8<' in picture  # the blocked one
     assert '>30<' in picture
-    words = ('--pitch', 20, '--picture', tmp_path / 'cube.png', tmp_path / 'cube.csv')
+    words = ('--pitch', 20, '--picture', tmp_path / 'cube.png', '--out', tmp_path / 'cube.csv')
     assert rigs.run('phantom', '--cube', '3x3x3', *words) == 0
     assert (tmp_path / 'cube.png').read_bytes()[:4] == b'\x89PNG'
     capsys.readouterr()
     assert rigs.run('phantom', '--square', '5x5', '--pitch', 0.01, tmp_path / 'no.csv') == 1
     assert rigs.run('phantom', '--square', '5', '--pitch', 10, tmp_path / 'no.csv') == 2
+    assert rigs.run('phantom', '--square', '5x5', '--pitch', 10) == 2
     assert not (tmp_path / 'no.csv').exists()

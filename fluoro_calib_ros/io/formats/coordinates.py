@@ -19,11 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DataError
-from ...exposures.names import Names, number_names, without_trivial
+from ...exposures.names import MAX_ID, Names, number_names, without_trivial
 from ...exposures.phantom import Phantom
+from ...limits import read_limits
 from ..access import read_text
+from ..csv_table import decimal_point
 from .content import UNITS_MM, Content, FileSettings, Format, Sample, from_units
-from .text import Row, table_of
+from .text import MAX_SHOWN, Row, table_of
 from .xmalab_frame import DEFAULT_SD_MM
 
 _COLUMN = re.compile(r'"?([a-z]+)(?:[ _]*[\[(]?(mm|cm|m)[\])]?)?"?')
@@ -53,7 +55,7 @@ def recognise(sample: Sample) -> bool:
     if len(lines) < 2:
         return False
     separator = _separator(lines)
-    rows = [[cell.strip() for cell in _cells(line, separator)] for line in lines]
+    rows = [_cells(line, separator) for line in lines]
     header = _header(rows[0])
     if header is not None:
         return len(rows[0]) <= MOST_CELLS
@@ -72,6 +74,9 @@ def read(path: Path, settings: FileSettings) -> Content:
     beads = rows if layout is None else rows[1:]
     if not beads:
         raise DataError(f'{path}: the file has a header, but no beads')
+    most = read_limits().max_targets
+    if len(beads) > most:
+        raise DataError(f'{path}: phantoms of more than {most} targets are not read')
     if layout is None:
         layout = _of_numbers(rows)
     for row in beads:
@@ -101,7 +106,10 @@ def _separator(lines: Sequence[str]) -> str:
 
 
 def _cells(line: str, separator: str) -> list[str]:
-    return line.split() if separator == ' ' else line.split(separator)
+    if separator == ' ':
+        return line.split()
+    cells = [cell.strip() for cell in line.split(separator)]
+    return [decimal_point(cell) for cell in cells] if separator == ';' else cells
 
 
 def _header(cells: Sequence[str]) -> _Layout | None:
@@ -172,7 +180,7 @@ def _numbers(row: Row, layout: _Layout, names: Sequence[str]) -> list[float]:
     for name in names:
         cell = row.cells[layout.columns[name]]
         if not _is_number(cell) or not np.isfinite(float(cell)):
-            row.fail(f'{name} is {cell!r}, not a finite number')
+            row.fail(f'{name} is {cell[:MAX_SHOWN]!r}, not a finite number')
         out.append(float(cell))
     return out
 
@@ -195,10 +203,13 @@ def _ids(rows: Sequence[Row], layout: _Layout) -> dict[str, int]:
             row.fail('the bead has no id')
         other = first.setdefault(cell, row)
         if other is not row:
-            row.fail(f'bead {cell!r} is already given in row {other.line}')
-    if all(cell.isascii() and cell.isdigit() for cell in cells):
-        return {cell: int(cell) for cell in cells}
-    return number_names(cells)
+            row.fail(f'bead {cell[:MAX_SHOWN]!r} is already given in row {other.line}')
+    if not all(cell.isascii() and cell.isdigit() for cell in cells):
+        return number_names(cells)
+    for row, cell in zip(rows, cells):
+        if len(cell) > len(str(MAX_ID)) or int(cell) > MAX_ID:
+            row.fail(f'id is {cell[:MAX_SHOWN]!r}, not between 0 and {MAX_ID}')
+    return {cell: int(cell) for cell in cells}
 
 
 FORMAT = Format(

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
@@ -27,6 +29,7 @@ HALVES_LIMIT = 1.5
 MAX_NAMED = 5
 OFF_SD = 1.5  # times what the sd of rough coordinates says, as an RMS of many beads
 DATUM = 7
+UNKNOWN = 1e6  # variance of a datum that is not known, over that of the beads
 
 
 def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
@@ -97,14 +100,22 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
 
     Neither has a datum of its own: each is fitted to the given coordinates of its own beads.
     """
-    _, row, partner = np.intersect1d(one.target_id, other.target_id, return_indices=True)
-    if len(row) < MIN_BEADS:
-        return halves_not_compared(f'two halves of the exposures have {len(row)} beads in common')
-    difference = one.xyz_mm[row] - other.xyz_mm[partner]
-    covariance = one.covariance[row] + other.covariance[partner]
-    design = similarity_directions(one.given_mm[row], one.given_mm[row].mean(axis=0))
-    left = difference - design @ _fitted(design, covariance, difference)
-    square = float(np.einsum('na,nab,nb->', left, np.linalg.inv(covariance), left))
+    common = np.intersect1d(one.target_id, other.target_id)
+    if len(common) < MIN_BEADS:
+        return halves_not_compared(
+            f'two halves of the exposures have {len(common)} beads in common'
+        )
+    one, other = (beads.without(np.setdiff1d(beads.target_id, common)) for beads in (one, other))
+    difference = (one.xyz_mm - other.xyz_mm).reshape(-1, 1)
+    covariance = one.covariance + other.covariance
+    flat = similarity_directions(one.given_mm, one.given_mm.mean(axis=0)).reshape(-1, DATUM)
+    flat = flat / np.linalg.norm(flat, axis=0)
+    weighted = _weighted_by(one, other, flat)
+    left = difference - flat @ np.linalg.solve(
+        flat.T @ weighted(flat), flat.T @ weighted(difference)
+    )
+    square = float(np.sum(left * weighted(left)))
+    freedom = 3 * len(common) - DATUM
     rms = float(np.sqrt(np.mean(left**2)))
     expected = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3))
     return Check(
@@ -112,9 +123,9 @@ def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
         f'two halves of the exposures give coordinates that differ by {rms:.3f} mm, where '
         f'{expected:.3f} mm is predicted',
         advice='see that phantom and fluoroscope stand still in each exposure, and take more',
-        numbers={'difference_mm': rms, 'predicted_mm': expected, 'beads': len(row)},
-        value=square / (3 * len(row) - DATUM),
-        limit=HALVES_LIMIT,
+        numbers={'difference_mm': rms, 'predicted_mm': expected, 'beads': len(common)},
+        value=square / freedom,
+        limit=max(HALVES_LIMIT, float(chdtri(freedom, FALSE_ALARM)) / freedom),
         unit='predicted variance',
     )
 
@@ -128,14 +139,20 @@ def halves_not_compared(reason: str) -> Check:
     )
 
 
-def _fitted(
-    design: NDArray[np.float64], covariance: NDArray[np.float64], values: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Coefficients (7,) of a weighted fit of a design (n, 3, 7) to values (n, 3)."""
-    half = np.linalg.inv(covariance) @ design
-    normal = np.einsum('nai,naj->ij', design, half)
-    right = np.einsum('nai,na->i', half, values)
-    return np.linalg.pinv(normal, hermitian=True, rcond=1e-12) @ right
+def _weighted_by(
+    one: SurveyedBeads, other: SurveyedBeads, datum: NDArray[np.float64]
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return what multiplies values (3n, k) by the information of the difference of two surveys.
+
+    Few beads have the errors of interior orientation and correction in common; the datum (3n, 7),
+    unit columns, is not known to either survey.
+    """
+    if one.joint_covariance is not None and other.joint_covariance is not None:
+        joint = one.joint_covariance + other.joint_covariance
+        information = np.linalg.inv(joint + UNKNOWN * np.trace(joint) * datum @ datum.T)
+        return lambda values: information @ values
+    blocks = np.linalg.inv(one.covariance + other.covariance)
+    return lambda values: (blocks @ values.reshape(len(blocks), 3, -1)).reshape(values.shape)
 
 
 def _check_intersection(beads: SurveyedBeads) -> Check:

@@ -76,6 +76,8 @@ class SurveyedBeads:
     distances : tuple of MeasuredDistance
     scaled : Scaled or None
         How the distances agree; None without any.
+    joint_covariance : (3n, 3n) ndarray or None
+        Of all beads in the free network, without scale [mm^2]; None where they are too many.
     """
 
     target_id: NDArray[np.int64]
@@ -89,6 +91,7 @@ class SurveyedBeads:
     scale_sd: float
     distances: tuple[MeasuredDistance, ...] = ()
     scaled: Scaled | None = None
+    joint_covariance: NDArray[np.float64] | None = None
 
     @property
     def sd_mm(self) -> NDArray[np.float64]:
@@ -100,7 +103,12 @@ class SurveyedBeads:
         keep = ~np.isin(self.target_id, list(target_id))
         of_beads = ('target_id', 'xyz_mm', 'covariance', 'given_mm', 'given_sd_mm')
         names = (*of_beads, 'rays', 'angle_rad')
-        return replace(self, **{name: getattr(self, name)[keep] for name in names})
+        joint = self.joint_covariance
+        if joint is not None:
+            rows = np.flatnonzero(np.repeat(keep, 3))
+            joint = joint[np.ix_(rows, rows)]
+        kept = {name: getattr(self, name)[keep] for name in names}
+        return replace(self, joint_covariance=joint, **kept)
 
     @property
     def off_mm(self) -> NDArray[np.float64]:
@@ -155,6 +163,7 @@ def surveyed_beads(
         scale_sd=scale_sd,
         distances=tuple(distances),
         scaled=scaled,
+        joint_covariance=targets.joint_covariance,
     )
 
 

@@ -12,7 +12,12 @@ import pytest
 import rigs
 
 from fluoro_calib_ros.checks.check import verdict_of
-from fluoro_calib_ros.checks.survey import check_survey, displaced, unsurveyed
+from fluoro_calib_ros.checks.survey import (
+    check_survey,
+    check_survey_halves,
+    displaced,
+    unsurveyed,
+)
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import adjust_with_calibrations, calibrate
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
@@ -59,12 +64,21 @@ def measured(rig, ends=ENDS, seed=6):
 
 def errors(beads, rig):
     """Errors (n, 3) [mm] after a rigid motion, with which the datum has nothing to do."""
+    return compared(beads, rig)[0]
+
+
+def scale_error(beads, rig):
+    """Error of the scale over its standard deviation."""
+    return compared(beads, rig)[1] / beads.scale_sd
+
+
+def compared(beads, rig):
     true = rig.true_mm[rig.phantom.index(beads.target_id)]
-    centre = true.mean(axis=0)
-    middle = beads.xyz_mm.mean(axis=0)
-    u, _, vt = np.linalg.svd((beads.xyz_mm - middle).T @ (true - centre))
-    turn = u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt
-    return beads.xyz_mm - middle - (true - centre) @ turn.T
+    true = true - true.mean(axis=0)
+    found = beads.xyz_mm - beads.xyz_mm.mean(axis=0)
+    u, _, vt = np.linalg.svd(found.T @ true)
+    true = true @ (u @ np.diag([1, 1, np.linalg.det(u @ vt)]) @ vt).T
+    return found - true, np.sum(found * true) / np.sum(true**2) - 1
 
 
 def nse(beads, rig):
@@ -129,7 +143,7 @@ def test_a_perturbed_phantom_is_recovered_within_its_claims():
     beads = outcome.beads
     assert outcome.validation.verdict == 'pass'
     assert 0.8 < nse(beads, rig) < 1.25
-    assert abs(beads.scale - GROWN) < 3 * beads.scale_sd
+    assert abs(scale_error(beads, rig)) < 3
     assert beads.scale_sd < 5e-4
     assert np.sqrt(np.mean(errors(beads, rig) ** 2)) < 0.1
     assert outcome.phantom.sd_mm == pytest.approx(beads.sd_mm, abs=1e-6)
@@ -160,6 +174,26 @@ def test_a_scale_that_nothing_checks_does_not_pass(count):
     assert check.passed is None
     assert check.numbers['distances'] == count
     assert verdict_of(check_survey(beads)) == 'cannot tell'
+
+
+def test_halves_that_differ_by_more_than_they_claim_are_found():
+    _, _, outcome = surveyed()
+    beads = outcome.beads
+    rng = np.random.default_rng(3)
+    root = np.linalg.cholesky(beads.covariance)
+    one, other = (
+        replace(
+            beads, xyz_mm=beads.given_mm + (root @ rng.normal(size=(*root.shape[:2], 1)))[..., 0]
+        )
+        for _ in range(2)
+    )
+    good = check_survey_halves(one, other)
+    assert good.passed and good.value == pytest.approx(1.0, abs=0.15)
+    face = (beads.given_mm[:, 0] > 100)[:, None]
+    turned = replace(other, xyz_mm=1.01 * other.xyz_mm @ matrix_from_vector([0, 0, 0.02]).T + 3)
+    assert check_survey_halves(one, turned).passed  # the datum is not compared
+    moved = replace(other, xyz_mm=other.xyz_mm + face * [0.2, 0, 0])
+    assert check_survey_halves(one, moved).passed is False
 
 
 def test_coordinates_that_are_wrong_are_named():
@@ -301,7 +335,7 @@ def test_claims_of_beads_and_scale_hold_over_seeds():
             continue
         if outcome.validation.verdict == 'pass':
             squares.append(nse(outcome.beads, rig))
-            scales.append((outcome.beads.scale - GROWN) / outcome.beads.scale_sd)
+            scales.append(scale_error(outcome.beads, rig))
     assert len(squares) >= 3
     assert 0.8 < np.mean(squares) < 1.25
     assert np.max(np.abs(scales)) < 3.5

@@ -169,7 +169,7 @@ def compared(seed: int) -> dict[str, float]:
     }
 
 
-def row(drawn: Drawing | None, exposures: int, fluoroscopes: int, seeds: Iterable[int]) -> str:
+def row(seeds: Iterable[int], drawn: Drawing | None, exposures: int, fluoroscopes: int) -> str:
     """Row of the table of a case."""
     found = []
     for seed in seeds:
@@ -202,10 +202,10 @@ def section(seeds: int) -> str:
         'of the scale, too. chi2 of the distances: 2 is expected. Halves: the largest value\nof '
         'the check, whose limit is 1.5 (1.8 for 18 beads).',
         '',
-        '| phantom | exposures | fluoroscopes | surveyed | sd [mm] | RMSE [mm] | NSE | sd of scale [ppm] | '
-        'NSE of scale | chi2 | halves | pass |',
+        '| phantom | exposures | fluoroscopes | surveyed | sd [mm] | RMSE [mm] | NSE | '
+        'sd of scale [ppm] | NSE of scale | chi2 | halves | pass |',
         '|---:|---:|---:|---:|---:|---:|---|---:|---:|---:|---:|---|',
-        *(row(*each, seeds=range(seeds)) for each in CASES),
+        *(row(range(seeds), *each) for each in CASES),
         '',
         'Calibrations from 15 other exposures, joint, and the RMS error of distances between the '
         'beads that they reconstruct in 20\nexposures without false matches that nothing used:',

@@ -192,7 +192,7 @@ def test_halves_that_differ_by_more_than_they_claim_are_found():
     face = (beads.given_mm[:, 0] > 100)[:, None]
     turned = replace(other, xyz_mm=1.01 * other.xyz_mm @ matrix_from_vector([0, 0, 0.02]).T + 3)
     assert check_survey_halves(one, turned).passed  # the datum is not compared
-    moved = replace(other, xyz_mm=other.xyz_mm + face * [0.2, 0, 0])
+    moved = replace(other, xyz_mm=other.xyz_mm + face * [0.5, 0, 0])
     assert check_survey_halves(one, moved).passed is False
 
 
@@ -285,7 +285,8 @@ def test_a_bead_with_one_good_ray_does_not_spoil_the_datum_of_a_free_network():
 
 def test_the_command_writes_the_phantom_unless_it_fails(tmp_path, capsys):
     rig, frames, _ = surveyed()
-    write_observations_csv(tmp_path / 'seen.csv', frames)
+    few = {name: each[:7] for name, each in frames.items()}
+    write_observations_csv(tmp_path / 'seen.csv', few)
     write_phantom(tmp_path / 'rough.csv', rough(rig))
     words = ['survey', tmp_path / 'seen.csv', '--phantom', tmp_path / 'rough.csv', '--json']
     words += ['--image-size', '1024x1024', '--out', tmp_path / 'out.csv', '--model', 'parametric']

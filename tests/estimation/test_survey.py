@@ -26,6 +26,7 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.observations import write_observations_csv
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
+from fluoro_calib_ros.jobs import survey as surveying
 from fluoro_calib_ros.jobs.calibration import run_calibration
 from fluoro_calib_ros.jobs.survey import SurveyRequest, survey
 from fluoro_calib_ros.photogrammetry.measured_distances import Distances, scaled_by_distances
@@ -255,7 +256,7 @@ def test_poses_that_do_not_separate_the_unknowns_are_refused(monkeypatch, degree
     rig = virtual_rig(1, names=('a',))
     frames = simulated.simulate_exposures(rig, 12, 1).frames
     with rigs.refused(kind):
-        survey(SurveyRequest(frames, rough(rig), options=CalibrationOptions(model='parametric')))
+        survey(SurveyRequest(frames, rough(rig)))
 
 
 def test_a_bead_with_one_good_ray_does_not_spoil_the_datum_of_a_free_network():
@@ -283,13 +284,27 @@ def test_a_bead_with_one_good_ray_does_not_spoil_the_datum_of_a_free_network():
     assert np.median(sd) < 0.15
 
 
-def test_the_command_writes_the_phantom_unless_it_fails(tmp_path, capsys):
-    rig, frames, _ = surveyed()
-    few = {name: each[:7] for name, each in frames.items()}
-    write_observations_csv(tmp_path / 'seen.csv', few)
+def test_the_command_writes_the_phantom_unless_it_fails(tmp_path, capsys, monkeypatch):
+    rig, frames, outcome = surveyed()
+    write_observations_csv(tmp_path / 'seen.csv', frames)
     write_phantom(tmp_path / 'rough.csv', rough(rig))
+    requests = []
+    checks = outcome.validation.checks
+
+    def surveyed_again(request, progress):
+        """The survey of these exposures, with other distances."""
+        requests.append(request)
+        beads = surveyed_beads(outcome.result, request.given, request.distances)
+        checked_again = (*check_survey(beads), checks[-1])
+        verdict = verdict_of(checked_again)
+        return replace(
+            outcome,
+            validation=replace(outcome.validation, verdict=verdict, checks=checked_again),
+        )
+
+    monkeypatch.setattr(surveying, 'survey', surveyed_again)
     words = ['survey', tmp_path / 'seen.csv', '--phantom', tmp_path / 'rough.csv', '--json']
-    words += ['--image-size', '1024x1024', '--out', tmp_path / 'out.csv', '--model', 'parametric']
+    words += ['--image-size', '1024x1024', '--out', tmp_path / 'out.csv', '--keep-given']
     spoilt = measured(rig)[:2]
     spoilt[1] = replace(spoilt[1], length_mm=spoilt[1].length_mm + 3)
     for distances, status in ((spoilt, 1), (measured(rig)[:2], 0)):
@@ -299,8 +314,11 @@ def test_the_command_writes_the_phantom_unless_it_fails(tmp_path, capsys):
         document = json.loads(capsys.readouterr().out)
         assert document['validation']['verdict'] == ('fail' if status else 'pass')
         assert document['out'] == (None if status else str(tmp_path / 'out.csv'))
+        assert requests[-1].distances == distances and requests[-1].keep_given
     found = read_phantom(tmp_path / 'out.csv')
     assert found.target_id.tolist() == [bead['target_id'] for bead in document['beads']]
+    assert rigs.run(*words, '--distance', '1,nobody,5,0.1') == 1
+    assert rigs.run(*words, '--distance', '1,2') == 2
 
 
 @pytest.mark.long

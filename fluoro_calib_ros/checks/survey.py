@@ -24,8 +24,8 @@ MIN_ANGLE_RAD = np.deg2rad(20.0)
 FALSE_ALARM = 1e-3
 MIN_BEADS = 10  # of both halves
 # Mean square of the normalised differences of two halves: docs/how_good.md. It is 1.41 at most in
-# simulated surveys whose sds are right, and was 1.64 in one whose sds are not (NSE 1.6: 8 exposures,
-# seed 7 of benchmarks.survey).
+# simulated surveys whose sds are right, and was 1.64 in one with an NSE of 1.6 (8 exposures, seed
+# 7 of benchmarks.survey).
 HALVES_LIMIT = 1.5
 MAX_NAMED = 5
 OFF_SD = 1.5  # times what the sd of rough coordinates says, as an RMS of many beads

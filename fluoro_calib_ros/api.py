@@ -20,6 +20,7 @@ from .correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCali
 from .errors import DataError
 from .estimation.options import CalibrationOptions, CalibrationRequest
 from .estimation.result import CalibrationResult
+from .estimation.survey import MeasuredDistance
 from .exposures.frame import Frame
 from .exposures.moving_points import MovingPoints
 from .exposures.names import Names
@@ -27,7 +28,7 @@ from .exposures.phantom import Phantom
 from .findings import Finding, Kind, Severity
 from .io.calibration_request import read_request
 from .io.formats.content import FileSettings
-from .io.phantom import read_moving_points, read_phantom
+from .io.phantom import read_moving_points, read_phantom, write_phantom
 from .io.reconstructed_points import write_reconstruction
 from .io.rig_orientation import load_orientation, save_orientation
 from .jobs.calibration import CalibrationOutcome, adjust, run_calibration
@@ -46,6 +47,7 @@ from .jobs.sources import (
     read_source,
     read_survey,
 )
+from .jobs.survey import SurveyOutcome, SurveyRequest, survey
 from .photogrammetry.known_orientation import KnownOrientation
 from .photogrammetry.rig_orientation import RigOrientation
 
@@ -65,6 +67,7 @@ __all__ = [
     'Frame',
     'Kind',
     'KnownOrientation',
+    'MeasuredDistance',
     'MovingPoints',
     'Names',
     'OrientationOutcome',
@@ -76,6 +79,8 @@ __all__ = [
     'Severity',
     'SimulationOptions',
     'Survey',
+    'SurveyOutcome',
+    'SurveyRequest',
     'Validation',
     'adjust',
     'calibrate',
@@ -98,7 +103,9 @@ __all__ = [
     'save_outcome',
     'save_result',
     'simulate',
+    'survey',
     'validate',
+    'write_phantom',
     'write_reconstruction',
 ]
 

@@ -60,6 +60,7 @@ class Kind(str, Enum):
     ONE_POSE = 'one_pose'
     UNDETERMINED = 'undetermined'
     UNTILTED_TARGETS = 'untilted_targets'
+    WEAK_INTERSECTION = 'weak_intersection'
 
     # Input that cannot be right.
     DUPLICATE_NAME = 'duplicate_name'

@@ -25,6 +25,7 @@ from fluoro_calib_ros.checks.drift_options import ERROR, WARN
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch
 from fluoro_calib_ros.checks.rigidity import doubtful
+from fluoro_calib_ros.checks.survey import unsurveyed
 from fluoro_calib_ros.checks.verdict import validate, validate_or_report
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.constraints import _without_targets_of_few_rays
@@ -73,6 +74,11 @@ def checks():
     job = calibrated('a', 8, model='parametric', max_iterations=2)
     found = validate(request, job.calibrations).checks
     return {check.kind: replace(check, limit=-1.0) for check in found}
+
+
+def weak_intersection():
+    beads = Fake(target_id=np.arange(7), rays=np.full(7, 4), angle_rad=np.full(7, 0.1))
+    return unsurveyed(beads)[0]
 
 
 def other_view_missing():
@@ -345,6 +351,7 @@ MAKERS = {
     ),
     Kind.UNDETERMINED: undetermined,
     Kind.UNTILTED_TARGETS: lambda: replace(UNTILTED, place=Place(('a',))),
+    Kind.WEAK_INTERSECTION: weak_intersection,
     Kind.DUPLICATE_NAME: lambda: raised(inputs.validate_names, ('a', 'A')),
     Kind.FRAMES_SHIFTED: lambda: trial(Kind.FRAMES_SHIFTED),
     Kind.IDS_REVERSED: lambda: inputs.CONFUSIONS[2][0],
@@ -539,6 +546,10 @@ SENTENCES = {
     Kind.UNDETERMINED: (
         'the exposures do not determine the unknowns: the orientation of exposure # of a is '
         'left open; add exposures with the phantom turned and moved, with more targets'
+    ),
+    Kind.WEAK_INTERSECTION: (
+        '# beads are not surveyed, their rays meet at less than # degrees: #, #, #, #, # and # '
+        'more'
     ),
     Kind.UNTILTED_TARGETS: (
         'fluoroscope a: the targets are flat and not tilted, so that the principal distance '

@@ -22,9 +22,11 @@ from . import (
     correct,
     extract,
     orient,
+    phantom,
     reconstruct,
     report,
     simulate,
+    survey,
     validate,
     watch,
 )
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 # arguments depend on each other, check(arguments, error).
 COMMANDS = (
     simulate,
+    phantom,
     extract,
     calibrate,
     adjust,
@@ -48,6 +51,7 @@ COMMANDS = (
     validate,
     report,
     compare,
+    survey,
     orient,
     reconstruct,
     convert,
@@ -56,7 +60,7 @@ COMMANDS = (
     bridge,
 )
 
-READ_NOTHING = (simulate, watch, bridge)
+READ_NOTHING = (simulate, phantom, watch, bridge)
 
 
 class _Version(argparse.Action):

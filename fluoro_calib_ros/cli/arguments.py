@@ -300,8 +300,8 @@ def add_phantom(parser: Parser, **changes: Any) -> None:
     settings: dict[str, Any] = {
         'required': True,
         'type': Path,
-        'help': 'surveyed coordinates target_id,x,y,z,sd [mm], or an XMALab frame specification, '
-        'project or .xyz file',
+        'help': 'surveyed coordinates target_id,x,y,z,sd [mm], or another list of coordinates, an '
+        'XMALab frame specification, project or .xyz file',
     }
     settings.update(changes)
     parser.add_argument('--phantom', **settings)

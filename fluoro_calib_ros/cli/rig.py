@@ -19,6 +19,7 @@ USED = {
     'calibrate': (*_SOURCE, 'phantom', 'out'),
     'adjust': (*_SOURCE, 'phantom', 'calibration'),
     'correct': ('calibration',),
+    'survey': _SOURCE,  # its --phantom is a rough one, and its --out is not the rig's folder
     'validate': ('calibration', *_ANGLE),
     'report': ('calibration',),
     'orient': (*_SOURCE, 'phantom', 'calibration'),

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ..correction.base import CorrectionModel
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust
+from ..photogrammetry.datum import in_determined_datum
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
@@ -297,9 +298,11 @@ def calibrate_by_regression(
         if iteration < options.max_iterations:
             rounds.accelerate()
     # The correction of the last round stays; its adjustment is completed here.
+    last = rounds.state.after
+    network, start = in_determined_datum(network, last.parameters, last.inliers)
     after, precise = adjusted_with_precision(
         network,
-        rounds.state.after.parameters,
+        start,
         rounds.correction,
         rounds.state.noise,
         raise_if_cancelled=raise_if_cancelled,

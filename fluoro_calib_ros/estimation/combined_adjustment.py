@@ -19,6 +19,7 @@ import numpy as np
 from ..correction.base import CorrectionModel
 from ..errors import DataError
 from ..photogrammetry.adjustment import Adjustment, SolverOptions, adjust_with_matrix
+from ..photogrammetry.datum import in_determined_datum
 from ..photogrammetry.elimination import factorize
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise_estimation import estimate_noise
@@ -87,6 +88,8 @@ def calibrate_by_adjustment(
             report=report,
             raise_if_cancelled=raise_if_cancelled,
         )
+        network, parameters = in_determined_datum(network, after.parameters, after.inliers)
+        after = replace(after, parameters=parameters)
         precise = precision(network, after)
         fields = {
             name: terms.fit_angles(f, after, precise)

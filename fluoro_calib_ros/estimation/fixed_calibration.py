@@ -16,7 +16,7 @@ from ..exposures.frame import Frame, angles_of
 from ..exposures.phantom import Phantom
 from ..photogrammetry.adjustment import Adjustment
 from ..photogrammetry.diagnosis import global_names
-from ..photogrammetry.elimination import factorize
+from ..photogrammetry.elimination import CovarianceBlocks, factorize
 from ..photogrammetry.network import Network
 from ..photogrammetry.noise import Noise
 from ..photogrammetry.normal_equations import normal_equations
@@ -91,17 +91,9 @@ class SolvedNetwork:
 
         Raises numpy.linalg.LinAlgError where the network does not determine them.
         """
+        blocks = self._blocks()
         network = self.measured.network
         parameters = self.adjustment.parameters
-        noise = self.adjustment.noise
-        if self.held is not None:
-            network, equations = equations_with_fixed_interiors(
-                network, self.adjustment, self.correction, self.held
-            )
-        else:
-            factor = noise.information_factor(self.adjustment.q)
-            equations = normal_equations(network, parameters, self.correction, noise, factor)
-        blocks = covariance_blocks(factorize(network, equations))
         angles = np.full((network.n_exposures, 3), np.nan)
         others = [p.ravel() for p in parameters.additional if p is not None]
         relative = [np.append(p.translation_mm, angles[0]) for p in parameters.relative]
@@ -118,6 +110,40 @@ class SolvedNetwork:
             ),
             self._as_stated(joint_covariance(blocks).matrix),
         )
+
+    def covariance_of_points(
+        self,
+    ) -> Callable[[NDArray[np.int64], NDArray[np.int64]], NDArray[np.float64]]:
+        """Return what gives the blocks (k, 3, 3) of targets p (k,) with targets q (k,) [mm^2].
+
+        p and q are rows. Raises numpy.linalg.LinAlgError as `joint_precision`.
+        """
+        blocks = self._blocks()
+        factor = np.ones((len(blocks.pp), 3))
+        if self.stated is not None:
+            claimed = np.diagonal(self.stated.points, axis1=1, axis2=2)
+            factor = np.sqrt(claimed / np.diagonal(blocks.pp, axis1=1, axis2=2))
+
+        def between(p: NDArray[np.int64], q: NDArray[np.int64]) -> NDArray[np.float64]:
+            covariance = blocks.points_between(p, q)
+            return factor[p][:, :, None] * covariance * factor[q][:, None, :]
+
+        return between
+
+    def _blocks(self) -> CovarianceBlocks:
+        """Return blocks of the covariance matrix, those of the network."""
+        network = self.measured.network
+        noise = self.adjustment.noise
+        if self.held is not None:
+            network, equations = equations_with_fixed_interiors(
+                network, self.adjustment, self.correction, self.held
+            )
+        else:
+            factor = noise.information_factor(self.adjustment.q)
+            equations = normal_equations(
+                network, self.adjustment.parameters, self.correction, noise, factor
+            )
+        return covariance_blocks(factorize(network, equations))
 
     def _as_stated(self, covariance: np.ndarray) -> np.ndarray:
         """Scale a covariance matrix to the standard deviations that the unknowns claim."""

@@ -11,9 +11,14 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import DataError
+from ..findings import Kind
 from .columns import first_repeated, is_positive
 
 MIN_TARGETS = 4
+# Largest side of what a fluoroscope can see: from a grid before the detector of a specimen scanner
+# to a frame around a treadmill, with a factor of five in hand. A wrong unit is a factor of ten.
+EXTENT_MM = (2.0, 10_000.0)
+UNITS_MM = {'m': 1000.0, 'cm': 10.0, 'micrometres': 1e-3}
 
 
 @dataclass(frozen=True)
@@ -92,3 +97,25 @@ def _validate(ids: np.ndarray, xyz: np.ndarray, sd: np.ndarray) -> None:
     repeated = first_repeated(ids)
     if repeated is not None:
         raise DataError(f'phantom: target {ids[repeated[0]]} is given twice')
+
+
+def require_size(phantom: Phantom) -> None:
+    """Raise DataError for a phantom of a size that none has: its unit is another one.
+
+    Targets that are all in one place have no size, and are left to others.
+    """
+    extent = float(np.ptp(phantom.xyz_mm, axis=0).max())
+    low, high = EXTENT_MM
+    if extent == 0 or low <= extent <= high:
+        return
+    likely = [unit for unit, mm in UNITS_MM.items() if low <= extent * mm <= high]
+    if not likely:
+        why = 'this is no phantom'
+    else:
+        why = f'the coordinates are in {likely[0]}, not in mm, or in another unit'
+    raise DataError(
+        f'the phantom would be {extent:.3g} mm large, between {low:g} and {high:g} mm are '
+        f'possible: {why}',
+        kind=Kind.WRONG_UNIT,
+        numbers={'extent_mm': extent},
+    )

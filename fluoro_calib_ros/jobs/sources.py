@@ -19,7 +19,7 @@ from ..exposures.collector import collect_recorded
 from ..exposures.frame import Frame
 from ..exposures.names import Names
 from ..exposures.pairing import PairingOptions, disagreement_of_recording
-from ..exposures.phantom import Phantom
+from ..exposures.phantom import Phantom, require_size
 from ..findings import Kind, sentences
 from ..io.access import check_regular_file
 from ..io.bags.reader import joint_topics, read_frames, with_angles
@@ -158,6 +158,10 @@ def read_survey(path: str | os.PathLike[str], settings: FileSettings | None = No
     content = read_content(path, settings or FileSettings(), 'survey', 'phantom')
     if content.survey is None:
         raise DataError(f'{path}: the file has no phantom')
+    try:
+        require_size(content.survey)
+    except DataError as error:
+        raise error.at(path) from None
     return Survey(content.survey, content.names, content.notes)
 
 

@@ -26,6 +26,7 @@ from .rotations import cross_matrix
 from .unknowns import Parameters, UnknownVector
 
 DATUMS = ('survey', 'inner')
+MIN_RAYS_IN_DATUM = 3  # inliers: two may be a false match and its accidental partner
 
 
 @dataclass(frozen=True)
@@ -63,6 +64,9 @@ def open_gauge(network: Network, parameters: Parameters) -> Gauge | None:
     e = np.zeros((network.n_exposures, 6, DATUM_DEFECT))
     e[:, :3] = similarity_directions(parameters.position_mm, centre)
     e[:, 3:, 3:6] = -parameters.rotation
+    constraint = similarity_directions(network.survey_mm, centre)
+    if network.in_datum is not None:
+        constraint *= network.in_datum[:, None, None]
     g = np.zeros((network.layout.n_globals, DATUM_DEFECT))
     for columns, pose in zip(network.layout.relative, parameters.relative):
         g[columns][:3, 6] = pose.translation_mm
@@ -70,8 +74,23 @@ def open_gauge(network: Network, parameters: Parameters) -> Gauge | None:
         e,
         similarity_directions(parameters.points_mm, centre),
         g,
-        similarity_directions(network.survey_mm, centre),
+        constraint,
     )
+
+
+def in_determined_datum(
+    network: Network, parameters: Parameters, inliers: NDArray[np.bool_]
+) -> tuple[Network, Parameters]:
+    """Free network whose datum is that of the object points that enough inliers (N,) show.
+
+    A point with one ray is anywhere along it. Among those that define the datum, it would shift,
+    turn and scale all others by its own uncertainty.
+    """
+    if network.datum == 'survey':
+        return network, parameters
+    rays = np.bincount(network.point[inliers], minlength=network.n_points)
+    network = replace(network, in_datum=rays >= MIN_RAYS_IN_DATUM)
+    return network, transform_to_datum(network, parameters)
 
 
 def stabilising_factor(directions: np.ndarray, diagonal: np.ndarray) -> NDArray[np.float64]:
@@ -92,10 +111,11 @@ def transform_to_datum(network: Network, parameters: Parameters) -> Parameters:
     """
     if network.datum == 'survey':
         return parameters
-    centre = parameters.points_mm.mean(axis=0)
-    survey_centre = network.survey_mm.mean(axis=0)
-    found = parameters.points_mm - centre
-    wanted = network.survey_mm - survey_centre
+    used = slice(None) if network.in_datum is None else network.in_datum
+    centre = parameters.points_mm[used].mean(axis=0)
+    survey_centre = network.survey_mm[used].mean(axis=0)
+    found = parameters.points_mm[used] - centre
+    wanted = network.survey_mm[used] - survey_centre
     u, _, vt = np.linalg.svd(wanted.T @ found)
     turn = u @ np.diag([1, 1, np.sign(np.linalg.det(u @ vt))]) @ vt
     scale = np.sum(wanted**2) / np.sum(wanted * (found @ turn.T))

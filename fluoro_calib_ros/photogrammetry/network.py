@@ -56,6 +56,8 @@ class Network:
     datum : {'survey', 'inner'}
         'survey': the surveyed coordinates are weighted observations. 'inner': they have no weight,
         and inner constraints over the object points define the datum.
+    in_datum : (n,) ndarray of bool, optional
+        Object points that define the datum of a free network; by default all.
     """
 
     uv: NDArray[np.float64]
@@ -72,6 +74,7 @@ class Network:
     interior_sd: NDArray[np.float64] | None = None
     exterior: ExteriorPrior | None = None
     datum: str = 'survey'
+    in_datum: NDArray[np.bool_] | None = None
 
     @property
     def n_image_points(self) -> int:

@@ -60,6 +60,7 @@ def _seeds() -> list[bytes]:
             except DataError:
                 continue
             seeds += [Path(path).read_bytes() for path in done.paths]
+    seeds.append(b'id,x_mm,y_mm,z_mm,sd\n1,0,0,0,1\n2,9,0,0,1\n3,0,9,0,1\n4,0,0,9,1\n')
     return [seed for seed in seeds if len(seed) < 20_000]
 
 

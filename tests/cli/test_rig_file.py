@@ -62,6 +62,7 @@ READ_A_BAG = {
     'calibrate': ['bag', '--phantom', 'p.csv', '--out', 'o'],
     'adjust': ['bag', '--phantom', 'p.csv', '--calibration', 'c', '--out', 'o'],
     'validate': ['c', '--source', 'bag'],
+    'survey': ['bag', '--phantom', 'p.csv', '--out', 'o.csv'],
     'orient': ['bag', '--phantom', 'p.csv', '--calibration', 'c'],
     'reconstruct': ['bag', '--calibration', 'c', '--out', 'o.csv'],
     'convert': ['bag', '--to', 'observations', '--out', 'o.csv'],
@@ -161,7 +162,7 @@ def test_source_is_the_first_argument_of_every_command():
     commands = next(a for a in parser._actions if a.dest == 'command').choices
     for module in COMMANDS:
         places = [a for a in commands[module.NAME]._actions if not a.option_strings]
-        if places and module.NAME not in ('bag', 'compare', 'report', 'validate'):
+        if places and module.NAME not in ('bag', 'compare', 'phantom', 'report', 'validate'):
             assert places[0].metavar == 'SOURCE', module.NAME
 
 

@@ -1,0 +1,248 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Checks of a survey of the phantom from its own exposures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+from scipy.special import chdtri
+
+from ..estimation.survey import SurveyedBeads
+from ..findings import Finding, Kind, Place, Severity
+from ..photogrammetry.datum import similarity_directions
+from .check import Check
+
+MIN_RAYS = 3  # that agree: two determine a bead, but nothing would check them
+# Errors along two rays are cot(angle / 2) times those across: 6 times at 20 degrees. A single sd
+# for all axes would then be wrong by more than half for the worst of them.
+MIN_ANGLE_RAD = np.deg2rad(20.0)
+FALSE_ALARM = 1e-3
+MIN_BEADS = 10  # of both halves
+# Mean square of the normalised differences of two halves: docs/how_good.md. It is 1.41 at most in
+# simulated surveys whose sds are right, and was 1.64 in one with an NSE of 1.6 (8 exposures, seed
+# 7 of benchmarks.survey).
+HALVES_LIMIT = 1.5
+MAX_NAMED = 5
+OFF_SD = 1.5  # times what the sd of rough coordinates says, as an RMS of many beads
+DATUM = 7
+UNKNOWN = 1e6  # variance of a datum that is not known, over that of the beads
+
+
+def unsurveyed(beads: SurveyedBeads) -> list[Finding]:
+    """Return a finding for beads of too few rays, and for beads whose rays meet too acutely."""
+    few = beads.rays < MIN_RAYS
+    acute = ~few & (beads.angle_rad < MIN_ANGLE_RAD)
+    out = []
+    if few.any():
+        ids = beads.target_id[few]
+        out.append(
+            Finding(
+                Kind.FEW_RAYS,
+                f'{len(ids)} beads are not surveyed, fewer than {MIN_RAYS} of their image points '
+                f'agree: {_named(ids)}',
+                Place(target_id=tuple(ids.tolist()), name=''),
+                severity=Severity.NOTE,
+                numbers={'beads': len(ids)},
+            )
+        )
+    if acute.any():
+        ids = beads.target_id[acute]
+        out.append(
+            Finding(
+                Kind.WEAK_INTERSECTION,
+                f'{len(ids)} beads are not surveyed, their rays meet at less than '
+                f'{np.rad2deg(MIN_ANGLE_RAD):.0f} degrees: {_named(ids)}',
+                Place(target_id=tuple(ids.tolist()), name=''),
+                severity=Severity.NOTE,
+                numbers={'beads': len(ids)},
+            )
+        )
+    return out
+
+
+def displaced(beads: SurveyedBeads) -> Finding | None:
+    """Return a finding for beads that are not where the given coordinates say."""
+    variance = beads.covariance + beads.given_sd_mm[:, None, None] ** 2 * np.eye(3)
+    off = beads.xyz_mm - beads.given_mm
+    square = np.einsum('na,nab,nb->n', off, np.linalg.inv(variance), off)
+    wrong = square > chdtri(3, FALSE_ALARM / len(off))
+    if not wrong.any():
+        return None
+    order = np.flatnonzero(wrong)[np.argsort(-beads.off_mm[wrong])]
+    ids = beads.target_id[order]
+    largest = float(beads.off_mm[order[0]])
+    return Finding(
+        Kind.BEADS,
+        f'{len(ids)} beads lie further from the given coordinates than their sd says, by up to '
+        f'{largest:.2f} mm: {_named(ids)}',
+        Place(target_id=tuple(ids.tolist()), name=''),
+        severity=Severity.NOTE,
+        numbers={'beads': len(ids), 'largest_mm': largest},
+    )
+
+
+def check_survey(beads: SurveyedBeads) -> list[Check]:
+    """Return the checks of the geometry, the scale, the ids and the precision of a survey."""
+    return [
+        _check_intersection(beads),
+        _check_distances(beads),
+        _check_layout(beads),
+        _check_precision(beads),
+    ]
+
+
+def check_survey_halves(one: SurveyedBeads, other: SurveyedBeads) -> Check:
+    """Compare surveys from two halves of the exposures, up to shift, turn and scale.
+
+    Neither has a datum of its own: each is fitted to the given coordinates of its own beads.
+    """
+    common = np.intersect1d(one.target_id, other.target_id)
+    if len(common) < MIN_BEADS:
+        return halves_not_compared(
+            f'two halves of the exposures have {len(common)} beads in common'
+        )
+    one, other = (beads.without(np.setdiff1d(beads.target_id, common)) for beads in (one, other))
+    difference = (one.xyz_mm - other.xyz_mm).reshape(-1, 1)
+    covariance = one.covariance + other.covariance
+    flat = similarity_directions(one.given_mm, one.given_mm.mean(axis=0)).reshape(-1, DATUM)
+    flat = flat / np.linalg.norm(flat, axis=0)
+    weighted = _weighted_by(one, other, flat)
+    left = difference - flat @ np.linalg.solve(
+        flat.T @ weighted(flat), flat.T @ weighted(difference)
+    )
+    square = float(np.sum(left * weighted(left)))
+    freedom = 3 * len(common) - DATUM
+    rms = float(np.sqrt(np.mean(left**2)))
+    expected = float(np.sqrt(np.trace(covariance, axis1=1, axis2=2).mean() / 3))
+    return Check(
+        Kind.HALVES,
+        f'two halves of the exposures give coordinates that differ by {rms:.3f} mm, where '
+        f'{expected:.3f} mm is predicted',
+        advice='see that phantom and fluoroscope stand still in each exposure, and take more',
+        numbers={'difference_mm': rms, 'predicted_mm': expected, 'beads': len(common)},
+        value=square / freedom,
+        limit=max(HALVES_LIMIT, float(chdtri(freedom, FALSE_ALARM)) / freedom),
+        unit='predicted variance',
+    )
+
+
+def halves_not_compared(reason: str) -> Check:
+    """Return the check 'halves' that could not be made for a reason."""
+    return Check(
+        Kind.HALVES,
+        f'check halves could not be made, {reason}',
+        advice='take more exposures',
+    )
+
+
+def _weighted_by(
+    one: SurveyedBeads, other: SurveyedBeads, datum: NDArray[np.float64]
+) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """Return what multiplies values (3n, k) by the information of the difference of two surveys.
+
+    Few beads have the errors of interior orientation and correction in common; the datum (3n, 7),
+    unit columns, is not known to either survey.
+    """
+    if one.joint_covariance is not None and other.joint_covariance is not None:
+        joint = one.joint_covariance + other.joint_covariance
+        information = np.linalg.inv(joint + UNKNOWN * np.trace(joint) * datum @ datum.T)
+        return lambda values: information @ values
+    blocks = np.linalg.inv(one.covariance + other.covariance)
+    return lambda values: (blocks @ values.reshape(len(blocks), 3, -1)).reshape(values.shape)
+
+
+def _check_intersection(beads: SurveyedBeads) -> Check:
+    angle = float(np.median(beads.angle_rad))
+    return Check(
+        Kind.WEAK_INTERSECTION,
+        f'the rays of a bead meet at up to {np.rad2deg(angle):.0f} degrees (median)',
+        advice='turn the phantom between the exposures, by a right angle in all',
+        numbers={'angle_deg': float(np.rad2deg(angle))},
+        value=1 / np.tan(max(angle, 1e-9) / 2),
+        limit=1 / np.tan(MIN_ANGLE_RAD / 2),
+        unit='error along a ray over that across',
+    )
+
+
+def _check_distances(beads: SurveyedBeads) -> Check:
+    numbers = {'scale': beads.scale, 'scale_sd': beads.scale_sd, 'distances': 0}
+    scale = f'the scale is {beads.scale:.6f} (sd {beads.scale_sd:.6f})'
+    advice = 'measure two distances or more between beads that are far apart, and give them'
+    if beads.scaled is None:
+        return Check(
+            Kind.DISTANCES,
+            'no distance was measured, the scale is that of the given coordinates '
+            f'(sd {beads.scale_sd:.6f}, if their errors are independent)',
+            advice=advice,
+            numbers=numbers,
+        )
+    numbers['distances'] = len(beads.distances)
+    if not beads.scaled.freedom:
+        return Check(
+            Kind.DISTANCES,
+            f'{scale} times that of the given coordinates by one distance, which nothing checks',
+            advice=advice,
+            numbers=numbers,
+        )
+    ratio = np.abs(beads.scaled.normalised)
+    worst = int(np.argmax(ratio))
+    off = float(beads.scaled.error_mm[worst])
+    # Of two distances either may be wrong.
+    named = beads.distances if len(ratio) == 2 else beads.distances[worst : worst + 1]
+    names = ' or '.join(one.name for one in named)
+    return Check(
+        Kind.DISTANCES,
+        f'{scale} times that of the given coordinates by {len(ratio)} distances; {names} is off '
+        f'by {abs(off):.3f} mm, {ratio[worst]:.1f} times its sd, the most',
+        Place(target_id=tuple(end for one in named for end in (one.first, one.second)), name=''),
+        'measure again, between the centres of the beads, or give a larger sd',
+        numbers={**numbers, 'error_mm': off, 'normalised': float(ratio[worst])},
+        value=beads.scaled.chi2,
+        limit=float(chdtri(beads.scaled.freedom, FALSE_ALARM)),
+        unit='chi2',
+    )
+
+
+def _check_layout(beads: SurveyedBeads) -> Check:
+    """Beads that lie further off than half a spacing may be others, unless their sd allows it."""
+    nearest = float(np.median(KDTree(beads.given_mm).query(beads.given_mm, k=2)[0][:, 1]))
+    off = float(np.sqrt(np.mean(beads.off_mm**2)))
+    allowed = OFF_SD * np.sqrt(3) * float(np.sqrt(np.mean(beads.given_sd_mm**2)))
+    return Check(
+        Kind.OTHER_PHANTOM,
+        f'the beads lie {off:.2f} mm from the given coordinates, neighbours are {nearest:.2f} mm '
+        'apart',
+        advice='check that the ids of the image points are those of the given coordinates, and '
+        'that their sd says how rough they are',
+        numbers={'off_mm': off, 'spacing_mm': nearest},
+        value=off,
+        limit=max(nearest / 2, allowed),
+        unit='mm',
+    )
+
+
+def _check_precision(beads: SurveyedBeads) -> Check:
+    sd = float(np.median(beads.sd_mm))
+    given = float(np.median(beads.given_sd_mm))
+    return Check(
+        Kind.PRECISION,
+        f'the coordinates have a standard deviation of {sd:.3f} mm (median), the given ones '
+        f'{given:.3f} mm',
+        advice='take more exposures, and measure longer distances, or keep the given coordinates',
+        numbers={'sd_mm': sd, 'given_sd_mm': given},
+        value=sd,
+        limit=given,
+        unit='mm',
+    )
+
+
+def _named(target_id: NDArray[np.int64]) -> str:
+    """Return some ids as text."""
+    listed = ', '.join(map(str, target_id[:MAX_NAMED]))
+    further = len(target_id) - MAX_NAMED
+    return f'{listed} and {further} more' if further > 0 else listed

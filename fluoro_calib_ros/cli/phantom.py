@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""fluoro-calib phantom."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable
+from pathlib import Path
+
+from ..errors import DataError
+from .arguments import number_in
+from .output import print_result
+
+NAME = 'phantom'
+HELP = 'Write the phantom file of a regular sheet or block from its drawing, with a picture.'
+EXAMPLE = 'fluoro-calib phantom --hex 45x45 --pitch 7 --diameter 3 --blocked 10,12 sheet.csv'
+MAX_COUNT = 1000  # of places along an axis
+PICTURES = ('.svg', '.png')
+
+
+def counts(length: int) -> Callable[[str], tuple[int, ...]]:
+    """Return an argument type: length whole numbers with an x between them."""
+
+    def convert(text: str) -> tuple[int, ...]:
+        parts = text.lower().split('x')
+        if len(parts) == length and all(part.isascii() and part.isdigit() for part in parts):
+            values = tuple(map(int, parts))
+            if all(1 <= value <= MAX_COUNT for value in values):
+                return values
+        form = 'x'.join(['N'] * length)
+        raise argparse.ArgumentTypeError(f'{text!r} is not {form}, numbers from 1 to {MAX_COUNT}')
+
+    return convert
+
+
+def place(text: str) -> tuple[int, ...]:
+    """Parse ROW,COLUMN or ROW,COLUMN,LAYER."""
+    parts = text.split(',')
+    if len(parts) in (2, 3) and all(part.isascii() and part.isdigit() for part in parts):
+        return tuple(map(int, parts))
+    raise argparse.ArgumentTypeError(f'{text!r} is not ROW,COLUMN or ROW,COLUMN,LAYER')
+
+
+def pitches(text: str) -> tuple[float, float, float]:
+    """Parse one pitch, or those along x, y and z [mm]."""
+    try:
+        values = [number_in(1e-3, 1e4)(part) for part in text.split(',')]
+        x, y, z = values * 3 if len(values) == 1 else values
+    except ValueError:
+        raise argparse.ArgumentTypeError(f'{text!r} is not MM or MM,MM,MM') from None
+    return x, y, z
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    kind = parser.add_mutually_exclusive_group(required=True)
+    kind.add_argument(
+        '--hex',
+        type=counts(2),
+        metavar='COLUMNSxROWS',
+        help='perforated sheet, every second row shifted to the right by half a pitch',
+    )
+    kind.add_argument(
+        '--square', type=counts(2), metavar='COLUMNSxROWS', help='sheet of rows and columns'
+    )
+    kind.add_argument(
+        '--cube',
+        type=counts(3),
+        metavar='COLUMNSxROWSxLAYERS',
+        help='block of layers of rows and columns of beads',
+    )
+    parser.add_argument(
+        '--pitch',
+        type=pitches,
+        required=True,
+        metavar='MM[,MM,MM]',
+        help='distance of neighbours [mm]: everywhere, or along x, y and z',
+    )
+    parser.add_argument(
+        '--diameter', type=number_in(1e-3, 1e4), metavar='MM', help='of beads or holes [mm]'
+    )
+    parser.add_argument(
+        '--blocked',
+        type=place,
+        action='append',
+        default=[],
+        metavar='ROW,COLUMN[,LAYER]',
+        help='place without hole or bead, counted from 1 at the upper left; repeat it',
+    )
+    parser.add_argument(
+        '--sd',
+        type=number_in(1e-6, 1e3),
+        default=0.1,
+        metavar='MM',
+        help='tolerance of the manufacture, as standard deviation of a coordinate [mm] '
+        '(default: 0.1)',
+    )
+    parser.add_argument(
+        '--picture',
+        type=Path,
+        metavar='FILE',
+        help='picture with ids, .svg or .png, to hold against the part (default: OUT.svg)',
+    )
+    parser.add_argument(
+        'file', type=Path, nargs='?', metavar='OUT.csv', help='phantom file to write'
+    )
+    parser.add_argument(
+        '--out', type=Path, metavar='OUT.csv', help='the same, as other commands name it'
+    )
+
+
+def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
+    """Call error with a sentence unless there is one file to write."""
+    if (arguments.file is None) == (arguments.out is None):
+        error('one file to write is needed: OUT.csv')
+    arguments.out = arguments.out or arguments.file
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Write the phantom file and its picture. Raises DataError."""
+    from ..exposures.phantom import require_size
+    from ..exposures.phantom_drawing import Drawing
+    from ..io.atomic import write_bytes
+    from ..io.phantom import write_phantom
+    from ..report.phantom_figure import phantom_figure, picture_bytes
+
+    picture = arguments.picture or arguments.out.with_suffix('.svg')
+    if picture.suffix.lower() not in PICTURES:
+        raise DataError(f'{picture}: a picture is {" or ".join(PICTURES)}')
+    if picture == arguments.out:
+        raise DataError(f'{picture}: picture and phantom file are the same file')
+    columns, rows, layers = (*(arguments.cube or arguments.square or arguments.hex), 1)[:3]
+    drawing = Drawing(
+        columns=columns,
+        rows=rows,
+        layers=layers,
+        pitch_mm=arguments.pitch,
+        hexagonal=arguments.hex is not None,
+        blocked=arguments.blocked,
+        diameter_mm=arguments.diameter,
+        sd_mm=arguments.sd,
+    )
+    phantom = drawing.phantom()
+    require_size(phantom)
+    drawn = picture_bytes(phantom_figure(drawing), picture.suffix.lower())
+    write_phantom(arguments.out, phantom)
+    write_bytes(picture, drawn)
+    count = len(phantom.target_id)
+    document = {
+        'out': str(arguments.out),
+        'picture': str(picture),
+        'targets': count,
+        'blocked': drawing.blocked_id.tolist(),
+    }
+    text = (
+        f'{count} targets, {len(drawing.blocked_id)} places are blocked\n'
+        f'written to {arguments.out}; hold {picture} against the part: ids from the upper left, '
+        'blocked places crossed out'
+    )
+    print_result(arguments, document, text)

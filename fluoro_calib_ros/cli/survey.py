@@ -1,0 +1,185 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""fluoro-calib survey."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..errors import DataError
+from ..options import declared
+from .arguments import (
+    add_bag_options,
+    add_collect,
+    add_option,
+    add_phantom,
+    add_source,
+    bag_selection,
+    file_settings,
+    number_in,
+    options_of,
+)
+from .output import print_findings, print_notes, print_result, print_round, print_unpaired
+
+if TYPE_CHECKING:
+    from ..estimation.survey import MeasuredDistance
+    from ..exposures.names import Names
+    from ..jobs.survey import SurveyOutcome
+
+NAME = 'survey'
+HELP = 'Survey the beads of your own phantom from its exposures: coordinates with their sd.'
+EXAMPLE = (
+    'fluoro-calib survey recording --phantom rough.csv --distance 1,45,120.05,0.02 '
+    '--distance 3,17,98.4,0.02 --out phantom.csv'
+)
+OPTIONS = ('model', 'loss', 'max_iterations', 'interior_sd')
+
+
+def distance(text: str) -> tuple[str, str, float, float]:
+    """Parse A,B,MM,SD as two beads and numbers."""
+    parts = [part.strip() for part in text.split(',')]
+    try:
+        first, second, length, sd = parts
+        return first, second, float(length), float(sd)
+    except ValueError:
+        raise argparse.ArgumentTypeError(
+            f'{text!r} is not BEAD,BEAD,MM,SD, such as 1,45,120.05,0.02'
+        ) from None
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..estimation.options import CalibrationOptions
+
+    source = add_source(parser, 'image size of a file that does not contain it [px]')
+    add_phantom(
+        source,
+        help='coordinates as far as they are known: to some centimetres for a phantom of some '
+        'decimetres; any file of a phantom, or one of the command phantom',
+    )
+    add_collect(source)
+    add_bag_options(parser)
+    parser.add_argument(
+        '--distance',
+        type=distance,
+        action='append',
+        default=[],
+        metavar='BEAD,BEAD,MM,SD',
+        help='measured distance between the centres of two beads, and its sd [mm]; repeat it: '
+        'the scale follows from one, and a second one checks it (default: scale of --phantom)',
+    )
+    group = parser.add_argument_group('adjustment')
+    options = declared(CalibrationOptions)
+    for name in OPTIONS:
+        add_option(group, options[name])
+    group.add_argument(
+        '--principal-distance',
+        type=number_in(1, 1e7),
+        metavar='PX',
+        help='start value [px] (default: from the observations)',
+    )
+    parser.add_argument(
+        '--keep-given',
+        action='store_true',
+        help='beads that cannot be surveyed keep their given coordinates, with the sd that the '
+        'others show (default: left out)',
+    )
+    parser.add_argument(
+        '--force', action='store_true', help='write the coordinates though the verdict is fail'
+    )
+    parser.add_argument(
+        '--out', required=True, type=Path, metavar='OUT.csv', help='phantom file to write'
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Write the surveyed phantom. Raises DataError, also for the verdict 'fail'."""
+    from ..estimation.options import CalibrationOptions
+    from ..io.phantom import write_phantom
+    from ..jobs.sources import read_source, read_survey
+    from ..jobs.survey import SurveyRequest, survey
+
+    given = read_survey(arguments.phantom, file_settings(arguments))
+    recording = read_source(
+        arguments.source,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+        collect=arguments.collect,
+        settings=file_settings(arguments, names=given.names),
+        selection=bag_selection(arguments),
+    )
+    print_notes((*given.notes, *recording.notes))
+    print_unpaired(arguments.source, recording.unpaired)
+    request = SurveyRequest(
+        recording.frames,
+        given.phantom,
+        _distances(arguments, given.names),
+        options_of(CalibrationOptions, arguments),
+        arguments.principal_distance,
+        keep_given=arguments.keep_given,
+    )
+    try:
+        outcome = survey(request, print_round)
+    except DataError as error:
+        raise error.at(arguments.source) from None
+    print_findings(outcome.findings, 'this cannot be right: ')
+    failed = [check for check in outcome.validation.checks if check.passed is False]
+    written = not failed or arguments.force
+    if written:
+        write_phantom(arguments.out, outcome.phantom, given.names)
+    path = str(arguments.out) if written else None
+    calibrate = ('calibrate', 'OTHER_EXPOSURES', '--phantom', arguments.out, '--out', 'result')
+    print_result(
+        arguments, _document(outcome, path), _text(outcome, path), calibrate if written else ()
+    )
+    if failed:
+        hint = '' if written else ', nothing is written (--force writes it)'
+        raise DataError(
+            f'the verdict is fail{hint}: {failed[0]}', at=arguments.source, kind=failed[0].kind
+        )
+
+
+def _distances(arguments: argparse.Namespace, names: Names) -> list[MeasuredDistance]:
+    """Return the distances of the arguments by target ids. Raises DataError."""
+    from ..estimation.survey import MeasuredDistance
+
+    def target(bead: str) -> int:
+        if bead in names.targets:
+            return names.targets[bead]
+        if not (bead.isascii() and bead.isdigit()):
+            raise DataError(f'--distance: {arguments.phantom} has no bead {bead!r}')
+        return int(bead)
+
+    return [
+        MeasuredDistance(target(first), target(second), length, sd)
+        for first, second, length, sd in arguments.distance
+    ]
+
+
+def _document(outcome: SurveyOutcome, path: str | None) -> dict[str, Any]:
+    from ..io.result_document import validation_document
+
+    beads = outcome.beads
+    columns = (beads.target_id, beads.xyz_mm, beads.covariance, beads.rays)
+    return {
+        'out': path,
+        'validation': validation_document(outcome.validation),
+        'scale': beads.scale,
+        'scale_sd': beads.scale_sd,
+        'beads': [
+            {'target_id': target, 'xyz_mm': xyz, 'covariance_mm2': covariance, 'rays': rays}
+            for target, xyz, covariance, rays in zip(*(column.tolist() for column in columns))
+        ],
+    }
+
+
+def _text(outcome: SurveyOutcome, path: str | None) -> str:
+    from ..report.verdict import verdict_text
+
+    sd = outcome.beads.sd_mm
+    counted = f'{len(sd)} beads surveyed, sd of a coordinate {min(sd):.3f} to {max(sd):.3f} mm'
+    written = '' if path is None else f'written to {path}'
+    return '\n'.join([counted, verdict_text(outcome.validation), written])

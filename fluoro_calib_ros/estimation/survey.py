@@ -1,0 +1,211 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The survey of a phantom from its own exposures: a free network at a measured scale.
+
+The self-calibration with inner constraints gives the shape of the phantom. Position and attitude
+are those of the given coordinates; the scale is that of measured distances, or else that of the
+given coordinates, too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+from ..exposures.phantom import Phantom
+from ..findings import Kind, Place
+from ..photogrammetry.adjustment import Adjustment
+from ..photogrammetry.measured_distances import Distances, Scaled, scaled_by_distances
+from ..photogrammetry.network import Network
+from .result import CalibrationResult
+
+
+@dataclass(frozen=True)
+class MeasuredDistance:
+    """Distance between the centres of two beads, as measured with a caliper or the like.
+
+    Attributes
+    ----------
+    first, second : int
+        Target ids.
+    length_mm, sd_mm : float
+    """
+
+    first: int
+    second: int
+    length_mm: float
+    sd_mm: float
+
+    def __post_init__(self) -> None:
+        where = Place(target_id=(self.first, self.second), name=self.name)
+        if self.first == self.second:
+            raise DataError('both ends are the same bead', place=where)
+        if not (0 < self.length_mm < np.inf and 0 < self.sd_mm < np.inf):
+            raise DataError('length and standard deviation are numbers above 0', place=where)
+
+    @property
+    def name(self) -> str:
+        """What it is called in a sentence."""
+        return f'distance {self.first} to {self.second}'
+
+
+@dataclass(frozen=True)
+class SurveyedBeads:
+    """Beads found from the images of an adjustment.
+
+    Attributes
+    ----------
+    target_id : (n,) ndarray of int
+    xyz_mm : (n, 3) ndarray
+    covariance : (n, 3, 3) ndarray
+        [mm^2]; with the uncertainty of the scale, which is common to all.
+    given_mm : (n, 3) ndarray
+    given_sd_mm : (n,) ndarray
+        The coordinates at the start.
+    rays : (n,) ndarray of int
+        Image points that agree.
+    angle_rad : (n,) ndarray
+        Largest angle between two of these rays.
+    scale, scale_sd : float
+        Factor on the given coordinates, and its standard deviation.
+    distances : tuple of MeasuredDistance
+    scaled : Scaled or None
+        How the distances agree; None without any.
+    joint_covariance : (3n, 3n) ndarray or None
+        Of all beads in the free network, without scale [mm^2]; None where they are too many.
+    """
+
+    target_id: NDArray[np.int64]
+    xyz_mm: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    given_mm: NDArray[np.float64]
+    given_sd_mm: NDArray[np.float64]
+    rays: NDArray[np.int64]
+    angle_rad: NDArray[np.float64]
+    scale: float
+    scale_sd: float
+    distances: tuple[MeasuredDistance, ...] = ()
+    scaled: Scaled | None = None
+    joint_covariance: NDArray[np.float64] | None = None
+
+    @property
+    def sd_mm(self) -> NDArray[np.float64]:
+        """Standard deviations (n,) of a coordinate, the RMS of all three axes."""
+        return np.sqrt(np.trace(self.covariance, axis1=1, axis2=2) / 3)
+
+    def without(self, target_id: Iterable[int]) -> SurveyedBeads:
+        """Return the beads except those with a target id; the scale stays."""
+        keep = ~np.isin(self.target_id, list(target_id))
+        of_beads = ('target_id', 'xyz_mm', 'covariance', 'given_mm', 'given_sd_mm')
+        names = (*of_beads, 'rays', 'angle_rad')
+        joint = self.joint_covariance
+        if joint is not None:
+            rows = np.flatnonzero(np.repeat(keep, 3))
+            joint = joint[np.ix_(rows, rows)]
+        kept = {name: getattr(self, name)[keep] for name in names}
+        return replace(self, joint_covariance=joint, **kept)
+
+    @property
+    def off_mm(self) -> NDArray[np.float64]:
+        """Distances (n,) from the given coordinates."""
+        return np.linalg.norm(self.xyz_mm - self.given_mm, axis=1)
+
+
+def surveyed_beads(
+    result: CalibrationResult, given: Phantom, distances: Sequence[MeasuredDistance] = ()
+) -> SurveyedBeads:
+    """Return the beads of a joint calibration with inner constraints, at a measured scale.
+
+    Raises DataError for a distance whose ends are not among its targets.
+    """
+    (solved,) = result.solved.values()
+    targets = result.targets
+    row = given.index(targets.target_id)
+    given_mm = given.xyz_mm[row]
+    given_sd = given.sd_mm[row]
+    network = solved.measured.network
+    in_datum = slice(None) if network.in_datum is None else network.in_datum
+    centre = targets.xyz_mm[in_datum].mean(axis=0)
+    if distances:
+        scaled = scaled_by_distances(
+            targets.xyz_mm,
+            targets.covariance,
+            solved.covariance_of_points(),
+            _rows(distances, targets.target_id),
+            centre,
+        )
+        xyz = scaled.xyz_mm
+        covariance = scaled.covariance
+        scale = scaled.scale
+        scale_sd = scaled.scale_sd
+    else:
+        scaled = None
+        xyz = targets.xyz_mm
+        scale = 1.0
+        scale_sd = _scale_sd(given_mm[in_datum], given_sd[in_datum])
+        arm = xyz - centre
+        covariance = targets.covariance + scale_sd**2 * arm[:, :, None] * arm[:, None, :]
+    rays, angle = _rays(network, solved.adjustment)
+    return SurveyedBeads(
+        target_id=targets.target_id,
+        xyz_mm=xyz,
+        covariance=covariance,
+        given_mm=given_mm,
+        given_sd_mm=given_sd,
+        rays=rays,
+        angle_rad=angle,
+        scale=scale,
+        scale_sd=scale_sd,
+        distances=tuple(distances),
+        scaled=scaled,
+        joint_covariance=targets.joint_covariance,
+    )
+
+
+def _rows(distances: Sequence[MeasuredDistance], target_id: NDArray[np.int64]) -> Distances:
+    """Return the distances by rows of targets. Raises DataError for an end without a row."""
+    for one in distances:
+        for end in (one.first, one.second):
+            if end not in target_id:
+                raise DataError(
+                    f'bead {end} is not found from the images: it is not on the phantom, or too '
+                    'few exposures show it',
+                    kind=Kind.FEW_RAYS,
+                    place=Place(target_id=(end,), name=one.name),
+                )
+    pairs = np.array([(one.first, one.second) for one in distances])
+    return Distances(
+        np.searchsorted(target_id, pairs),
+        np.array([one.length_mm for one in distances], dtype=float),
+        np.array([one.sd_mm for one in distances], dtype=float),
+    )
+
+
+def _scale_sd(given_mm: NDArray[np.float64], given_sd: NDArray[np.float64]) -> float:
+    """Standard deviation of the scale of given coordinates with independent errors."""
+    square = np.sum((given_mm - given_mm.mean(axis=0)) ** 2, axis=1)
+    return float(np.sqrt(np.sum(given_sd**2 * square)) / np.sum(square))
+
+
+def _rays(
+    network: Network, adjustment: Adjustment
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Number (n,) of the inlier rays of each object point, and largest angle (n,) of two."""
+    parameters = adjustment.parameters
+    rows = np.flatnonzero(adjustment.inliers)
+    point = network.point[rows]
+    ray = parameters.points_mm[point] - parameters.position_mm[network.exposure[rows]]
+    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
+    order = np.argsort(point, kind='stable')
+    count = np.bincount(point, minlength=network.n_points)
+    angle = np.zeros(network.n_points)
+    for number, own in enumerate(np.split(ray[order], np.cumsum(count)[:-1])):
+        if len(own) > 1:
+            # Rays from both sides are one direction: they meet as badly as parallel ones.
+            angle[number] = np.arccos(np.clip(np.abs(own @ own.T).min(), 0, 1))
+    return count, angle

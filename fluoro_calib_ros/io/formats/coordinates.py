@@ -1,0 +1,224 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Lists of bead coordinates as labs and makers of phantoms share them.
+
+A row a bead, separated by blanks, commas, tabs or semicolons. Without a header: x y z, and the
+beads are counted from 1; or id x y z; or x y z name. With a header: columns x, y, z in any order,
+id or name, sd and diameter, a unit after the name of a column (x_mm, "x [mm]", X (cm)). Rows that
+begin with # are comments.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...errors import DataError
+from ...exposures.names import MAX_ID, Names, number_names, without_trivial
+from ...exposures.phantom import Phantom
+from ...limits import read_limits
+from ..access import read_text
+from ..csv_table import decimal_point
+from .content import UNITS_MM, Content, FileSettings, Format, Sample, from_units
+from .text import MAX_SHOWN, Row, table_of
+from .xmalab_frame import DEFAULT_SD_MM
+
+_COLUMN = re.compile(r'"?([a-z]+)(?:[ _]*[\[(]?(mm|cm|m)[\])]?)?"?')
+# Names of columns that mean the same.
+_SAME = {
+    **dict.fromkeys(('bead', 'label', 'marker', 'name', 'no', 'nr', 'number', 'point'), 'id'),
+    **dict.fromkeys(('sigma', 'std', 'accuracy', 'precision'), 'sd'),
+    'd': 'diameter',
+}
+# Columns of other files of coordinates, whose own readers say what they lack.
+_OTHERS = {'target_id', 'frame', 'exposure'}
+_KNOWN = ('id', 'x', 'y', 'z', 'sd', 'diameter')
+MOST_CELLS = 12  # of a header that may be one of beads
+
+
+@dataclass(frozen=True)
+class _Layout:
+    """Column of every part, by name, and the unit of the header, None where it says none."""
+
+    columns: dict[str, int]
+    unit: str | None = None
+
+
+def recognise(sample: Sample) -> bool:
+    """Return whether the first rows are those of such a list."""
+    lines = [line for line in sample.lines if not line.startswith('#')]
+    if len(lines) < 2:
+        return False
+    separator = _separator(lines)
+    rows = [_cells(line, separator) for line in lines]
+    header = _header(rows[0])
+    if header is not None:
+        return len(rows[0]) <= MOST_CELLS
+    return all(
+        _without_header(row) == _without_header(rows[0]) != () for row in rows[1:-1] or rows
+    )
+
+
+def read(path: Path, settings: FileSettings) -> Content:
+    """Read the survey of a phantom. Raises DataError that names the row."""
+    text = read_text(path)
+    lines = ['' if line.lstrip().startswith('#') else line for line in text.splitlines()]
+    separator = _separator([line.strip() for line in lines if line.strip()])
+    rows = table_of(path, '\n'.join(lines), separator)
+    layout = _header(rows[0].cells)
+    beads = rows if layout is None else rows[1:]
+    if not beads:
+        raise DataError(f'{path}: the file has a header, but no beads')
+    most = read_limits().max_targets
+    if len(beads) > most:
+        raise DataError(f'{path}: phantoms of more than {most} targets are not read')
+    if layout is None:
+        layout = _of_numbers(rows)
+    for row in beads:
+        if len(row.cells) != len(rows[0].cells):
+            row.fail(f'{len(row.cells)} columns, but the first row has {len(rows[0].cells)}')
+    mm = _unit(path, layout, settings)
+    xyz = from_units(np.array([_numbers(row, layout, ('x', 'y', 'z')) for row in beads]), mm)
+    sd = np.full(len(beads), DEFAULT_SD_MM)
+    notes: tuple[str, ...] = ()
+    if 'sd' in layout.columns:
+        sd = _positive(beads, layout, 'sd') * mm
+    else:
+        notes = (f'{path}: the file has no standard deviation, {DEFAULT_SD_MM:g} mm is used',)
+    diameter = _positive(beads, layout, 'diameter') * mm if 'diameter' in layout.columns else None
+    ids = _ids(beads, layout)
+    try:
+        survey = Phantom(np.array(list(ids.values())), xyz, sd, diameter)
+    except DataError as error:
+        raise error.at(path) from None
+    return Content(survey=survey, names=Names(without_trivial(ids)), notes=notes)
+
+
+def _separator(lines: Sequence[str]) -> str:
+    """Return the separator that the first bead has, ' ' for blanks."""
+    first = lines[1] if len(lines) > 1 else ''.join(lines)
+    return next((mark for mark in ';\t,' if mark in first), ' ')
+
+
+def _cells(line: str, separator: str) -> list[str]:
+    if separator == ' ':
+        return line.split()
+    cells = [cell.strip() for cell in line.split(separator)]
+    return [decimal_point(cell) for cell in cells] if separator == ';' else cells
+
+
+def _header(cells: Sequence[str]) -> _Layout | None:
+    """Return the layout that the first row tells, None where it is no header."""
+    columns: dict[str, int] = {}
+    units = set()
+    for number, cell in enumerate(cells):
+        found = _COLUMN.fullmatch(cell.strip().lower())
+        if found is None:
+            continue
+        name = _SAME.get(found[1], found[1])
+        if name in columns:
+            return None
+        columns[name] = number
+        if found[2] and name in ('x', 'y', 'z'):
+            units.add(found[2])
+    if not {'x', 'y', 'z'} <= set(columns) or _OTHERS & {cell.lower() for cell in cells}:
+        return None
+    known = {name: columns[name] for name in _KNOWN if name in columns}
+    return _Layout(known, ''.join(units) if len(units) == 1 else None)
+
+
+def _without_header(cells: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of the columns of a row without header, none for no such row."""
+    is_number = [_is_number(cell) for cell in cells]
+    if len(cells) == 3 and all(is_number):
+        return 'x', 'y', 'z'
+    if len(cells) == 4 and all(is_number[1:]) and (cells[0].isdigit() or not is_number[0]):
+        return 'id', 'x', 'y', 'z'
+    if len(cells) == 4 and all(is_number[:3]) and not is_number[3]:
+        return 'x', 'y', 'z', 'id'
+    return ()
+
+
+def _of_numbers(rows: Sequence[Row]) -> _Layout:
+    """Return the layout of rows without header. Raises DataError for other columns."""
+    names = _without_header(rows[0].cells)
+    if not names:
+        rows[0].fail(
+            f'{len(rows[0].cells)} columns without a header that names x, y and z; a bead is '
+            'x y z, id x y z or x y z name'
+        )
+    return _Layout({name: number for number, name in enumerate(names)})
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return '_' not in cell
+
+
+def _unit(path: Path, layout: _Layout, settings: FileSettings) -> float:
+    """Return the mm of the unit. Raises DataError where header and user contradict each other."""
+    if layout.unit is None:
+        return settings.unit_read(path)
+    if settings.units not in (None, layout.unit):
+        raise DataError(
+            f'{path}: the header says {layout.unit}, but --units says {settings.units}'
+        )
+    return UNITS_MM[layout.unit]
+
+
+def _numbers(row: Row, layout: _Layout, names: Sequence[str]) -> list[float]:
+    """Return the numbers of some columns. Raises DataError that names the column."""
+    out = []
+    for name in names:
+        cell = row.cells[layout.columns[name]]
+        if not _is_number(cell) or not np.isfinite(float(cell)):
+            row.fail(f'{name} is {cell[:MAX_SHOWN]!r}, not a finite number')
+        out.append(float(cell))
+    return out
+
+
+def _positive(rows: Sequence[Row], layout: _Layout, name: str) -> np.ndarray:
+    values = np.array([_numbers(row, layout, (name,))[0] for row in rows])
+    if not (values > 0).all():
+        rows[int(np.argmin(values > 0))].fail(f'{name} is not above 0')
+    return values
+
+
+def _ids(rows: Sequence[Row], layout: _Layout) -> dict[str, int]:
+    """Return the ids by name, in the order of the rows. Raises DataError for one that is twice."""
+    if 'id' not in layout.columns:
+        return {str(number): number for number in range(1, len(rows) + 1)}
+    cells = [row.cells[layout.columns['id']] for row in rows]
+    first: dict[str, Row] = {}
+    for row, cell in zip(rows, cells):
+        if not cell:
+            row.fail('the bead has no id')
+        other = first.setdefault(cell, row)
+        if other is not row:
+            row.fail(f'bead {cell[:MAX_SHOWN]!r} is already given in row {other.line}')
+    if not all(cell.isascii() and cell.isdigit() for cell in cells):
+        return number_names(cells)
+    for row, cell in zip(rows, cells):
+        if len(cell) > len(str(MAX_ID)) or int(cell) > MAX_ID:
+            row.fail(f'id is {cell[:MAX_SHOWN]!r}, not between 0 and {MAX_ID}')
+    return {cell: int(cell) for cell in cells}
+
+
+FORMAT = Format(
+    'coordinates',
+    'list of bead coordinates',
+    parts=('survey',),
+    recognise=recognise,
+    read=read,
+    write=None,
+    looks_like='x y z, id x y z, or a header such as id,x_mm,y_mm,z_mm,sd_mm,diameter_mm',
+    says_units=False,
+)

@@ -1,0 +1,262 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The survey job: coordinates of a phantom from its own exposures.
+
+Given coordinates need only be good enough to tell where each exposure was taken from: to some
+centimetres for a phantom of some decimetres. The self-calibration does the rest.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ..checks.check import Check, Validation, verdict_of
+from ..checks.survey import (
+    check_survey,
+    check_survey_halves,
+    displaced,
+    halves_not_compared,
+    unsurveyed,
+)
+from ..errors import DataError
+from ..estimation.calibrate import calibrate_request
+from ..estimation.initial_network import MIN_EXPOSURES
+from ..estimation.options import CalibrationOptions, CalibrationRequest
+from ..estimation.result import CalibrationResult
+from ..estimation.rounds import Round
+from ..estimation.survey import MeasuredDistance, SurveyedBeads, surveyed_beads
+from ..exposures.frame import Frame
+from ..exposures.phantom import MIN_TARGETS, Phantom
+from ..findings import Finding, Kind, Severity
+from .calibration import run_calibration
+
+EXACT_SD_MM = 1e-6  # of coordinates that count as known
+DECIMALS = 6  # of mm in the file
+
+
+@dataclass(frozen=True)
+class SurveyRequest:
+    """Exposures of a phantom that is to be surveyed.
+
+    Attributes
+    ----------
+    frames : mapping of str to sequence of Frame
+        By fluoroscope; all are adjusted together.
+    given : Phantom
+        Its coordinates as far as they are known, by a drawing or a ruler, and their sd.
+    distances : sequence of MeasuredDistance
+        Two or more, for scale and check.
+    options : CalibrationOptions
+        Of the self-calibration; the datum is that of a free network.
+    principal_distance : float or None
+        Start value [px]; None: from the observations.
+    keep_given : bool
+        Whether beads that cannot be surveyed keep their given coordinates; else they are left out.
+    """
+
+    frames: Mapping[str, Sequence[Frame]]
+    given: Phantom
+    distances: Sequence[MeasuredDistance] = ()
+    options: CalibrationOptions = field(default_factory=CalibrationOptions)
+    principal_distance: float | None = None
+    keep_given: bool = False
+
+    def calibration_of(
+        self, frames: Mapping[str, Sequence[Frame]], phantom: Phantom
+    ) -> CalibrationRequest:
+        """Return the request of the free network of some exposures."""
+        return CalibrationRequest(
+            frames,
+            phantom,
+            replace(self.options, datum='inner'),
+            joint=True,
+            principal_distance=self.principal_distance,
+        )
+
+
+@dataclass(frozen=True)
+class SurveyOutcome:
+    """A surveyed phantom.
+
+    Attributes
+    ----------
+    phantom : Phantom
+    beads : SurveyedBeads
+        Those that were surveyed.
+    validation : Validation
+        Verdict on the survey.
+    findings : tuple of Finding
+        What was excluded, and where the given coordinates are wrong.
+    result : CalibrationResult
+        The self-calibration behind it.
+    """
+
+    phantom: Phantom
+    beads: SurveyedBeads
+    validation: Validation
+    findings: tuple[Finding, ...]
+    result: CalibrationResult
+
+
+def survey(
+    request: SurveyRequest,
+    progress: Callable[[str, Round], None] | None = None,
+    raise_if_cancelled: Callable[[], None] | None = None,
+) -> SurveyOutcome:
+    """Survey a phantom from its own exposures.
+
+    Parameters
+    ----------
+    request : SurveyRequest
+    progress : callable, optional
+        Called with the names of the fluoroscopes and the Round after every round.
+    raise_if_cancelled : callable, optional
+        Called before every step; may raise to stop.
+
+    Returns
+    -------
+    SurveyOutcome
+
+    Raises
+    ------
+    DataError
+        For exposures that do not determine coordinates, interior orientation and distortion, that
+        cannot be of the phantom, or that show too few beads well.
+    """
+    began = time.perf_counter()
+    _require_known(request)
+    result = _free_network(request, progress, raise_if_cancelled)
+    if not result.converged:
+        raise DataError(
+            'the adjustment did not converge: the exposures hardly determine coordinates, '
+            'interior orientation and distortion together',
+            kind=Kind.UNDETERMINED,
+            advice='turn and move the phantom more between the exposures',
+        )
+    found = surveyed_beads(result, request.given, request.distances)
+    left_out = unsurveyed(found)
+    lacking = {target for one in left_out for target in one.place.target_id}
+    beads = found.without(lacking)
+    checks = check_survey(found)
+    if len(beads.target_id) < MIN_TARGETS:
+        raise DataError(
+            f'only {len(beads.target_id)} beads can be surveyed',
+            *(replace(one, severity=Severity.ERROR) for one in left_out),
+            kind=Kind.FEW_TARGETS,
+        )
+    checks.append(_halves(request, result, raise_if_cancelled))
+    moved = displaced(beads)
+    return SurveyOutcome(
+        _phantom(request, beads),
+        beads,
+        Validation(verdict_of(checks), tuple(checks), {}, time.perf_counter() - began),
+        (*result.findings, *left_out, *([] if moved is None else [moved])),
+        result,
+    )
+
+
+def _require_known(request: SurveyRequest) -> None:
+    """Raise DataError for a distance to a bead that the phantom does not have."""
+    for one in request.distances:
+        for end in (one.first, one.second):
+            if request.given.index([end])[0] < 0:
+                raise DataError(
+                    f'{one.name}: bead {end} is not on the phantom', kind=Kind.NOT_IN_BOTH
+                )
+
+
+def _free_network(
+    request: SurveyRequest,
+    progress: Callable[[str, Round], None] | None,
+    raise_if_cancelled: Callable[[], None] | None,
+) -> CalibrationResult:
+    """Self-calibrate with inner constraints; rough coordinates are replaced and tried again.
+
+    Raises DataError.
+    """
+
+    def adjusted(given: Phantom, force: bool) -> CalibrationResult:
+        return run_calibration(
+            request.calibration_of(request.frames, given),
+            force=force,
+            progress=progress,
+            raise_if_cancelled=raise_if_cancelled,
+        ).result
+
+    try:
+        return adjusted(request.given, force=False)
+    except DataError as error:
+        # What does not fit the given coordinates may fit those that the images give.
+        if any(found.kind is not Kind.OTHER_PHANTOM for found in error.findings):
+            raise
+        refused = error
+    try:
+        rough = adjusted(request.given, force=True)
+        return adjusted(_with_found(request.given, rough), force=False)
+    except DataError:
+        raise refused from None
+
+
+def _with_found(given: Phantom, result: CalibrationResult) -> Phantom:
+    """Return given coordinates with those that an adjustment found in their place."""
+    xyz = given.xyz_mm.copy()
+    xyz[given.index(result.targets.target_id)] = result.targets.xyz_mm
+    return replace(given, xyz_mm=xyz)
+
+
+def _halves(
+    request: SurveyRequest,
+    result: CalibrationResult,
+    raise_if_cancelled: Callable[[], None] | None,
+) -> Check:
+    """Compare surveys of every other exposure."""
+    numbers = sorted({e.exposure for one in result.fluoroscopes.values() for e in one.exposures})
+    fewest = min(len(one.exposures) for one in result.fluoroscopes.values())
+    if fewest < 2 * MIN_EXPOSURES:
+        return halves_not_compared(
+            f'{fewest} exposures are too few for two halves of {MIN_EXPOSURES} or more'
+        )
+    # The coordinates found so far are the better start values. The scale is not compared, so that
+    # its uncertainty does not count.
+    start = replace(
+        _with_found(request.given, result), sd_mm=np.full(len(request.given.sd_mm), EXACT_SD_MM)
+    )
+    parts = []
+    for half in (set(numbers[::2]), set(numbers[1::2])):
+        frames = {
+            name: [frame for frame in exposures if frame.number in half]
+            for name, exposures in request.frames.items()
+        }
+        try:
+            part = calibrate_request(
+                request.calibration_of(frames, start), None, raise_if_cancelled
+            )
+        except (DataError, np.linalg.LinAlgError) as error:
+            return halves_not_compared(f'half of the exposures cannot be adjusted ({error})')
+        beads = surveyed_beads(part, start)
+        lacking = {target for one in unsurveyed(beads) for target in one.place.target_id}
+        parts.append(beads.without(lacking))
+    return check_survey_halves(*parts)
+
+
+def _phantom(request: SurveyRequest, beads: SurveyedBeads) -> Phantom:
+    """Return the phantom with the coordinates that were found."""
+    given = request.given
+    row = given.index(beads.target_id)
+    found_mm = np.round(beads.xyz_mm, DECIMALS)
+    found_sd = np.maximum(np.round(beads.sd_mm, DECIMALS), EXACT_SD_MM)
+    if not request.keep_given:
+        diameter = None if given.diameter_mm is None else given.diameter_mm[row]
+        return Phantom(beads.target_id, found_mm, found_sd, diameter)
+    # They are as far off as those that were surveyed, if not further by their sd.
+    off = float(np.sqrt(np.mean(beads.off_mm**2) / 3))
+    xyz = given.xyz_mm.copy()
+    sd = np.maximum(given.sd_mm, off)
+    xyz[row] = found_mm
+    sd[row] = found_sd
+    return replace(given, xyz_mm=xyz, sd_mm=sd)

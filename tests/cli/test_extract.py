@@ -144,7 +144,7 @@ def test_a_stack_is_numbered_by_its_order(folder):
     [
         (np.zeros((SIZE, SIZE), np.uint8), 'the image is empty'),
         (np.zeros((1, 1), np.uint8), 'only 1 x 1 px'),
-        (bead_image([[200, 200]], (SIZE, SIZE), noise=0.0), 'at least 10 are needed'),
+        (bead_image([[200, 200]], (SIZE, SIZE), noise=0.01), 'at least 10 are needed'),
     ],
 )
 def test_images_without_the_phantom_give_one_sentence(folder, capsys, image, sentence):

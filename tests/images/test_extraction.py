@@ -310,7 +310,7 @@ def test_a_survey_with_wrong_beads_gives_no_wrong_observation():
     wrong = rng.permutation(len(xyz))[:40]
     xyz[wrong] += rng.normal(0, 6, (40, 3))
     seen_of = extraction().detections
-    seen = Seen.of(seen_of.uv, seen_of.field, seen_of.radius_px)
+    seen = Seen.of(seen_of.uv, seen_of.light.field, seen_of.radius_px)
     found = match(seen, PhantomModel.of(xyz), Lens((1024, 1024), 4400.0))
     error = np.linalg.norm(seen.uv[found.detection] - true[found.bead], axis=1)
     right = ~np.isin(found.bead, wrong)

@@ -1,0 +1,162 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Rigid bodies with markers, and their poses over a trial with the covariances of all errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import DataError
+
+POSE_SIZE = 6  # position [mm], then rotation about the axes of the rig frame [rad]
+
+
+@dataclass(frozen=True)
+class Body:
+    """A rigid body and the coordinates of its markers.
+
+    Raises DataError for arrays of other lengths, repeated markers and values that are not finite.
+
+    Attributes
+    ----------
+    name : str
+    target_id : (m,) ndarray
+        Markers, ascending.
+    xyz_mm : (m, 3) ndarray
+        In the frame of the body; NaN for a marker whose place is to be estimated.
+    sd_mm : (m,) ndarray
+        Standard deviations of each of these coordinates; infinite where they are not known.
+    """
+
+    name: str
+    target_id: NDArray[np.int64]
+    xyz_mm: NDArray[np.float64]
+    sd_mm: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        target_id = np.array(self.target_id, dtype=np.int64).reshape(-1)
+        xyz = np.array(self.xyz_mm, dtype=float).reshape(-1, 3)
+        sd = np.array(self.sd_mm, dtype=float).reshape(-1)
+        if not self.name:
+            raise DataError('a body has no name')
+        if not len(target_id) == len(xyz) == len(sd):
+            raise DataError(
+                f'body {self.name}: {len(target_id)} markers, {len(xyz)} positions and {len(sd)} '
+                'standard deviations'
+            )
+        if not len(target_id):
+            raise DataError(f'body {self.name}: it has no markers')
+        order = np.argsort(target_id, kind='stable')
+        target_id = target_id[order]
+        repeated = target_id[1:][np.diff(target_id) == 0]
+        if len(repeated):
+            raise DataError(f'body {self.name}: marker {repeated[0]} is given twice')
+        known = np.isfinite(xyz).all(axis=1)[order]
+        bad = (known & ~(sd[order] >= 0)) | np.isinf(xyz[order]).any(axis=1)
+        if bad.any():
+            raise DataError(
+                f'body {self.name}: the coordinates or the standard deviation of marker '
+                f'{target_id[bad][0]} are not finite, or negative'
+            )
+        for name, array in (('target_id', target_id), ('xyz_mm', xyz[order]), ('sd_mm', sd[order])):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether the place of a marker (m,) is known."""
+        return np.isfinite(self.xyz_mm).all(axis=1)
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """Mean (3,) of the known markers [mm]."""
+        return self.xyz_mm[self.known].mean(axis=0)
+
+
+def check_bodies(bodies: Sequence[Body]) -> None:
+    """Raise DataError for no bodies, two of one name, and a marker of two bodies."""
+    if not bodies:
+        raise DataError('there are no bodies')
+    owners: dict[int, str] = {}
+    names: set[str] = set()
+    for body in bodies:
+        if body.name in names:
+            raise DataError(f'two bodies are called {body.name}')
+        names.add(body.name)
+        for marker in body.target_id.tolist():
+            if marker in owners:
+                raise DataError(
+                    f'marker {marker} is one of {owners[marker]} and of {body.name}; '
+                    'a marker belongs to one body'
+                )
+            owners[marker] = body.name
+
+
+class PoseStatus(IntEnum):
+    """How a pose was obtained; the values are those of the messages."""
+
+    OK = 0
+    WEAK = 1  # too few markers or views for all of it: what is missing is predicted
+    FILLED = 2  # no marker of the body was seen: predicted, or interpolated
+    FAILED = 3  # unknown
+    AMBIGUOUS = 4  # markers nearly on a plane or a line fit in a second pose, too
+
+
+STATUS_NAMES = tuple(status.name for status in PoseStatus)
+
+
+@dataclass(frozen=True)
+class BodyPoses:
+    """Poses of one body, body -> rig frame: P = R x + t.
+
+    Errors are (dt, w): t + dt [mm] and exp([w]x) R [rad], about the axes of the rig frame.
+
+    Attributes
+    ----------
+    body : str
+    number, stamp_ns : (T,) ndarray
+        Of the exposures.
+    rotation : (T, 3, 3) ndarray
+        NaN where there is no pose.
+    position_mm : (T, 3) ndarray
+        Of the origin of the body.
+    covariance_noise : (T, 6, 6) ndarray
+        Of the random errors, which differ from exposure to exposure.
+    covariance_fixed : (T, 6, 6) ndarray
+        Of errors of this body that stay: its shape, and the corrections of the images.
+    rig_root : (T, 6, k) ndarray
+        By k independent unknowns of variance one of the orientation of the rig, which the poses of
+        all bodies and exposures have in common.
+    markers : (T,) ndarray
+        Number of markers that were used.
+    status : (T,) ndarray
+        PoseStatus as uint8.
+    """
+
+    body: str
+    number: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+    rotation: NDArray[np.float64]
+    position_mm: NDArray[np.float64]
+    covariance_noise: NDArray[np.float64]
+    covariance_fixed: NDArray[np.float64]
+    rig_root: NDArray[np.float64]
+    markers: NDArray[np.int64]
+    status: NDArray[np.uint8]
+
+    @property
+    def covariance(self) -> NDArray[np.float64]:
+        """Covariances (T, 6, 6) by all errors [mm, rad]."""
+        by_rig = self.rig_root @ np.swapaxes(self.rig_root, 1, 2)
+        return self.covariance_noise + self.covariance_fixed + by_rig
+
+    @property
+    def sd(self) -> NDArray[np.float64]:
+        """Standard deviations (T, 6) by all errors [mm, rad]."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
-
 """What the program finds, as data: kind, place, cause, advice, severity and numbers.
 
 A Finding travels from where it is made to the edge (command, report, file, message), which prints

@@ -1,8 +1,5 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
-
-# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
 """The terms of one fluoroscope in a collocation: functions, prior, gauge, terms of exposures."""
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
-
-# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
 """Refinements of a collocation: what a solution shows that its terms do not have yet.
 
 A refinement of one prior proposes another prior for the same functions. A refinement of the terms

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
-
 """Node that collects exposures of the phantom and self-calibrates the fluoroscopes on request.
 
 A thread of its own receives the frames. Another one runs all other callbacks: those that take long

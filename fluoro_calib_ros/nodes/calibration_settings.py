@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
-
 """Parameters of the calibration node, and the rig that they describe."""
 
 from __future__ import annotations

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
-
 """Node that finds the beads of the phantom, or markers, in the images of the fluoroscopes, live.
 
 One thread receives the images and numbers them; each fluoroscope has a thread and a process of its

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
-
 """Node that intersects the corrected views of a rig: points in space with covariance, live."""
 
 from __future__ import annotations

@@ -1,9 +1,6 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
-# SPDX-License-Identifier: Apache-2.0
-
 """Orientations of the rig that arrive at the reconstruction node, ready for use."""
 
 from __future__ import annotations

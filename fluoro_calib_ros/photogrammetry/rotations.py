@@ -131,3 +131,21 @@ def rotation_angle(rotation: ArrayLike) -> np.ndarray:
     )
     cosine = 0.5 * (np.trace(r, axis1=-2, axis2=-1) - 1)
     return np.arctan2(sine, cosine)
+
+
+def left_jacobian(w: ArrayLike) -> np.ndarray:
+    """Matrices J (..., 3, 3) with exp(w + d) = exp(J d) exp(w) to first order, of vectors (..., 3).
+
+    Source: Sola, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics", 2018,
+    Eq. 145.
+    """
+    w = np.asarray(w, dtype=float)
+    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    k = cross_matrix(w)
+    first = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
+    # (a - sin a) / a^3; its series where the quotient would lose digits.
+    small = angle < 0.05
+    square = angle * angle
+    safe = np.where(small, 1.0, angle)
+    second = np.where(small, (1 - square / 20) / 6, (safe - np.sin(safe)) / safe**3)
+    return np.eye(3) + first * k + second * (k @ k)

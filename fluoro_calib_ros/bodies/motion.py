@@ -1,0 +1,452 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Motion of rigid bodies over a trial: a Kalman filter and smoother without a cutoff to choose.
+
+State: position of the centre of a body and rotation about the axes of the rig frame, their
+velocities and accelerations. The jerk is white noise whose density changes in time,
+
+    x' = F x + w,  w ~ N(0, Q),  Q = diag(q_t, q_r) (x) Q_3(dt)
+
+(Bar-Shalom, Li and Kirubarajan, "Estimation with Applications to Tracking and Navigation", 2001,
+6.2.3). Rotations are deviations from the predicted rotation, exp([th]x) R, as in an
+error-state filter (Sola et al. 2018). What an exposure tells of a pose has the form of a normal
+matrix, which may be singular: an image point of one view is used, too.
+
+Smoothing is that of de Jong ("Smoothing and interpolation with the state-space model", J. Am.
+Stat. Assoc. 84, 1989): backwards,
+
+    r <- H'z + L'F'r,  N <- H'MH + L'F'N F L,  x_T = x + P r,  P_T = P - P N P.
+
+The log of each density, h = log q, follows a random walk. The derivative of the likelihood of all
+data by h_k is (r'Qr - tr QN) / 2 with r and N of the step k (Koopman, "Disturbance smoother for
+state space models", Biometrika 80, 1993), its expected information about tr(QN) / 2. So the most
+probable course of h follows by Fisher scoring with a tridiagonal matrix, and the variance of its
+steps by EM. A trial tells how quickly it changes: nothing is to be chosen. Live, h is updated by
+the derivative of the likelihood of each exposure.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solveh_banded
+
+from ..photogrammetry.rotations import left_jacobian, matrix_from_vector, vector_from_matrix
+
+STATE = 18
+POSE = slice(0, 6)
+KINDS = (slice(0, 3), slice(3, 6))  # of the components of a pose: position, rotation
+
+# Of a body that appears: wide enough for any motion of a living joint. A fall from 2 m ends with
+# 6 m/s, a golf swing turns the forearm at 40 rad/s; impacts reach 100 g and 5000 rad/s^2.
+START_SD = np.repeat([0.0, 6e3, 1e6], 6) * np.tile(np.repeat([1.0, 1 / 150], 3), 3)
+# Log of the density of jerk of a body that appears, [mm^2/s^5] and [rad^2/s^5], and its standard
+# deviation: from a body at rest (a jerk of 1 mm/s^3 for 1 s) to an impact (1e8 mm/s^3 for 1 ms).
+START_LOG = np.array([18.0, 8.0])
+START_LOG_SD = 6.0
+# First variance of the walk of h in a second, then estimated: h changes by about 3 in 0.1 s.
+WALK = 90.0
+MAX_ROUNDS = 12
+ROUND_ENDS = 0.1  # largest change of h in a round; it changes a standard deviation by 1 %
+MAX_STEP = 2.5  # of h in a round
+ADAPTATIONS = 4  # rounds of h in an exposure, live
+LOG_RANGE = (-20.0, 50.0)
+
+
+@dataclass(frozen=True)
+class PoseInformation:
+    """What one exposure tells of the poses of B bodies, about a pose that it was linearised at.
+
+    Attributes
+    ----------
+    rotation : (B, 3, 3) ndarray
+    centre_mm : (B, 3) ndarray
+    normal : (B, 6, 6) ndarray
+        Normal matrix of position and rotation by the random errors, 0 for a body that is not seen.
+    right : (B, 6) ndarray
+        Right side: 0 at the most likely pose.
+    """
+
+    rotation: NDArray[np.float64]
+    centre_mm: NDArray[np.float64]
+    normal: NDArray[np.float64]
+    right: NDArray[np.float64]
+
+
+@dataclass
+class _Step:
+    """One exposure of the filter: its prediction, and what the exposure changed.
+
+    into (B, 18, 18): transition from the exposure before, 0 where a body appears. dt_s: time since
+    it. reference (B, 3, 3): predicted rotations; mean (B, 18): predicted state, without rotation.
+    z (B, 6), m (B, 6, 6): of the smoother. log_q (B, 2): h of the noise into this exposure.
+    """
+
+    dt_s: float
+    into: np.ndarray
+    reference: np.ndarray
+    mean: np.ndarray
+    covariance: np.ndarray
+    z: np.ndarray
+    m: np.ndarray
+    log_q: np.ndarray
+    started: np.ndarray
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Smoothed motion of B bodies in T exposures.
+
+    NaN before a body appears. Covariances are those of the random errors.
+
+    Attributes
+    ----------
+    rotation : (T, B, 3, 3) ndarray
+    centre_mm : (T, B, 3) ndarray
+    velocity, acceleration : (T, B, 6) ndarray
+        [mm/s, rad/s] and [mm/s^2, rad/s^2], about the axes of the rig frame.
+    covariance : (T, B, 18, 18) ndarray
+        Of position, rotation, velocities and accelerations.
+    log_q : (T, B, 2) ndarray
+        Log of the densities of the jerk of position and rotation.
+    """
+
+    rotation: NDArray[np.float64]
+    centre_mm: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    log_q: NDArray[np.float64]
+
+
+def noise_factors(dt_s: float) -> NDArray[np.float64]:
+    """Covariance (3, 3) of position, velocity and acceleration after dt_s of white jerk."""
+    powers = np.array([[5, 4, 3], [4, 3, 2], [3, 2, 1]])
+    return dt_s**powers / np.array([[20.0, 8, 6], [8, 3, 2], [6, 2, 1]])
+
+
+class MotionFilter:
+    """Kalman filter of the motion of bodies, exposure by exposure.
+
+    Parameters
+    ----------
+    count : int
+        Number of bodies B.
+    lag : int
+        Exposures that are kept to smooth with; None keeps all.
+    """
+
+    def __init__(self, count: int, lag: int | None = 0) -> None:
+        self.lag = lag
+        self.steps: list[_Step] = []
+        self.alive = np.zeros(count, dtype=bool)
+        self.rotation = np.broadcast_to(np.eye(3), (count, 3, 3)).copy()
+        self.mean = np.zeros((count, STATE))  # the rotation is a deviation, 0 after each step
+        self.covariance = np.zeros((count, STATE, STATE))
+        self.log_q = np.broadcast_to(START_LOG, (count, 2)).copy()
+        self._log_variance = np.full((count, 2), START_LOG_SD**2)
+        # Derivatives of the covariance by the two log densities.
+        self._slope = np.zeros((count, 2, STATE, STATE))
+        self._predicted: _Step | None = None
+
+    def predict(self, dt_s: float, log_q: NDArray[np.float64] | None = None) -> None:
+        """Predict the next exposure, dt_s later; log_q (B, 2) are given densities."""
+        count = len(self.alive)
+        if log_q is not None:
+            self.log_q = log_q
+        turn = dt_s * self.mean[:, 9:12] + dt_s**2 / 2 * self.mean[:, 15:18]
+        into = _transition(dt_s, turn)
+        noise = _noise(dt_s, self.log_q)
+        mean = (into @ self.mean[:, :, None])[:, :, 0]
+        mean[:, 3:6] = 0
+        back = np.swapaxes(into, 1, 2)
+        covariance = into @ self.covariance @ back + noise[:, 0] + noise[:, 1]
+        if log_q is None:
+            self._slope = into[:, None] @ self._slope @ back[:, None] + noise
+            self._log_variance = np.minimum(
+                self._log_variance + WALK * dt_s, START_LOG_SD**2
+            )
+        self._predicted = _Step(
+            dt_s,
+            into,
+            reference=matrix_from_vector(turn) @ self.rotation,
+            mean=mean,
+            covariance=covariance,
+            z=np.zeros((count, 6)),
+            m=np.zeros((count, 6, 6)),
+            log_q=self.log_q,
+            started=np.zeros(count, dtype=bool),
+        )
+
+    @property
+    def prediction(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Predicted rotations (B, 3, 3), centres (B, 3) and covariances (B, 6, 6) of the poses."""
+        step = self._predicted
+        assert step is not None
+        return step.reference, step.mean[:, :3], step.covariance[:, POSE, POSE]
+
+    def update(self, seen: PoseInformation, start: NDArray[np.bool_], adapt: bool = True) -> None:
+        """Take what an exposure tells; start (B,): bodies that appear, whose pose it determines.
+
+        adapt: whether the densities follow the exposures.
+        """
+        step = self._predicted
+        assert step is not None
+        if start.any():
+            self._start(step, seen, start)
+        normal = np.where(self.alive[:, None, None], seen.normal, 0)
+        right = np.where(self.alive[:, None], seen.right, 0)
+        difference = np.empty_like(right)
+        difference[:, :3] = seen.centre_mm - step.mean[:, :3]
+        difference[:, 3:] = vector_from_matrix(seen.rotation @ np.swapaxes(step.reference, 1, 2))
+        right = right + (normal @ difference[:, :, None])[:, :, 0]
+        _weigh(step, normal, right)
+        for _ in range(ADAPTATIONS if adapt else 0):
+            if not self._adapt(step):
+                break
+            _weigh(step, normal, right)
+        gain = step.covariance[:, :, POSE]
+        mean = step.mean + (gain @ step.z[:, :, None])[:, :, 0]
+        covariance = step.covariance - gain @ step.m @ np.swapaxes(gain, 1, 2)
+        if adapt:
+            kept = np.eye(STATE) - gain @ step.m @ np.eye(6, STATE)
+            self._slope = kept[:, None] @ self._slope @ np.swapaxes(kept, 1, 2)[:, None]
+        self.rotation = matrix_from_vector(mean[:, 3:6]) @ step.reference
+        mean[:, 3:6] = 0
+        self.mean = mean
+        self.covariance = (covariance + np.swapaxes(covariance, 1, 2)) / 2
+        self.steps.append(step)
+        if self.lag is not None:
+            del self.steps[: -(self.lag + 1)]
+
+    def lose(self, lost: NDArray[np.bool_]) -> None:
+        """Forget bodies (B,) whose prediction is worth nothing any more."""
+        self.alive = self.alive & ~lost
+
+    def _start(self, step: _Step, seen: PoseInformation, start: np.ndarray) -> None:
+        """Let bodies begin at the pose of an exposure."""
+        step.started = start
+        step.into = np.where(start[:, None, None], 0, step.into)
+        step.reference = np.where(start[:, None, None], seen.rotation, step.reference)
+        mean = np.zeros((len(start), STATE))
+        mean[:, :3] = seen.centre_mm
+        step.mean = np.where(start[:, None], mean, step.mean)
+        # The pose itself is unknown before: ten times the standard deviations of this exposure.
+        wide = np.zeros((len(start), STATE, STATE)) + np.diag(START_SD**2)
+        known = np.where(start[:, None, None], seen.normal, np.eye(6))
+        wide[:, POSE, POSE] = 100 * np.linalg.inv(known)
+        step.covariance = np.where(start[:, None, None], wide, step.covariance)
+        self.alive = self.alive | start
+        self.log_q = np.where(start[:, None], START_LOG, self.log_q)
+        self._log_variance[start] = START_LOG_SD**2
+        self._slope[start] = 0
+
+    def _adapt(self, step: _Step) -> bool:
+        """Improve the log densities by the likelihood of an exposure; return whether they grew.
+
+        With S the covariance of the prediction error and D its derivative by h, the derivative of
+        the log likelihood is (e'S^-1 D S^-1 e - tr S^-1 D) / 2, its expected information
+        tr(S^-1 D S^-1 D) / 2 (Ljung, "System Identification", 1999, 7.4, of a prediction error
+        that itself does not depend on h). Here S^-1 e is z, and S^-1 is M. Where a density grows,
+        the prediction was less sure than it seemed: its covariance grows with it.
+        """
+        slope = self._slope[:, :, POSE, POSE]
+        z = step.z[:, None, :, None]
+        moved = step.m[:, None] @ slope
+        gradient = 0.5 * (
+            (np.swapaxes(z, 2, 3) @ slope @ z)[..., 0, 0] - np.trace(moved, axis1=2, axis2=3)
+        )
+        information = 0.5 * np.sum(moved * np.swapaxes(moved, 2, 3), axis=(2, 3))
+        variance = 1 / (1 / self._log_variance + information)
+        change = np.clip(variance * gradient, -MAX_STEP, MAX_STEP)
+        self.log_q = np.clip(self.log_q + change, *LOG_RANGE)
+        self._log_variance = variance
+        more = np.maximum(np.expm1(change), 0)[:, :, None, None] * self._slope
+        step.covariance = step.covariance + more[:, 0] + more[:, 1]
+        self._slope = self._slope + more
+        return bool((change > ROUND_ENDS).any())
+
+    def smoothed(self) -> Motion:
+        """Motion of the exposures that are kept, by all of them."""
+        return _smooth(self.steps)[0]
+
+
+def _weigh(step: _Step, normal: np.ndarray, right: np.ndarray) -> None:
+    """Weigh an exposure (B, 6, 6), (B, 6) against its prediction."""
+    inner = np.linalg.inv(np.eye(6) + normal @ step.covariance[:, POSE, POSE])
+    step.z = (inner @ right[:, :, None])[:, :, 0]
+    m = inner @ normal
+    step.m = (m + np.swapaxes(m, 1, 2)) / 2
+
+
+@dataclass
+class _Scores:
+    """Derivatives (T, B, 2) of the log likelihood by h, and twice their information."""
+
+    gradient: np.ndarray
+    information: np.ndarray
+
+
+def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
+    """Smooth backwards over the steps of a filter."""
+    count = len(steps[0].z)
+    total = len(steps)
+    motion = Motion(
+        np.full((total, count, 3, 3), np.nan),
+        np.full((total, count, 3), np.nan),
+        velocity=np.full((total, count, 6), np.nan),
+        acceleration=np.full((total, count, 6), np.nan),
+        covariance=np.full((total, count, STATE, STATE), np.nan),
+        log_q=np.stack([step.log_q for step in steps]),
+    )
+    scores = _Scores(np.zeros((total, count, 2)), np.zeros((total, count, 2)))
+    r = np.zeros((count, STATE))
+    n = np.zeros((count, STATE, STATE))
+    seen = np.zeros((total, count), dtype=bool)
+    alive = np.zeros(count, dtype=bool)
+    for k, step in enumerate(steps):
+        alive = alive | step.started | (step.covariance[:, 0, 0] > 0)
+        seen[k] = alive
+    for k in range(total - 1, -1, -1):
+        step = steps[k]
+        # L'F'r and L'F'N F L of the next step are in r and n already.
+        gain = step.covariance[:, :, POSE]
+        kept = np.eye(STATE) - gain @ step.m @ np.eye(6, STATE)
+        back = np.swapaxes(kept, 1, 2)
+        r = (back @ r[:, :, None])[:, :, 0]
+        n = back @ n @ kept
+        r[:, POSE] += step.z
+        n[:, POSE, POSE] += step.m
+        mean = step.mean + (step.covariance @ r[:, :, None])[:, :, 0]
+        covariance = step.covariance - step.covariance @ n @ step.covariance
+        motion.rotation[k] = matrix_from_vector(mean[:, 3:6]) @ step.reference
+        motion.centre_mm[k] = mean[:, :3]
+        motion.velocity[k] = mean[:, 6:12]
+        motion.acceleration[k] = mean[:, 12:]
+        motion.covariance[k] = covariance
+        for kind, noise in enumerate(np.swapaxes(_noise(step.dt_s, step.log_q), 0, 1)):
+            moved = noise @ n
+            information = np.trace(moved, axis1=1, axis2=2)
+            squared = (r[:, None] @ noise @ r[:, :, None])[:, 0, 0]
+            scores.gradient[k, :, kind] = np.where(step.started, 0, 0.5 * (squared - information))
+            scores.information[k, :, kind] = np.where(step.started, 0, 0.5 * information)
+        forward = np.swapaxes(step.into, 1, 2)
+        r = (forward @ r[:, :, None])[:, :, 0]
+        n = forward @ n @ step.into
+    for array in (motion.rotation, motion.centre_mm, motion.velocity, motion.acceleration):
+        array[~seen] = np.nan
+    motion.covariance[~seen] = np.nan
+    return motion, scores
+
+
+def smooth_trial(
+    first: MotionFilter, seen: Sequence[PoseInformation]
+) -> Motion:
+    """Smooth a whole trial with the most probable course of its densities.
+
+    Parameters
+    ----------
+    first : MotionFilter
+        That has followed the trial, and kept all of its exposures.
+    seen : sequence of PoseInformation
+        What they told.
+
+    Returns
+    -------
+    Motion
+    """
+    steps = first.steps
+    dt = np.array([step.dt_s for step in steps])
+    log_q = np.stack([step.log_q for step in steps])
+    walk = np.full(log_q.shape[1:], WALK)
+    motion, scores = _smooth(steps)
+    for _ in range(MAX_ROUNDS):
+        log_q, change, walk = _improved(log_q, scores, dt, walk)
+        follower = MotionFilter(len(first.alive), lag=None)
+        for k, step in enumerate(steps):
+            follower.predict(step.dt_s, log_q[k])
+            follower.update(seen[k], step.started, adapt=False)
+        steps = follower.steps
+        motion, scores = _smooth(steps)
+        if change < ROUND_ENDS:
+            break
+    return motion
+
+
+def _improved(
+    log_q: np.ndarray, scores: _Scores, dt_s: np.ndarray, walk: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray]:
+    """Return log densities (T, B, 2) after a step of Fisher scoring, its size, and new walks (B, 2)."""
+    out = log_q.copy()
+    new_walk = walk.copy()
+    largest = 0.0
+    for body, kind in np.ndindex(*walk.shape):
+        h = log_q[:, body, kind]
+        prior = 1 / (walk[body, kind] * np.maximum(dt_s[1:], 1e-6))
+        banded = np.zeros((2, len(h)))
+        banded[1] = scores.information[:, body, kind] + 1e-6
+        banded[1, :-1] += prior
+        banded[1, 1:] += prior
+        banded[0, 1:] = -prior
+        right = scores.gradient[:, body, kind].copy()
+        pull = prior * np.diff(h)
+        right[:-1] += pull
+        right[1:] -= pull
+        step = np.clip(solveh_banded(banded, right), -MAX_STEP, MAX_STEP)
+        out[:, body, kind] = np.clip(h + step, *LOG_RANGE)
+        largest = max(largest, float(np.abs(step).max()))
+        spread = _variance_of_steps(banded)
+        moved = np.diff(out[:, body, kind]) ** 2 + spread
+        new_walk[body, kind] = np.sum(moved) / np.sum(dt_s[1:])
+    return out, largest, new_walk
+
+
+def _variance_of_steps(banded: np.ndarray) -> NDArray[np.float64]:
+    """Variances (T - 1,) of the differences of neighbours, from a tridiagonal normal matrix.
+
+    The elements of its inverse near the diagonal follow from a forward and a backward elimination
+    (Meurant, "A review on the inverse of symmetric tridiagonal and block tridiagonal matrices",
+    SIAM J. Matrix Anal. Appl. 13, 1992).
+    """
+    diagonal = banded[1]
+    off = banded[0, 1:]
+    size = len(diagonal)
+    forward = np.empty(size)
+    backward = np.empty(size)
+    forward[0] = diagonal[0]
+    backward[-1] = diagonal[-1]
+    for k in range(1, size):
+        forward[k] = diagonal[k] - off[k - 1] ** 2 / forward[k - 1]
+        backward[-1 - k] = diagonal[-1 - k] - off[-k] ** 2 / backward[-k]
+    variance = 1 / (forward + backward - diagonal)
+    covariance = -off / forward[:-1] * variance[1:]
+    return variance[:-1] + variance[1:] - 2 * covariance
+
+
+def _transition(dt_s: float, turn: np.ndarray) -> np.ndarray:
+    """Transitions (B, 18, 18) over dt_s of bodies that turn by vectors (B, 3)."""
+    out = np.broadcast_to(np.eye(STATE), (len(turn), STATE, STATE)).copy()
+    eye = np.eye(3)
+    jacobian = left_jacobian(turn)
+    out[:, 0:3, 6:9] = dt_s * eye
+    out[:, 0:3, 12:15] = dt_s**2 / 2 * eye
+    out[:, 3:6, 3:6] = matrix_from_vector(turn)
+    out[:, 3:6, 9:12] = dt_s * jacobian
+    out[:, 3:6, 15:18] = dt_s**2 / 2 * jacobian
+    out[:, 6:12, 12:18] = dt_s * np.eye(6)
+    return out
+
+
+def _noise(dt_s: float, log_q: np.ndarray) -> np.ndarray:
+    """Covariances (B, 2, 18, 18) of the noise of positions and of rotations over dt_s."""
+    factors = noise_factors(dt_s)
+    shares = np.zeros((2, STATE, STATE))
+    for kind, components in enumerate(KINDS):
+        chosen = np.zeros((6, 6))
+        chosen[components, components] = np.eye(3)
+        shares[kind] = np.kron(factors, chosen)
+    return np.exp(log_q)[:, :, None, None] * shares

@@ -265,14 +265,25 @@ class MotionFilter:
         change = np.clip(variance * gradient, -MAX_STEP, MAX_STEP)
         self.log_q = np.clip(self.log_q + change, *LOG_RANGE)
         self._log_variance = variance
+        if not (change > ROUND_ENDS).any():
+            return False
         more = np.maximum(np.expm1(change), 0)[:, :, None, None] * self._slope
         step.covariance = step.covariance + more[:, 0] + more[:, 1]
         self._slope = self._slope + more
-        return bool((change > ROUND_ENDS).any())
+        return True
 
     def smoothed(self) -> Motion:
         """Motion of the exposures that are kept, by all of them."""
-        return _smooth(self.steps)[0]
+        if self.lag != 0:
+            return _smooth(self.steps)[0]
+        return Motion(
+            self.rotation[None],
+            self.mean[None, :, :3],
+            velocity=self.mean[None, :, 6:12],
+            acceleration=self.mean[None, :, 12:],
+            covariance=self.covariance[None],
+            log_q=self.log_q[None],
+        )
 
 
 def _weigh(step: _Step, normal: np.ndarray, right: np.ndarray) -> None:

@@ -25,13 +25,12 @@ take less than a millisecond, and each numpy call costs a microsecond.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, erfc
 
-from ..photogrammetry.collinearity import project_with_jacobian
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
 from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from ..reconstruction.intersection import OK, OUTSIDE
@@ -74,16 +73,14 @@ class FramePoses:
     alone : (B,) ndarray of bool
         Whether the exposure alone gives the pose.
     covariance_noise, covariance_fixed : (B, 6, 6) ndarray
-        See BodyPoses; of the pose by the exposure alone.
+        See BodyPoses. Where the exposure alone does not give the pose, by its prediction, too.
     rig_root : (B, 6, k) ndarray
     information : PoseInformation
         For a filter, by the random errors.
-    fixed : (B, 6, 6) ndarray
-        Covariance of the errors that stay, of a pose by this information.
     used : (B, M) ndarray of bool
         Markers, by their row in the body.
     test : (B, M) ndarray
-        Test of each marker over its limit; NaN for one that is not seen.
+        Test of a marker over its limit; NaN where it needs none.
     chi2, freedom : (B,) ndarray
         Weighted sum of squares of the used image points, and its expectation.
     """
@@ -95,7 +92,6 @@ class FramePoses:
     covariance_fixed: NDArray[np.float64]
     rig_root: NDArray[np.float64]
     information: PoseInformation
-    fixed: NDArray[np.float64]
     used: NDArray[np.bool_]
     test: NDArray[np.float64]
     chi2: NDArray[np.float64]
@@ -119,11 +115,11 @@ class _Points:
 
 @dataclass(frozen=True)
 class _Linear:
-    """Image points at a pose: residuals (B, M, F, 2), derivatives by place and orientation."""
+    """Image points at a pose: residuals (B, M, F, 2), and derivatives by place (B, M, F, 2, 3)."""
 
     residual: np.ndarray
     by_place: np.ndarray
-    by_orientation: np.ndarray
+    uv: np.ndarray  # predicted
     by_pose: np.ndarray  # (B, M, 3, 6), derivatives D of places by the pose
 
 
@@ -131,12 +127,30 @@ class _Linear:
 class _Marker:
     """What markers tell: S, s, r'Wr (B, M), M, and M S, M s."""
 
+    weight: np.ndarray  # (B, M, F), W
     s_matrix: np.ndarray
     s_vector: np.ndarray
     squares: np.ndarray
     m: np.ndarray
     ms_matrix: np.ndarray
     ms_vector: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Solution:
+    """Poses of B bodies, whether (B,) the exposure alone gives them, and their normal matrices.
+
+    prior (B, 6, 6): normal matrices of the predictions; away (B, 6): from pose to prediction.
+    """
+
+    rotation: np.ndarray
+    centre: np.ndarray
+    alone: np.ndarray
+    normal: np.ndarray
+    linear: _Linear
+    marker: _Marker
+    prior: np.ndarray
+    away: np.ndarray
 
 
 class PoseSolver:
@@ -169,6 +183,14 @@ class PoseSolver:
             self.xyz[row, :count] = body.xyz_mm - self.centre[row]
             self.variance[row, :count] = body.sd_mm**2
         self._views = len(orientation.fluoroscopes)
+        camera = np.zeros((self._views, 3, 3))
+        camera[:, 0, 0] = camera[:, 1, 1] = orientation.interior[:, 2]
+        camera[:, :, 2] = np.column_stack([orientation.interior[:, :2], np.ones(self._views)])
+        rows = camera @ orientation.rotation
+        self._matrix = rows.reshape(-1, 3).T.copy()
+        self._shift = -(rows @ orientation.position_mm[:, :, None]).reshape(-1)
+        self._uv_rows = rows[:, :2]
+        self._depth_rows = rows[:, 2:]
         self._root = orientation.covariance_root().reshape(self._views, ORIENTATION_SIZE, -1)
         tail = erfc(reject / np.sqrt(2))
         freedom = np.arange(2 * self._views + 1)
@@ -188,18 +210,13 @@ class PoseSolver:
         )
         test = np.full(used.shape, np.nan)
         for _ in range(self.xyz.shape[1]):
-            rotation, centre, alone = self._converge((rotation, centre), points, used, prior)
-            linear = self._linear(rotation, centre, points)
-            marker = self._marker(linear, points, used, points.noise + points.correction)
-            current = self._test(marker, linear, points, used, np.where(alone[:, None, None], 0, prior))
-            test = np.where(used, current, test)
-            worst = np.argmax(np.where(used, current, 0), axis=1)
-            rows = np.arange(len(worst))
-            wrong = np.flatnonzero(np.where(used, current, 0)[rows, worst] > 1)
+            solution = self._converge((rotation, centre), points, used, prior)
+            wrong, worst = self._false_markers(solution, points, used, test)
             if not len(wrong):
                 break
-            used[wrong, worst[wrong]] = False
-        return self._result((rotation, centre, alone), points, used, test, prior)
+            used[wrong, worst] = False
+            rotation, centre = solution.rotation, solution.centre
+        return self._result(solution, points, used, test)
 
     def _points(self, exposure: IntersectedViews) -> _Points:
         """Sort the image points of an exposure by bodies and their markers."""
@@ -255,26 +272,22 @@ class PoseSolver:
         points: _Points,
         used: np.ndarray,
         prior: np.ndarray,
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Iterate rotations and centres; also return whether (B,) the exposure alone gives them.
+    ) -> _Solution:
+        """Iterate from rotations and centres.
 
-        Where it does not, the prediction of variance prior^-1 holds what is not seen.
+        Where an exposure alone does not give a pose, the prediction, with the normal matrix prior,
+        holds what is not seen.
         """
         first_rotation, first_centre = rotation, centre = pose
-        alone = np.zeros(len(rotation), dtype=bool)
+        variance = points.noise + points.correction
         for _ in range(MAX_STEPS):
             linear = self._linear(rotation, centre, points)
-            marker = self._marker(linear, points, used, points.noise + points.correction)
+            marker = self._marker(linear, points, used, variance)
             normal, right = _sum(marker, linear.by_pose)
             alone = _is_determined(normal)
             held = np.where(alone[:, None, None], 0.0, prior)
-            away = np.concatenate(
-                [
-                    first_centre - centre,
-                    _small_vector(first_rotation @ np.swapaxes(rotation, 1, 2)),
-                ],
-                axis=1,
-            )
+            turned = _small_vector(first_rotation @ np.swapaxes(rotation, 1, 2))
+            away = np.concatenate([first_centre - centre, turned], axis=1)
             normal = normal + held
             right = right + (held @ away[:, :, None])[:, :, 0]
             step = _solved(normal, right)
@@ -282,35 +295,54 @@ class PoseSolver:
             rotation = matrix_from_vector(step[:, 3:]) @ rotation
             if not (np.sum(step * right, axis=1) > LAST_STEP).any():
                 break
-        return rotation, centre, alone
+        # The derivatives hold; only the residuals change by the last step.
+        moved = (linear.by_pose @ step[:, None, :, None])[:, :, None]
+        linear = replace(linear, residual=linear.residual - (linear.by_place @ moved)[..., 0])
+        marker = self._marker(linear, points, used, variance)
+        return _Solution(
+            rotation,
+            centre,
+            alone,
+            normal=normal,
+            linear=linear,
+            marker=marker,
+            prior=prior,
+            away=away,
+        )
 
     def _linear(self, rotation: np.ndarray, centre: np.ndarray, points: _Points) -> _Linear:
-        """Derivatives of all image points at poses."""
+        """Residuals and derivatives of all image points at poses."""
         shape = points.seen.shape
         arm = self.xyz @ np.swapaxes(rotation, 1, 2)
-        place = arm + centre[:, None]
-        count = shape[0] * shape[1]
-        orientation = self.orientation
-        tiled = np.repeat(place.reshape(-1, 3), self._views, axis=0)
-        uv, by_exterior, by_place, by_interior = project_with_jacobian(
-            np.tile(orientation.rotation, (count, 1, 1)),
-            np.tile(orientation.position_mm, (count, 1)),
-            tiled,
-            np.tile(orientation.interior, (count, 1)),
-        )
+        image = ((arm + centre[:, None]) @ self._matrix + self._shift).reshape(*shape, 3)
+        depth = np.where(image[..., 2] > 0, image[..., 2], np.nan)
+        uv = image[..., :2] / depth[..., None]
+        by_place = (self._uv_rows - uv[..., None] * self._depth_rows) / depth[..., None, None]
+        good = points.seen & np.isfinite(depth)
+        residual = np.where(good[..., None], points.uv - uv, 0.0)
+        by_place = np.where(good[..., None, None], by_place, 0.0)
         by_pose = np.zeros((*shape[:2], 3, POSE_SIZE))
         by_pose[..., :3] = np.eye(3)
         by_pose[..., 3:] = -cross_matrix(arm)
-        residual = points.uv - uv.reshape(*shape, 2)
-        good = points.seen & np.isfinite(residual).all(axis=-1)
-        return _Linear(
-            np.where(good[..., None], residual, 0.0),
-            np.where(good[..., None, None], by_place.reshape(*shape, 2, 3), 0.0),
-            by_orientation=np.concatenate([by_exterior, by_interior], axis=2).reshape(
-                *shape, 2, ORIENTATION_SIZE
-            ),
-            by_pose=by_pose,
-        )
+        return _Linear(residual, by_place, uv, by_pose)
+
+    def _by_orientation(self, linear: _Linear) -> np.ndarray:
+        """Derivatives (B, M, F, 2, 9) of image points by T, w, xp, yp, c, see collinearity."""
+        interior = self.orientation.interior
+        c = interior[:, 2]
+        x, y = np.moveaxis((linear.uv - interior[:, :2]) / c[:, None], -1, 0)
+        out = np.zeros((*x.shape, 2, ORIENTATION_SIZE))
+        out[..., :3] = -linear.by_place
+        out[..., 0, 3] = out[..., 1, 4] = c * x * y
+        out[..., 0, 3] *= -1
+        out[..., 0, 4] = c * (1 + x * x)
+        out[..., 0, 5] = -c * y
+        out[..., 1, 3] = -c * (1 + y * y)
+        out[..., 1, 5] = c * x
+        out[..., 0, 6] = out[..., 1, 7] = 1
+        out[..., 0, 8] = x
+        out[..., 1, 8] = y
+        return np.nan_to_num(out)
 
     def _marker(
         self, linear: _Linear, points: _Points, used: np.ndarray, variance: np.ndarray
@@ -325,6 +357,7 @@ class PoseSolver:
         squares = np.sum(np.sum(linear.residual**2, axis=-1) * weight, axis=-1)
         m = np.linalg.inv(np.eye(3) + self.variance[..., None, None] * s_matrix)
         return _Marker(
+            weight,
             s_matrix,
             s_vector,
             squares,
@@ -333,30 +366,52 @@ class PoseSolver:
             ms_vector=(m @ s_vector[..., None])[..., 0],
         )
 
-    def _test(
-        self,
-        marker: _Marker,
-        linear: _Linear,
-        points: _Points,
-        used: np.ndarray,
-        prior: np.ndarray,
-    ) -> np.ndarray:
-        """Return the test (B, M) of each marker over its limit."""
-        d = linear.by_pose
-        own = np.swapaxes(d, 2, 3) @ marker.ms_matrix @ d
-        normal = own.sum(axis=1) + prior
-        others = normal[:, None] - own
-        gradient = np.swapaxes(d, 2, 3) @ marker.ms_vector[..., None]
-        alone = self._own_squares(marker)
+    def _false_markers(
+        self, solution: _Solution, points: _Points, used: np.ndarray, test: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Rows of bodies that contain a false marker, and its row in each; fill in the tests.
+
+        The sum of squares of a body is at least that which one of its markers adds: most bodies
+        need no test of single markers.
+        """
+        marker = solution.marker
+        d = solution.linear.by_pose
+        transposed = np.swapaxes(d, 2, 3)
+        by_marker = transposed @ marker.ms_matrix @ d
+        gradient = (transposed @ marker.ms_vector[..., None])[..., 0]
+        # Markers are compared with each other. A prediction that they contradict is no reason to
+        # reject them: the body may have been hit.
+        normal = by_marker.sum(axis=1)
+        away = _solved(normal, gradient.sum(axis=1))[:, None, :, None]
+        change = (by_marker @ away)[..., 0]
+        own = self._own_squares(marker)
+        own = own + np.sum((change - 2 * gradient) * away[..., 0], axis=-1)
+        gradient = gradient - change
+        limit = self._limit[2 * points.seen.sum(axis=2) * used]
+        suspect = np.flatnonzero((own.sum(axis=1)[:, None] > limit).any(axis=1))
+        if not len(suspect):
+            return suspect, suspect
+        gradient = gradient[suspect]
+        others = normal[suspect, None] - by_marker[suspect]
         # A marker that the others do not predict is tested by its own rays only.
         scale = np.sqrt(np.maximum(np.diagonal(others, axis1=2, axis2=3), 1e-12))
         unit = others / (scale[..., :, None] * scale[..., None, :])
-        tested = np.linalg.eigvalsh(unit)[..., 0] > 1e-9
-        inverse = np.linalg.inv(np.where(tested[..., None, None], unit, np.eye(POSE_SIZE)))
-        reduced = gradient[..., 0] / scale
+        predicted = np.linalg.eigvalsh(unit)[..., 0] > 1e-9
+        inverse = np.linalg.inv(np.where(predicted[..., None, None], unit, np.eye(POSE_SIZE)))
+        reduced = gradient / scale
         gain = np.sum(reduced * (inverse @ reduced[..., None])[..., 0], axis=-1)
-        squares = alone + np.where(tested, gain, 0.0)
-        return squares / self._limit[2 * points.seen.sum(axis=2) * used]
+        excess = (own[suspect] + np.where(predicted, gain, 0.0)) / limit[suspect]
+        excess = np.where(used[suspect], excess, 0.0)
+        test[suspect] = np.where(used[suspect], excess, test[suspect])
+        # Of several that contradict each other, the one goes without which the rest agrees best,
+        # with the prediction, too.
+        held = solution.prior[suspect]
+        pulled = (held @ solution.away[suspect, :, None])[:, None, :, 0] - gradient
+        rest = np.linalg.inv(others + held[:, None] + 1e-9 * np.eye(POSE_SIZE))
+        left = own[suspect] + np.sum(pulled * (rest @ pulled[..., None])[..., 0], axis=-1)
+        worst = np.argmax(np.where(excess > 1, left, -np.inf), axis=1)
+        wrong = np.flatnonzero((excess > 1).any(axis=1))
+        return suspect[wrong], worst[wrong]
 
     def _own_squares(self, marker: _Marker) -> np.ndarray:
         """Weighted sum of squares (B, M) of each marker, its shape being unsure."""
@@ -364,80 +419,56 @@ class PoseSolver:
         return np.maximum(marker.squares - shape, 0.0)
 
     def _result(
-        self,
-        pose: tuple[np.ndarray, np.ndarray, np.ndarray],
-        points: _Points,
-        used: np.ndarray,
-        test: np.ndarray,
-        prior: np.ndarray,
+        self, solution: _Solution, points: _Points, used: np.ndarray, test: np.ndarray
     ) -> FramePoses:
         """Return the poses with their covariances."""
-        rotation, centre, alone = pose
-        linear = self._linear(rotation, centre, points)
-        total = self._marker(linear, points, used, points.noise + points.correction)
-        normal, _ = _sum(total, linear.by_pose)
-        noise, fixed, rig_root = self._covariances(
-            _inverse(normal, alone), total, linear, points, points.noise + points.correction
-        )
+        alone = solution.alone
+        seen = used.any(axis=1)
+        inverse = _inverse(solution.normal, seen)
+        noise, fixed, rig_root = self._covariances(inverse, solution, points)
+        # A filter takes shape and correction as they are: their errors stay.
+        linear = solution.linear
         random = self._marker(linear, points, used, points.noise)
-        # A filter takes the shape as it is; its errors stay.
-        of_noise = np.swapaxes(linear.by_pose, 2, 3)
-        information = (of_noise @ random.s_matrix @ linear.by_pose).sum(axis=1)
-        right = (of_noise @ random.s_vector[..., None])[..., 0].sum(axis=1)
-        held = information + np.where(alone[:, None, None], 0.0, prior)
-        unweighted = _Marker(
-            random.s_matrix,
-            random.s_vector,
-            random.squares,
-            m=np.broadcast_to(np.eye(3), random.m.shape),
-            ms_matrix=random.s_matrix,
-            ms_vector=random.s_vector,
-        )
-        _, filter_fixed, _ = self._covariances(
-            _inverse(held, used.any(axis=1)), unweighted, linear, points, points.noise
-        )
+        transposed = np.swapaxes(linear.by_pose, 2, 3)
+        information = (transposed @ random.s_matrix @ linear.by_pose).sum(axis=1)
+        right = (transposed @ random.s_vector[..., None])[..., 0].sum(axis=1)
         return FramePoses(
-            np.where(alone[:, None, None], rotation, np.nan),
-            np.where(alone[:, None], centre, np.nan),
+            np.where(alone[:, None, None], solution.rotation, np.nan),
+            np.where(alone[:, None], solution.centre, np.nan),
             alone=alone,
-            covariance_noise=noise,
+            covariance_noise=np.where(alone[:, None, None], noise, np.nan),
             covariance_fixed=fixed,
             rig_root=rig_root,
-            information=PoseInformation(rotation, centre, information, right),
-            fixed=filter_fixed,
+            information=PoseInformation(solution.rotation, solution.centre, information, right),
             used=used,
             test=test,
-            chi2=np.sum(self._own_squares(total), axis=1),
+            chi2=np.sum(self._own_squares(solution.marker), axis=1),
             freedom=2.0 * np.sum(points.seen & used[..., None], axis=(1, 2)) - POSE_SIZE,
         )
 
     def _covariances(
-        self,
-        inverse: np.ndarray,
-        marker: _Marker,
-        linear: _Linear,
-        points: _Points,
-        variance: np.ndarray,
+        self, inverse: np.ndarray, solution: _Solution, points: _Points
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Covariances (B, 6, 6) of poses by noise and by what stays, and the root by the rig.
 
-        inverse (B, 6, 6): of the normal matrix; variance (B, M, F): what the weights are made of.
+        inverse (B, 6, 6): of the normal matrix.
         """
-        weight = np.where(points.seen, 1 / variance, 0.0) * (marker.squares[..., None] >= 0)
-        weight = weight * (np.trace(marker.s_matrix, axis1=2, axis2=3) > 0)[..., None]
-        a = linear.by_place
+        marker = solution.marker
+        linear = solution.linear
         gain = np.swapaxes(linear.by_pose, 2, 3) @ marker.m  # (B, M, 6, 3)
-        by_noise = np.swapaxes(a, 3, 4) @ a  # (B, M, F, 3, 3)
-        of_noise = np.sum(by_noise * (weight**2 * points.noise)[..., None, None], axis=2)
-        of_fixed = np.sum(by_noise * (weight**2 * points.correction)[..., None, None], axis=2)
-        of_shape = self.variance[..., None, None] * (marker.s_matrix @ marker.s_matrix)
-        back = np.swapaxes(gain, 2, 3)
-        noise = inverse @ (gain @ of_noise @ back).sum(axis=1) @ inverse
-        fixed = inverse @ (gain @ (of_fixed + of_shape) @ back).sum(axis=1) @ inverse
-        pulled = np.swapaxes(a * weight[..., None, None], 3, 4) @ np.where(
-            points.seen[..., None, None], linear.by_orientation, 0.0
+        weighted = linear.by_place * marker.weight[..., None, None]
+        pulled = np.swapaxes(weighted, 3, 4)
+        rows = (*marker.weight.shape[:2], -1, 3)
+        by_noise = (weighted * points.noise[..., None, None]).reshape(rows)
+        by_correction = (weighted * points.correction[..., None, None]).reshape(rows)
+        flat = np.swapaxes(weighted.reshape(rows), 2, 3)
+        stays = flat @ by_correction + self.variance[..., None, None] * (
+            marker.s_matrix @ marker.s_matrix
         )
-        by_view = (gain[:, :, None] @ pulled).sum(axis=1)  # (B, F, 6, 9)
+        back = np.swapaxes(gain, 2, 3)
+        noise = inverse @ (gain @ (flat @ by_noise) @ back).sum(axis=1) @ inverse
+        fixed = inverse @ (gain @ stays @ back).sum(axis=1) @ inverse
+        by_view = (gain[:, :, None] @ (pulled @ self._by_orientation(linear))).sum(axis=1)
         rig_root = -inverse @ (by_view @ self._root).sum(axis=1)
         return noise, fixed, rig_root
 

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..bodies.rigid import fitted_pose
 from ..checks.cluster_watch import Cluster
 from .marker_ids import ClusterShape
-from .marker_rays import fitted_pose
 
 RIGID_MM = 0.1  # what a marker may move in its cluster, a standard deviation
 RIGID_SIGMAS = 5.0

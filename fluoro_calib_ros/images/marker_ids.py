@@ -18,13 +18,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..bodies.rigid import fitted_pose
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.epipolar import EpipolarGeometry
 from ..reconstruction.intersection import OK, OUTSIDE, Intersector
 from .marker_intensity import check_image, learn_look, search_image
-from .marker_rays import fitted_pose, project_observed
+from .marker_rays import project_observed
 from .markers import FirstMarkers
 
 MARKER_SCALES = (1.1, 1.5, 2.1)  # of the blur at which markers stand out [px]

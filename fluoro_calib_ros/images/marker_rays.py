@@ -166,17 +166,3 @@ def project_observed(
         step = ideal - np.stack([u, v], axis=1)
         observed = observed + np.where(np.isfinite(step), step, 0.0)
     return observed
-
-
-def fitted_pose(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation (3, 3) and shift (3,) that take points (k, 3) to others, by least squares.
-
-    Kabsch, "A solution for the best rotation to relate two sets of vectors", Acta Cryst. A32,
-    1976.
-    """
-    a = source.mean(axis=0)
-    b = target.mean(axis=0)
-    u, _, vt = np.linalg.svd((source - a).T @ (target - b))
-    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(vt.T @ u.T))])
-    rotation = vt.T @ sign @ u.T
-    return rotation, b - rotation @ a

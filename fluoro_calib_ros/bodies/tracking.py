@@ -1,0 +1,278 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Poses of all bodies of a rig over a trial, exposure by exposure, live and offline.
+
+Every exposure is solved with the poses that the filter predicts, and then given to the filter. So a
+body is followed where one view or one marker is left. Live, an exposure is reported `lag`
+exposures later, smoothed by those that came after it. Offline, the same object follows the trial
+first; then the whole trial is smoothed, or reported with the same lag and the same numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.rotations import cross_matrix
+from ..reconstruction.reconstruct import IntersectedViews
+from .body import POSE_SIZE, Body, BodyPoses, PoseStatus
+from .motion import POSE, Motion, MotionFilter, smooth_trial
+from .pose import FramePoses, PoseSolver, Prediction
+
+# A rotation that is predicted less surely says nothing for the markers that are looked for: at
+# 20 mm from the centre this is as far as the next marker.
+LOST_SD_RAD = 0.3
+NS_PER_S = 1e9
+
+
+@dataclass(frozen=True)
+class TrackedExposure:
+    """Poses of B bodies in one exposure.
+
+    Attributes
+    ----------
+    number, stamp_ns : int
+    rotation : (B, 3, 3) ndarray
+        Body -> rig; NaN where a body is lost.
+    centre_mm : (B, 3) ndarray
+        Centres of the markers.
+    velocity, acceleration : (B, 6) ndarray
+        [mm/s, rad/s] and [mm/s^2, rad/s^2]; NaN without a filter.
+    covariance : (B, 18, 18) ndarray
+        Of the random errors of pose, velocity and acceleration.
+    fixed : (B, 6, 6) ndarray
+        Of the errors of the pose that stay.
+    rig_root : (B, 6, k) ndarray
+    frame : FramePoses
+        What the exposure alone tells.
+    status : (B,) ndarray
+        PoseStatus as uint8.
+    """
+
+    number: int
+    stamp_ns: int
+    rotation: NDArray[np.float64]
+    centre_mm: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    fixed: NDArray[np.float64]
+    rig_root: NDArray[np.float64]
+    frame: FramePoses
+    status: NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class _Taken:
+    """An exposure that the filter has taken, with the last known errors that stay."""
+
+    number: int
+    stamp_ns: int
+    frame: FramePoses
+    alive: np.ndarray
+    fixed: np.ndarray
+    rig_root: np.ndarray
+
+
+class BodyTracker:
+    """Follows bodies from exposure to exposure.
+
+    Parameters
+    ----------
+    orientation : RigOrientation
+    bodies : sequence of Body
+    reject : float
+        Standardised deviation above which a marker does not belong to its body.
+    lag : int or None
+        Exposures after which a pose is reported; None: only by `smoothed`.
+    """
+
+    def __init__(
+        self,
+        orientation: RigOrientation,
+        bodies: Sequence[Body],
+        reject: float = 4.0,
+        lag: int | None = 0,
+    ) -> None:
+        self.solver = PoseSolver(orientation, bodies, reject)
+        self.lag = lag
+        count = len(bodies)
+        self.filter = MotionFilter(count, lag)
+        self._taken: list[_Taken] = []
+        self._stamp_ns: int | None = None
+        columns = orientation.covariance.shape[0]
+        self._fixed = np.full((count, POSE_SIZE, POSE_SIZE), np.nan)
+        self._rig_root = np.full((count, POSE_SIZE, columns), np.nan)
+
+    @property
+    def bodies(self) -> tuple[Body, ...]:
+        """The bodies that are followed."""
+        return self.solver.bodies
+
+    def add(self, exposure: IntersectedViews, number: int, stamp_ns: int) -> TrackedExposure | None:
+        """Take an exposure; return the one of `lag` exposures before, if there is one.
+
+        An exposure that is not later than the one before is not taken.
+        """
+        if self._stamp_ns is not None and stamp_ns <= self._stamp_ns:
+            return None
+        dt_s = 0.0 if self._stamp_ns is None else (stamp_ns - self._stamp_ns) / NS_PER_S
+        self._stamp_ns = stamp_ns
+        self.filter.predict(dt_s)
+        rotation, centre, covariance = self.filter.prediction
+        unsure = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1) > LOST_SD_RAD**2
+        self.filter.lose(unsure)
+        known = self.filter.alive.copy()
+        frame = self.solver.solve(exposure, Prediction(rotation, centre, covariance, known))
+        self.filter.update(frame.information, frame.alone & ~known)
+        self._keep(number, stamp_ns, frame)
+        if self.lag is None or len(self._taken) <= self.lag:
+            return None
+        return self._report(self._taken.pop(0), self.filter.smoothed(), 0)
+
+    def flush(self) -> list[TrackedExposure]:
+        """Return the exposures that are not reported yet, at the end of a stream."""
+        if not self._taken or self.lag is None:
+            return []
+        motion = self.filter.smoothed()
+        first = len(motion.centre_mm) - len(self._taken)
+        taken, self._taken = self._taken, []
+        return [self._report(one, motion, first + k) for k, one in enumerate(taken)]
+
+    def smoothed(self) -> list[TrackedExposure]:
+        """Return all exposures, smoothed by the whole trial; lag is None."""
+        if not self._taken:
+            return []
+        motion = smooth_trial(self.filter, [one.frame.information for one in self._taken])
+        taken = _filled_backwards(self._taken)
+        return [self._report(one, motion, k) for k, one in enumerate(taken)]
+
+    def _keep(self, number: int, stamp_ns: int, frame: FramePoses) -> None:
+        """Note an exposure, and the errors that stay of bodies that are seen."""
+        seen = np.isfinite(frame.covariance_fixed).all(axis=(1, 2))[:, None, None]
+        self._fixed = np.where(seen, frame.covariance_fixed, self._fixed)
+        self._rig_root = np.where(seen, frame.rig_root, self._rig_root)
+        self._taken.append(
+            _Taken(
+                number,
+                stamp_ns,
+                frame=frame,
+                alive=self.filter.alive.copy(),
+                fixed=self._fixed,
+                rig_root=self._rig_root,
+            )
+        )
+
+    def _report(self, one: _Taken, motion: Motion, row: int) -> TrackedExposure:
+        """Return an exposure with its row of a motion."""
+        frame = one.frame
+        lost = ~one.alive
+        status = np.where(
+            frame.alone,
+            PoseStatus.OK,
+            np.where(frame.markers > 0, PoseStatus.WEAK, PoseStatus.FILLED),
+        )
+        status = np.where(lost, PoseStatus.FAILED, status).astype(np.uint8)
+
+        def kept(values: np.ndarray) -> np.ndarray:
+            shape = (-1,) + (1,) * (values.ndim - 1)
+            return np.where(lost.reshape(shape), np.nan, values)
+
+        return TrackedExposure(
+            one.number,
+            one.stamp_ns,
+            rotation=kept(motion.rotation[row]),
+            centre_mm=kept(motion.centre_mm[row]),
+            velocity=kept(motion.velocity[row]),
+            acceleration=kept(motion.acceleration[row]),
+            covariance=kept(motion.covariance[row]),
+            fixed=kept(one.fixed),
+            rig_root=kept(one.rig_root),
+            frame=frame,
+            status=status,
+        )
+
+
+def _filled_backwards(taken: Sequence[_Taken]) -> list[_Taken]:
+    """Give exposures before the first known errors of a body those that follow."""
+    out: list[_Taken] = []
+    fixed = taken[-1].fixed
+    root = taken[-1].rig_root
+    for one in reversed(taken):
+        fixed = np.where(np.isnan(one.fixed), fixed, one.fixed)
+        root = np.where(np.isnan(one.rig_root), root, one.rig_root)
+        out.append(replace(one, fixed=fixed, rig_root=root))
+    return out[::-1]
+
+
+def poses_of(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> list[BodyPoses]:
+    """Poses of the frames of the bodies, from those of the centres of their markers."""
+    return [
+        _poses(
+            body,
+            exposures,
+            rotation=np.array([one.rotation[row] for one in exposures]),
+            centre=np.array([one.centre_mm[row] for one in exposures]),
+            covariances=(
+                np.array([one.covariance[row][POSE, POSE] for one in exposures]),
+                np.array([one.fixed[row] for one in exposures]),
+            ),
+            row=row,
+        )
+        for row, body in enumerate(bodies)
+    ]
+
+
+def poses_alone(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> list[BodyPoses]:
+    """Poses that each exposure gives alone, without a filter."""
+    out = []
+    for row, body in enumerate(bodies):
+        frames = [one.frame for one in exposures]
+        poses = _poses(
+            body,
+            exposures,
+            rotation=np.array([frame.rotation[row] for frame in frames]),
+            centre=np.array([frame.centre_mm[row] for frame in frames]),
+            covariances=(
+                np.array([frame.covariance_noise[row] for frame in frames]),
+                np.array([frame.covariance_fixed[row] for frame in frames]),
+            ),
+            row=row,
+        )
+        alone = np.array([frame.alone[row] for frame in frames])
+        status = np.where(alone, PoseStatus.OK, PoseStatus.FAILED).astype(np.uint8)
+        out.append(replace(poses, status=status))
+    return out
+
+
+def _poses(
+    body: Body,
+    exposures: Sequence[TrackedExposure],
+    rotation: np.ndarray,
+    centre: np.ndarray,
+    covariances: tuple[np.ndarray, np.ndarray],
+    row: int,
+) -> BodyPoses:
+    """Move poses from the centre of the markers to the origin of a body: t = c - R x_c."""
+    arm = rotation @ body.centre
+    move = np.broadcast_to(np.eye(POSE_SIZE), (len(exposures), POSE_SIZE, POSE_SIZE)).copy()
+    move[:, :3, 3:] = cross_matrix(arm)
+    back = np.swapaxes(move, 1, 2)
+    noise, fixed = (move @ covariance @ back for covariance in covariances)
+    return BodyPoses(
+        body.name,
+        np.array([one.number for one in exposures]),
+        np.array([one.stamp_ns for one in exposures]),
+        rotation=rotation,
+        position_mm=centre - arm,
+        covariance_noise=noise,
+        covariance_fixed=fixed,
+        rig_root=move @ np.array([one.rig_root[row] for one in exposures]),
+        markers=np.array([one.frame.markers[row] for one in exposures]),
+        status=np.array([one.status[row] for one in exposures]),
+    )

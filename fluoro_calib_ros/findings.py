@@ -125,6 +125,15 @@ class Kind(str, Enum):
     OTHER_SHADOW = 'other_shadow'
     SHADOWS_MET = 'shadows_met'
 
+    # Rigid bodies and their markers.
+    BODY_MIRRORED = 'body_mirrored'
+    BODY_NOT_RIGID = 'body_not_rigid'
+    BODY_ON_A_LINE = 'body_on_a_line'
+    BODY_UNSEEN = 'body_unseen'
+    MARKER_LOOSE = 'marker_loose'
+    MARKER_MIGRATED = 'marker_migrated'
+    MARKERS_EXCHANGED = 'markers_exchanged'
+
     # Files that do not belong together.
     EDITED_RESULT = 'edited_result'
     EXCHANGED_CALIBRATION = 'exchanged_calibration'

@@ -91,7 +91,10 @@ def test_killed_calibrations_leave_a_whole_folder(tmp_path, outcomes):
     start = time.monotonic()
     work()
     longest = 1.5 * (time.monotonic() - start)
-    for _ in range(KILLS):
+    # On a busy machine a kill may come after the work, or before it: those do not count.
+    for kills in range(10 * KILLS):
+        if kills >= KILLS and found == {0, 1} and leftovers > KILLS // 4:
+            break
         killed(work, rng.uniform(0.0, longest))
         found.add(number_of_whole(path, outcomes))
         leftovers += len(hidden(tmp_path))

@@ -1,0 +1,631 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Shapes of rigid bodies from a recording, together with what CT says of them.
+
+One least-squares adjustment has the coordinates of all markers of a body in its frame, and its
+pose in every exposure. Places measured by CT are observations with their standard deviations; a
+marker without one is estimated from the image points alone. Poses are eliminated exposure by
+exposure: with S and s of a marker, its derivatives D by the pose and R by its coordinates (see
+`pose`),
+
+    H = sum R'SR - (R'SD) N^-1 (D'SR),   h = sum R's - (R'SD) N^-1 D's.
+
+What markers have in common, a motion of all of them in the frame of the body, images do not tell:
+it follows from CT, and is the uncertainty of the frame. The coordinates relative to each other are
+in the datum of the markers (S-transformation; Baarda 1973). Tests of single markers follow Baarda
+1968, the condition number and the mean error of rigid-body fitting ISO 16087:2013.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import chdtri
+
+from ..findings import Finding, Kind, Place, Severity
+from ..photogrammetry.rotations import cross_matrix
+from .body import POSE_SIZE, Body
+from .rigid import fitted_pose
+
+ROUNDS = 4  # the problem is nearly linear once poses are known
+# ISO 16087:2013 and Valstar et al., "Guidelines for standardization of radiostereometry", Acta
+# Orthop. 76, 2005: condition number [1/m] above which markers lie too near a line, and mean error of
+# rigid-body fitting [mm] above which a body is not stable.
+MAX_CONDITION = 120.0
+MAX_MEAN_ERROR_MM = 0.35
+REJECT_TAIL = 6.3e-5  # probability of four standard deviations, as everywhere
+# Of the coordinates of a body in another unit, or mirrored, the images tell at once: by the fit of
+# its shape to points in space.
+SCALE_TOLERANCE = 0.05
+_MOVED = (Kind.MARKER_MIGRATED, Kind.MARKERS_EXCHANGED)
+UNITS = {10.0: 'cm', 1000.0: 'm', 25.4: 'inches'}
+
+
+@dataclass(frozen=True)
+class BodyPlaces:
+    """Places of the markers of a body in T exposures, as points in space.
+
+    Attributes
+    ----------
+    xyz_mm : (T, m, 3) ndarray
+        NaN where a marker is not known in space.
+    covariance : (T, m, 3, 3) ndarray
+        Of the random errors.
+    fixed : (T, m, 3, 3) ndarray
+        Of the errors that stay while a marker stands still, by the corrections.
+    """
+
+    xyz_mm: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    fixed: NDArray[np.float64]
+
+    @property
+    def seen(self) -> NDArray[np.bool_]:
+        """Return (T, m) whether a marker is known in space."""
+        return np.isfinite(self.xyz_mm).all(axis=2)
+
+
+@dataclass(frozen=True)
+class EstimatedShape:
+    """The shape of a body.
+
+    Attributes
+    ----------
+    body : Body
+        Coordinates in its frame, and their standard deviations relative to each other.
+    frame_covariance : (6, 6) ndarray
+        Of position [mm] and rotation [rad] of the frame about the centre of the markers, along the
+        axes of the body, by CT.
+    condition : float
+        Condition number [1/m].
+    mean_error_mm : float
+        Mean error of rigid-body fitting, over all exposures.
+    exposures : int
+        Exposures that contributed.
+    findings : tuple of Finding
+    """
+
+    body: Body
+    frame_covariance: NDArray[np.float64]
+    condition: float
+    mean_error_mm: float
+    exposures: int
+    findings: tuple[Finding, ...]
+
+
+def condition_number(xyz_mm: NDArray[np.float64]) -> float:
+    """Condition number [1/m] of markers (m, 3): how far they lie from the line that fits best.
+
+    One over the root of the sum of squared distances from that line (Soderkvist and Wedin,
+    "Determining the movements of the skeleton using well-configured markers", J. Biomech. 26,
+    1993). Infinite for markers on a line.
+    """
+    centred = xyz_mm - xyz_mm.mean(axis=0)
+    values = np.linalg.svd(centred, compute_uv=False)
+    across = float(np.sqrt(np.sum(values[1:] ** 2)))
+    return 1000.0 / across if across > 0 else np.inf
+
+
+def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
+    """Estimate the shape of a body from the places of its markers in space and from CT.
+
+    Parameters
+    ----------
+    body : Body
+        With the coordinates that are known.
+    places : BodyPlaces
+
+    Returns
+    -------
+    EstimatedShape
+        With the body unchanged where no exposure shows three of its markers, and where its
+        coordinates are mirrored or in another unit.
+    """
+    start = _start(body, places)
+    if start is None:
+        return _unchanged(body, [_few_markers(body)])
+    wrong = _wrong_frame(body, places)
+    if wrong:
+        return _unchanged(body, wrong)
+    adjustment = _adjust(body, places, start)
+    known = np.isfinite(adjustment.xyz).all(axis=1)
+    findings = _contradictions(body, places, adjustment)
+    moved = [marker for one in findings if one.kind in _MOVED for marker in one.place.target_id]
+    if moved:  # what CT says of them is no observation of these markers
+        sd = np.where(np.isin(body.target_id, moved), np.inf, body.sd_mm)
+        adjustment = _adjust(replace(body, sd_mm=sd), places, start)
+    shape = adjustment.xyz
+    frame, relative = _datum(shape[known], adjustment.covariance)
+    sd = np.full(len(shape), np.inf)
+    sd[known] = np.sqrt(np.diagonal(relative).reshape(-1, 3).mean(axis=1))
+    condition = condition_number(shape[known])
+    findings += _stability(body, condition, adjustment.mean_error_mm)
+    return EstimatedShape(
+        replace(body, xyz_mm=shape, sd_mm=sd),
+        frame,
+        condition,
+        mean_error_mm=adjustment.mean_error_mm,
+        exposures=adjustment.exposures,
+        findings=tuple(findings),
+    )
+
+
+@dataclass(frozen=True)
+class _Adjustment:
+    """Coordinates (m, 3), covariance (3k, 3k) of the k known ones, and how markers fit.
+
+    test (m,): sum of squares of a marker over its expectation.
+    """
+
+    xyz: np.ndarray
+    covariance: np.ndarray
+    test: np.ndarray
+    mean_error_mm: float
+    exposures: int
+
+
+def _start(body: Body, places: BodyPlaces) -> tuple[np.ndarray, np.ndarray] | None:
+    """First coordinates (m, 3), NaN for markers never seen, and the exposures that give poses.
+
+    The shape is that of the images, so that wrong coordinates of CT do not lead astray; CT says
+    where its frame is.
+    """
+    seen = places.seen
+    richest = int(np.argmax(seen.sum(axis=1))) if len(seen) else 0
+    if not len(seen) or np.count_nonzero(seen[richest]) < 3:
+        return None
+    xyz = np.where(seen[richest][:, None], places.xyz_mm[richest], np.nan)
+    for marker in np.flatnonzero(~seen[richest]):
+        for place in places.xyz_mm[seen[:, marker]]:
+            common = np.isfinite(place).all(axis=1) & np.isfinite(xyz).all(axis=1)
+            if np.count_nonzero(common) >= 3:
+                rotation, shift = fitted_pose(place[common], xyz[common])
+                xyz[marker] = rotation @ place[marker] + shift
+                break
+    found = np.isfinite(xyz).all(axis=1)
+    given = found & body.known
+    if np.count_nonzero(given) >= 3:
+        rotation, shift = fitted_pose(xyz[given], body.xyz_mm[given])
+        xyz = xyz @ rotation.T + shift
+    else:
+        xyz = xyz - xyz[found].mean(axis=0)
+    return xyz, np.flatnonzero(np.count_nonzero(seen & found, axis=1) >= 3)
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """Places (T, k, 3) of known markers, their information (T, k, 3, 3) and CT (k, 3) with weights."""
+
+    place: np.ndarray
+    information: np.ndarray
+    seen: np.ndarray
+    ct: np.ndarray
+    ct_weight: np.ndarray
+
+
+@dataclass(frozen=True)
+class _Reduced:
+    """Normal equations of the shape after the elimination of the poses.
+
+    solved (T, 6, 3k + 1): N^-1 (D'SR, D's); by_pose (T, k, 3, 6); normal (T, 6, 6).
+    """
+
+    matrix: np.ndarray
+    right: np.ndarray
+    solved: np.ndarray
+    by_pose: np.ndarray
+    normal: np.ndarray
+
+
+def _adjust(
+    body: Body, places: BodyPlaces, start: tuple[np.ndarray, np.ndarray]
+) -> _Adjustment:
+    """Adjust coordinates and poses together, from first coordinates and exposures."""
+    xyz, rows = start
+    known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
+    problem = _problem(body, places, xyz, (rows, known))
+    shape = xyz[known].copy()
+    poses = [fitted_pose(shape[s], p[s]) for s, p in zip(problem.seen, problem.place)]
+    rotation = np.array([one[0] for one in poses])
+    shift = np.array([one[1] for one in poses])
+    for _ in range(ROUNDS):
+        reduced = _reduced(problem, shape, rotation, shift)
+        covariance = np.linalg.inv(reduced.matrix)
+        step = covariance @ reduced.right
+        of_pose = reduced.solved[:, :, -1] - reduced.solved[:, :, :-1] @ step
+        shape = shape + step.reshape(-1, 3)
+        shift = shift + of_pose[:, :3]
+        rotation = _turned(rotation, of_pose[:, 3:])
+    residual = _residual(problem, shape, rotation, shift)
+    out = xyz.copy()
+    out[known] = shape
+    test = np.full(len(xyz), np.nan)
+    test[known] = _squares_over_expectation(problem, reduced, residual)
+    stays = _stays(places, (rows, known), problem, reduced, rotation)
+    count = max(np.count_nonzero(problem.seen), 1)
+    return _Adjustment(
+        out,
+        covariance + covariance @ stays @ covariance,
+        test=test,
+        mean_error_mm=float(np.sqrt(np.sum(residual**2) / count)),
+        exposures=len(rows),
+    )
+
+
+def _problem(
+    body: Body, places: BodyPlaces, xyz: np.ndarray, chosen: tuple[np.ndarray, np.ndarray]
+) -> _Problem:
+    """Return what is observed of the chosen exposures and markers."""
+    known = chosen[1]
+    given = body.known[known] & np.isfinite(body.sd_mm[known])
+    if np.count_nonzero(given) < 3:  # they define no frame
+        given[:] = False
+    weight = np.where(given, 1 / np.maximum(body.sd_mm[known], 1e-6) ** 2, 0.0)
+    seen = places.seen[np.ix_(*chosen)]
+    total = (places.covariance + places.fixed)[np.ix_(*chosen)]
+    information = np.linalg.inv(np.where(seen[..., None, None], total, np.eye(3)))
+    return _Problem(
+        np.where(seen[..., None], places.xyz_mm[np.ix_(*chosen)], 0.0),
+        np.where(seen[..., None, None], information, 0.0),
+        seen,
+        ct=np.where(given[:, None], body.xyz_mm[known], xyz[known]),
+        ct_weight=weight,
+    )
+
+
+def _residual(
+    problem: _Problem, shape: np.ndarray, rotation: np.ndarray, shift: np.ndarray
+) -> np.ndarray:
+    """Residuals (T, k, 3) of the places, 0 where a marker is not seen."""
+    expected = shape @ np.swapaxes(rotation, 1, 2) + shift[:, None]
+    return np.where(problem.seen[..., None], problem.place - expected, 0.0)
+
+
+def _reduced(
+    problem: _Problem, shape: np.ndarray, rotation: np.ndarray, shift: np.ndarray
+) -> _Reduced:
+    """Eliminate the poses from the normal equations."""
+    exposures, count = problem.seen.shape
+    residual = _residual(problem, shape, rotation, shift)
+    by_pose = np.zeros((exposures, count, 3, POSE_SIZE))
+    by_pose[..., :3] = np.eye(3)
+    by_pose[..., 3:] = -cross_matrix(shape @ np.swapaxes(rotation, 1, 2))
+    transposed = np.swapaxes(by_pose, 2, 3)
+    back = np.swapaxes(rotation, 1, 2)[:, None]
+    turned = problem.information @ rotation[:, None]  # S R
+    told = problem.information @ residual[..., None]  # s
+    normal = (transposed @ problem.information @ by_pose).sum(axis=1)
+    cross = (transposed @ turned).transpose(0, 2, 1, 3).reshape(exposures, POSE_SIZE, 3 * count)
+    right = (transposed @ told).sum(axis=1)
+    solved = np.linalg.solve(normal, np.concatenate([cross, right], axis=2))
+    flat = cross.reshape(-1, 3 * count)
+    matrix = -flat.T @ solved[:, :, :-1].reshape(-1, 3 * count)
+    own = (back @ turned).sum(axis=0) + problem.ct_weight[:, None, None] * np.eye(3)
+    for k in range(count):
+        matrix[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] += own[k]
+    if not problem.ct_weight.any():
+        # Inner constraints: the centre and the attitude of the markers are those of the first
+        # coordinates (Foerstner and Wrobel 2016, 4.3.2).
+        motion = _motion(shape)
+        matrix += np.trace(matrix) / (3 * count) * (motion @ np.linalg.pinv(motion))
+    by_shape = (back @ told)[..., 0].sum(axis=0)
+    by_shape += problem.ct_weight[:, None] * (problem.ct - shape)
+    return _Reduced(
+        matrix,
+        by_shape.ravel() - flat.T @ solved[:, :, -1].ravel(),
+        solved=solved,
+        by_pose=by_pose,
+        normal=normal,
+    )
+
+
+def _squares_over_expectation(
+    problem: _Problem, reduced: _Reduced, residual: np.ndarray
+) -> np.ndarray:
+    """Weighted squares (k,) of the residuals of markers over their redundancy, NaN without any."""
+    squares = np.sum(residual * (problem.information @ residual[..., None])[..., 0], axis=2)
+    of_place = reduced.by_pose @ np.linalg.inv(reduced.normal)[:, None]
+    of_place = of_place @ np.swapaxes(reduced.by_pose, 2, 3)
+    share = np.trace(of_place @ problem.information, axis1=2, axis2=3)
+    freedom = np.where(problem.seen, 3 - share, 0.0).sum(axis=0)
+    return np.where(freedom > 1, squares.sum(axis=0) / np.maximum(freedom, 1), np.nan)
+
+
+def _stays(
+    places: BodyPlaces,
+    chosen: tuple[np.ndarray, np.ndarray],
+    problem: _Problem,
+    reduced: _Reduced,
+    rotation: np.ndarray,
+) -> np.ndarray:
+    """Covariance of the right side of the shape by errors of the corrections.
+
+    They do not average out: they are taken to be the same in all exposures, the most that they can
+    be, as for a body that stands still.
+    """
+    seen = problem.seen
+    exposures, count = seen.shape
+    fixed = np.where(seen[..., None, None], places.fixed[np.ix_(*chosen)], 0.0)
+    mean = fixed.sum(axis=0) / np.maximum(seen.sum(axis=0), 1)[:, None, None]
+    direct = (np.swapaxes(rotation, 1, 2)[:, None] @ problem.information).sum(axis=0)
+    by_pose = np.swapaxes(reduced.by_pose, 2, 3) @ problem.information  # (T, k, 6, 3), D'S
+    by_pose = by_pose.transpose(0, 2, 1, 3).reshape(exposures * POSE_SIZE, 3 * count)
+    pulled = -reduced.solved[:, :, :-1].reshape(-1, 3 * count).T @ by_pose
+    root = np.zeros((3 * count, 3 * count))
+    for k in range(count):
+        rows = slice(3 * k, 3 * k + 3)
+        pulled[rows, rows] += direct[k]
+        root[rows, rows] = mean[k]
+    return pulled @ root @ pulled.T
+
+
+def _turned(rotation: np.ndarray, w: np.ndarray) -> np.ndarray:
+    """Rotations (T, 3, 3) varied on the left, made orthogonal again."""
+    u, _, vt = np.linalg.svd((np.eye(3) + cross_matrix(w)) @ rotation)
+    return u @ vt
+
+
+def _datum(xyz: np.ndarray, covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Covariance (6, 6) of the frame about the centre, and that of coordinates in their datum."""
+    motion = _motion(xyz)
+    read = np.linalg.pinv(motion)
+    relative = np.eye(len(covariance)) - motion @ read
+    return read @ covariance @ read.T, relative @ covariance @ relative.T
+
+
+def _motion(xyz: np.ndarray) -> np.ndarray:
+    """Derivatives (3k, 6) of coordinates (k, 3) by a motion of all of them about their centre."""
+    arm = xyz - xyz.mean(axis=0)
+    turn = -cross_matrix(arm).reshape(-1, 3)
+    return np.concatenate([np.tile(np.eye(3), (len(xyz), 1)), turn], axis=1)
+
+
+# What is wrong with a body.
+
+
+def _unchanged(body: Body, findings: Sequence[Finding]) -> EstimatedShape:
+    known = body.xyz_mm[body.known]
+    condition = condition_number(known) if len(known) >= 2 else np.inf
+    return EstimatedShape(
+        body,
+        np.zeros((POSE_SIZE, POSE_SIZE)),
+        condition,
+        mean_error_mm=np.nan,
+        exposures=0,
+        findings=tuple(findings),
+    )
+
+
+def _place(body: Body, markers: Sequence[int] = ()) -> Place:
+    return Place(target_id=tuple(int(i) for i in markers), name=f'body {body.name}')
+
+
+def _few_markers(body: Body) -> Finding:
+    return Finding(
+        Kind.FEW_MARKERS,
+        'no exposure shows three of its markers in space, its shape is not estimated',
+        place=_place(body),
+        severity=Severity.WARNING,
+        numbers={'markers': float(len(body.target_id))},
+    )
+
+
+def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
+    """Say where coordinates are those of the mirrored body, or in another unit."""
+    seen = places.seen & body.known
+    count = seen.sum(axis=1)
+    row = int(np.argmax(count))
+    if count[row] < 3:
+        return []
+    given = body.xyz_mm[seen[row]]
+    measured = places.xyz_mm[row][seen[row]]
+    spread = [np.sqrt(np.sum((x - x.mean(axis=0)) ** 2)) for x in (given, measured)]
+    factor = float(spread[1] / spread[0])
+    for scale, unit in UNITS.items():
+        if abs(factor / scale - 1) < SCALE_TOLERANCE:
+            cause = f'its coordinates are in {unit}, not in mm: distances in space are larger {factor:.4g} times'
+            numbers = {'factor': factor}
+            return [Finding(Kind.WRONG_UNIT, cause, place=_place(body), numbers=numbers)]
+    if count[row] < 4:
+        return []
+    errors = []
+    for sign in (1.0, -1.0):
+        mirrored = given * np.array([sign, 1.0, 1.0])
+        rotation, shift = fitted_pose(mirrored, measured)
+        errors.append(float(np.sqrt(np.mean((mirrored @ rotation.T + shift - measured) ** 2))))
+    sd = float(np.sqrt(np.mean(np.where(np.isfinite(body.sd_mm), body.sd_mm, 0.0) ** 2)))
+    limit = 4 * np.hypot(sd, np.sqrt(np.nanmedian(places.covariance[..., 0, 0])))
+    if errors[1] < limit < errors[0]:
+        cause = (
+            f'its coordinates are those of the mirrored body: they fit the points in space to '
+            f'{errors[0]:.2g} mm, mirrored to {errors[1]:.2g} mm'
+        )
+        numbers = {'rms_mm': errors[0], 'rms_mirrored_mm': errors[1]}
+        return [Finding(Kind.BODY_MIRRORED, cause, place=_place(body), numbers=numbers)]
+    return []
+
+
+def _contradictions(body: Body, places: BodyPlaces, adjustment: _Adjustment) -> list[Finding]:
+    """Name markers that are loose, have migrated since CT, or are exchanged."""
+    findings = []
+    known = body.known & np.isfinite(adjustment.xyz).all(axis=1) & np.isfinite(body.sd_mm)
+    if np.count_nonzero(known) >= 4:
+        findings += _migrated(body, adjustment, known)
+    test = adjustment.test
+    typical = float(np.nanmedian(test)) if np.isfinite(test).any() else 1.0
+    loose = np.flatnonzero(test > _limit_of_ratio(places) * max(1.0, typical))
+    for row in loose:
+        marker = int(body.target_id[row])
+        cause = (
+            f'marker {marker} moves against the others: its places scatter '
+            f'{np.sqrt(test[row]):.1f} times as much as their standard deviations'
+        )
+        findings.append(
+            Finding(
+                Kind.MARKER_LOOSE,
+                cause,
+                place=_place(body, [marker]),
+                severity=Severity.WARNING,
+                numbers={'ratio': float(np.sqrt(test[row]))},
+            )
+        )
+    return findings
+
+
+def _limit_of_ratio(places: BodyPlaces) -> float:
+    """Largest mean square of residuals of a marker that chance explains.
+
+    Errors that stay are the same in many exposures: as if there were ten independent ones.
+    """
+    independent = 3 * min(10, int(np.count_nonzero(places.seen.any(axis=1))))
+    return float(chdtri(independent, REJECT_TAIL) / independent)
+
+
+def _migrated(body: Body, adjustment: _Adjustment, known: np.ndarray) -> list[Finding]:
+    """Compare the shape of the images with that of CT, marker by marker."""
+    rows = np.flatnonzero(known)
+    limit = float(chdtri(3, REJECT_TAIL))
+    given = body.xyz_mm[rows]
+    sd = np.maximum(body.sd_mm[rows], 1e-3)
+    found = adjustment.xyz[rows]
+    pair = _exchanged(given, found, sd)
+    if pair is not None:
+        markers = [int(body.target_id[rows[k]]) for k in pair]
+        distance = float(np.linalg.norm(given[pair[0]] - given[pair[1]]))
+        cause = f'markers {markers[0]} and {markers[1]} are exchanged in CT or in the images'
+        return [
+            Finding(
+                Kind.MARKERS_EXCHANGED,
+                cause,
+                place=_place(body, markers),
+                numbers={'distance_mm': distance},
+            )
+        ]
+    out: list[int] = []
+    while len(rows) - len(out) >= 4:
+        kept = [k for k in range(len(rows)) if k not in out]
+        tests = [_against_others(given, found, sd, k, kept) for k in kept]
+        worst = int(np.argmax(tests))
+        if tests[worst] <= limit:
+            break
+        out.append(kept[worst])
+    kept = [k for k in range(len(rows)) if k not in out]
+    rotation, shift = fitted_pose(found[kept], given[kept], 1 / sd[kept] ** 2)
+    shifts = found @ rotation.T + shift - given
+    findings = []
+    for k in out:
+        marker = int(body.target_id[rows[k]])
+        distance = float(np.linalg.norm(shifts[k]))
+        cause = (
+            f'marker {marker} is {distance:.2g} mm from where CT has it, with a standard '
+            f'deviation of {sd[k]:.2g} mm: it has migrated, or is another one'
+        )
+        findings.append(
+            Finding(
+                Kind.MARKER_MIGRATED,
+                cause,
+                place=_place(body, [marker]),
+                severity=Severity.WARNING,
+                numbers={'distance_mm': distance, 'sd_mm': float(sd[k])},
+            )
+        )
+    return findings
+
+
+def _against_others(
+    given: np.ndarray, found: np.ndarray, sd: np.ndarray, marker: int, kept: Sequence[int]
+) -> float:
+    """Square of the deviation of a marker from CT over its covariance, by the fit of the others."""
+    others = [k for k in kept if k != marker]
+    weight = 1 / sd[others] ** 2
+    rotation, shift = fitted_pose(found[others], given[others], weight)
+    arm = np.concatenate([given[others], given[[marker]]]) - given[others].mean(axis=0)
+    motion = np.zeros((len(arm), 3, POSE_SIZE))
+    motion[..., :3] = np.eye(3)
+    motion[..., 3:] = -cross_matrix(arm)
+    normal = (np.swapaxes(motion[:-1], 1, 2) @ (motion[:-1] * weight[:, None, None])).sum(axis=0)
+    away = rotation @ found[marker] + shift - given[marker]
+    covariance = sd[marker] ** 2 * np.eye(3) + motion[-1] @ np.linalg.solve(normal, motion[-1].T)
+    return float(away @ np.linalg.solve(covariance, away))
+
+
+def _misfit(given: np.ndarray, found: np.ndarray, sd: np.ndarray) -> float:
+    """Weighted sum of squares of the fit of coordinates (k, 3) to those of CT, over its limit."""
+    rotation, shift = fitted_pose(found, given, 1 / sd**2)
+    away = (found @ rotation.T + shift - given) / sd[:, None]
+    return float(np.sum(away**2) / chdtri(3 * len(given) - POSE_SIZE, REJECT_TAIL))
+
+
+def _exchanged(given: np.ndarray, found: np.ndarray, sd: np.ndarray) -> tuple[int, int] | None:
+    """Two markers that contradict CT, and agree with it when they are exchanged."""
+    if _misfit(given, found, sd) <= 1:
+        return None
+    pairs = list(combinations(range(len(given)), 2))
+    tried = []
+    for first, second in pairs:
+        order = np.arange(len(given))
+        order[[first, second]] = second, first
+        tried.append(_misfit(given[order], found, sd))
+    best = int(np.argmin(tried))
+    return pairs[best] if tried[best] <= 1 else None
+
+
+def _stability(body: Body, condition: float, mean_error_mm: float) -> list[Finding]:
+    """Say where markers lie on a line, or a body is not rigid."""
+    findings = []
+    if condition > MAX_CONDITION:
+        line = not np.isfinite(condition) or condition > 100 * MAX_CONDITION
+        cause = (
+            f'its markers lie {"on" if line else "nearly on"} a line (condition number '
+            f'{condition:.0f} per m, at most {MAX_CONDITION:.0f} by ISO 16087): the rotation '
+            'about it is weak'
+        )
+        findings.append(
+            Finding(
+                Kind.BODY_ON_A_LINE,
+                cause,
+                place=_place(body),
+                severity=Severity.WARNING,
+                numbers={'condition_per_m': condition},
+            )
+        )
+    if mean_error_mm > MAX_MEAN_ERROR_MM:
+        cause = (
+            f'it is not rigid: its markers deviate from its shape by {mean_error_mm:.2g} mm '
+            f'(RMS; at most {MAX_MEAN_ERROR_MM} mm by ISO 16087)'
+        )
+        findings.append(
+            Finding(
+                Kind.BODY_NOT_RIGID,
+                cause,
+                place=_place(body),
+                severity=Severity.WARNING,
+                numbers={'mean_error_mm': mean_error_mm},
+            )
+        )
+    return findings
+
+
+def places_of(
+    body: Body, target_ids: Sequence[np.ndarray], points: Sequence[Mapping[str, np.ndarray]]
+) -> BodyPlaces:
+    """Collect the places of the markers of a body from points in space.
+
+    target_ids: (n,) of each exposure; points: of each, 'xyz_mm' (n, 3), 'noise' and 'fixed'
+    (n, 3, 3), with NaN for points that are not to be used.
+    """
+    shape = (len(target_ids), len(body.target_id))
+    xyz = np.full((*shape, 3), np.nan)
+    noise = np.full((*shape, 3, 3), np.nan)
+    fixed = np.full((*shape, 3, 3), np.nan)
+    for row, (ids, values) in enumerate(zip(target_ids, points)):
+        _, own, given = np.intersect1d(body.target_id, ids, return_indices=True)
+        xyz[row, own] = values['xyz_mm'][given]
+        noise[row, own] = values['noise'][given]
+        fixed[row, own] = values['fixed'][given]
+    return BodyPlaces(xyz, noise, fixed)

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from ..errors import DataError
-from ..photogrammetry.rotations import matrix_from_vector
+from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
 from .anatomical_frames import AXES, BODY_FRAME, AnatomicalFrame
 from .body import BodyPoses, PoseStatus
 from .joint_conventions import Convention, convention
@@ -269,9 +269,9 @@ def _relative(
     by_d[:, :3, 3:] = to_p_axial
     # w x a = -[a]x w; the proximal axes turn against what is seen in them.
     by_p[:, 3:, :3] = -to_p
-    by_p[:, 3:, 3:] = to_p @ _cross(arm_p + between)
+    by_p[:, 3:, 3:] = to_p @ cross_matrix(arm_p + between)
     by_d[:, 3:, :3] = to_p
-    by_d[:, 3:, 3:] = -to_p @ _cross(arm_d)
+    by_d[:, 3:, 3:] = -to_p @ cross_matrix(arm_d)
 
     covariance = np.zeros_like(by_p)
     for jacobian, poses in ((by_p, proximal), (by_d, distal)):
@@ -286,11 +286,6 @@ def _relative(
             turned = rotation @ joint.neutral_covariance @ np.swapaxes(rotation, 1, 2)
             covariance[:, :3, :3] += turned
     return _Relative(rotation, translation, covariance)
-
-
-def _cross(v: np.ndarray) -> np.ndarray:
-    """Return matrices (T, 3, 3) with _cross(v) w = v x w."""
-    return np.cross(v[:, None, :], np.eye(3), axis=-1).swapaxes(1, 2)
 
 
 def _angles(of: Convention, rotation: np.ndarray) -> np.ndarray:

@@ -191,7 +191,9 @@ class PoseSolver:
             rotation, centre, alone = self._converge((rotation, centre), points, used, prior)
             linear = self._linear(rotation, centre, points)
             marker = self._marker(linear, points, used, points.noise + points.correction)
-            current = self._test(marker, linear, points, used, np.where(alone[:, None, None], 0, prior))
+            current = self._test(
+                marker, linear, points, used, np.where(alone[:, None, None], 0, prior)
+            )
             test = np.where(used, current, test)
             worst = np.argmax(np.where(used, current, 0), axis=1)
             rows = np.arange(len(worst))

@@ -222,6 +222,17 @@ def _array(name: str, value: Any, shape: tuple[int, ...]) -> np.ndarray:
     return array
 
 
+def joint_definition(joint: Joint, landmarks: Mapping[str, Mapping[str, np.ndarray]]) -> str:
+    """Return the text of a joints.toml with one joint, from landmarks (3,) by body [mm]."""
+    keys = {name: getattr(joint, name) for name in (*REQUIRED, 'side') if getattr(joint, name)}
+    lines = ['[[joint]]', *(f'{key} = "{value}"' for key, value in keys.items())]
+    for end in ('proximal', 'distal'):
+        lines += ['', f'[joint.{end}_frame.landmarks]']
+        points = landmarks[getattr(joint, end)]
+        lines += [f'{name} = {np.asarray(x).tolist()!r}' for name, x in points.items()]
+    return '\n'.join(lines) + '\n'
+
+
 def write_joints(path: PathLike, motions: Sequence[JointMotion], start_ns: int) -> None:
     """Write joints.csv: a row for each joint and exposure, with times since start_ns.
 

@@ -34,6 +34,7 @@ MAX_PRINCIPAL_DISTANCE_PX = 1e9
 BYTES_OF_TRAINING_POINT = 36  # in a message: four numbers and an exposure
 BYTES_OF_CALIBRATION = 2 * MEGABYTE  # in a message, at most, without training points
 BYTES_OF_IMAGE = MEGABYTE  # in a message, at most, without pixels
+MAX_JOINTS = 1000  # of a joints.toml
 # Texts [characters].
 MAX_TEXT = 4096  # of a parameter
 

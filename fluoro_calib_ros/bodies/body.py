@@ -64,7 +64,11 @@ class Body:
                 f'body {self.name}: the coordinates or the standard deviation of marker '
                 f'{target_id[bad][0]} are not finite, or negative'
             )
-        for name, array in (('target_id', target_id), ('xyz_mm', xyz[order]), ('sd_mm', sd[order])):
+        for name, array in (
+            ('target_id', target_id),
+            ('xyz_mm', xyz[order]),
+            ('sd_mm', sd[order]),
+        ):
             array.setflags(write=False)
             object.__setattr__(self, name, array)
 

@@ -29,7 +29,7 @@ the derivative of the likelihood of each exposure.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -167,9 +167,7 @@ class MotionFilter:
         covariance = into @ self.covariance @ back + noise[:, 0] + noise[:, 1]
         if log_q is None:
             self._slope = into[:, None] @ self._slope @ back[:, None] + noise
-            self._log_variance = np.minimum(
-                self._log_variance + WALK * dt_s, START_LOG_SD**2
-            )
+            self._log_variance = np.minimum(self._log_variance + WALK * dt_s, START_LOG_SD**2)
         self._predicted = _Step(
             dt_s,
             into,
@@ -354,9 +352,7 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
     return motion, scores
 
 
-def smooth_trial(
-    first: MotionFilter, seen: Sequence[PoseInformation]
-) -> Motion:
+def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion:
     """Smooth a whole trial with the most probable course of its densities.
 
     Parameters

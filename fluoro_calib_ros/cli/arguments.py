@@ -79,13 +79,15 @@ def names(text: str) -> list[str]:
 def add_option(parser: Parser, option: Option, **changes: Any) -> None:
     """Add the argument of a declared option: --name with its choices, default and description.
 
-    changes replace keyword arguments of `add_argument`.
+    One that is False by default is a flag. changes replace keyword arguments of `add_argument`.
     """
     settings: dict[str, Any] = {'default': option.default}
     unit = f' [{option.unit}]' if option.unit else ''
     default = '' if option.default is None else f' (default: {_text(option.default)})'
     settings['help'] = f'{option.description}{unit}{default}'
-    if option.choices:
+    if option.default is False:
+        settings = {'action': 'store_true', 'help': option.description}
+    elif option.choices:
         settings['choices'] = option.choices
     elif option.length is not None:
         settings['type'] = numbers_of(option.length)

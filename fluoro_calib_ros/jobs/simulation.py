@@ -22,7 +22,10 @@ from ..images.codec import encode
 from ..io.access import PathLike, make_folder
 from ..io.atomic import write_bytes, write_text
 from ..io.bags.writer import BagWriter
+from ..io.bodies import write_bodies
 from ..io.folder import FolderKind, replaced_folder
+from ..io.joints import COLUMNS as JOINT_COLUMNS
+from ..io.joints import joint_definition
 from ..io.observations import write_observations_csv
 from ..io.phantom import write_phantom
 from ..io.text_files import write_json
@@ -30,6 +33,16 @@ from ..options import option, validate_options
 from ..photogrammetry.rotations import quaternion_from_matrix
 from ..processes import OF_STREAM, WorkerProcess
 from ..simulation.exposures import Detection, SimulatedExposures, simulate_exposures
+from ..simulation.knee import JOINT as KNEE
+from ..simulation.knee import (
+    LANDING_HZ,
+    LANDING_S,
+    MOTIONS,
+    SimulatedKnee,
+    VirtualKnee,
+    simulate_knee,
+    virtual_knee,
+)
 from ..simulation.marker_images import (
     HARD_MARKER_SETTINGS,
     MARKER_SETTINGS,
@@ -48,6 +61,8 @@ from ..simulation.tracking import SimulatedTracking, simulate_tracking
 IMAGES = 'images'  # folder of radiographs, a folder for each fluoroscope
 MARKER_IMAGES = 'marker_images'  # the same of moving markers
 FIRST_MARKERS = 'first_markers.csv'  # where they are in the first image, to some pixel
+BODIES = 'bodies.csv'
+JOINTS = 'joints.toml'
 CLUSTERS = 'clusters.txt'  # markers that are rigid together, a line for each cluster
 TRUTH = 'truth'  # folder of what a data set was made with
 TRUE_SD_MM = 1e-6  # the file of the true coordinates has to contain a standard deviation
@@ -200,6 +215,43 @@ def write_tracking(directory: PathLike, tracking: SimulatedTracking) -> None:
     write_text(directory / TRUTH / 'markers.csv', '\n'.join(lines) + '\n')
 
 
+def write_knee(directory: PathLike, knee: VirtualKnee) -> None:
+    """Write bodies.csv and joints.toml of a knee, and truth/bodies.csv. Raises DataError."""
+    directory = Path(directory)
+    write_bodies(directory / BODIES, knee.surveyed)
+    write_bodies(directory / TRUTH / BODIES, knee.bodies)
+    write_text(directory / JOINTS, joint_definition(knee.joint, knee.landmarks))
+
+
+def write_knee_recording(directory: PathLike, name: str, recording: SimulatedKnee) -> None:
+    """Write a recording of a knee as the bag NAME, with truth/NAME_poses.csv and NAME_joints.csv.
+
+    Their columns are the first ones of poses.csv and joints.csv. Raises DataError.
+    """
+    directory = Path(directory)
+    write_bag(directory / name, recording.frames)
+    motion = recording.motion
+    numbers = [frame.number for frame in next(iter(recording.frames.values()))]
+    lines = ['body,exposure,time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw']
+    for body, rotation in motion.rotation.items():
+        wxyz = quaternion_from_matrix(rotation)
+        values = np.column_stack(
+            [motion.times_s, motion.position_mm[body], wxyz[:, 1:], wxyz[:, :1]]
+        )
+        lines += [
+            ','.join([body, str(number), *(f'{x:.9f}' for x in row)])
+            for number, row in zip(numbers, values)
+        ]
+    write_text(directory / TRUTH / f'{name}_poses.csv', '\n'.join(lines) + '\n')
+    lines = [','.join(JOINT_COLUMNS[:9])]
+    values = np.column_stack([motion.times_s, np.rad2deg(motion.angles), motion.translations])
+    lines += [
+        ','.join([KNEE, str(number), *(f'{x:.9f}' for x in row)])
+        for number, row in zip(numbers, values)
+    ]
+    write_text(directory / TRUTH / f'{name}_joints.csv', '\n'.join(lines) + '\n')
+
+
 def write_rig(directory: PathLike, rig: VirtualRig, options: Mapping[str, Any]) -> None:
     """Write phantom.csv (the survey), truth/phantom.csv (true coordinates) and truth/rig.json.
 
@@ -327,6 +379,9 @@ _PARTS = (
     MARKER_IMAGES,
     FIRST_MARKERS,
     CLUSTERS,
+    *MOTIONS,
+    BODIES,
+    JOINTS,
     TRUTH,
 )
 
@@ -366,6 +421,11 @@ class SimulationOptions:
         0.01, 'fraction of the targets with a wrong id', minimum=0, maximum=0.5
     )
     strength: float = option(1.0, 'strength of the distortion', minimum=0, maximum=10)
+    bodies: bool = option(
+        False,
+        'recordings of a knee that walks, as long and at the rate of the moving markers, and that '
+        'lands, with its bodies and joints',
+    )
     images: str = option(
         'none',
         'radiographs of the exposures of the phantom, clean or with clutter and little dose',
@@ -438,3 +498,27 @@ def _write(
             start=StreamStart(START_NS + 2 * HOUR_NS),
         )
         write_tracking(directory, tracking)
+    if options.bodies:
+        _write_knee(directory, rig, options)
+
+
+def _write_knee(directory: Path, rig: VirtualRig, options: SimulationOptions) -> None:
+    """Write the knee and its recordings."""
+    knee = virtual_knee(options.seed)
+    write_knee(directory, knee)
+    lengths = {
+        'walking': (options.seconds, options.rate),
+        'landing': (LANDING_S, LANDING_HZ),
+    }
+    for number, (name, move) in enumerate(MOTIONS.items()):
+        seconds, rate = lengths[name]
+        times_s = np.arange(round(seconds * rate)) / rate
+        recording = simulate_knee(
+            rig,
+            knee,
+            move(knee, times_s),
+            noise_px=options.noise,
+            seed=options.seed + number,
+            start=StreamStart(START_NS + (3 + number) * HOUR_NS),
+        )
+        write_knee_recording(directory, name, recording)

@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..exposures.frame import Frame
+from ..exposures.frame import Frame, points_on_image
 from ..photogrammetry.rotations import matrix_from_vector
 from .rig import VirtualRig
 from .streams import DECIMALS, StreamStart
@@ -91,18 +91,38 @@ def simulate_tracking(
     times_s = [index / rate_hz for index in range(round(seconds * rate_hz))]
     points = np.array([_markers_at(time_s, shapes) for time_s in times_s])
     points = points.reshape(len(times_s), len(ids), 3)
-    frames = {}
-    ideal = {}
+    frames, ideal = image_frames(rig, points, ids, times_s, noise_px, rng, start)
+    return SimulatedTracking(frames, ids, points, ideal)
+
+
+def image_frames(
+    rig: VirtualRig,
+    points_mm: np.ndarray,
+    target_id: np.ndarray,
+    times_s: Sequence[float],
+    noise_px: float,
+    rng: np.random.Generator,
+    start: StreamStart,
+) -> tuple[dict[str, list[Frame]], dict[str, NDArray[np.float64]]]:
+    """Return frames of moving points and their ideal image points (T, k, 2), by fluoroscope.
+
+    points_mm (T, k, 3) are those of the targets (k,) at times (T,). A frame has the points that
+    are on the image.
+    """
+    frames: dict[str, list[Frame]] = {}
+    ideal: dict[str, NDArray[np.float64]] = {}
     for fluoroscope in rig.fluoroscopes:
-        uv = fluoroscope.ideal(points.reshape(-1, 3)).reshape(*points.shape[:2], 2)
+        uv = fluoroscope.ideal(points_mm.reshape(-1, 3)).reshape(*points_mm.shape[:2], 2)
         observed = fluoroscope.distortion.distort(uv.reshape(-1, 2)).reshape(uv.shape)
         observed = np.round(observed + rng.normal(0, noise_px, uv.shape), DECIMALS)
+        seen = points_on_image(observed.reshape(-1, 2), fluoroscope.image_size)
+        seen = seen.reshape(observed.shape[:2])
         ideal[fluoroscope.name] = uv
         frames[fluoroscope.name] = [
-            start.frame(fluoroscope, index, time_s, ids, observed[index])
-            for index, time_s in enumerate(times_s)
+            start.frame(fluoroscope, t, time_s, target_id[seen[t]], observed[t, seen[t]])
+            for t, time_s in enumerate(times_s)
         ]
-    return SimulatedTracking(frames, ids, points, ideal)
+    return frames, ideal
 
 
 def _markers_at(time_s: float, shapes: list[np.ndarray]) -> np.ndarray:

@@ -1,0 +1,253 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Anatomical frames of bones: from a matrix, from axes, or from landmarks.
+
+Sources of the landmark frames: Grood and Suntay, "A joint coordinate system for the clinical
+description of three-dimensional motions: application to the knee", J. Biomech. Eng. 105 (1983);
+Wu et al., "ISB recommendation on definitions of joint coordinate system ... part I: ankle, hip,
+and spine", J. Biomech. 35 (2002), and "... part II: shoulder, elbow, wrist and hand", J. Biomech.
+38 (2005). Grood and Suntay: x right, y anterior, z proximal. ISB: x anterior, y proximal, z right.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import DataError
+from ..photogrammetry.rotations import matrix_from_quaternion
+
+AXES = 'xyz'
+SIDES = ('left', 'right')
+# Three decimals of a direction leave half a thousandth.
+AXES_TOLERANCE = 1e-3
+# A landmark picked to 1 mm leaves the direction of a line of 50 mm open by this angle [rad].
+MIN_SINE = 0.02
+MIN_LENGTH_MM = 1.0
+
+
+@dataclass(frozen=True)
+class AnatomicalFrame:
+    """Axes of a bone in the coordinates of its body.
+
+    Raises DataError for axes that are not finite, not perpendicular or left-handed.
+
+    Attributes
+    ----------
+    rotation : (3, 3) ndarray
+        Columns are the x, y and z axis; unit lengths and right angles to AXES_TOLERANCE.
+    origin_mm : (3,) ndarray
+    """
+
+    rotation: NDArray[np.float64]
+    origin_mm: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        rotation = np.array(self.rotation, dtype=float)
+        origin = np.array(self.origin_mm, dtype=float)
+        if rotation.shape != (3, 3) or origin.shape != (3,):
+            raise DataError('a frame has three axes and an origin of three coordinates')
+        if not (np.isfinite(rotation).all() and np.isfinite(origin).all()):
+            raise DataError('the frame has coordinates that are not finite')
+        if np.abs(rotation.T @ rotation - np.eye(3)).max() > AXES_TOLERANCE:
+            raise DataError('the axes of the frame are not perpendicular unit vectors')
+        if np.linalg.det(rotation) < 0:
+            raise DataError('the axes of the frame are left-handed')
+        u, _, vt = np.linalg.svd(rotation)  # the nearest rotation (Schoenemann 1966)
+        for name, array in (('rotation', u @ vt), ('origin_mm', origin)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+
+BODY_FRAME = AnatomicalFrame(np.eye(3), np.zeros(3))
+
+
+def frame_of_quaternion(wxyz: ArrayLike, origin_mm: ArrayLike) -> AnatomicalFrame:
+    """Return the frame of a quaternion (4,), anatomical axes -> body. Raises DataError."""
+    q = np.array(wxyz, dtype=float)
+    if q.shape != (4,) or not abs(np.linalg.norm(q) - 1) <= AXES_TOLERANCE:
+        raise DataError('the quaternion of the frame does not have four numbers and length one')
+    return AnatomicalFrame(matrix_from_quaternion(q), np.array(origin_mm, dtype=float))
+
+
+def frame_of_axes(axes: Mapping[str, ArrayLike], origin_mm: ArrayLike) -> AnatomicalFrame:
+    """Return the frame with two or three given axes x, y, z (3,) of any length.
+
+    Raises DataError for other axes, and as AnatomicalFrame.
+    """
+    if not set(axes) <= set(AXES) or len(axes) < 2:
+        raise DataError('a frame has two or three of the axes x, y and z')
+    unit: dict[str, np.ndarray] = {}
+    for name, axis in axes.items():
+        vector = np.array(axis, dtype=float)
+        length = np.linalg.norm(vector)
+        if vector.shape != (3,) or not (0 < length < np.inf):
+            raise DataError(f'the {name} axis of the frame is not a direction of three numbers')
+        unit[name] = vector / length
+    for index, name in enumerate(AXES):
+        if name not in unit:
+            unit[name] = np.cross(unit[AXES[index - 2]], unit[AXES[index - 1]])
+    return AnatomicalFrame(
+        np.column_stack([unit[name] for name in AXES]), np.array(origin_mm, dtype=float)
+    )
+
+
+@dataclass(frozen=True)
+class Direction:
+    """An axis from the mean of some landmarks to that of others.
+
+    A lateral one is that of a right limb; on the left it is reversed, so that it points to the
+    right of the person, too.
+    """
+
+    axis: str
+    start: tuple[str, ...]
+    end: tuple[str, ...]
+    lateral: bool = False
+
+
+@dataclass(frozen=True)
+class LandmarkFrame:
+    """How landmarks make a frame.
+
+    Attributes
+    ----------
+    origin : tuple of str
+        Landmarks with this mean.
+    first : Direction
+        An axis of the frame.
+    second : Direction
+        Spans a plane with the first; its part that is perpendicular to the first is an axis.
+    """
+
+    origin: tuple[str, ...]
+    first: Direction
+    second: Direction
+
+    @property
+    def landmarks(self) -> tuple[str, ...]:
+        """Names of the landmarks, each once."""
+        first, second = self.first, self.second
+        names = (*self.origin, *first.start, *first.end, *second.start, *second.end)
+        return tuple(dict.fromkeys(names))
+
+
+_EPICONDYLES = ('medial_epicondyle', 'lateral_epicondyle')
+_MALLEOLI = ('medial_malleolus', 'lateral_malleolus')
+_EMINENCES = ('medial_eminence', 'lateral_eminence')
+_RADIUS = ('proximal_radius', 'distal_radius')
+
+LANDMARK_FRAMES = {
+    # z: mechanical axis; y: perpendicular to it and to the line of the posterior condyles.
+    'femur_grood_suntay': LandmarkFrame(
+        ('intercondylar',),
+        Direction('z', ('intercondylar',), ('femoral_head',)),
+        Direction(
+            'x', ('medial_posterior_condyle',), ('lateral_posterior_condyle',), lateral=True
+        ),
+    ),
+    'tibia_grood_suntay': LandmarkFrame(
+        _EMINENCES,
+        Direction('z', ('ankle_centre',), _EMINENCES),
+        Direction('x', ('medial_plateau',), ('lateral_plateau',), lateral=True),
+    ),
+    'pelvis_isb': LandmarkFrame(
+        ('hip_centre',),
+        Direction('z', ('left_asis',), ('right_asis',)),
+        Direction('x', ('left_psis', 'right_psis'), ('left_asis', 'right_asis')),
+    ),
+    'femur_isb': LandmarkFrame(
+        ('hip_centre',),
+        Direction('y', _EPICONDYLES, ('hip_centre',)),
+        Direction('z', ('medial_epicondyle',), ('lateral_epicondyle',), lateral=True),
+    ),
+    'tibia_isb': LandmarkFrame(
+        _MALLEOLI,
+        Direction('z', ('medial_malleolus',), ('lateral_malleolus',), lateral=True),
+        Direction('y', _MALLEOLI, ('medial_condyle', 'lateral_condyle')),
+    ),
+    'thorax_isb': LandmarkFrame(
+        ('suprasternal_notch',),
+        Direction('y', ('xiphoid', 't8'), ('suprasternal_notch', 'c7')),
+        Direction('x', ('c7',), ('suprasternal_notch',)),
+    ),
+    'scapula_isb': LandmarkFrame(
+        ('acromial_angle',),
+        Direction('z', ('trigonum_spinae',), ('acromial_angle',), lateral=True),
+        Direction('y', ('inferior_angle',), ('trigonum_spinae',)),
+    ),
+    # The first option of the recommendation: the humerus without the forearm.
+    'humerus_isb': LandmarkFrame(
+        ('glenohumeral_centre',),
+        Direction('y', _EPICONDYLES, ('glenohumeral_centre',)),
+        Direction('z', ('medial_epicondyle',), ('lateral_epicondyle',), lateral=True),
+    ),
+    'forearm_isb': LandmarkFrame(
+        ('ulnar_styloid',),
+        Direction('y', ('ulnar_styloid',), _EPICONDYLES),
+        Direction('z', ('ulnar_styloid',), ('radial_styloid',), lateral=True),
+    ),
+    'radius_isb': LandmarkFrame(
+        _RADIUS,
+        Direction('y', ('distal_radius',), ('proximal_radius',)),
+        Direction('z', ('sigmoid_notch',), ('radial_styloid',), lateral=True),
+    ),
+    # The palmar point lies in the plane that halves the bone.
+    'metacarpal_isb': LandmarkFrame(
+        ('metacarpal_head', 'metacarpal_base'),
+        Direction('y', ('metacarpal_head',), ('metacarpal_base',)),
+        Direction('x', ('metacarpal_head', 'metacarpal_base'), ('palmar_point',)),
+    ),
+}
+
+
+def frame_of_landmarks(
+    kind: str, landmarks: Mapping[str, ArrayLike], side: str
+) -> AnatomicalFrame:
+    """Return the frame of a kind of bone from landmarks (3,) in the coordinates of its body [mm].
+
+    kind is a name of LANDMARK_FRAMES, side one of SIDES. Raises DataError for landmarks that are
+    missing, unknown or not finite, coincide, or lie on a line.
+    """
+    recipe = LANDMARK_FRAMES[kind]
+    names = recipe.landmarks
+    for name in names:
+        if name not in landmarks:
+            raise DataError(f'the landmark {name} is missing, there are {", ".join(names)}')
+    for name in landmarks:
+        if name not in names:
+            raise DataError(f'the landmark {name} is unknown, there are {", ".join(names)}')
+    points = {name: np.array(landmarks[name], dtype=float) for name in names}
+    for name, point in points.items():
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise DataError(f'the landmark {name} does not have three finite coordinates')
+
+    first = _vector(recipe.first, points, side)
+    second = _vector(recipe.second, points, side)
+    across = second - (second @ first) * first
+    if np.linalg.norm(across) < MIN_SINE:
+        raise DataError(f'the landmarks {", ".join(names)} lie on a line')
+    return frame_of_axes(
+        {recipe.first.axis: first, recipe.second.axis: across}, _mean(recipe.origin, points)
+    )
+
+
+def _mean(names: tuple[str, ...], points: Mapping[str, np.ndarray]) -> np.ndarray:
+    return np.mean([points[name] for name in names], axis=0)
+
+
+def _vector(direction: Direction, points: Mapping[str, np.ndarray], side: str) -> np.ndarray:
+    """Return a direction (3,) of length one. Raises DataError."""
+    vector = _mean(direction.end, points) - _mean(direction.start, points)
+    length = np.linalg.norm(vector)
+    if length < MIN_LENGTH_MM:
+        raise DataError(
+            f'the landmarks {", ".join((*direction.start, *direction.end))} of the '
+            f'{direction.axis} axis are {length:g} mm apart'
+        )
+    sign = -1 if direction.lateral and side == 'left' else 1
+    return sign * vector / length

@@ -1,0 +1,463 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Joints: angles and translations between two bodies, with the covariance of both.
+
+With proximal and distal anatomical axes P and D in the rig frame, R = P^T D is resolved into three
+rotations about the axes e1, e2, e3 of the convention. Errors (dt, w) of the poses, as BodyPoses
+has them, turn R by w_r = P^T (w_d - w_p). As w_r = E da with E = (e1 e2 e3), the angles change by
+da = E^-1 w_r (the Jacobian of a joint coordinate system, Woltring, J. Biomech. 27, 1994).
+
+E is singular where e1 and e3 are parallel (gimbal lock). Close to it the angle about e1 is the
+direction of a short vector, with errors that are neither small nor Gaussian. There, and where
+angles are uncertain for other reasons, the second moments of their errors are integrated over the
+distribution of w_r.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from ..errors import DataError
+from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
+from .anatomical_frames import AXES, BODY_FRAME, AnatomicalFrame
+from .body import BodyPoses, PoseStatus
+from .joint_conventions import Convention, convention
+
+# Distance from gimbal lock in standard deviations: the first angle has one of 0.2 rad (11 degrees)
+# there, and one of its errors in two million crosses the lock.
+LOCK_SDS = 5.0
+# Below it the second-order part of an angle's error is less than 1 % of the first-order one, and
+# translations of 50 mm along turning axes are linear to 0.01 mm.
+LINEAR_SD_RAD = 0.02
+# Of the Gauss-Hermite rule along each axis: for quadratic errors, and near gimbal lock.
+NODES = 3
+LOCK_NODES = 9
+BLOCK = 256  # exposures that are integrated at once
+
+
+class JointStatus(IntEnum):
+    """How the motion of a joint was obtained; 0 to 4 are the PoseStatus of the worse body."""
+
+    OK = 0
+    WEAK = 1
+    FILLED = 2
+    FAILED = 3
+    AMBIGUOUS = 4
+    GIMBAL = 5  # so close to gimbal lock that the first and the third angle mean little
+
+
+STATUS_NAMES = tuple(status.name for status in JointStatus)
+
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint between two bodies.
+
+    Raises DataError for a joint of a body with itself, an unknown convention, and a missing side.
+
+    Attributes
+    ----------
+    name, proximal, distal : str
+        Of the joint and its bodies.
+    convention : str
+        Name in `joint_conventions.CONVENTIONS`.
+    proximal_frame, distal_frame : AnatomicalFrame
+    side : {'left', 'right', ''}
+        '' only where the convention has no sides.
+    neutral_covariance : (3, 3) ndarray
+        Of the neutral rotation, about the proximal axes [rad^2].
+    """
+
+    name: str
+    proximal: str
+    distal: str
+    convention: str
+    proximal_frame: AnatomicalFrame = BODY_FRAME
+    distal_frame: AnatomicalFrame = BODY_FRAME
+    side: str = ''
+    neutral_covariance: NDArray[np.float64] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.name:
+            raise DataError('a joint has no name')
+        if self.proximal == self.distal:
+            raise DataError(f'joint {self.name}: both of its bodies are {self.distal}')
+        try:
+            convention(self.convention).check_side(self.side)
+        except DataError as error:
+            raise DataError(f'joint {self.name}: {error}') from None
+
+
+@dataclass(frozen=True)
+class JointMotion:
+    """Motion of a joint over a trial; NaN where a body has no pose.
+
+    Attributes
+    ----------
+    joint : Joint
+    number, stamp_ns : (T,) ndarray
+        Of the exposures.
+    angles : (T, 3) ndarray
+        [rad], by `angle_names`; full turns are counted over the trial.
+    translations : (T, 3) ndarray
+        Of the distal origin from the proximal one [mm], by `translation_names`.
+    covariance : (T, 6, 6) ndarray
+        Of angles and translations [rad, mm]; near gimbal lock second moments of their errors.
+    status : (T,) ndarray
+        JointStatus as uint8.
+    """
+
+    joint: Joint
+    number: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64]
+    angles: NDArray[np.float64]
+    translations: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    status: NDArray[np.uint8]
+
+    @property
+    def angle_names(self) -> tuple[str, str, str]:
+        """Clinical names; each says which direction is positive."""
+        return convention(self.joint.convention).angles
+
+    @property
+    def translation_names(self) -> tuple[str, str, str]:
+        """Clinical names; each says which direction is positive."""
+        return convention(self.joint.convention).translations
+
+    @property
+    def sd(self) -> NDArray[np.float64]:
+        """Standard deviations (T, 6) of angles and translations [rad, mm]."""
+        return np.sqrt(np.diagonal(self.covariance, axis1=1, axis2=2))
+
+
+def joint_motion(
+    joint: Joint,
+    proximal: BodyPoses,
+    distal: BodyPoses,
+    before: NDArray[np.float64] | None = None,
+) -> JointMotion:
+    """Return the motion of a joint from the poses of its bodies.
+
+    The errors of the anatomical frames themselves are not part of the covariance: they stay over
+    all trials of a person. before: angles (3,) [rad] to count full turns from, such as those of
+    the exposure before. Raises DataError for poses of other bodies or of other exposures.
+    """
+    _check_poses(joint, proximal, distal)
+    relative = _relative(joint, proximal, distal)
+    of = convention(joint.convention)
+    angles = _angles(of, relative.rotation)
+    axes = _axes(of, angles)
+    jacobian = _jacobian(of, axes, relative.translation)
+    covariance = jacobian @ relative.covariance @ np.swapaxes(jacobian, 1, 2)
+    locked = _near_lock(of, angles, covariance)
+    for nodes, bent in ((NODES, _is_nonlinear(covariance) & ~locked), (LOCK_NODES, locked)):
+        for rows in np.array_split(np.flatnonzero(bent), 1 + bent.sum() // BLOCK):
+            covariance[rows] = _second_moments(of, relative.of(rows), angles[rows], nodes)
+    signs = np.array([*of.angle_signs, *of.translation_signs], dtype=float)
+    return JointMotion(
+        joint,
+        proximal.number,
+        proximal.stamp_ns,
+        angles=_unwrapped(angles * signs[:3], locked, before),
+        translations=_translations(of, axes, relative.translation) * signs[3:],
+        covariance=covariance * signs[:, None] * signs,
+        status=_status(proximal.status, distal.status, locked, angles),
+    )
+
+
+def with_neutral(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> Joint:
+    """Return a joint whose rotation is zero in the mean over a neutral trial.
+
+    The distal axes become parallel to the proximal ones there, as ISB has it for the ankle; the
+    origins stay. The mean is that of rotation matrices (Moakher, SIAM J. Matrix Anal. 24, 2002),
+    its covariance that of the random errors, independent from exposure to exposure. Errors that
+    stay would cancel in part: the standard deviations of angles are then too large, not too
+    small. Raises DataError where no exposure has poses of both bodies that were measured.
+    """
+    _check_poses(joint, proximal, distal)
+    measured = np.isin(proximal.status, (PoseStatus.OK, PoseStatus.WEAK))
+    measured &= np.isin(distal.status, (PoseStatus.OK, PoseStatus.WEAK))
+    measured &= np.isfinite(proximal.rotation + distal.rotation).all(axis=(1, 2))
+    if not measured.any():
+        raise DataError(f'joint {joint.name}: no exposure of the neutral trial has both bodies')
+    relative = _relative(joint, proximal, distal, only_noise=True)
+    mean = Rotation.from_matrix(relative.rotation[measured]).mean().as_matrix()
+    covariance = relative.covariance[measured][:, :3, :3].mean(axis=0) / measured.sum()
+    mirror = convention(joint.convention).mirror(joint.side)
+    offset = mirror @ mean.T @ mirror
+    frame = replace(joint.distal_frame, rotation=joint.distal_frame.rotation @ offset)
+    return replace(joint, distal_frame=frame, neutral_covariance=covariance)
+
+
+def check_joints(joints: Sequence[Joint], bodies: Iterable[str]) -> None:
+    """Raise DataError for two joints of one name, for unknown bodies and for a cycle."""
+    known = tuple(bodies)
+    names: set[str] = set()
+    children: dict[str, list[str]] = {}
+    for joint in joints:
+        if joint.name in names:
+            raise DataError(f'two joints are called {joint.name}')
+        names.add(joint.name)
+        for body in (joint.proximal, joint.distal):
+            if body not in known:
+                raise DataError(
+                    f'joint {joint.name}: there is no body {body}, only {", ".join(known)}'
+                )
+        children.setdefault(joint.proximal, []).append(joint.distal)
+    for joint in joints:
+        reached = [joint.distal]
+        for body in reached:
+            reached += [child for child in children.get(body, ()) if child not in reached]
+        if joint.proximal in reached:
+            raise DataError(
+                f'joint {joint.name} closes a cycle: {joint.proximal} is also distal of '
+                f'{joint.distal}'
+            )
+
+
+def _check_poses(joint: Joint, proximal: BodyPoses, distal: BodyPoses) -> None:
+    """Raise DataError for poses that are not those of the joint."""
+    for wanted, poses in ((joint.proximal, proximal), (joint.distal, distal)):
+        if poses.body != wanted:
+            raise DataError(f'joint {joint.name}: the poses are of {poses.body}, not of {wanted}')
+    if not np.array_equal(proximal.number, distal.number):
+        raise DataError(f'joint {joint.name}: the poses of its bodies are of other exposures')
+
+
+@dataclass(frozen=True)
+class _Relative:
+    """Distal -> proximal anatomical axes, of a right limb.
+
+    rotation (T, 3, 3), translation (T, 3) [mm], covariance (T, 6, 6) of the rotation errors about
+    the proximal axes and of the translation.
+    """
+
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+
+    def of(self, rows: np.ndarray) -> _Relative:
+        return _Relative(self.rotation[rows], self.translation[rows], self.covariance[rows])
+
+
+def _relative(
+    joint: Joint, proximal: BodyPoses, distal: BodyPoses, only_noise: bool = False
+) -> _Relative:
+    """Return the pose of the distal frame in the proximal one, and its covariance."""
+    mirror = convention(joint.convention).mirror(joint.side)
+    frame_p, frame_d = joint.proximal_frame, joint.distal_frame
+    to_p = mirror @ np.swapaxes(proximal.rotation @ frame_p.rotation, 1, 2)
+    arm_p = proximal.rotation @ frame_p.origin_mm
+    arm_d = distal.rotation @ frame_d.origin_mm
+    between = (arm_d + distal.position_mm) - (arm_p + proximal.position_mm)
+    rotation = to_p @ distal.rotation @ frame_d.rotation @ mirror
+    translation = (to_p @ between[..., None])[..., 0]
+
+    # Rotation errors are axial vectors: a mirror turns them round, too.
+    to_p_axial = np.linalg.det(mirror) * to_p
+    by_p = np.zeros((len(rotation), 6, 6))
+    by_d = np.zeros_like(by_p)
+    by_p[:, :3, 3:] = -to_p_axial
+    by_d[:, :3, 3:] = to_p_axial
+    # w x a = -[a]x w; the proximal axes turn against what is seen in them.
+    by_p[:, 3:, :3] = -to_p
+    by_p[:, 3:, 3:] = to_p @ cross_matrix(arm_p + between)
+    by_d[:, 3:, :3] = to_p
+    by_d[:, 3:, 3:] = -to_p @ cross_matrix(arm_d)
+
+    covariance = np.zeros_like(by_p)
+    for jacobian, poses in ((by_p, proximal), (by_d, distal)):
+        own = poses.covariance_noise
+        if not only_noise:
+            own = own + poses.covariance_fixed
+        covariance += jacobian @ own @ np.swapaxes(jacobian, 1, 2)
+    if not only_noise:
+        root = by_p @ proximal.rig_root + by_d @ distal.rig_root
+        covariance += root @ np.swapaxes(root, 1, 2)
+        if joint.neutral_covariance is not None:
+            turned = rotation @ joint.neutral_covariance @ np.swapaxes(rotation, 1, 2)
+            covariance[:, :3, :3] += turned
+    return _Relative(rotation, translation, covariance)
+
+
+def _angles(of: Convention, rotation: np.ndarray) -> np.ndarray:
+    """Return the angles (..., 3) [rad] of R = R_i R_j R_k, matrices (..., 3, 3).
+
+    The third angle is that of R_i^T R, so that the three give R also in gimbal lock.
+    """
+    i, j, k = (AXES.index(axis) for axis in of.sequence)
+    m = 3 - i - j
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    r = rotation
+    if of.is_euler:
+        sine = np.hypot(r[..., i, j], r[..., i, m])
+        second = of.branch * np.arctan2(sine, r[..., i, i])
+        first = np.arctan2(of.branch * r[..., j, i], -of.branch * sign * r[..., m, i])
+    else:
+        second = np.arctan2(sign * r[..., i, k], np.hypot(r[..., i, i], r[..., i, j]))
+        first = np.arctan2(-sign * r[..., j, k], r[..., k, k])
+    row = np.cos(first)[..., None] * r[..., j, :] + sign * np.sin(first)[..., None] * r[..., m, :]
+    sine_of_third = -sign * row[..., m] if of.is_euler else sign * row[..., i]
+    return np.stack([first, second, np.arctan2(sine_of_third, row[..., j])], axis=-1)
+
+
+def _axes(of: Convention, angles: np.ndarray) -> np.ndarray:
+    """Return the axes of rotation (..., 3, 3), in the columns, in the proximal frame."""
+    i, j, k = (AXES.index(axis) for axis in of.sequence)
+    unit = np.eye(3)
+    turn_1 = matrix_from_vector(angles[..., :1] * unit[i])
+    turn_2 = matrix_from_vector(angles[..., 1:2] * unit[j])
+    e1 = np.broadcast_to(unit[i], angles.shape)
+    return np.stack([e1, turn_1[..., j], (turn_1 @ turn_2)[..., k]], axis=-1)
+
+
+def _translations(of: Convention, axes: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Return the translations (..., 3) of the convention [mm]."""
+    if not of.along_axes:
+        return translation
+    return (np.swapaxes(axes, -1, -2) @ translation[..., None])[..., 0]
+
+
+def _jacobian(of: Convention, axes: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """Derivatives (T, 6, 6) of angles and translations by rotation error and translation."""
+    jacobian = np.zeros((len(axes), 6, 6))
+    by_turn = _inverse(axes)
+    jacobian[:, :3, :3] = by_turn
+    if not of.along_axes:
+        jacobian[:, 3:, 3:] = np.eye(3)
+        return jacobian
+    # The second axis turns about the first, the third one about both.
+    e1, e2, e3 = (axes[..., n] for n in range(3))
+    by_angle = np.zeros_like(axes)
+    by_angle[:, 1, 0] = np.sum(np.cross(e1, e2) * translation, axis=1)
+    by_angle[:, 2, 0] = np.sum(np.cross(e1, e3) * translation, axis=1)
+    by_angle[:, 2, 1] = np.sum(np.cross(e2, e3) * translation, axis=1)
+    jacobian[:, 3:, :3] = by_angle @ by_turn
+    jacobian[:, 3:, 3:] = np.swapaxes(axes, 1, 2)
+    return jacobian
+
+
+def _inverse(axes: np.ndarray) -> np.ndarray:
+    """Return the inverse (T, 3, 3) of the axes, finite in gimbal lock, too."""
+    e1, e2, e3 = (axes[..., n] for n in range(3))
+    rows = np.stack([np.cross(e2, e3), np.cross(e3, e1), np.cross(e1, e2)], axis=1)
+    volume = np.sum(rows[:, 0] * e1, axis=1)
+    volume = np.where(np.abs(volume) < 1e-9, 1e-9, volume)  # what follows is not used
+    return rows / volume[:, None, None]
+
+
+def _near_lock(of: Convention, angles: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+    """Return whether exposures with covariances (T, 6, 6) are LOCK_SDS from gimbal lock or less.
+
+    The third axis has the polar coordinates (distance from the lock, first angle) about the first.
+    """
+    second = np.abs(angles[:, 1])
+    distance = np.minimum(second, np.pi - second) if of.is_euler else np.pi / 2 - second
+    sd = np.sqrt(np.maximum(covariance[:, 1, 1], covariance[:, 0, 0] * np.sin(distance) ** 2))
+    return distance < LOCK_SDS * sd  # False for NaN
+
+
+def _is_nonlinear(covariance: np.ndarray) -> np.ndarray:
+    """Return whether angles are too uncertain for linear propagation."""
+    variance = np.diagonal(covariance[:, :3, :3], axis1=1, axis2=2)
+    return np.asarray(variance.max(axis=1) > LINEAR_SD_RAD**2)  # False for NaN
+
+
+def _second_moments(
+    of: Convention, relative: _Relative, angles: np.ndarray, nodes: int
+) -> np.ndarray:
+    """Return second moments (T, 6, 6) of the errors of angles and translations.
+
+    By a Gauss-Hermite rule over the rotation error; what the translation has besides is linear.
+    """
+    node, weight = np.polynomial.hermite_e.hermegauss(nodes)
+    z = np.stack(np.meshgrid(node, node, node, indexing='ij'), axis=-1).reshape(-1, 3)
+    weight = np.einsum('i,j,k->ijk', weight, weight, weight).ravel() / weight.sum() ** 3
+
+    of_turn = relative.covariance[:, :3, :3]
+    values, vectors = np.linalg.eigh(of_turn)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))[:, None, :]
+    turn = z @ np.swapaxes(root, 1, 2)
+    gain = relative.covariance[:, 3:, :3] @ np.linalg.pinv(of_turn, hermitian=True)
+    rest = relative.covariance[:, 3:, 3:] - gain @ relative.covariance[:, :3, 3:]
+
+    rotation = matrix_from_vector(turn) @ relative.rotation[:, None]
+    translation = relative.translation[:, None] + turn @ np.swapaxes(gain, 1, 2)
+    at = _angles(of, rotation)
+    difference = angle_errors(of, at, angles[:, None])
+    axes = _axes(of, at)
+    before = _translations(of, _axes(of, angles), relative.translation)
+    moved = _translations(of, axes, translation) - before[:, None]
+    error = np.concatenate([difference, moved], axis=-1)
+    moments = np.swapaxes(error * weight[:, None], 1, 2) @ error
+    if of.along_axes:
+        by_rest = np.swapaxes(axes, -1, -2) @ rest[:, None] @ axes
+        moments[:, 3:, 3:] += np.sum(weight[:, None, None] * by_rest, axis=1)
+    else:
+        moments[:, 3:, 3:] += rest
+    return moments
+
+
+def angle_errors(of: Convention, angles: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Return the differences (..., 3) [rad] of two sets of angles, without full turns.
+
+    Close to gimbal lock the sum or difference of the first and the third angle is known well where
+    each of them is not: full turns are taken from it, not from the third angle alone.
+    """
+    turn = 2 * np.pi
+    difference = angles - true
+    i, j, _ = (AXES.index(axis) for axis in of.sequence)
+    if of.is_euler:
+        sign = np.where(np.cos(angles[..., 1]) > 0, 1, -1)
+    else:
+        sign = np.where(angles[..., 1] > 0, 1, -1) * (1 if (j - i) % 3 == 1 else -1)
+    first = difference[..., 0] - turn * np.round(difference[..., 0] / turn)
+    both = difference[..., 2] + sign * difference[..., 0]
+    third = both - turn * np.round(both / turn) - sign * first
+    return np.stack([first, difference[..., 1], third], axis=-1)
+
+
+def _unwrapped(
+    angles: np.ndarray, locked: np.ndarray, before: NDArray[np.float64] | None
+) -> np.ndarray:
+    """Return angles (T, 3) without jumps by full turns.
+
+    Near gimbal lock an angle may turn by noise; each is compared with the last one that is not.
+    """
+    known = np.isfinite(angles).all(axis=1)
+    firm = np.flatnonzero(known & ~locked)
+    start = np.zeros(3) if before is None else np.asarray(before, dtype=float)
+    # Without earlier angles the first ones are between -pi and pi.
+    chain = np.concatenate([start[None], angles[firm]])
+    if before is None and len(firm):
+        chain[0] = chain[1]
+    chain = np.unwrap(chain, axis=0)
+    last = np.cumsum(known & ~locked)
+    out = chain[last]
+    loose = np.flatnonzero(locked & known)
+    jump = angles[loose] - out[loose]
+    out[loose] += jump - 2 * np.pi * np.round(jump / (2 * np.pi))
+    out[~known] = np.nan
+    return out
+
+
+def _status(
+    proximal: np.ndarray, distal: np.ndarray, locked: np.ndarray, angles: np.ndarray
+) -> NDArray[np.uint8]:
+    """Return the JointStatus (T,): of the worse body, and of gimbal lock."""
+    status = np.full(len(angles), JointStatus.OK, dtype=np.uint8)
+    # What a user has to know most comes last.
+    status[(proximal == PoseStatus.WEAK) | (distal == PoseStatus.WEAK)] = JointStatus.WEAK
+    status[locked] = JointStatus.GIMBAL
+    for code in (PoseStatus.AMBIGUOUS, PoseStatus.FILLED, PoseStatus.FAILED):
+        status[(proximal == code) | (distal == code)] = code
+    status[np.isnan(angles).any(axis=1)] = JointStatus.FAILED
+    return status

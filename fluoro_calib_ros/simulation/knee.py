@@ -1,0 +1,309 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A virtual right knee with markers in femur and tibia, walking and landing, with its truth.
+
+Frames of the bones are those of Grood and Suntay: x right, y anterior, z proximal. The person
+faces along y of the rig. Coordinates of bodies are those of a CT, which lies anywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..bodies.anatomical_frames import AnatomicalFrame, frame_of_landmarks
+from ..bodies.body import Body
+from ..bodies.joints import Joint
+from ..exposures.frame import Frame
+from ..photogrammetry.rotations import matrix_from_vector
+from .rig import VirtualRig
+from .streams import StreamStart
+from .tracking import image_frames
+
+CT_SD_MM = 0.1
+SIDE = 'right'
+JOINT = 'knee'
+CONVENTION = 'grood_suntay_knee'
+# Markers [mm] in the frames of the bones, and their first ids.
+FIRST_ID = {'femur': 3001, 'tibia': 3011}
+MARKERS_MM = {
+    'femur': [[-31, -6, 16], [29, -14, 21], [6, 13, 46], [-9, -8, 66]],
+    'tibia': [[-29, 6, -17], [27, -9, -21], [4, 16, -44], [-3, -7, -62]],
+}
+LANDMARKS_MM = {
+    'femur': {
+        'femoral_head': [0, 0, 425],
+        'intercondylar': [0, 0, 0],
+        'medial_posterior_condyle': [-24, -22, 4],
+        'lateral_posterior_condyle': [26, -22, 4],
+    },
+    'tibia': {
+        'medial_eminence': [-6, 0, 0],
+        'lateral_eminence': [6, 0, 0],
+        'ankle_centre': [0, 0, -375],
+        'medial_plateau': [-23, -3, -5],
+        'lateral_plateau': [24, -3, -5],
+    },
+}
+
+# Flexion [deg] over a gait cycle from initial contact on: coefficients of cosines and sines, from
+# the harmonic 0 and 1 on. Fitted to the means of free walking, every 2 % of the cycle, of Schwartz
+# et al., J. Biomech. 41 (2008) 1639; the largest residual is 0.44 degrees.
+GAIT_COS_DEG = (23.338, -1.981, -14.122, -0.619, -0.895, -0.598)
+GAIT_SIN_DEG = (-18.904, 6.962, 4.516, 0.641, 0.742)
+CYCLE_S = 1.1
+THIGH_MM = 425.0
+SHANK_MM = 375.0
+GRAVITY = 9810.0  # mm/s^2
+
+# Landing from 0.2 m on one leg. The pulse of the tibia, t exp(-t/RISE_S), takes up its speed and
+# peaks after RISE_S at speed / (e RISE_S) = 25 g.
+DROP_MM = 200.0
+RISE_S = 0.003
+FLEX_S = 0.05  # time to the largest angular velocity of the knee, 370 degrees a second
+FALL_S = 0.06  # recorded before the contact
+LANDING_S = 0.4
+LANDING_HZ = 500.0
+
+
+@dataclass(frozen=True)
+class VirtualKnee:
+    """The bones of a knee in the coordinates of their CT.
+
+    Attributes
+    ----------
+    bodies : tuple of Body
+        Femur and tibia with their true markers; sd 0.
+    surveyed : tuple of Body
+        The same with the errors of CT.
+    landmarks : mapping of str to mapping of str to (3,) ndarray
+        By body [mm].
+    joint : Joint
+    """
+
+    bodies: tuple[Body, ...]
+    surveyed: tuple[Body, ...]
+    landmarks: Mapping[str, Mapping[str, NDArray[np.float64]]]
+    joint: Joint
+
+
+@dataclass(frozen=True)
+class KneeMotion:
+    """True motion at times (T,) [s]: poses of bodies -> rig by name, and the joint.
+
+    rotation (T, 3, 3), position_mm (T, 3); angles (T, 3) [rad] and translations (T, 3) [mm] with
+    the names of the convention.
+    """
+
+    times_s: NDArray[np.float64]
+    rotation: Mapping[str, NDArray[np.float64]]
+    position_mm: Mapping[str, NDArray[np.float64]]
+    angles: NDArray[np.float64]
+    translations: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class SimulatedKnee:
+    """A recording of a virtual knee: frames by fluoroscope, and the true motion."""
+
+    frames: Mapping[str, list[Frame]]
+    motion: KneeMotion
+
+
+def virtual_knee(seed: int = 0) -> VirtualKnee:
+    """Draw a knee at random; the same seed gives the same knee."""
+    rng = np.random.default_rng([seed, 11])
+    bodies = []
+    surveyed = []
+    landmarks = {}
+    frames = {}
+    for name, markers in MARKERS_MM.items():
+        to_ct = matrix_from_vector(rng.uniform(-0.6, 0.6, 3))
+        shift = rng.uniform(-150, 150, 3)
+        xyz = (np.array(markers) + rng.uniform(-3, 3, (len(markers), 3))) @ to_ct.T + shift
+        target_id = FIRST_ID[name] + np.arange(len(xyz))
+        bodies.append(Body(name, target_id, xyz, np.zeros(len(xyz))))
+        survey = np.round(xyz + rng.normal(0, CT_SD_MM, xyz.shape), 4)
+        surveyed.append(Body(name, target_id, survey, np.full(len(xyz), CT_SD_MM)))
+        places = {n: np.round(to_ct @ x + shift, 6) for n, x in LANDMARKS_MM[name].items()}
+        landmarks[name] = places
+        frames[name] = frame_of_landmarks(f'{name}_grood_suntay', places, SIDE)
+    joint = Joint(
+        JOINT,
+        'femur',
+        'tibia',
+        CONVENTION,
+        proximal_frame=frames['femur'],
+        distal_frame=frames['tibia'],
+        side=SIDE,
+    )
+    return VirtualKnee(tuple(bodies), tuple(surveyed), landmarks, joint)
+
+
+def walking(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
+    """Motion of a knee on a treadmill; the thigh swings by 20 degrees to both sides."""
+    phase = 2 * np.pi * times_s / CYCLE_S
+    order = np.arange(len(GAIT_COS_DEG))
+    waves = np.cos(np.outer(phase, order)) @ GAIT_COS_DEG
+    flexion = np.deg2rad(waves + np.sin(np.outer(phase, order[1:])) @ GAIT_SIN_DEG)
+    swing = np.deg2rad(20) * np.cos(phase)
+    zero = np.zeros_like(phase)
+    rotation = matrix_from_vector(np.column_stack([swing, zero, zero])) @ matrix_from_vector(
+        np.deg2rad(3) * np.column_stack([zero, np.sin(phase), np.sin(phase + 1)])
+    )
+    centre = np.column_stack(
+        [
+            8 * np.sin(phase),
+            THIGH_MM * np.sin(swing),
+            THIGH_MM * (np.cos(np.deg2rad(20)) - np.cos(swing)) + 20 * np.cos(2 * phase),
+        ]
+    )
+    angles, translations = _coupled(flexion, phase)
+    return _motion(knee, times_s, (rotation, centre), angles, translations)
+
+
+def landing(knee: VirtualKnee, times_s: NDArray[np.float64]) -> KneeMotion:
+    """Motion of a knee that falls and lands FALL_S after the time 0.
+
+    The tibia decelerates by a pulse, then tilts forward while the knee bends, both by
+    1 - (1 + t/FLEX_S) exp(-t/FLEX_S).
+    """
+    speed = np.sqrt(2 * GRAVITY * DROP_MM)
+    t = np.maximum(times_s - FALL_S, 0.0)
+    before = np.minimum(times_s - FALL_S, 0.0)
+    s = t / RISE_S
+    height = -speed * before - GRAVITY / 2 * before**2
+    height -= speed * RISE_S * (2 - (2 + s) * np.exp(-s))
+    bent = 1 - (1 + t / FLEX_S) * np.exp(-t / FLEX_S)
+    tilt = np.deg2rad(4 + 18 * bent)
+    zero = np.zeros_like(t)
+    rotation = matrix_from_vector(np.column_stack([-tilt, 0.05 * bent, 0.04 * bent]))
+    start = np.deg2rad(4)
+    centre = np.column_stack(
+        [
+            6 * bent,
+            SHANK_MM * (np.sin(tilt) - np.sin(start)) - 60,
+            SHANK_MM * (np.cos(tilt) - np.cos(start)) + height + 20,
+        ]
+    )
+    flexion = np.deg2rad(15 + 50 * bent)
+    angles, translations = _coupled(flexion, zero)
+    return _motion(knee, times_s, (rotation, centre), angles, translations, of_tibia=True)
+
+
+def _coupled(flexion: np.ndarray, phase: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return angles and translations (T, 3): what goes with flexion (T,) [rad].
+
+    A few degrees and millimetres, as pins in the bones showed (Lafortune et al., J. Biomech. 25,
+    1992).
+    """
+    adduction = 0.03 * np.sin(phase) - 0.04 * np.sin(flexion)
+    internal = 0.02 + 0.1 * np.sin(flexion) + 0.03 * np.cos(phase)
+    lateral = 1.0 + 1.5 * np.sin(flexion)
+    drawer = 4 - 6 * (1 - np.cos(flexion))
+    distraction = 3 + 2 * np.sin(flexion) ** 2
+    return (
+        np.column_stack([flexion, adduction, internal]),
+        np.column_stack([lateral, drawer, distraction]),
+    )
+
+
+def _motion(
+    knee: VirtualKnee,
+    times_s: np.ndarray,
+    driven: tuple[np.ndarray, np.ndarray],
+    angles: np.ndarray,
+    translations: np.ndarray,
+    of_tibia: bool = False,
+) -> KneeMotion:
+    """Return the motion of both bones; driven: pose of the femur, or the tibia, in the rig."""
+    unit = np.eye(3)
+    by_flexion, by_adduction, by_turn = (
+        matrix_from_vector(sign * angles[:, n : n + 1] * unit[n])
+        for n, sign in enumerate((-1, 1, 1))
+    )
+    turn = by_flexion @ by_adduction @ by_turn
+    # The shifts along the three axes; distraction is against the last one.
+    axes = np.stack(
+        [np.broadcast_to(unit[0], angles.shape), by_flexion[:, :, 1], turn[:, :, 2]], axis=1
+    )
+    shift = np.linalg.solve(axes, (translations * [1, 1, -1])[..., None])[..., 0]
+    rotation, origin = driven
+    if of_tibia:
+        tibia = driven
+        of_femur = rotation @ np.swapaxes(turn, 1, 2)
+        femur = of_femur, origin - (of_femur @ shift[..., None])[..., 0]
+    else:
+        femur = driven
+        tibia = rotation @ turn, origin + (rotation @ shift[..., None])[..., 0]
+    poses = {
+        'femur': _of_body(*femur, knee.joint.proximal_frame),
+        'tibia': _of_body(*tibia, knee.joint.distal_frame),
+    }
+    return KneeMotion(
+        times_s,
+        {name: pose[0] for name, pose in poses.items()},
+        {name: pose[1] for name, pose in poses.items()},
+        angles=angles,
+        translations=translations,
+    )
+
+
+def _of_body(
+    rotation: np.ndarray, origin: np.ndarray, frame: AnatomicalFrame
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pose of a body whose anatomical frame has this pose."""
+    of_body = rotation @ frame.rotation.T
+    return of_body, origin - of_body @ frame.origin_mm
+
+
+def simulate_knee(
+    rig: VirtualRig,
+    knee: VirtualKnee,
+    motion: KneeMotion,
+    noise_px: float = 0.25,
+    seed: int = 0,
+    start: StreamStart | None = None,
+) -> SimulatedKnee:
+    """Simulate a recording of a knee: image points of the markers that are on the image.
+
+    Parameters
+    ----------
+    rig : VirtualRig
+    knee : VirtualKnee
+    motion : KneeMotion
+        Such as walking(knee, times) returns it.
+    noise_px : float
+        Standard deviation of an image coordinate.
+    seed : int
+        The same seed gives the same noise.
+    start : StreamStart, optional
+
+    Returns
+    -------
+    SimulatedKnee
+    """
+    ids = np.concatenate([body.target_id for body in knee.bodies])
+    points = np.concatenate(
+        [
+            body.xyz_mm @ np.swapaxes(motion.rotation[body.name], 1, 2)
+            + motion.position_mm[body.name][:, None]
+            for body in knee.bodies
+        ],
+        axis=1,
+    )
+    rng = np.random.default_rng([seed, 12])
+    frames, _ = image_frames(
+        rig, points, ids, motion.times_s.tolist(), noise_px, rng, start or StreamStart()
+    )
+    return SimulatedKnee(frames, motion)
+
+
+MOTIONS: Mapping[str, Callable[[VirtualKnee, NDArray[np.float64]], KneeMotion]] = {
+    'walking': walking,
+    'landing': landing,
+}

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 
 import numpy as np
@@ -32,12 +32,18 @@ class Body:
         In the frame of the body; NaN for a marker whose place is to be estimated.
     sd_mm : (m,) ndarray
         Standard deviations of each of these coordinates; infinite where they are not known.
+    frame_covariance : (6, 6) ndarray
+        Of the frame itself against the markers: a shift [mm] and a rotation [rad] about their
+        centre, along the axes of the body. 0 where sd_mm contains it.
     """
 
     name: str
     target_id: NDArray[np.int64]
     xyz_mm: NDArray[np.float64]
     sd_mm: NDArray[np.float64]
+    frame_covariance: NDArray[np.float64] = field(
+        default_factory=lambda: np.zeros((POSE_SIZE, POSE_SIZE))
+    )
 
     def __post_init__(self) -> None:
         target_id = np.array(self.target_id, dtype=np.int64).reshape(-1)
@@ -153,6 +159,16 @@ class BodyPoses:
     rig_root: NDArray[np.float64]
     markers: NDArray[np.int64]
     status: NDArray[np.uint8]
+
+    @property
+    def known(self) -> NDArray[np.bool_]:
+        """Whether (T,) there is a pose."""
+        return np.asarray(np.isfinite(self.rotation[:, 0, 0]))
+
+    def rows(self, chosen: NDArray[np.bool_]) -> BodyPoses:
+        """Poses of some exposures (T,)."""
+        names = (entry.name for entry in fields(self) if entry.name != 'body')
+        return replace(self, **{name: getattr(self, name)[chosen] for name in names})
 
     @property
     def covariance(self) -> NDArray[np.float64]:

@@ -387,7 +387,7 @@ def smooth_trial(first: MotionFilter, seen: Sequence[PoseInformation]) -> Motion
 def _improved(
     log_q: np.ndarray, scores: _Scores, dt_s: np.ndarray, walk: np.ndarray
 ) -> tuple[np.ndarray, float, np.ndarray]:
-    """Return log densities (T, B, 2) after a step of Fisher scoring, its size, and new walks (B, 2)."""
+    """Return log densities (T, B, 2) after a step of scoring, its size, and walks (B, 2)."""
     out = log_q.copy()
     new_walk = walk.copy()
     largest = 0.0

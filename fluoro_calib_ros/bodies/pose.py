@@ -43,8 +43,8 @@ MAX_STEPS = 8
 # Square of a step in standard deviations after which the iteration ends: what remains after a
 # Gauss-Newton step is far smaller.
 LAST_STEP = 1e-3
-# Rotation [rad] up to which derivatives hold: the neglected part of a marker's place is half of its
-# square, 0.1 % of its distance from the centre.
+# Rotation [rad] up to which derivatives hold: what they neglect of a marker's place is half of its
+# square, 0.1 % of the distance from the centre.
 LINEAR_RAD = 0.05
 # An exposure alone gives a pose if it determines the rotation so that derivatives hold at two
 # standard deviations.
@@ -53,7 +53,10 @@ ALONE_SD_RAD = LINEAR_RAD / 2
 
 @dataclass(frozen=True)
 class Prediction:
-    """Poses (B) that are expected: rotation, centre [mm], covariance (6, 6), and whether there is one."""
+    """Poses that are expected: rotations (B, 3, 3), centres (B, 3) [mm], covariances (B, 6, 6).
+
+    known (B,): whether there is one.
+    """
 
     rotation: NDArray[np.float64]
     centre_mm: NDArray[np.float64]
@@ -105,7 +108,7 @@ class FramePoses:
 
 @dataclass(frozen=True)
 class _Points:
-    """Image points of markers (B, M) in views F: uv, variances of noise and of correction, seen."""
+    """Image points (B, M, F): uv, variances of noise and of correction, and whether seen."""
 
     uv: np.ndarray
     noise: np.ndarray
@@ -424,7 +427,7 @@ class PoseSolver:
         """Return the poses with their covariances."""
         alone = solution.alone
         seen = used.any(axis=1)
-        inverse = _inverse(solution.normal, seen)
+        inverse = _inverse(solution.normal, np.asarray(seen))
         noise, fixed, rig_root = self._covariances(inverse, solution, points)
         # A filter takes shape and correction as they are: their errors stay.
         linear = solution.linear

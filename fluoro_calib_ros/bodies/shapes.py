@@ -34,8 +34,8 @@ from .rigid import fitted_pose
 
 ROUNDS = 4  # the problem is nearly linear once poses are known
 # ISO 16087:2013 and Valstar et al., "Guidelines for standardization of radiostereometry", Acta
-# Orthop. 76, 2005: condition number [1/m] above which markers lie too near a line, and mean error of
-# rigid-body fitting [mm] above which a body is not stable.
+# Orthop. 76, 2005: condition number [1/m] above which markers lie too near a line, and mean error
+# of rigid-body fitting [mm] above which a body is not stable.
 MAX_CONDITION = 120.0
 MAX_MEAN_ERROR_MM = 0.35
 REJECT_TAIL = 6.3e-5  # probability of four standard deviations, as everywhere
@@ -67,7 +67,7 @@ class BodyPlaces:
     @property
     def seen(self) -> NDArray[np.bool_]:
         """Return (T, m) whether a marker is known in space."""
-        return np.isfinite(self.xyz_mm).all(axis=2)
+        return np.asarray(np.isfinite(self.xyz_mm).all(axis=2))
 
 
 @dataclass(frozen=True)
@@ -77,10 +77,8 @@ class EstimatedShape:
     Attributes
     ----------
     body : Body
-        Coordinates in its frame, and their standard deviations relative to each other.
-    frame_covariance : (6, 6) ndarray
-        Of position [mm] and rotation [rad] of the frame about the centre of the markers, along the
-        axes of the body, by CT.
+        Coordinates in its frame, their standard deviations relative to each other, and the
+        covariance of the frame by CT.
     condition : float
         Condition number [1/m].
     mean_error_mm : float
@@ -91,7 +89,6 @@ class EstimatedShape:
     """
 
     body: Body
-    frame_covariance: NDArray[np.float64]
     condition: float
     mean_error_mm: float
     exposures: int
@@ -146,8 +143,7 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     condition = condition_number(shape[known])
     findings += _stability(body, condition, adjustment.mean_error_mm)
     return EstimatedShape(
-        replace(body, xyz_mm=shape, sd_mm=sd),
-        frame,
+        replace(body, xyz_mm=shape, sd_mm=sd, frame_covariance=frame),
         condition,
         mean_error_mm=adjustment.mean_error_mm,
         exposures=adjustment.exposures,
@@ -199,7 +195,7 @@ def _start(body: Body, places: BodyPlaces) -> tuple[np.ndarray, np.ndarray] | No
 
 @dataclass(frozen=True)
 class _Problem:
-    """Places (T, k, 3) of known markers, their information (T, k, 3, 3) and CT (k, 3) with weights."""
+    """Places (T, k, 3), their information (T, k, 3, 3), and CT (k, 3) with its weights (k,)."""
 
     place: np.ndarray
     information: np.ndarray
@@ -222,9 +218,7 @@ class _Reduced:
     normal: np.ndarray
 
 
-def _adjust(
-    body: Body, places: BodyPlaces, start: tuple[np.ndarray, np.ndarray]
-) -> _Adjustment:
+def _adjust(body: Body, places: BodyPlaces, start: tuple[np.ndarray, np.ndarray]) -> _Adjustment:
     """Adjust coordinates and poses together, from first coordinates and exposures."""
     xyz, rows = start
     known = np.flatnonzero(np.isfinite(xyz).all(axis=1))
@@ -393,7 +387,6 @@ def _unchanged(body: Body, findings: Sequence[Finding]) -> EstimatedShape:
     condition = condition_number(known) if len(known) >= 2 else np.inf
     return EstimatedShape(
         body,
-        np.zeros((POSE_SIZE, POSE_SIZE)),
         condition,
         mean_error_mm=np.nan,
         exposures=0,
@@ -428,7 +421,10 @@ def _wrong_frame(body: Body, places: BodyPlaces) -> list[Finding]:
     factor = float(spread[1] / spread[0])
     for scale, unit in UNITS.items():
         if abs(factor / scale - 1) < SCALE_TOLERANCE:
-            cause = f'its coordinates are in {unit}, not in mm: distances in space are larger {factor:.4g} times'
+            cause = (
+                f'its coordinates are in {unit}, not in mm: distances in space are larger '
+                f'{factor:.4g} times'
+            )
             numbers = {'factor': factor}
             return [Finding(Kind.WRONG_UNIT, cause, place=_place(body), numbers=numbers)]
     if count[row] < 4:
@@ -540,7 +536,7 @@ def _migrated(body: Body, adjustment: _Adjustment, known: np.ndarray) -> list[Fi
 def _against_others(
     given: np.ndarray, found: np.ndarray, sd: np.ndarray, marker: int, kept: Sequence[int]
 ) -> float:
-    """Square of the deviation of a marker from CT over its covariance, by the fit of the others."""
+    """Squared deviation of a marker from CT over its variance, by the fit of the others."""
     others = [k for k in kept if k != marker]
     weight = 1 / sd[others] ** 2
     rotation, shift = fitted_pose(found[others], given[others], weight)

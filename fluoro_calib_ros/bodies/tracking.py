@@ -3,8 +3,8 @@
 
 """Poses of all bodies of a rig over a trial, exposure by exposure, live and offline.
 
-Every exposure is solved with the poses that the filter predicts, and then given to the filter. So a
-body is followed where one view or one marker is left. Live, an exposure is reported `lag`
+Every exposure is solved with the poses that the filter predicts, and then given to the filter. So
+a body is followed where one view or one marker is left. Live, an exposure is reported `lag`
 exposures later, smoothed by those that came after it. Offline, the same object follows the trial
 first; then the whole trial is smoothed, or reported with the same lag and the same numbers.
 """
@@ -114,7 +114,9 @@ class BodyTracker:
         """The bodies that are followed."""
         return self.solver.bodies
 
-    def add(self, exposure: IntersectedViews, number: int, stamp_ns: int) -> TrackedExposure | None:
+    def add(
+        self, exposure: IntersectedViews, number: int, stamp_ns: int
+    ) -> TrackedExposure | None:
         """Take an exposure; return the one of `lag` exposures before, if there is one.
 
         An exposure that is not later than the one before is not taken.
@@ -125,11 +127,12 @@ class BodyTracker:
         self._stamp_ns = stamp_ns
         self.filter.predict(dt_s)
         rotation, centre, covariance = self.filter.prediction
-        unsure = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1) > LOST_SD_RAD**2
-        self.filter.lose(unsure)
-        known = self.filter.alive.copy()
-        frame = self.solver.solve(exposure, Prediction(rotation, centre, covariance, known))
-        self.filter.update(frame.information, frame.alone & ~known)
+        variance = np.diagonal(covariance, axis1=1, axis2=2)[:, 3:].max(axis=1)
+        expected = self.filter.alive & (variance < LOST_SD_RAD**2)
+        frame = self.solver.solve(exposure, Prediction(rotation, centre, covariance, expected))
+        # A body that has just appeared is not expected anywhere yet: its speed is unknown.
+        self.filter.lose(~expected & ~frame.alone)
+        self.filter.update(frame.information, frame.alone & ~self.filter.alive)
         self._keep(number, stamp_ns, frame)
         if self.lag is None or len(self._taken) <= self.lag:
             return None
@@ -154,7 +157,7 @@ class BodyTracker:
 
     def _keep(self, number: int, stamp_ns: int, frame: FramePoses) -> None:
         """Note an exposure, and the errors that stay of bodies that are seen."""
-        seen = np.isfinite(frame.covariance_fixed).all(axis=(1, 2))[:, None, None]
+        seen = np.isfinite(frame.covariance_fixed[:, 0, 0])[:, None, None]
         self._fixed = np.where(seen, frame.covariance_fixed, self._fixed)
         self._rig_root = np.where(seen, frame.rig_root, self._rig_root)
         self._taken.append(
@@ -263,7 +266,11 @@ def _poses(
     move = np.broadcast_to(np.eye(POSE_SIZE), (len(exposures), POSE_SIZE, POSE_SIZE)).copy()
     move[:, :3, 3:] = cross_matrix(arm)
     back = np.swapaxes(move, 1, 2)
-    noise, fixed = (move @ covariance @ back for covariance in covariances)
+    axes = np.zeros_like(move)
+    axes[:, :3, :3] = axes[:, 3:, 3:] = rotation
+    of_frame = axes @ body.frame_covariance @ np.swapaxes(axes, 1, 2)
+    noise = move @ covariances[0] @ back
+    fixed = move @ (covariances[1] + of_frame) @ back
     return BodyPoses(
         body.name,
         np.array([one.number for one in exposures]),

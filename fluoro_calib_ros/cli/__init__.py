@@ -15,6 +15,7 @@ from ..errors import DataError, printable, shortened
 from . import (
     adjust,
     bag,
+    bodies,
     bridge,
     calibrate,
     compare,
@@ -54,6 +55,7 @@ COMMANDS = (
     survey,
     orient,
     reconstruct,
+    bodies,
     convert,
     bag,
     watch,

@@ -134,7 +134,7 @@ def rotation_angle(rotation: ArrayLike) -> np.ndarray:
 
 
 def left_jacobian(w: ArrayLike) -> np.ndarray:
-    """Matrices J (..., 3, 3) with exp(w + d) = exp(J d) exp(w) to first order, of vectors (..., 3).
+    """Matrices J (..., 3, 3) of vectors (..., 3): exp(w + d) = exp(J d) exp(w) to first order.
 
     Source: Sola, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics", 2018,
     Eq. 145.

@@ -226,13 +226,7 @@ def reconstruct_exposure(
     DataError
         For an image whose size is not that of the calibration, and for a repeated target.
     """
-    frames = [exposure.get(name) for name in intersector.orientation.fluoroscopes]
-    views = [
-        None if frame is None else _corrected_view(frame, calibrations[frame.fluoroscope])
-        for frame in frames
-    ]
-    found = intersect_exposure(views, intersector, scatter)
-    present = [frame for frame in frames if frame is not None]
+    found, present = intersect_frames(exposure, calibrations, intersector, scatter)
     if watch is not None:
         watch_exposure(watch, present[0].stamp_ns, found)
     return ReconstructedFrame(
@@ -242,6 +236,25 @@ def reconstruct_exposure(
         found.points,
         tuple(frame.fluoroscope for frame in present),
     )
+
+
+def intersect_frames(
+    exposure: Mapping[str, Frame],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    intersector: Intersector,
+    scatter: ObservedScatter | None = None,
+) -> tuple[IntersectedViews, list[Frame]]:
+    """Correct, match and intersect the frames of an exposure, see `reconstruct_exposure`.
+
+    Also returns the frames that are there, in the order of the orientation.
+    """
+    frames = [exposure.get(name) for name in intersector.orientation.fluoroscopes]
+    views = [
+        None if frame is None else _corrected_view(frame, calibrations[frame.fluoroscope])
+        for frame in frames
+    ]
+    found = intersect_exposure(views, intersector, scatter)
+    return found, [frame for frame in frames if frame is not None]
 
 
 def _corrected_view(frame: Frame, calibration: FluoroscopeCalibration) -> CorrectedView:
@@ -300,7 +313,28 @@ def reconstruct_recording(
     DataError
         As reconstruct_exposure, and where a fluoroscope of the rig has no frames.
     """
-    names = intersector.orientation.fluoroscopes
+    exposures, unpaired = pair_recording(
+        frames, intersector.orientation.fluoroscopes, pair_by, tolerance_s
+    )
+    scatter = scatter or ObservedScatter()
+    out = [
+        reconstruct_exposure(exposure, calibrations, intersector, watch, scatter)
+        for exposure in exposures
+    ]
+    return out, unpaired
+
+
+def pair_recording(
+    frames: Mapping[str, Sequence[Frame]],
+    names: Sequence[str],
+    pair_by: str,
+    tolerance_s: float,
+) -> tuple[list[dict[str, Frame]], dict[str, int]]:
+    """Pair the frames of a recording to exposures, in the order of time.
+
+    Also returns the number of frames without partners by fluoroscope. Raises DataError where a
+    fluoroscope has no frames.
+    """
     for name in names:
         if name not in frames:
             raise DataError(
@@ -312,9 +346,4 @@ def reconstruct_recording(
     )
     exposures = [exposure for frame in ordered for exposure in pairer.add(frame)]
     exposures += pairer.flush()
-    scatter = scatter or ObservedScatter()
-    out = [
-        reconstruct_exposure(exposure, calibrations, intersector, watch, scatter)
-        for exposure in exposures
-    ]
-    return out, dict(pairer.unpaired)
+    return exposures, dict(pairer.unpaired)

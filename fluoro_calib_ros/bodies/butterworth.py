@@ -1,0 +1,106 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The low-pass filter that labs use, for comparison: Butterworth, forwards and backwards.
+
+Of order 4 in total, two each way, as in Winter ("Biomechanics and motor control of human
+movement", 4th ed., 2009, 2.2.4.4). The cutoff is chosen by whoever uses it. Standard deviations are
+propagated for errors that are independent from exposure to exposure; what the filter takes from
+the motion itself they do not contain.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import butter, fftconvolve, filtfilt
+
+from ..errors import DataError
+from ..photogrammetry.rotations import matrix_from_quaternion, quaternion_from_matrix
+from .body import BodyPoses, PoseStatus
+
+ORDER = 2  # in each direction
+SETTLED = 1e-6  # share of the impulse response that is left out
+
+
+def filtered_poses(poses: BodyPoses, cutoff_hz: float) -> BodyPoses:
+    """Return poses after a low-pass filter; gaps are interpolated before, and marked.
+
+    Raises DataError for a cutoff that the rate does not allow, exposures that are not equally far
+    apart, and fewer than ten poses.
+    """
+    known = poses.known
+    if np.count_nonzero(known) < 10:
+        raise DataError(f'body {poses.body}: {np.count_nonzero(known)} poses are not filtered')
+    rate = _rate(poses)
+    if not 0 < cutoff_hz < rate / 2:
+        raise DataError(
+            f'a cutoff of {cutoff_hz:g} Hz is not between 0 and half of the rate, {rate / 2:g} Hz'
+        )
+    b, a = butter(ORDER, cutoff_hz, fs=rate)
+    time = np.arange(len(known))
+
+    def smooth(values: np.ndarray) -> np.ndarray:
+        flat = values.reshape(len(values), -1)
+        whole = np.stack([np.interp(time, time[known], v[known]) for v in flat.T], axis=1)
+        return filtfilt(b, a, whole, axis=0).reshape(values.shape)
+
+    quaternion = quaternion_from_matrix(np.where(known[:, None, None], poses.rotation, np.eye(3)))
+    quaternion[known] = _continuous(quaternion[known])
+    covariance = _propagated(poses.covariance_noise, known, (b, a))
+    status = np.where(known, poses.status, PoseStatus.FILLED).astype(np.uint8)
+    return replace(
+        poses,
+        rotation=matrix_from_quaternion(smooth(quaternion)),
+        position_mm=smooth(poses.position_mm),
+        covariance_noise=covariance,
+        covariance_fixed=_nearest(poses.covariance_fixed, known),
+        rig_root=_nearest(poses.rig_root, known),
+        status=status,
+    )
+
+
+def _rate(poses: BodyPoses) -> float:
+    """Rate [Hz] of the exposures. Raises DataError where they are not equally far apart."""
+    dt = np.diff(poses.stamp_ns) / 1e9
+    typical = float(np.median(dt))
+    if typical <= 0 or np.abs(dt - typical).max() > 0.2 * typical:
+        raise DataError(
+            'the exposures are not equally far apart, which a filter with a cutoff needs'
+        )
+    return 1 / typical
+
+
+def _continuous(quaternion: np.ndarray) -> NDArray[np.float64]:
+    """Quaternions (T, 4) without changes of sign."""
+    same = np.sum(quaternion[1:] * quaternion[:-1], axis=1) >= 0
+    sign = np.cumprod(np.concatenate([[1.0], np.where(same, 1.0, -1.0)]))
+    return quaternion * sign[:, None]
+
+
+def _propagated(
+    covariance: np.ndarray, known: np.ndarray, filter_: tuple[np.ndarray, np.ndarray]
+) -> NDArray[np.float64]:
+    """Covariances (T, 6, 6) after the filter: sums by the square of its impulse response."""
+    size = len(covariance)
+    impulse = np.zeros(2 * size + 1)
+    impulse[size] = 1.0
+    response = filtfilt(*filter_, impulse) ** 2
+    wide = np.flatnonzero(response > SETTLED * response.max())
+    half = size - int(wide[0])
+    response = response[size - half : size + half + 1]
+    filled = _nearest(covariance, known).reshape(size, -1)
+    padded = np.pad(filled, ((half, half), (0, 0)), mode='edge')
+    return fftconvolve(padded, response[:, None], mode='valid', axes=0).reshape(covariance.shape)
+
+
+def _nearest(values: np.ndarray, known: np.ndarray) -> NDArray[np.float64]:
+    """Values (T, ...) with those of the nearest known exposure where there are none."""
+    rows = np.flatnonzero(known)
+    after = np.searchsorted(rows, np.arange(len(known))).clip(0, len(rows) - 1)
+    before = np.maximum(after - 1, 0)
+    time = np.arange(len(known))
+    nearer = np.abs(rows[before] - time) < np.abs(rows[after] - time)
+    return values[np.where(nearer, rows[before], rows[after])]

@@ -1,0 +1,165 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""fluoro-calib bodies."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import DataError
+from .arguments import (
+    add_bag_options,
+    add_calibration,
+    add_options,
+    add_source,
+    bag_selection,
+    file_settings,
+    number_in,
+    options_of,
+)
+from .output import ProgressBar, print_findings, print_notes, print_result, print_unpaired
+
+if TYPE_CHECKING:
+    from ..jobs.bodies import BodiesOutcome
+
+NAME = 'bodies'
+HELP = 'Find the poses of bones from their markers, and the motion of joints, with their sd.'
+EXAMPLE = (
+    'fluoro-calib bodies rig/walking --bodies rig/bodies.csv --joints rig/joints.toml '
+    '--calibration result --out motion'
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..jobs.bodies import BodiesOptions
+
+    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
+    add_bag_options(parser, pairing=False)
+    add_calibration(parser)
+    parser.add_argument(
+        '--bodies',
+        required=True,
+        type=Path,
+        metavar='FILE',
+        help='bodies and their markers, CSV body,marker,x,y,z,sd in mm; x, y, z and sd are empty '
+        'where they are not known from CT',
+    )
+    parser.add_argument(
+        '--joints', type=Path, metavar='FILE', help='joints between the bodies, TOML'
+    )
+    parser.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder to write')
+    parser.add_argument(
+        '--orientation',
+        type=Path,
+        metavar='FILE',
+        help='orientation of the rig (default: rig_orientation.npz in the result folder)',
+    )
+    add_options(parser, BodiesOptions, reject={'metavar': 'S'})
+    parser.add_argument(
+        '--keep-shapes',
+        action='store_true',
+        help='take the coordinates of the markers as they are, do not estimate them anew',
+    )
+    parser.add_argument(
+        '--rate',
+        type=number_in(0.001, 1e6),
+        metavar='HZ',
+        help='rate of the exposures, for files without times',
+    )
+
+
+def run(arguments: argparse.Namespace) -> None:
+    """Write poses and joints of a recording. Raises DataError."""
+    from ..io.bodies import read_bodies
+    from ..io.joints import read_joints
+    from ..io.rig_orientation import load_orientation, orientation_path
+    from ..jobs.bodies import BodiesOptions, Rig, track_bodies
+    from ..jobs.bodies_folder import check_bodies_folder, save_bodies
+    from ..jobs.reconstruction import check_orientation
+    from ..jobs.sources import is_bag, read_calibrated_source
+
+    path = arguments.orientation or orientation_path(arguments.calibration)
+    inputs = [arguments.source, arguments.calibration, path, arguments.bodies]
+    check_bodies_folder(arguments.out, [*inputs, arguments.joints or path])
+    bodies = read_bodies(arguments.bodies)
+    names = [body.name for body in bodies]
+    joints = read_joints(arguments.joints, names) if arguments.joints else ()
+    recording, calibrations = read_calibrated_source(
+        arguments.source,
+        arguments.calibration,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+        validate=False,
+        settings=file_settings(arguments),
+        selection=bag_selection(arguments, pairing=False),
+    )
+    print_notes(recording.notes)
+    if arguments.rate is None and not is_bag(arguments.source):
+        raise DataError(
+            f'{arguments.source}: the file does not contain the times of its exposures; give '
+            'their rate, --rate HZ'
+        )
+    orientation = load_orientation(path)
+    try:
+        check_orientation(orientation, calibrations)
+    except DataError as error:
+        raise error.at(path) from None
+    options = options_of(
+        BodiesOptions,
+        arguments,
+        pair_tolerance=arguments.pair_tolerance,
+        estimate_shapes=not arguments.keep_shapes,
+        rate=arguments.rate,
+    )
+    try:
+        with ProgressBar('exposures') as bar:
+            rig = Rig(calibrations, orientation)
+            outcome = track_bodies(recording.frames, rig, bodies, joints, options, bar)
+    except DataError as error:
+        raise error.at(arguments.source) from None
+    save_bodies(arguments.out, outcome)
+    print_unpaired(arguments.source, outcome.unpaired)
+    print_findings(outcome.findings, 'doubtful: ')
+    _print(arguments, outcome)
+
+
+def _print(arguments: argparse.Namespace, outcome: BodiesOutcome) -> None:
+    """Print how well poses and joints are known."""
+    lines = [f'{len(outcome.exposures)} exposures, written to {arguments.out}']
+    document: dict[str, Any] = {'out': str(arguments.out), 'bodies': {}, 'joints': {}}
+    for poses, shape in zip(outcome.poses, outcome.shapes):
+        known = poses.known
+        sd = np.median(poses.sd[known], axis=0) if known.any() else np.full(6, np.nan)
+        position = float(np.sqrt(np.mean(sd[:3] ** 2)))
+        rotation = float(np.degrees(np.sqrt(np.mean(sd[3:] ** 2))))
+        document['bodies'][poses.body] = {
+            'poses': int(np.count_nonzero(known)),
+            'sd_mm': position,
+            'sd_deg': rotation,
+            'condition_per_m': shape.condition,
+            'mean_error_mm': shape.mean_error_mm,
+        }
+        lines.append(
+            f'{poses.body}: {np.count_nonzero(known)} poses, sd {position:.3f} mm and '
+            f'{rotation:.3f} degrees (medians); condition number {shape.condition:.0f} per m, '
+            f'mean error of the rigid body {shape.mean_error_mm:.3f} mm'
+        )
+    for motion in outcome.joints:
+        angles = np.degrees(motion.angles[np.isfinite(motion.angles).all(axis=1)])
+        span = np.ptp(angles, axis=0) if len(angles) else np.full(3, np.nan)
+        sd = np.degrees(np.nanmedian(motion.sd[:, :3], axis=0))
+        document['joints'][motion.joint.name] = {
+            name: {'range_deg': float(a), 'sd_deg': float(s)}
+            for name, a, s in zip(motion.angle_names, span, sd)
+        }
+        lines += [
+            f'{motion.joint.name}: {name} over {a:.1f} degrees, sd {s:.3f} (median)'
+            for name, a, s in zip(motion.angle_names, span, sd)
+        ]
+    print_result(arguments, document, '\n'.join(lines))

@@ -81,7 +81,7 @@ class Body:
     @property
     def known(self) -> NDArray[np.bool_]:
         """Whether the place of a marker (m,) is known."""
-        return np.isfinite(self.xyz_mm).all(axis=1)
+        return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
 
     @property
     def centre(self) -> NDArray[np.float64]:

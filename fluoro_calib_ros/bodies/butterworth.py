@@ -4,9 +4,9 @@
 """The low-pass filter that labs use, for comparison: Butterworth, forwards and backwards.
 
 Of order 4 in total, two each way, as in Winter ("Biomechanics and motor control of human
-movement", 4th ed., 2009, 2.2.4.4). The cutoff is chosen by whoever uses it. Standard deviations are
-propagated for errors that are independent from exposure to exposure; what the filter takes from
-the motion itself they do not contain.
+movement", 4th ed., 2009, 2.2.4.4). The cutoff is chosen by whoever uses it. Standard deviations
+are propagated for errors that are independent from exposure to exposure; what the filter takes
+from the motion itself they do not contain.
 """
 
 from __future__ import annotations

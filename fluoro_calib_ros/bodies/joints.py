@@ -39,6 +39,7 @@ LINEAR_SD_RAD = 0.02
 # Of the Gauss-Hermite rule along each axis: for quadratic errors, and near gimbal lock.
 NODES = 3
 LOCK_NODES = 9
+MIN_VOLUME = 1e-9  # of the axes: the Jacobian is finite in gimbal lock, and not used there
 BLOCK = 256  # exposures that are integrated at once
 
 
@@ -159,7 +160,9 @@ def joint_motion(
     covariance = jacobian @ relative.covariance @ np.swapaxes(jacobian, 1, 2)
     locked = _near_lock(of, angles, covariance)
     for nodes, bent in ((NODES, _is_nonlinear(covariance) & ~locked), (LOCK_NODES, locked)):
-        for rows in np.array_split(np.flatnonzero(bent), 1 + bent.sum() // BLOCK):
+        exposures = np.flatnonzero(bent)
+        for start in range(0, len(exposures), BLOCK):
+            rows = exposures[start : start + BLOCK]
             covariance[rows] = _second_moments(of, relative.of(rows), angles[rows], nodes)
     signs = np.array([*of.angle_signs, *of.translation_signs], dtype=float)
     return JointMotion(
@@ -310,13 +313,25 @@ def _angles(of: Convention, rotation: np.ndarray) -> np.ndarray:
 
 
 def _axes(of: Convention, angles: np.ndarray) -> np.ndarray:
-    """Return the axes of rotation (..., 3, 3), in the columns, in the proximal frame."""
-    i, j, k = (AXES.index(axis) for axis in of.sequence)
-    unit = np.eye(3)
-    turn_1 = matrix_from_vector(angles[..., :1] * unit[i])
-    turn_2 = matrix_from_vector(angles[..., 1:2] * unit[j])
-    e1 = np.broadcast_to(unit[i], angles.shape)
-    return np.stack([e1, turn_1[..., j], (turn_1 @ turn_2)[..., k]], axis=-1)
+    """Return the axes of rotation (..., 3, 3), in the columns, in the proximal frame.
+
+    They are the unit vectors i, R_i j and R_i R_j k.
+    """
+    i, j, _ = (AXES.index(axis) for axis in of.sequence)
+    m = 3 - i - j
+    sign = 1.0 if (j - i) % 3 == 1 else -1.0
+    sine_1, sine_2 = np.moveaxis(np.sin(angles[..., :2]), -1, 0)
+    cosine_1, cosine_2 = np.moveaxis(np.cos(angles[..., :2]), -1, 0)
+    # Of R_j k, along i and along the third unit vector, which R_i turns.
+    along, across = (cosine_2, -sign * sine_2) if of.is_euler else (sign * sine_2, cosine_2)
+    axes = np.zeros((*angles.shape, 3))
+    axes[..., i, 0] = 1.0
+    axes[..., j, 1] = cosine_1
+    axes[..., m, 1] = sign * sine_1
+    axes[..., i, 2] = along
+    axes[..., j, 2] = -sign * across * sine_1
+    axes[..., m, 2] = across * cosine_1
+    return axes
 
 
 def _translations(of: Convention, axes: np.ndarray, translation: np.ndarray) -> np.ndarray:
@@ -328,30 +343,25 @@ def _translations(of: Convention, axes: np.ndarray, translation: np.ndarray) -> 
 
 def _jacobian(of: Convention, axes: np.ndarray, translation: np.ndarray) -> np.ndarray:
     """Derivatives (T, 6, 6) of angles and translations by rotation error and translation."""
+    e1, e2, e3 = (axes[..., n] for n in range(3))
+    by_1, by_2, between = np.cross(np.stack([e1, e1, e2]), np.stack([e2, e3, e3]))
+    volume = np.sum(between * e1, axis=1)
+    volume = np.where(np.abs(volume) < MIN_VOLUME, MIN_VOLUME, volume)
+    by_turn = np.stack([between, -by_2, by_1], axis=1) / volume[:, None, None]  # E^-1
+
     jacobian = np.zeros((len(axes), 6, 6))
-    by_turn = _inverse(axes)
     jacobian[:, :3, :3] = by_turn
     if not of.along_axes:
         jacobian[:, 3:, 3:] = np.eye(3)
         return jacobian
     # The second axis turns about the first, the third one about both.
-    e1, e2, e3 = (axes[..., n] for n in range(3))
     by_angle = np.zeros_like(axes)
-    by_angle[:, 1, 0] = np.sum(np.cross(e1, e2) * translation, axis=1)
-    by_angle[:, 2, 0] = np.sum(np.cross(e1, e3) * translation, axis=1)
-    by_angle[:, 2, 1] = np.sum(np.cross(e2, e3) * translation, axis=1)
+    by_angle[:, 1, 0] = np.sum(by_1 * translation, axis=1)
+    by_angle[:, 2, 0] = np.sum(by_2 * translation, axis=1)
+    by_angle[:, 2, 1] = np.sum(between * translation, axis=1)
     jacobian[:, 3:, :3] = by_angle @ by_turn
     jacobian[:, 3:, 3:] = np.swapaxes(axes, 1, 2)
     return jacobian
-
-
-def _inverse(axes: np.ndarray) -> np.ndarray:
-    """Return the inverse (T, 3, 3) of the axes, finite in gimbal lock, too."""
-    e1, e2, e3 = (axes[..., n] for n in range(3))
-    rows = np.stack([np.cross(e2, e3), np.cross(e3, e1), np.cross(e1, e2)], axis=1)
-    volume = np.sum(rows[:, 0] * e1, axis=1)
-    volume = np.where(np.abs(volume) < 1e-9, 1e-9, volume)  # what follows is not used
-    return rows / volume[:, None, None]
 
 
 def _near_lock(of: Convention, angles: np.ndarray, covariance: np.ndarray) -> np.ndarray:

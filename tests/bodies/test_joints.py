@@ -4,6 +4,7 @@
 """Joint angles against SciPy and the printed formulas, their covariance against Monte Carlo."""
 
 import dataclasses
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -623,3 +624,15 @@ def test_two_joints_of_one_bone_are_no_cycle():
     pairs = (('thorax', 'scapula'), ('scapula', 'humerus'), ('thorax', 'humerus'))
     joints = [Joint(f'{a}-{b}', a, b, 'cardan_xyz') for a, b in pairs]
     check_joints(joints, ['thorax', 'scapula', 'humerus'])
+
+
+def test_the_documentation_has_all_names():
+    """Conventions, names of angles and translations, landmarks and states."""
+    text = (Path(__file__).parents[2] / 'docs' / 'joints.md').read_text()
+    names = [name for frame in LANDMARK_FRAMES.values() for name in frame.landmarks]
+    for name in CLINICAL:
+        names += [name, *CONVENTIONS[name].angles]
+        if CONVENTIONS[name].along_axes:
+            names += CONVENTIONS[name].translations
+    names += [status.name for status in JointStatus]
+    assert not [name for name in names if name not in text]

@@ -234,7 +234,10 @@ def test_correct_reads_points_of_xmalab(lab, result, capsys):
     ('arguments', 'sentence'),
     [
         (('points.csv', '--to', 'mayacam2'), 'needs cameras, but the source has image points'),
-        (('phantom.csv', '--to', 'c3d'), 'C3D needs 3-D points, but the source has a phantom'),
+        (
+            ('phantom.csv', '--to', 'c3d'),
+            'C3D needs 3-D points or poses of rigid bodies, but the source has a phantom',
+        ),
         (('missing.csv', '--to', 'bag'), 'missing.csv: there is no such file'),
         (('result', '--to', 'mayacam2', '--exposure', '77'), 'there is no exposure 77'),
         (('result', '--to', 'dlt', '--fluoroscopes', 'c'), "no fluoroscope 'c', only a, b"),

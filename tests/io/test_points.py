@@ -4,6 +4,7 @@
 """Formats of image points, phantoms, points in space and poses: written, read, refused."""
 
 import csv
+import dataclasses
 import json
 import os
 import pathlib
@@ -15,6 +16,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from fluoro_calib_ros.bodies.body import BodyPoses
+from fluoro_calib_ros.bodies.joints import Joint, JointMotion
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.exposures.names import Names, number_names, safe_names
@@ -29,6 +32,8 @@ from fluoro_calib_ros.io.formats.content import (
     Station,
     points_without_precision,
 )
+from fluoro_calib_ros.io.formats.frames_of_points import bodies_of_poses
+from fluoro_calib_ros.io.formats.opensim import write_joint_motion
 from fluoro_calib_ros.jobs.sources import read_source
 
 SIZE = (1024, 768)
@@ -459,6 +464,225 @@ def test_matrix_that_is_no_rotation_is_refused(tmp_path):
     assert 'row 2: the matrix of b is not a rotation' in refused(path)
 
 
+def moving_bodies(rate=250.0):
+    """Two bodies in frames 4, 5 and 7; the second has no pose in the second one."""
+    rng = np.random.default_rng(4)
+    turn = Rotation.random(6, random_state=rng).as_matrix().reshape(3, 2, 3, 3)
+    shift = np.round(rng.uniform(-200, 200, (3, 2, 3)), 4)
+    turn[1, 1] = shift[1, 1] = np.nan
+    return Bodies(('femur', 'tibia'), np.array([4, 5, 7]), turn, shift, rate)
+
+
+def test_rotations_of_c3d_are_read_by_ezc3d(tmp_path):
+    """Alone or beside points; frame 6 has none. What ezc3d reads is read here, too."""
+    path = tmp_path / 'bodies.c3d'
+    bodies = moving_bodies(200.0)
+    for content in (Content(bodies=bodies), Content(bodies=bodies, points=points(), names=NAMED)):
+        registry.write(path, 'c3d', content, FileSettings())
+        file = ezc3d.c3d(str(path))
+        assert file['parameters']['ROTATION']['LABELS']['value'] == ['femur', 'tibia']
+        assert file['parameters']['ROTATION']['RATE']['value'].tolist() == [200]
+        first = file['header']['points']['first_frame'] + 1
+        matrices = file['data']['rotations'][..., bodies.frame - first]
+        np.testing.assert_allclose(
+            matrices[:3, :3].transpose(3, 2, 0, 1), bodies.rotation, atol=1e-6
+        )
+        np.testing.assert_allclose(
+            matrices[:3, 3].transpose(2, 1, 0), bodies.translation_mm, rtol=1e-6
+        )
+        assert np.isnan(file['data']['rotations'][..., 6 - first]).all()
+        found = registry.read(path, FileSettings())
+        assert found.parts == content.parts
+        assert (found.bodies.names, found.bodies.rate_hz) == (bodies.names, 200)
+        rows = np.isin(found.bodies.frame, bodies.frame)
+        np.testing.assert_allclose(found.bodies.rotation[rows], bodies.rotation, atol=1e-6)
+        np.testing.assert_allclose(
+            found.bodies.translation_mm[rows], bodies.translation_mm, rtol=1e-6
+        )
+        assert np.isnan(found.bodies.rotation[~rows]).all()
+    metres = FileSettings(units='m')
+    registry.write(path, 'c3d', Content(bodies=bodies), metres)
+    found = registry.read(path, FileSettings()).bodies
+    np.testing.assert_allclose(found.translation_mm[0], bodies.translation_mm[0], rtol=1e-5)
+    with pytest.raises(DataError, match='--rate HZ is needed'):
+        registry.write(path, 'c3d', Content(bodies=moving_bodies(None)), FileSettings())
+
+
+def test_rotation_of_c3d_that_is_none_is_refused(tmp_path):
+    bodies = moving_bodies()
+    scaled = dataclasses.replace(bodies, rotation=2 * bodies.rotation)
+    path = tmp_path / 'bodies.c3d'
+    registry.write(path, 'c3d', Content(bodies=scaled), FileSettings())
+    assert 'frame 4: the matrix of femur is not a rotation' in refused(path)
+
+
+def test_tracking_of_autoscoper(tmp_path):
+    """Rows of matrices, row by row; a row for every frame, NaN where there is no pose."""
+    path = tmp_path / 'trial.tra'
+    bodies = moving_bodies(None)
+    written = registry.write(path, 'autoscoper', Content(bodies=bodies), FileSettings(units='mm'))
+    assert 'row 1 is frame 4' in written.notes[0]
+    rows = np.array([[float(cell) for cell in r.split(',')] for r in path.read_text().split()])
+    assert rows.shape == (4, 32)
+    assert np.isnan(rows[2]).all() and np.isnan(rows[1, 16:]).all()
+    matrix = rows[3, 16:].reshape(4, 4)
+    np.testing.assert_array_equal(matrix[:3, :3], bodies.rotation[2, 1])
+    np.testing.assert_array_equal(matrix[:3, 3], bodies.translation_mm[2, 1])
+    np.testing.assert_array_equal(matrix[3], [0, 0, 0, 1])
+    assert 'only written' in refused(path)
+
+
+POSES_BY_OPENSIM = """
+import json, sys
+import opensim
+opensim.Logger.setLevelString('Off')
+out = []
+kinds = (opensim.TimeSeriesTableQuaternion, 4), (opensim.TimeSeriesTableVec3, 3)
+for path, (kind, size) in zip(sys.argv[1:], kinds):
+    table = kind(path)
+    rows = [table.getRowAtIndex(t) for t in range(table.getNumRows())]
+    out.append({
+        'labels': list(table.getColumnLabels()),
+        'times': list(table.getIndependentColumn()),
+        'values': [
+            [[row.getElt(0, b).get(k) for k in range(size)] for b in range(row.size())]
+            for row in rows
+        ],
+    })
+json.dump(out, sys.stdout)
+"""
+
+
+def by_opensim(script, folder, *paths):
+    """Return what a script that runs with opensim writes as JSON."""
+    if sys.version_info < (3, 11):
+        pytest.skip('opensim has no wheel for Python 3.10')
+    done = subprocess.run(
+        [sys.executable, '-c', script, *paths],
+        capture_output=True,
+        text=True,
+        check=True,
+        cwd=folder,
+    )
+    return json.loads(done.stdout)
+
+
+def test_poses_are_read_by_opensim(tmp_path):
+    """Orientations and positions in metres; NaN in frame 6 and where a body has no pose."""
+    bodies = moving_bodies()
+    written = registry.write(
+        tmp_path / 'poses.sto', 'opensim', Content(bodies=bodies), FileSettings()
+    )
+    assert [pathlib.Path(p).name for p in written.paths] == ['poses.sto', 'poses_positions.sto']
+    turns, places = by_opensim(POSES_BY_OPENSIM, tmp_path, *written.paths)
+    for table in (turns, places):
+        assert table['labels'] == ['femur', 'tibia']
+        np.testing.assert_allclose(table['times'], np.arange(4) / 250)
+    rows = bodies.frame - 4
+    wxyz = np.array(turns['values'])
+    position = 1000 * np.array(places['values'])
+    assert np.isnan(wxyz[2]).all() and np.isnan(position[2]).all()
+    np.testing.assert_allclose(position[rows], bodies.translation_mm)
+    assert (np.isnan(wxyz[rows]).any(axis=2) == np.isnan(position[rows]).any(axis=2)).all()
+    known = np.isfinite(wxyz[rows]).all(axis=2)
+    matrices = Rotation.from_quat(wxyz[rows][known][:, [1, 2, 3, 0]]).as_matrix()
+    np.testing.assert_allclose(matrices, bodies.rotation[known], atol=1e-12)
+    assert 'only written' in refused(tmp_path / 'poses.sto')
+
+
+def joint_of_two(name, count=3):
+    """Motion of a knee, unknown in the second exposure."""
+    angles = np.array([[0.5, -0.25, 7.0], [np.nan] * 3, [0.1, 0.2, 0.3]])
+    return JointMotion(
+        Joint(name, 'femur', 'tibia', 'grood_suntay_knee', side='left'),
+        np.arange(count),
+        np.arange(count) * 4_000_000 + 10**18,
+        angles=angles,
+        translations=10 * angles,
+        covariance=np.zeros((count, 6, 6)),
+        status=np.zeros(count, np.uint8),
+    )
+
+
+MOTION_BY_OPENSIM = """
+import json, sys
+import opensim
+opensim.Logger.setLevelString('Off')
+table = opensim.TimeSeriesTable(sys.argv[1])
+storage = opensim.Storage(sys.argv[1])
+vectors = [storage.getStateVector(t) for t in range(storage.getSize())]
+json.dump({
+    'in_degrees': table.getTableMetaDataString('inDegrees') == 'yes' and storage.isInDegrees(),
+    'times': list(table.getIndependentColumn()),
+    'columns': {
+        name: table.getDependentColumn(name).to_numpy().tolist()
+        for name in table.getColumnLabels()
+    },
+    'storage': [[v.getData().get(k) for k in range(v.getSize())] for v in vectors],
+}, sys.stdout)
+"""
+
+
+def test_joint_motion_is_read_by_opensim(tmp_path):
+    """By both of its readers; an exposure in which it is unknown is left out."""
+    path = tmp_path / 'joints.mot'
+    motions = [joint_of_two('knee_l'), joint_of_two('knee_r')]
+    write_joint_motion(path, motions, 10**18)
+    found = by_opensim(MOTION_BY_OPENSIM, tmp_path, path)
+    known = [0, 2]
+    assert found['in_degrees']
+    np.testing.assert_allclose(found['times'], [0, 0.008])
+    columns = {name: np.array(values) for name, values in found['columns'].items()}
+    np.testing.assert_allclose(
+        np.deg2rad(columns['knee_r_internal_rotation']), motions[1].angles[known, 2]
+    )
+    np.testing.assert_allclose(
+        1000 * columns['knee_l_anterior_drawer'], motions[0].translations[known, 1]
+    )
+    np.testing.assert_allclose(found['storage'], np.column_stack(list(columns.values())))
+
+
+def test_joint_motion_that_cannot_be_written_is_refused(tmp_path):
+    path = tmp_path / 'joints.mot'
+    unknown = dataclasses.replace(joint_of_two('knee'), angles=np.full((3, 3), np.nan))
+    for motions, cause in (
+        ([], 'one joint at least'),
+        ([unknown], 'no exposure'),
+        ([joint_of_two('a\tb')], 'tabulator'),
+    ):
+        with pytest.raises(DataError, match=cause):
+            write_joint_motion(path, motions, 0)
+    assert not path.exists()
+
+
+def test_poses_become_bodies():
+    """The rate is that of the stamps, also where exposures are missing."""
+    rotation = Rotation.random(3, random_state=np.random.default_rng(1)).as_matrix()
+    poses = [
+        BodyPoses(
+            name,
+            np.array([4, 5, 7]),
+            np.array([0, 4, 12]) * 10**6,
+            rotation=rotation,
+            position_mm=np.arange(9.0).reshape(3, 3) + n,
+            covariance_noise=np.zeros((3, 6, 6)),
+            covariance_fixed=np.zeros((3, 6, 6)),
+            rig_root=np.zeros((3, 6, 0)),
+            markers=np.full(3, 4),
+            status=np.zeros(3, np.uint8),
+        )
+        for n, name in enumerate(('femur', 'tibia'))
+    ]
+    bodies = bodies_of_poses(poses)
+    assert bodies.names == ('femur', 'tibia') and bodies.rate_hz == pytest.approx(250)
+    np.testing.assert_array_equal(bodies.rotation[:, 1], rotation)
+    np.testing.assert_array_equal(bodies.translation_mm[:, 1], poses[1].position_mm)
+    other = dataclasses.replace(poses[1], number=np.array([4, 5, 6]))
+    for wrong in ([], [poses[0], other]):
+        with pytest.raises(DataError, match='one body at least'):
+            bodies_of_poses(wrong)
+
+
 # ---- lookup tables
 
 
@@ -495,7 +719,7 @@ def test_damaged_files_are_refused_in_one_sentence(tmp_path, kind):
     """Truncated, with rows left out or doubled, or with other bytes: no other exception."""
     matrix = np.array([[4000.0, 0, 500], [0, 4000, 380], [0, 0, 1]])
     camera = Camera('cam1', matrix, SIZE, np.eye(3), np.zeros(3))
-    bodies = Bodies(('f',), np.array([1]), np.eye(3)[None, None], np.ones((1, 1, 3)))
+    bodies = Bodies(('f',), np.array([1]), np.eye(3)[None, None], np.ones((1, 1, 3)), 50.0)
     shifted = Camera('cam1', matrix, SIZE, np.eye(3), np.array([0.0, 0, 1000]))
     content = Content(
         observations={'cam1': frames(sigma=True)['cam1']},

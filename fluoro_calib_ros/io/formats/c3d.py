@@ -1,11 +1,12 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""C3D (c3d.org), read and written with ezc3d: points in mm, their residual, rate and names.
+"""C3D (c3d.org), read and written with ezc3d: points in mm, rotations, rate and names.
 
 The residual of a C3D point is in the unit of the points, and negative where there is no point. It
 is written as the standard deviation of the position, the root of the sum of its variances in x, y
 and z [mm]; 0 where that is unknown. C3D holds coordinates as float32, and residuals in 255 steps.
+Poses of bodies are the 4 x 4 matrices, body -> world, of the group ROTATION.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from __future__ import annotations
 import io
 import os
 import struct
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -25,8 +27,18 @@ from ...processes import run_module
 from ..access import read_bytes
 from ..atomic import write_bytes
 from . import c3d_process
-from .content import UNITS_MM, Content, FileSettings, Format, Points, Sample, Written
-from .frames_of_points import at_constant_rate, labels, named_targets
+from .content import (
+    UNITS_MM,
+    Bodies,
+    Content,
+    FileSettings,
+    Format,
+    Points,
+    Sample,
+    Written,
+    homogeneous,
+)
+from .frames_of_points import bodies_of, frames_of, labels, named_targets, points_of
 
 MISSING = -1.0
 STEPS = 255  # of the byte of a residual, in units of POINT:SCALE
@@ -38,6 +50,7 @@ MAX_FRAME = 65535  # the header counts in uint16
 _MAGIC = 0x50
 _INTEL = 84  # processor type
 BLOCK = 512  # bytes
+ROTATION_TOLERANCE = 1e-4  # float32, and programs that compute in it
 
 
 def recognise(sample: Sample) -> bool:
@@ -60,17 +73,20 @@ def read(path: Path, settings: FileSettings) -> Content:
     _check_size(path, read_bytes(path))
     _ezc3d()
     arrays = _arrays(path)
+    if not arrays['xyz'].size and not arrays['rotations'].size:
+        raise DataError(f'{path}: the file has no points')
+    content = _points(path, arrays, settings) if arrays['xyz'].size else Content()
+    if arrays['rotations'].size:
+        content = replace(content, bodies=_bodies(path, arrays, settings))
+    return content
+
+
+def _points(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -> Content:
+    """Return the points of a file. Raises DataError."""
     names = arrays['labels'].tolist()
-    unit = str(arrays['unit'])
-    rate = float(arrays['rate'])
-    first = int(arrays['first'])
     xyz = arrays['xyz']
     residual = arrays['residual']
-    if not xyz.size:
-        raise DataError(f'{path}: the file has no points')
-    mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(unit)
-    if mm is None:
-        raise DataError(f'{path}: the unit of the points is {unit!r}, give it with --units')
+    mm = _unit(path, str(arrays['unit']), settings)
     names = names[: xyz.shape[1]]
     if len(set(names)) < xyz.shape[1]:
         raise DataError(f'{path}: {xyz.shape[1]} points, but {len(set(names))} different names')
@@ -79,14 +95,54 @@ def read(path: Path, settings: FileSettings) -> Content:
     xyz[np.isnan(xyz).any(axis=2)] = np.nan
     sd = np.where(residual > 0, residual * mm, np.nan)
     points = Points(
-        np.arange(first, first + len(xyz)),
+        int(arrays['first']) + np.arange(len(xyz)),
         np.array([ids[name] for name in names], dtype=np.int64),
         xyz_mm=xyz,
         sd_mm=sd,
         residual_px=np.full(sd.shape, np.nan),
-        rate_hz=rate,
+        rate_hz=float(arrays['rate']),
     )
     return Content(points=points, names=Names(named_targets({n: ids[n] for n in names})))
+
+
+def _bodies(path: Path, arrays: dict[str, np.ndarray], settings: FileSettings) -> Bodies:
+    """Return the rotations of a file, of the frames of its points. Raises DataError."""
+    matrices = arrays['rotations']
+    names = arrays['rotation_labels'].tolist()[: matrices.shape[1]]
+    if len(set(names)) < matrices.shape[1]:
+        raise DataError(
+            f'{path}: {matrices.shape[1]} rotations, but {len(set(names))} different names'
+        )
+    mm = _unit(path, str(arrays['rotation_unit'] or arrays['unit']), settings)
+    rotation = matrices[..., :3, :3].copy()
+    translation = matrices[..., :3, 3] * mm
+    missing = np.isnan(matrices).any(axis=(2, 3))
+    turn = np.where(missing[..., None, None], np.eye(3), rotation)
+    error = np.abs(turn @ np.swapaxes(turn, 2, 3) - np.eye(3)).max(axis=(2, 3))
+    wrong = (error > ROTATION_TOLERANCE) | (np.linalg.det(turn) < 0)
+    first = int(arrays['first'])
+    if wrong.any():
+        row, column = np.argwhere(wrong)[0]
+        raise DataError(
+            f'{path}, frame {first + row}: the matrix of {names[column]} is not a rotation'
+        )
+    rotation[missing] = np.nan
+    translation[missing] = np.nan
+    return Bodies(
+        tuple(names),
+        first + np.arange(len(matrices)),
+        rotation,
+        translation,
+        rate_hz=float(arrays['rotation_rate']),
+    )
+
+
+def _unit(path: Path, unit: str, settings: FileSettings) -> float:
+    """Return the mm of the unit of a file. Raises DataError for an unknown one."""
+    mm = UNITS_MM[settings.units] if settings.units else UNITS_MM.get(unit)
+    if mm is None:
+        raise DataError(f'{path}: the unit of the points is {unit!r}, give it with --units')
+    return mm
 
 
 def _check_size(path: Path, content: bytes) -> None:
@@ -126,33 +182,45 @@ def _arrays(path: Path) -> dict[str, np.ndarray]:
 
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
-    """Write points in space. Raises DataError."""
-    points = at_constant_rate(path, content, settings)
-    first = int(points.frame[0])
-    if not 1 <= first <= int(points.frame[-1]) <= MAX_FRAME:
+    """Write points in space and poses of bodies. Raises DataError."""
+    frames = frames_of(path, [p for p in (content.points, content.bodies) if p], settings)
+    last = frames.first + frames.count - 1
+    if not 1 <= frames.first <= last <= MAX_FRAME:
         raise DataError(
-            f'{path}: frames {first} to {points.frame[-1]}, but C3D counts from 1 to {MAX_FRAME}'
+            f'{path}: frames {frames.first} to {last}, but C3D counts from 1 to {MAX_FRAME}'
         )
     unit = settings.units or 'mm'
-    mm = UNITS_MM[unit]
     file = _ezc3d().c3d()
+    parameters = file['parameters']['POINT']
+    parameters['UNITS']['value'] = [unit]
+    parameters['RATE']['value'] = [frames.rate_hz]
+    file['header']['points']['first_frame'] = frames.first - 1
+    file['data']['points'] = np.zeros((4, 0, frames.count))
+    if content.points is not None:
+        parameters['LABELS']['value'] = labels(content)
+        _add_points(file, points_of(content.points, frames), UNITS_MM[unit])
+    if content.bodies is not None:
+        matrices = homogeneous(bodies_of(content.bodies, frames), UNITS_MM[unit])
+        file.add_parameter('ROTATION', 'LABELS', list(content.bodies.names))
+        file.add_parameter('ROTATION', 'RATE', [frames.rate_hz])
+        file.add_parameter('ROTATION', 'UNITS', [unit])
+        file['data']['rotations'] = matrices.transpose(2, 3, 1, 0)
+    write_bytes(path, _bytes_of(file, path))
+    return Written((str(path),))
+
+
+def _add_points(file: Any, points: Points, mm: float) -> None:
+    """Add points of all frames to a file, in units of mm, with their residuals."""
     missing = np.asarray(np.isnan(points.xyz_mm).any(axis=2))
     xyz = np.where(missing[..., None], 0.0, points.xyz_mm / mm)
-    homogeneous = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
+    with_one = np.concatenate([xyz, np.ones((*xyz.shape[:2], 1))], axis=2)
     sd = np.nan_to_num(points.sd_mm / mm)
     step = max(float(sd.max(initial=0.0)) / STEPS, 1e-6)
     # The byte of a residual is cut off, not rounded.
     residual = np.where(missing, MISSING, (np.round(sd / step) + 0.01) * step)
-    parameters = file['parameters']['POINT']
-    parameters['LABELS']['value'] = labels(content)
-    parameters['UNITS']['value'] = [unit]
-    parameters['RATE']['value'] = [points.rate_hz]
-    parameters['SCALE']['value'] = [-step]
-    file['header']['points']['first_frame'] = first - 1
-    file['data']['points'] = homogeneous.transpose(2, 1, 0)
+    file['parameters']['POINT']['SCALE']['value'] = [-step]
+    file['data']['points'] = with_one.transpose(2, 1, 0)
     file['data']['meta_points']['residuals'] = residual.T[None]
-    write_bytes(path, _bytes_of(file, path))
-    return Written((str(path),))
 
 
 def _bytes_of(file: Any, path: Path) -> bytes:
@@ -169,7 +237,7 @@ def _bytes_of(file: Any, path: Path) -> bytes:
 FORMAT = Format(
     'c3d',
     'C3D',
-    parts=('points',),
+    parts=('points', 'bodies'),
     recognise=recognise,
     read=read,
     write=write,

@@ -4,7 +4,8 @@
 """Read a C3D file with ezc3d in a process of its own: `python -m ...c3d_process PATH`.
 
 ezc3d trusts what a file says about itself: a damaged one can make it crash, or fill the memory.
-Standard output is an .npz of the arrays labels, unit, rate, first, xyz (m, n, 3), residual (m, n).
+Standard output is an .npz of the arrays labels, unit, rate, first, xyz (m, n, 3), residual (m, n),
+and rotation_labels, rotation_unit, rotation_rate, rotations (m, b, 4, 4).
 """
 
 from __future__ import annotations
@@ -42,7 +43,19 @@ def arrays_of(path: str) -> dict[str, Any]:
     file = ezc3d.c3d(path)
     parameters = file['parameters']['POINT']
     header = file['header']['points']
+    # A file without rotations has neither the group nor matrices.
+    group = file['parameters'].get('ROTATION', {})
+    rotations = np.asarray(file['data']['rotations'], dtype=float)
+
+    def of_group(name: str, default: Any) -> Any:
+        values = group[name]['value'] if name in group else []
+        return values[0] if len(values) else default
+
     return {
+        'rotation_labels': np.array(labels_of(group) if 'LABELS' in group else [], dtype=str),
+        'rotation_unit': str(of_group('UNITS', '')).strip(),
+        'rotation_rate': float(of_group('RATE', header['frame_rate'])),
+        'rotations': rotations.reshape(4, 4, *rotations.shape[2:]).transpose(3, 2, 0, 1),
         'labels': np.array(labels_of(parameters), dtype=str),
         'unit': str(parameters['UNITS']['value'][0]).strip(),
         'rate': float(header['frame_rate']),

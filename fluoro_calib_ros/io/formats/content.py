@@ -174,12 +174,25 @@ class Bodies:
     frame : (m,) ndarray of int
     rotation : (m, b, 3, 3) ndarray
     translation_mm : (m, b, 3) ndarray
+    rate_hz : float or None
+        Frames per second; None where it is unknown.
     """
 
     names: tuple[str, ...]
     frame: NDArray[np.int64]
     rotation: NDArray[np.float64]
     translation_mm: NDArray[np.float64]
+    rate_hz: float | None = None
+
+
+def homogeneous(bodies: Bodies, mm: float = 1.0) -> NDArray[np.float64]:
+    """Return the poses of bodies as matrices (m, b, 4, 4) with lengths in units of mm."""
+    matrices = np.zeros((*bodies.rotation.shape[:2], 4, 4))
+    matrices[..., :3, :3] = bodies.rotation
+    matrices[..., :3, 3] = in_units(bodies.translation_mm, mm)
+    matrices[..., 3, 3] = 1.0
+    matrices[np.isnan(matrices).any(axis=(2, 3))] = np.nan
+    return matrices
 
 
 @dataclass(frozen=True)

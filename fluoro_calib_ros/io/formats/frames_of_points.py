@@ -1,19 +1,22 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Points in space as the formats of motion analysis hold them: every frame, at a constant rate."""
+"""Points and bodies as the formats of motion analysis hold them: every frame, at one rate."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import replace
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
+from ...bodies.body import BodyPoses
 from ...errors import DataError
 from ...exposures.names import without_trivial
-from .content import Content, FileSettings, Points
+from .content import Bodies, Content, FileSettings, Points
 
 # Names of targets in formats that need one.
 
@@ -31,34 +34,90 @@ def named_targets(ids: Mapping[str, int]) -> dict[str, int]:
 MAX_FRAMES = 10**6
 
 
-def at_constant_rate(path: Path, content: Content, settings: FileSettings) -> Points:
-    """Return the points of a content with all frames from the first to the last, and their rate.
+@dataclass(frozen=True)
+class Frames:
+    """All frames of a recording: the first, how many there are, and their rate, NaN if unknown."""
 
-    Frames that are missing have no points. Raises DataError without a rate.
-    """
-    points = content.points
-    assert points is not None
-    rate = settings.rate_hz or points.rate_hz
-    if rate is None:
-        raise DataError(f'{path}: the source does not contain the frame rate, --rate HZ is needed')
-    first = int(points.frame[0])
-    count = int(points.frame[-1]) - first + 1
-    if count > MAX_FRAMES:
-        raise DataError(f'{path}: frames {first} to {first + count - 1} are too many to write')
-    row = points.frame - first
+    first: int
+    count: int
+    rate_hz: float
 
-    def expanded(values: np.ndarray) -> np.ndarray:
-        out = np.full((count, *values.shape[1:]), np.nan)
-        out[row] = values
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """Numbers (m,) of the frames."""
+        return np.arange(self.first, self.first + self.count)
+
+    @property
+    def times_s(self) -> NDArray[np.float64]:
+        """Times (m,) after the first frame [s]."""
+        return np.arange(self.count) / self.rate_hz
+
+    def expanded(self, frame: np.ndarray, values: np.ndarray) -> NDArray[np.float64]:
+        """Return values (m, ...) of all frames, NaN for those that are not in frame (k,)."""
+        out = np.full((self.count, *values.shape[1:]), np.nan)
+        out[frame - self.first] = values
         return out
 
+
+def frames_of(
+    path: Path,
+    parts: Sequence[Points | Bodies],
+    settings: FileSettings,
+    needs_rate: bool = True,
+) -> Frames:
+    """Return the frames from the first to the last one of points and bodies.
+
+    Raises DataError where a rate is needed and unknown, and for too many frames.
+    """
+    rates = (settings.rate_hz, *(part.rate_hz for part in parts))
+    rate = next((rate for rate in rates if rate), None if needs_rate else math.nan)
+    if rate is None:
+        raise DataError(f'{path}: the source does not contain the frame rate, --rate HZ is needed')
+    first = min(int(part.frame[0]) for part in parts)
+    count = max(int(part.frame[-1]) for part in parts) - first + 1
+    if count > MAX_FRAMES:
+        raise DataError(f'{path}: frames {first} to {first + count - 1} are too many to write')
+    return Frames(first, count, float(rate))
+
+
+def points_of(points: Points, frames: Frames) -> Points:
+    """Return points with all frames."""
     return replace(
         points,
-        frame=np.arange(first, first + count),
-        xyz_mm=expanded(points.xyz_mm),
-        sd_mm=expanded(points.sd_mm),
-        residual_px=expanded(points.residual_px),
-        rate_hz=float(rate),
+        frame=frames.numbers,
+        xyz_mm=frames.expanded(points.frame, points.xyz_mm),
+        sd_mm=frames.expanded(points.frame, points.sd_mm),
+        residual_px=frames.expanded(points.frame, points.residual_px),
+        rate_hz=frames.rate_hz,
+    )
+
+
+def bodies_of(bodies: Bodies, frames: Frames) -> Bodies:
+    """Return bodies with all frames."""
+    return replace(
+        bodies,
+        frame=frames.numbers,
+        rotation=frames.expanded(bodies.frame, bodies.rotation),
+        translation_mm=frames.expanded(bodies.frame, bodies.translation_mm),
+        rate_hz=frames.rate_hz,
+    )
+
+
+def bodies_of_poses(poses: Sequence[BodyPoses]) -> Bodies:
+    """Return the poses of bodies as a part of a Content; the rate is that of their stamps.
+
+    Raises DataError for no bodies and for poses of other exposures.
+    """
+    if not poses or any(not np.array_equal(p.number, poses[0].number) for p in poses):
+        raise DataError('poses of bodies are written of one body at least, and the same exposures')
+    number, stamp_ns = poses[0].number, poses[0].stamp_ns
+    span_s = (stamp_ns[-1] - stamp_ns[0]) / 1e9 if len(number) > 1 else 0.0
+    return Bodies(
+        tuple(p.body for p in poses),
+        number,
+        np.stack([p.rotation for p in poses], axis=1),
+        np.stack([p.position_mm for p in poses], axis=1),
+        rate_hz=float((number[-1] - number[0]) / span_s) if span_s > 0 else None,
     )
 
 

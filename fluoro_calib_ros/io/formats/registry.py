@@ -17,6 +17,7 @@ from ...errors import DataError
 from ..access import PathLike, check_regular_file, os_error_reason
 from . import (
     anipose,
+    autoscoper,
     bundle,
     c3d,
     camera_info,
@@ -27,6 +28,7 @@ from . import (
     mayacam2,
     native,
     opencv_yaml,
+    opensim,
     trc,
     xmalab_bodies,
     xmalab_frame,
@@ -55,6 +57,7 @@ FORMATS: dict[str, Format] = {
         mayacam2.FORMAT,
         mayacam1.FORMAT,
         dlt.FORMAT,
+        autoscoper.FORMAT,
         xmalab_lookup.FORMAT,
         anipose.FORMAT,
         opencv_yaml.FORMAT,
@@ -63,6 +66,7 @@ FORMATS: dict[str, Format] = {
         bundle.FORMAT,
         c3d.FORMAT,
         trc.FORMAT,
+        opensim.FORMAT,
     )
 }
 

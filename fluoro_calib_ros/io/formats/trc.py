@@ -32,7 +32,7 @@ from .content import (
     in_units,
     points_without_precision,
 )
-from .frames_of_points import at_constant_rate, labels, named_targets
+from .frames_of_points import frames_of, labels, named_targets, points_of
 from .text import Row, joined, number_text
 
 _HEADER_ROWS = 5
@@ -103,7 +103,8 @@ def _coordinates(row: Row, count: int) -> np.ndarray:
 
 def write(path: Path, content: Content, settings: FileSettings) -> Written:
     """Write points in space. Raises DataError."""
-    points = at_constant_rate(path, content, settings)
+    assert content.points is not None
+    points = points_of(content.points, frames_of(path, [content.points], settings))
     unit = settings.units or 'mm'
     names = labels(content)
     rate = number_text(points.rate_hz or math.nan)

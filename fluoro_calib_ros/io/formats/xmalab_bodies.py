@@ -19,7 +19,16 @@ import numpy as np
 
 from ...errors import DataError
 from ..atomic import atomic_file
-from .content import Bodies, Content, FileSettings, Format, Sample, Written, from_units, in_units
+from .content import (
+    Bodies,
+    Content,
+    FileSettings,
+    Format,
+    Sample,
+    Written,
+    from_units,
+    homogeneous,
+)
 from .text import Row, joined, read_table, require_width
 
 COLUMNS = (
@@ -97,11 +106,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     bodies = content.bodies
     assert bodies is not None
     mm, notes = settings.unit_or('mm', str(path))
-    matrices = np.zeros((*bodies.rotation.shape[:2], 4, 4))
-    matrices[..., :3, :3] = bodies.rotation
-    matrices[..., :3, 3] = in_units(bodies.translation_mm, mm)
-    matrices[..., 3, 3] = 1.0
-    matrices[np.isnan(matrices).any(axis=(2, 3))] = np.nan
+    matrices = homogeneous(bodies, mm)
     header = ['Frame', *(f'{name}_{column}' for name in bodies.names for column in COLUMNS)]
     with atomic_file(path, 'w') as file:
         file.write(','.join(header) + '\n')

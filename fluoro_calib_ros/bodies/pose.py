@@ -394,6 +394,7 @@ class PoseSolver:
         suspect = np.flatnonzero((own.sum(axis=1)[:, None] > limit).any(axis=1))
         if not len(suspect):
             return suspect, suspect
+        limit = limit[suspect] * self._growth_by_rig(solution, points, normal, suspect)
         gradient = gradient[suspect]
         others = normal[suspect, None] - by_marker[suspect]
         # A marker that the others do not predict is tested by its own rays only.
@@ -403,7 +404,7 @@ class PoseSolver:
         inverse = np.linalg.inv(np.where(predicted[..., None, None], unit, np.eye(POSE_SIZE)))
         reduced = gradient / scale
         gain = np.sum(reduced * (inverse @ reduced[..., None])[..., 0], axis=-1)
-        excess = (own[suspect] + np.where(predicted, gain, 0.0)) / limit[suspect]
+        excess = (own[suspect] + np.where(predicted, gain, 0.0)) / limit
         excess = np.where(used[suspect], excess, 0.0)
         test[suspect] = np.where(used[suspect], excess, test[suspect])
         # Of several that contradict each other, the one goes without which the rest agrees best,
@@ -415,6 +416,25 @@ class PoseSolver:
         worst = np.argmax(np.where(excess > 1, left, -np.inf), axis=1)
         wrong = np.flatnonzero((excess > 1).any(axis=1))
         return suspect[wrong], worst[wrong]
+
+    def _growth_by_rig(
+        self, solution: _Solution, points: _Points, normal: np.ndarray, rows: np.ndarray
+    ) -> np.ndarray:
+        """Factor (S, M) of the expected squares of markers by errors of the rig's orientation.
+
+        What the pose takes up of these errors is no part of it. rows (S,): bodies.
+        """
+        linear = solution.linear
+        weight = solution.marker.weight[rows]
+        by_place = linear.by_place[rows]
+        by_rig = self._by_orientation(linear)[rows] @ self._root  # (S, M, F, 2, k)
+        pulled = (np.swapaxes(by_place * weight[..., None, None], 3, 4) @ by_rig).sum(axis=2)
+        d = linear.by_pose[rows]
+        right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pulled).sum(axis=1)
+        regular = normal[rows] + 1e-9 * np.eye(POSE_SIZE)
+        taken = by_place @ (d @ np.linalg.solve(regular, right)[:, None])[:, :, None]
+        squares = np.sum((by_rig - taken) ** 2, axis=(3, 4)) * weight
+        return 1 + squares.sum(axis=2) / np.maximum(2 * points.seen[rows].sum(axis=2), 1)
 
     def _own_squares(self, marker: _Marker) -> np.ndarray:
         """Weighted sum of squares (B, M) of each marker, its shape being unsure."""

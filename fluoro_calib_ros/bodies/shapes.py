@@ -135,7 +135,8 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     moved = [marker for one in findings if one.kind in _MOVED for marker in one.place.target_id]
     if moved:  # what CT says of them is no observation of these markers
         sd = np.where(np.isin(body.target_id, moved), np.inf, body.sd_mm)
-        adjustment = _adjust(replace(body, sd_mm=sd), places, start)
+        freed = replace(body, sd_mm=sd)
+        adjustment = _adjust(freed, places, _start(freed, places) or start)
     shape = adjustment.xyz
     frame, relative = _datum(shape[known], adjustment.covariance)
     sd = np.full(len(shape), np.inf)
@@ -184,7 +185,7 @@ def _start(body: Body, places: BodyPlaces) -> tuple[np.ndarray, np.ndarray] | No
                 xyz[marker] = rotation @ place[marker] + shift
                 break
     found = np.isfinite(xyz).all(axis=1)
-    given = found & body.known
+    given = found & body.known & np.isfinite(body.sd_mm)
     if np.count_nonzero(given) >= 3:
         rotation, shift = fitted_pose(xyz[given], body.xyz_mm[given])
         xyz = xyz @ rotation.T + shift

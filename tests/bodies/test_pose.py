@@ -1,0 +1,254 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Poses of one exposure: scatter against covariance, bound, scipy, and false markers."""
+
+import numpy as np
+import pytest
+from body_views import Noise, body, exposure, observed, orientation, project
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
+
+from fluoro_calib_ros.bodies.body import Body, check_bodies
+from fluoro_calib_ros.bodies.pose import PoseSolver, Prediction
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
+
+UNKNOWN = Prediction(np.eye(3)[None], np.zeros((1, 3)), np.eye(6)[None], np.zeros(1, dtype=bool))
+
+
+def random_pose(rng):
+    return Rotation.from_rotvec(rng.normal(0, 0.5, 3)).as_matrix(), rng.uniform(-25, 25, 3)
+
+
+def error_of(found, rotation, centre):
+    """Errors (6,) of a pose: shift, and rotation about the axes of the rig."""
+    return np.concatenate(
+        [found.centre_mm[0] - centre, vector_from_matrix(found.rotation[0] @ rotation.T)]
+    )
+
+
+def covariance_of(found):
+    by_rig = found.rig_root[0] @ found.rig_root[0].T
+    return found.covariance_noise[0] + found.covariance_fixed[0] + by_rig
+
+
+def trials(rng, rig, count, markers=4, noise=Noise(), shape_sd=0.0):
+    """Errors (count, 6) and covariances of random poses, with all errors drawn anew."""
+    root = rig.covariance_root()
+    errors = []
+    covariances = []
+    for _ in range(count):
+        given = body(rng, markers, sd=shape_sd)
+        true = given.xyz_mm + rng.normal(0, shape_sd, given.xyz_mm.shape)
+        rotation, centre = random_pose(rng)
+        points = (true - given.centre) @ rotation.T + centre
+        shift = rng.normal(0, noise.correction_px, (len(rig.fluoroscopes), markers, 2))
+        seen = observed(
+            rig,
+            given.target_id,
+            points,
+            rng,
+            Noise(noise.px, noise.correction_px, shift),
+            errors=root @ rng.normal(size=len(root)),
+        )
+        found = PoseSolver(rig, [given]).solve(seen, UNKNOWN)
+        assert found.alone[0]
+        errors.append(error_of(found, rotation, centre))
+        covariances.append(covariance_of(found))
+    return np.array(errors), np.array(covariances)
+
+
+def nse(errors, covariances):
+    solved = np.linalg.solve(covariances, errors[:, :, None])[:, :, 0]
+    return float(np.mean(np.sum(errors * solved, axis=1)) / 6)
+
+
+@pytest.mark.parametrize(('markers', 'views'), [(3, 2), (6, 2), (4, 3)])
+def test_scatter_is_as_claimed(markers, views):
+    rng = np.random.default_rng(markers)
+    errors, covariances = trials(
+        rng,
+        orientation(views),
+        150,
+        markers=markers,
+        noise=Noise(0.2, 0.1),
+        shape_sd=0.05,
+    )
+    assert nse(errors, covariances) == pytest.approx(1, abs=0.17)  # 3 sd: 3 sqrt(2 / 900)
+
+
+def test_errors_of_the_rig_are_part_of_the_covariance():
+    rng = np.random.default_rng(1)
+    sd = np.tile([0.05, 0.05, 0.05, 1e-4, 1e-4, 1e-4, 0.05, 0.05, 0.1], 2)
+    root = sd[:, None] * rng.normal(size=(18, 4)) / 2
+    rig = orientation(2, root @ root.T)
+    errors, covariances = trials(rng, rig, 150)
+    assert nse(errors, covariances) == pytest.approx(1, abs=0.17)
+
+
+def test_pose_is_that_of_scipy():
+    rng = np.random.default_rng(2)
+    rig = orientation()
+    given = body(rng, 5)
+    rotation, centre = random_pose(rng)
+    points = (given.xyz_mm - given.centre) @ rotation.T + centre
+    uv = project(rig, points) + rng.normal(0, 0.2, (2, 5, 2))
+    found = PoseSolver(rig, [given]).solve(exposure(rig, given.target_id, uv, Noise(0.2)), UNKNOWN)
+
+    def residuals(x):
+        turn = Rotation.from_rotvec(x[3:]).as_matrix()
+        return (project(rig, (given.xyz_mm - given.centre) @ turn.T + x[:3]) - uv).ravel()
+
+    start = np.concatenate([centre, Rotation.from_matrix(rotation).as_rotvec()])
+    peer = least_squares(residuals, start, xtol=1e-14, ftol=1e-14)
+    assert np.abs(found.centre_mm[0] - peer.x[:3]).max() < 1e-4
+    turn = Rotation.from_rotvec(peer.x[3:]).as_matrix()
+    assert np.abs(found.rotation[0] - turn).max() < 1e-6
+    bound = 0.2**2 * np.linalg.inv(peer.jac.T @ peer.jac)[:3, :3]
+    assert found.covariance_noise[0][:3, :3] == pytest.approx(bound, rel=0.02, abs=1e-7)
+
+
+@pytest.mark.parametrize('view', [0, 1])
+def test_one_view_contributes_what_it_sees(view):
+    """With a prediction, the pose of a single view scatters as claimed."""
+    rng = np.random.default_rng(3)
+    rig = orientation()
+    sd = np.array([2.0, 2, 2, 0.02, 0.02, 0.02])
+    squares = []
+    for _ in range(100):
+        given = body(rng, 4)
+        rotation, centre = random_pose(rng)
+        points = (given.xyz_mm - given.centre) @ rotation.T + centre
+        uv = project(rig, points) + rng.normal(0, 0.2, (2, 4, 2))
+        uv[1 - view] = np.nan
+        away = rng.normal(0, sd)
+        prediction = Prediction(
+            (Rotation.from_rotvec(away[3:]).as_matrix() @ rotation)[None],
+            (centre + away[:3])[None],
+            np.diag(sd**2)[None],
+            np.ones(1, dtype=bool),
+        )
+        found = PoseSolver(rig, [given]).solve(
+            exposure(rig, given.target_id, uv, Noise(0.2)), prediction
+        )
+        told = found.information
+        error = np.concatenate(
+            [
+                told.centre_mm[0] - centre,
+                vector_from_matrix(told.rotation[0] @ rotation.T),
+            ]
+        )
+        # At the point of linearisation the data pull by `right`; together with the prediction
+        # they are in balance there.
+        normal = told.normal[0]
+        values, vectors = np.linalg.eigh(normal)
+        seen = values > 1e-3 * values.max()
+        missing = (vectors.T @ (told.right[0] - normal @ -error))[seen] / np.sqrt(values[seen])
+        squares.append(np.mean(missing**2))
+        assert np.isfinite(found.covariance_fixed).all()
+    assert np.mean(squares) == pytest.approx(1, abs=0.25)
+
+
+def test_false_marker_is_found_and_the_others_stay():
+    rng = np.random.default_rng(4)
+    rig = orientation()
+    wrong = 0
+    for _ in range(60):
+        given = body(rng, 5)
+        rotation, centre = random_pose(rng)
+        points = (given.xyz_mm - given.centre) @ rotation.T + centre
+        uv = project(rig, points) + rng.normal(0, 0.2, (2, 5, 2))
+        row = int(rng.integers(5))
+        uv[:, row] += rng.normal(0, 10, (2, 2))
+        found = PoseSolver(rig, [given]).solve(
+            exposure(rig, given.target_id, uv, Noise(0.2), reject=None), UNKNOWN
+        )
+        right = not found.used[0, row] and found.used[0].sum() == 4
+        wrong += not right
+        if right:
+            assert found.test[0, row] > 1
+            error = error_of(found, rotation, centre)
+            assert np.linalg.norm(error[:3]) < 0.5
+    assert wrong <= 3
+
+
+def test_true_markers_are_kept():
+    rng = np.random.default_rng(5)
+    rig = orientation()
+    kept = []
+    for _ in range(150):
+        given = body(rng, 6)
+        rotation, centre = random_pose(rng)
+        points = (given.xyz_mm - given.centre) @ rotation.T + centre
+        found = PoseSolver(rig, [given]).solve(
+            observed(rig, given.target_id, points, rng), UNKNOWN
+        )
+        kept.append(found.used.sum())
+    assert sum(kept) >= 150 * 6 - 3  # 1 of 16,000 markers is beyond four standard deviations
+
+
+def test_two_markers_give_no_pose_alone():
+    rng = np.random.default_rng(6)
+    rig = orientation()
+    given = body(rng, 4)
+    uv = project(rig, given.xyz_mm - given.centre)
+    uv[:, 2:] = np.nan
+    found = PoseSolver(rig, [given]).solve(exposure(rig, given.target_id, uv, Noise(0.2)), UNKNOWN)
+    assert not found.alone[0] and np.isnan(found.rotation).all()
+
+
+def test_markers_on_a_line_give_no_rotation_about_it():
+    rng = np.random.default_rng(7)
+    rig = orientation()
+    xyz = np.outer(np.linspace(-15, 15, 4), [1.0, 0.5, 0.2])
+    given = Body('fibula', np.arange(4), xyz, np.zeros(4))
+    found = PoseSolver(rig, [given]).solve(observed(rig, given.target_id, xyz, rng), UNKNOWN)
+    assert not found.alone[0]
+
+
+def test_bodies_are_solved_as_one_by_one():
+    rng = np.random.default_rng(8)
+    rig = orientation()
+    bodies = [body(rng, 5, 'femur', 1), body(rng, 3, 'tibia', 20), body(rng, 4, 'talus', 40)]
+    ids = np.concatenate([one.target_id for one in bodies])
+    points = np.concatenate(
+        [one.xyz_mm - one.centre + [30 * k, 0, 0] for k, one in enumerate(bodies)]
+    )
+    seen = observed(rig, ids, points, rng)
+    count = len(bodies)
+    unknown = Prediction(
+        np.tile(np.eye(3), (count, 1, 1)),
+        np.zeros((count, 3)),
+        np.tile(np.eye(6), (count, 1, 1)),
+        np.zeros(count, dtype=bool),
+    )
+    together = PoseSolver(rig, bodies).solve(seen, unknown)
+    for row, one in enumerate(bodies):
+        alone = PoseSolver(rig, [one]).solve(seen, UNKNOWN)
+        assert together.centre_mm[row] == pytest.approx(alone.centre_mm[0], abs=1e-9)
+        assert together.rotation[row] == pytest.approx(alone.rotation[0], abs=1e-11)
+        assert together.markers[row] == len(one.target_id)
+
+
+@pytest.mark.parametrize(
+    ('arguments', 'cause'),
+    [
+        (('femur', [1, 1, 2], np.eye(3), np.zeros(3)), 'marker 1 is given twice'),
+        (('femur', [1, 2], np.eye(3), np.zeros(3)), '2 markers, 3 positions'),
+        (('', [1, 2, 3], np.eye(3), np.zeros(3)), 'no name'),
+        (('femur', [1, 2, 3], np.eye(3), [0, -1, 0]), 'marker 2'),
+        (('femur', [], np.zeros((0, 3)), []), 'no markers'),
+    ],
+)
+def test_impossible_bodies_are_refused(arguments, cause):
+    with pytest.raises(DataError, match=cause):
+        Body(*arguments)
+
+
+def test_a_marker_of_two_bodies_is_refused():
+    rng = np.random.default_rng(9)
+    with pytest.raises(DataError, match='marker 4 is one of femur and of tibia'):
+        check_bodies([body(rng, 4, 'femur', 1), body(rng, 4, 'tibia', 4)])
+    with pytest.raises(DataError, match='two bodies are called femur'):
+        check_bodies([body(rng, 4, 'femur', 1), body(rng, 4, 'femur', 11)])

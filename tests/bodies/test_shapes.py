@@ -1,0 +1,172 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Shapes from a recording and CT: scatter as claimed, and what is wrong with a body."""
+
+import numpy as np
+import pytest
+from rigs import kinds
+from scipy.spatial.transform import Rotation
+
+from fluoro_calib_ros.bodies.body import Body
+from fluoro_calib_ros.bodies.rigid import fitted_pose
+from fluoro_calib_ros.bodies.shapes import BodyPlaces, condition_number, estimate_shape
+from fluoro_calib_ros.findings import Kind
+from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
+
+SD_MM = np.array([0.03, 0.03, 0.06])
+CT_SD_MM = 0.1
+CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [11, 8, 10]])
+
+
+def recording(rng, true, exposures=200, fixed_mm=0.0, lost=0.1):
+    """Places of markers (m, 3) of a body that moves."""
+    count = len(true)
+    turn = Rotation.from_rotvec(rng.normal(0, 0.4, (exposures, 3))).as_matrix()
+    places = true @ np.swapaxes(turn, 1, 2) + rng.normal(0, 30, (exposures, 1, 3))
+    places += rng.normal(0, 1, places.shape) * SD_MM + rng.normal(0, fixed_mm, (count, 3))
+    places[rng.random((exposures, count)) < lost] = np.nan
+    shape = (exposures, count, 3, 3)
+    return BodyPlaces(
+        places,
+        np.broadcast_to(np.diag(SD_MM**2), shape),
+        np.broadcast_to(fixed_mm**2 * np.eye(3), shape),
+    )
+
+
+def by_ct(rng, true, sd=CT_SD_MM):
+    given = true + rng.normal(0, sd, true.shape)
+    return Body('femur', np.arange(len(true)) + 1, given, np.full(len(true), sd))
+
+
+def relative_errors(shape, true):
+    rotation, shift = fitted_pose(shape.body.xyz_mm, true)
+    return shape.body.xyz_mm @ rotation.T + shift - true
+
+
+@pytest.mark.parametrize('fixed_mm', [0.0, 0.04])
+def test_coordinates_scatter_as_claimed(fixed_mm):
+    rng = np.random.default_rng(1)
+    relative = []
+    frame = []
+    for _ in range(25):
+        shape = estimate_shape(by_ct(rng, CORNERS), recording(rng, CORNERS, 60, fixed_mm))
+        assert not shape.findings
+        relative.append(relative_errors(shape, CORNERS) / shape.body.sd_mm[:, None])
+        rotation, shift = fitted_pose(CORNERS, shape.body.xyz_mm)
+        moved = (CORNERS @ rotation.T + shift).mean(axis=0) - CORNERS.mean(axis=0)
+        away = np.concatenate([moved, vector_from_matrix(rotation)])
+        frame.append(away @ np.linalg.solve(shape.body.frame_covariance, away) / 6)
+    # The mean of three coordinates stands for each of them, and rounding for 6 of 15.
+    assert 0.6 < np.mean(np.square(relative)) < 1.5
+    if not fixed_mm:
+        assert np.mean(frame) == pytest.approx(1, abs=0.35)
+
+
+def test_errors_of_ct_are_recovered():
+    """0.1 mm of CT become 0.02 mm or less after 10 s at 60 Hz."""
+    rng = np.random.default_rng(2)
+    shape = estimate_shape(by_ct(rng, CORNERS), recording(rng, CORNERS, 600))
+    assert np.sqrt(np.mean(relative_errors(shape, CORNERS) ** 2)) < 0.02
+    assert (shape.body.sd_mm < 0.02).all()
+    assert 0.03 < shape.mean_error_mm < 0.1
+
+
+def test_a_shape_without_ct():
+    rng = np.random.default_rng(3)
+    unknown = Body('femur', np.arange(5), np.full((5, 3), np.nan), np.full(5, np.inf))
+    shape = estimate_shape(unknown, recording(rng, CORNERS))
+    assert not shape.findings and shape.body.known.all()
+    away = relative_errors(shape, CORNERS) / shape.body.sd_mm[:, None]
+    assert 0.3 < np.mean(away**2) < 1.6
+
+
+def test_a_marker_that_ct_does_not_have_gets_its_place():
+    rng = np.random.default_rng(4)
+    given = by_ct(rng, CORNERS)
+    xyz = given.xyz_mm.copy()
+    sd = given.sd_mm.copy()
+    xyz[4] = np.nan
+    sd[4] = np.inf
+    shape = estimate_shape(Body('femur', given.target_id, xyz, sd), recording(rng, CORNERS))
+    assert np.abs(relative_errors(shape, CORNERS)).max() < 0.03
+
+
+def migrated(true, given):
+    given[1] += [0.8, 0.6, 0.5]
+
+
+def exchanged(true, given):
+    given[[0, 2]] = given[[2, 0]]
+
+
+def mirrored(true, given):
+    given[:, 0] *= -1
+
+
+def in_cm(true, given):
+    given /= 10
+
+
+@pytest.mark.parametrize(
+    ('change', 'kind', 'markers'),
+    [
+        (migrated, Kind.MARKER_MIGRATED, (2,)),
+        (exchanged, Kind.MARKERS_EXCHANGED, (1, 3)),
+        (mirrored, Kind.BODY_MIRRORED, ()),
+        (in_cm, Kind.WRONG_UNIT, ()),
+    ],
+)
+def test_wrong_coordinates_of_ct_are_named(change, kind, markers):
+    rng = np.random.default_rng(5)
+    given = by_ct(rng, CORNERS).xyz_mm.copy()
+    change(CORNERS, given)
+    body = Body('femur', np.arange(5) + 1, given, np.full(5, CT_SD_MM))
+    shape = estimate_shape(body, recording(rng, CORNERS))
+    assert kinds(shape.findings) == [kind]
+    assert shape.findings[0].place.target_id == markers
+    if markers:  # what CT says of them has no part in the shape
+        assert np.abs(relative_errors(shape, CORNERS)).max() < 0.03
+
+
+def test_a_loose_marker_and_a_soft_body_are_named():
+    rng = np.random.default_rng(6)
+    loose = recording(rng, CORNERS)
+    loose.xyz_mm[:, 2] += rng.normal(0, 0.4, (200, 3))
+    shape = estimate_shape(by_ct(rng, CORNERS), loose)
+    assert kinds(shape.findings) == [Kind.MARKER_LOOSE]
+    assert shape.findings[0].place.target_id == (3,)
+    soft = recording(rng, CORNERS)
+    soft.xyz_mm[:] += rng.normal(0, 0.7, soft.xyz_mm.shape)
+    assert Kind.BODY_NOT_RIGID in kinds(estimate_shape(by_ct(rng, CORNERS), soft).findings)
+
+
+def test_sound_bodies_are_not_accused():
+    rng = np.random.default_rng(7)
+    for _ in range(30):
+        shape = estimate_shape(by_ct(rng, CORNERS), recording(rng, CORNERS, 40, 0.03))
+        assert not shape.findings
+
+
+def test_markers_near_a_line_are_named():
+    rng = np.random.default_rng(8)
+    line = np.outer(np.linspace(-20, 20, 4), [1.0, 0.2, 0.1]) + rng.normal(0, 1, (4, 3))
+    shape = estimate_shape(by_ct(rng, line), recording(rng, line))
+    assert kinds(shape.findings) == [Kind.BODY_ON_A_LINE]
+    assert shape.condition > 120
+
+
+def test_condition_number_is_that_of_its_definition():
+    # Four corners of a square of 20 mm: each is 10 mm from the best line.
+    square = np.array([[0.0, 0, 0], [20, 0, 0], [20, 20, 0], [0, 20, 0]])
+    assert condition_number(square) == pytest.approx(1000 / 20)
+    assert condition_number(np.outer([1.0, 2, 3], [1, 1, 1])) > 1e10
+
+
+def test_a_body_that_is_never_seen_stays_as_it_is():
+    rng = np.random.default_rng(9)
+    given = by_ct(rng, CORNERS)
+    nothing = recording(rng, CORNERS, lost=1.0)
+    shape = estimate_shape(given, nothing)
+    assert kinds(shape.findings) == [Kind.FEW_MARKERS]
+    assert (shape.body.xyz_mm == given.xyz_mm).all()

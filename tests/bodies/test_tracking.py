@@ -1,0 +1,194 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""A knee followed from image points: gaps, single views, impacts, and the job around it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from body_views import Noise, body, exposure, orientation, project
+from scipy.spatial.transform import Rotation
+
+from fluoro_calib_ros.bodies.body import PoseStatus
+from fluoro_calib_ros.bodies.butterworth import filtered_poses
+from fluoro_calib_ros.bodies.tracking import BodyTracker, poses_alone, poses_of
+from fluoro_calib_ros.errors import DataError
+from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
+
+RATE = 250.0
+COUNT = 120
+
+
+class Trial:
+    """Two bodies in motion, and their exposures."""
+
+    def __init__(self, seed=0, lost=0.0, hidden=None, count=COUNT):
+        rng = np.random.default_rng(seed)
+        self.rig = orientation()
+        self.bodies = [body(rng, 4, 'femur', 1), body(rng, 4, 'tibia', 11)]
+        self.ids = np.concatenate([one.target_id for one in self.bodies])
+        t = np.arange(count) / RATE
+        bend = 0.4 * np.sin(2 * np.pi * 1.5 * t)
+        self.rotation = [
+            Rotation.from_rotvec(np.stack([s * bend, 0.1 * bend, 0 * t], 1)).as_matrix()
+            for s in (1, -1)
+        ]
+        path = np.stack([30 * np.sin(3 * t), 20 * np.cos(4 * t), 10 * t], axis=1)
+        self.position = [path + [0, 40 * k, 0] - one.centre for k, one in enumerate(self.bodies)]
+        self.exposures = []
+        for k in range(count):
+            points = np.concatenate(
+                [
+                    one.xyz_mm @ turn[k].T + place[k]
+                    for one, turn, place in zip(self.bodies, self.rotation, self.position)
+                ]
+            )
+            uv = project(self.rig, points) + rng.normal(0, 0.2, (2, 8, 2))
+            uv[rng.random((2, 8)) < lost] = np.nan
+            if hidden is not None:
+                hidden(k, uv)
+            self.exposures.append(exposure(self.rig, self.ids, uv, Noise(0.2)))
+
+    def follow(self, lag=None):
+        """The tracker, and what it reported."""
+        tracker = BodyTracker(self.rig, self.bodies, lag=lag)
+        found = [
+            tracker.add(one, k, 1 + round(1e9 * k / RATE)) for k, one in enumerate(self.exposures)
+        ]
+        return tracker, [one for one in found if one is not None]
+
+    def errors(self, poses, row):
+        """Standardised errors (T, 6) of poses of a body."""
+        away = np.concatenate(
+            [
+                poses.position_mm - self.position[row],
+                vector_from_matrix(poses.rotation @ np.swapaxes(self.rotation[row], 1, 2)),
+            ],
+            axis=1,
+        )
+        return away, poses.sd
+
+
+def test_a_trial_is_smoothed_with_honest_deviations():
+    trial = Trial()
+    tracker, _ = trial.follow()
+    exposures = tracker.smoothed()
+    alone = poses_alone(trial.bodies, exposures)
+    for row, poses in enumerate(poses_of(trial.bodies, exposures)):
+        away, sd = trial.errors(poses, row)
+        single, _ = trial.errors(alone[row], row)
+        assert np.sqrt(np.mean(away**2)) < 0.6 * np.sqrt(np.mean(single**2))
+        assert 0.5 < np.mean((away / sd) ** 2) < 1.6
+        assert (poses.status == PoseStatus.OK).all() and (poses.markers == 4).all()
+
+
+def test_markers_that_come_and_go_make_no_jump():
+    """A third of all image points is lost: nowhere more than five standard deviations off."""
+    trial = Trial(1, lost=0.35)
+    tracker, _ = trial.follow()
+    for row, poses in enumerate(poses_of(trial.bodies, tracker.smoothed())):
+        away, sd = trial.errors(poses, row)
+        known = np.isfinite(away).all(axis=1)
+        assert known[30:].all()  # the first exposure with three markers in both views starts
+        assert np.abs(away[known] / sd[known]).max() < 5
+        assert {PoseStatus.OK, PoseStatus.WEAK} <= set(poses.status.tolist())
+
+
+def hide(first, last, keep):
+    """Hide image points of the femur in some exposures, but those with indices (view, marker)."""
+
+    def hidden(k, uv):
+        if first <= k < last:
+            kept = [(view, marker, uv[view, marker].copy()) for view, marker in keep]
+            uv[:, :4] = np.nan
+            for view, marker, value in kept:
+                uv[view, marker] = value
+
+    return hidden
+
+
+@pytest.mark.parametrize(
+    ('keep', 'status'),
+    [
+        ([(0, 0), (0, 1)], PoseStatus.WEAK),
+        ([(0, 0), (0, 1), (0, 2), (0, 3)], PoseStatus.OK),  # one view gives a pose
+        ([], PoseStatus.FILLED),
+    ],
+)
+def test_gaps_are_filled_and_marked(keep, status):
+    trial = Trial(2, hidden=hide(50, 65, keep))
+    tracker, _ = trial.follow()
+    poses = poses_of(trial.bodies, tracker.smoothed())[0]
+    away, sd = trial.errors(poses, 0)
+    assert (poses.status[50:65] == status).all()
+    assert (poses.status[:50] == PoseStatus.OK).all()
+    assert np.abs(away[50:65] / sd[50:65]).max() < 4
+    assert sd[57, :3].max() > 1.3 * sd[30, :3].max()
+
+
+def test_a_body_that_is_away_for_long_has_no_pose_until_it_is_seen_again():
+    trial = Trial(3, hidden=hide(20, 90, []))
+    _, found = trial.follow(lag=0)
+    status = np.array([one.status[0] for one in found])
+    assert status[85] == PoseStatus.FAILED and np.isnan(found[85].rotation[0]).all()
+    assert (status[90:] == PoseStatus.OK).all()
+    assert np.isfinite(found[85].rotation[1]).all()
+
+
+def test_live_and_recorded_with_the_same_lag_are_the_same_bytes():
+    trial = Trial(4, lost=0.2, count=60)
+    tracker, live = trial.follow(lag=4)
+    live += tracker.flush()
+    again, recorded = trial.follow(lag=4)
+    recorded += again.flush()
+    assert len(live) == len(recorded) == 60
+    for one, other in zip(live, recorded):
+        assert one.number == other.number
+        for name in ('rotation', 'centre_mm', 'covariance', 'fixed', 'rig_root'):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes()
+
+
+def test_an_exposure_that_is_not_later_is_not_taken():
+    trial = Trial(5, count=3)
+    tracker = BodyTracker(trial.rig, trial.bodies)
+    assert tracker.add(trial.exposures[0], 0, 1_000) is not None
+    assert tracker.add(trial.exposures[1], 1, 1_000) is None
+    assert tracker.add(trial.exposures[2], 2, 4_000_000) is not None
+
+
+def test_errors_that_stay_are_not_smoothed_away():
+    """The correction is the same error in all exposures, however many there are."""
+    rng = np.random.default_rng(6)
+    rig = orientation()
+    given = body(rng, 4)
+    squares = []
+    for _ in range(8):
+        tracker = BodyTracker(rig, [given], lag=None)
+        shift = rng.normal(0, 0.2, (2, 4, 2))
+        for k in range(15):
+            uv = project(rig, given.xyz_mm) + shift + rng.normal(0, 0.1, (2, 4, 2))
+            seen = exposure(rig, given.target_id, uv, Noise(0.1, 0.2))
+            tracker.add(seen, k, 1 + round(1e9 * k / RATE))
+        poses = poses_of([given], tracker.smoothed())[0]
+        away = poses.position_mm[7]
+        covariance = poses.covariance[7][:3, :3]
+        squares.append(away @ np.linalg.solve(covariance, away) / 3)
+        assert poses.covariance_noise[7][0, 0] < 0.3 * poses.covariance_fixed[7][0, 0]
+    assert 0.4 < np.mean(squares) < 2
+
+
+def test_butterworth_propagates_deviations_and_refuses_what_it_cannot_do():
+    trial = Trial(7)
+    tracker, _ = trial.follow()
+    alone = poses_alone(trial.bodies, tracker.smoothed())[0]
+    filtered = filtered_poses(alone, 12.0)
+    away, _ = trial.errors(filtered, 0)
+    sd = np.sqrt(np.diagonal(filtered.covariance_noise, axis1=1, axis2=2))
+    assert sd[60, 0] < 0.5 * alone.sd[60, 0]
+    assert np.mean((away[20:100] / sd[20:100]) ** 2) < 3
+    with pytest.raises(DataError, match='not between 0 and half of the rate'):
+        filtered_poses(alone, 125.0)
+    uneven = dataclasses.replace(alone, stamp_ns=alone.stamp_ns + (alone.number > 50) * 10**8)
+    with pytest.raises(DataError, match='not equally far apart'):
+        filtered_poses(uneven, 12.0)

@@ -14,6 +14,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .bodies.body import Body, BodyPoses
+from .bodies.joints import Joint, JointMotion
 from .checks.check import Validation
 from .checks.verdict import validate
 from .correction.fluoroscope_calibration import CorrectedPoints, FluoroscopeCalibration
@@ -26,11 +28,15 @@ from .exposures.moving_points import MovingPoints
 from .exposures.names import Names
 from .exposures.phantom import Phantom
 from .findings import Finding, Kind, Severity
+from .io.bodies import read_bodies, write_bodies
 from .io.calibration_request import read_request
 from .io.formats.content import FileSettings
+from .io.joints import JointEntry, read_joints
 from .io.phantom import read_moving_points, read_phantom, write_phantom
 from .io.reconstructed_points import write_reconstruction
 from .io.rig_orientation import load_orientation, save_orientation
+from .jobs.bodies import BodiesOptions, BodiesOutcome, Rig, track_bodies
+from .jobs.bodies_folder import save_bodies
 from .jobs.calibration import CalibrationOutcome, adjust, run_calibration
 from .jobs.conversion import ConversionRequest, convert
 from .jobs.extraction import ExtractionOutcome, ExtractionRequest
@@ -52,6 +58,10 @@ from .photogrammetry.known_orientation import KnownOrientation
 from .photogrammetry.rig_orientation import RigOrientation
 
 __all__ = [
+    'BodiesOptions',
+    'BodiesOutcome',
+    'Body',
+    'BodyPoses',
     'CalibrationOptions',
     'CalibrationOutcome',
     'CalibrationRequest',
@@ -65,6 +75,9 @@ __all__ = [
     'Finding',
     'FluoroscopeCalibration',
     'Frame',
+    'Joint',
+    'JointEntry',
+    'JointMotion',
     'Kind',
     'KnownOrientation',
     'MeasuredDistance',
@@ -75,6 +88,7 @@ __all__ = [
     'ReconstructionOptions',
     'ReconstructionOutcome',
     'Recording',
+    'Rig',
     'RigOrientation',
     'Severity',
     'SimulationOptions',
@@ -90,7 +104,9 @@ __all__ = [
     'extract',
     'load_orientation',
     'orient',
+    'read_bodies',
     'read_calibrations',
+    'read_joints',
     'read_moving_points',
     'read_orientations',
     'read_phantom',
@@ -99,12 +115,15 @@ __all__ = [
     'read_survey',
     'reconstruct',
     'run_calibration',
+    'save_bodies',
     'save_orientation',
     'save_outcome',
     'save_result',
     'simulate',
     'survey',
+    'track_bodies',
     'validate',
+    'write_bodies',
     'write_phantom',
     'write_reconstruction',
 ]

@@ -17,6 +17,8 @@ import numpy as np
 import pytest
 from rigs import calibrated, exposures, rig, small_network, true_calibrations, true_orientation
 
+from fluoro_calib_ros.bodies.body import Body
+from fluoro_calib_ros.bodies.shapes import BodyPlaces, _stability, _unseen, estimate_shape
 from fluoro_calib_ros.checks import given_interior, inputs, mixed_units
 from fluoro_calib_ros.checks import held_out as held_fit
 from fluoro_calib_ros.checks import inputs as plausibility
@@ -58,6 +60,23 @@ from fluoro_calib_ros.photogrammetry.known_orientation import KnownOrientation
 from fluoro_calib_ros.reconstruction import mismatch
 
 PHANTOM = rig().phantom
+CORNERS = np.array([[-15.0, -12, -3], [14, -10, 5], [2, 16, -8], [-6, 3, 15], [11, 8, 10]])
+
+
+def _body(name, xyz=CORNERS):
+    return Body(name, np.arange(5), xyz, np.full(5, 0.05))
+
+
+def shape(change=lambda given: given, moves=0.0):
+    """The first finding about a body whose CT is changed, or whose marker 0 moves [mm]."""
+    rng = np.random.default_rng(0)
+    places = CORNERS + rng.normal(0, 100, (50, 1, 3)) + rng.normal(0, 0.02, (50, 5, 3))
+    places[:, 0] += rng.normal(0, 1, (50, 3)) * moves
+    covariance = np.broadcast_to(4e-4 * np.eye(3), (50, 5, 3, 3))
+    recorded = BodyPlaces(places, covariance, 0 * covariance)
+    return estimate_shape(_body('femur', change(CORNERS)), recorded).findings[0]
+
+
 SIZES = {'a': (1024, 1024), 'b': (1024, 1024)}
 FAST = CalibrationOptions(model='parametric', max_iterations=2)
 NUMBER = r'(?:-?[\d.]+(?:e[+-]?\d+)?|nan)'
@@ -443,6 +462,13 @@ MAKERS = {
     Kind.LEARNING: lambda: state(1, 1),
     Kind.NO_DRIFT: lambda: state(1, 1000),
     Kind.FEW_MARKERS: lambda: _wrong_start(Fake(finding=None, target_id=[4, 5]), 8),
+    Kind.BODY_MIRRORED: lambda: shape(lambda given: given * [-1, 1, 1]),
+    Kind.BODY_NOT_RIGID: lambda: _stability(_body('femur'), 50.0, 0.5)[0],
+    Kind.BODY_ON_A_LINE: lambda: _stability(_body('femur'), 150.0, 0.1)[0],
+    Kind.BODY_UNSEEN: lambda: _unseen(_body('femur')),
+    Kind.MARKER_LOOSE: lambda: shape(moves=0.5),
+    Kind.MARKER_MIGRATED: lambda: shape(lambda given: given + np.eye(5, 3)),
+    Kind.MARKERS_EXCHANGED: lambda: shape(lambda given: given[[1, 0, 2, 3, 4]]),
     Kind.NO_MARKERS: lambda: state(0, 0),
     Kind.OTHER_VIEW_MISSING: other_view_missing,
     Kind.NOT_WATCHED: lambda: (
@@ -727,6 +753,30 @@ SENTENCES = {
     Kind.LEARNING: 'the start is being learned',
     Kind.NO_DRIFT: 'no drift is seen',
     Kind.FEW_MARKERS: 'only # of # markers are where they are said to be at first',
+    Kind.BODY_MIRRORED: (
+        'body femur: its coordinates are those of the mirrored body: they fit the points in '
+        'space to # mm, mirrored to # mm'
+    ),
+    Kind.BODY_NOT_RIGID: (
+        'body femur: it is not rigid: its markers deviate from its shape by # mm (RMS; at most '
+        '# mm by ISO #)'
+    ),
+    Kind.BODY_ON_A_LINE: (
+        'body femur: its markers lie nearly on a line (condition number # per m, at most # by '
+        'ISO #): the rotation about it is weak'
+    ),
+    Kind.BODY_UNSEEN: (
+        'body femur: no exposure shows three of its markers in space, its shape is not estimated'
+    ),
+    Kind.MARKER_LOOSE: (
+        'body femur: marker # moves against the others: its places scatter # times as much as '
+        'their standard deviations'
+    ),
+    Kind.MARKER_MIGRATED: (
+        'body femur: marker # is # mm from where CT has it, with a standard deviation of # mm: '
+        'it has migrated, or is another one'
+    ),
+    Kind.MARKERS_EXCHANGED: 'body femur: markers # and # are exchanged in CT or in the images',
     Kind.NO_MARKERS: 'no markers were seen',
     Kind.OTHER_VIEW_MISSING: 'the other view is missing',
     Kind.NOT_WATCHED: (

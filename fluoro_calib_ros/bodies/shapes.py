@@ -125,7 +125,7 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     """
     start = _start(body, places)
     if start is None:
-        return _unchanged(body, [_few_markers(body)])
+        return _unchanged(body, [_unseen(body)])
     wrong = _wrong_frame(body, places)
     if wrong:
         return _unchanged(body, wrong)
@@ -399,9 +399,9 @@ def _place(body: Body, markers: Sequence[int] = ()) -> Place:
     return Place(target_id=tuple(int(i) for i in markers), name=f'body {body.name}')
 
 
-def _few_markers(body: Body) -> Finding:
+def _unseen(body: Body) -> Finding:
     return Finding(
-        Kind.FEW_MARKERS,
+        Kind.BODY_UNSEEN,
         'no exposure shows three of its markers in space, its shape is not estimated',
         place=_place(body),
         severity=Severity.WARNING,

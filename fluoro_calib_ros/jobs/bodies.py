@@ -160,7 +160,9 @@ def track_bodies(
     tracked = tracker.smoothed() if lag is None else tracked + tracker.flush()
     poses = _poses(usable, tracked, options)
     findings = [finding for shape in shapes for finding in shape.findings]
-    findings += [_unseen(one) for one in poses if not np.isfinite(one.rotation).any()]
+    named = {one.place for one in findings if one.kind is Kind.BODY_UNSEEN}
+    unseen = [_unseen(one) for one in poses if not one.known.any()]
+    findings += [one for one in unseen if one.place not in named]
     return BodiesOutcome(
         tuple(shapes),
         tracked,
@@ -275,7 +277,7 @@ def _joints(requests: Sequence[JointEntry], poses: Sequence[BodyPoses]) -> list[
 def _unseen(poses: BodyPoses) -> Finding:
     return Finding(
         Kind.BODY_UNSEEN,
-        'no exposure shows three of its markers in space that fit its shape; it has no pose',
+        'no exposure shows three of its markers where they fit its shape; it has no pose',
         place=Place(name=f'body {poses.body}'),
         severity=Severity.WARNING,
         numbers={'exposures': float(len(poses.number))},

@@ -168,5 +168,5 @@ def test_a_body_that_is_never_seen_stays_as_it_is():
     given = by_ct(rng, CORNERS)
     nothing = recording(rng, CORNERS, lost=1.0)
     shape = estimate_shape(given, nothing)
-    assert kinds(shape.findings) == [Kind.FEW_MARKERS]
+    assert kinds(shape.findings) == [Kind.BODY_UNSEEN]
     assert (shape.body.xyz_mm == given.xyz_mm).all()

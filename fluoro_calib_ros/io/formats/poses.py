@@ -27,7 +27,7 @@ def recognise(sample: Sample) -> bool:
 
 def read(path: Path, settings: FileSettings) -> Content:
     """Read the poses of bodies. Raises DataError."""
-    cells = []
+    cells: list[tuple[str, int, tuple[float, ...]]] = []
     for block in read_blocks(path, COLUMNS):
         numbers = [block.floats_or_nan(name).tolist() for name in (*POSITION, *QUATERNION)]
         cells += zip(block.strings('body'), block.ids('exposure').tolist(), zip(*numbers))

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The files of this package as formats: observations, phantom, points, poses, grid points.
+"""The files of this package as formats: observations, phantom, reconstructed points, grid points.
 
 Targets, exposures and fluoroscopes may have names in them.
 """
@@ -14,9 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DataError
-from ...exposures.columns import first_repeated
 from ...exposures.names import Names, without_trivial
-from ...photogrammetry.rotations import matrix_from_quaternion
 from ..atomic import atomic_file
 from ..csv_table import format_float, read_blocks, write_rows
 from ..observations import COLUMNS as OBSERVATIONS
@@ -25,13 +23,10 @@ from ..phantom import COLUMNS as PHANTOM
 from ..phantom import read_named_phantom, write_phantom
 from ..reconstructed_points import COLUMNS as POINTS
 from ..reconstructed_points import NAME_COLUMN
-from .content import Bodies, Content, FileSettings, Format, Points, Sample, Written
+from .content import Content, FileSettings, Format, Points, Sample, Written
 from .frames_of_points import NS, rate_of
 
 GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
-# The first columns of poses.csv.
-POSES = ('body', 'exposure', 'time_s', 'x_mm', 'y_mm', 'z_mm', 'qx', 'qy', 'qz', 'qw')
-UNIT_TOLERANCE = 1e-6  # of a quaternion: rounding of nine digits is far below
 
 
 def _has_columns(sample: Sample, columns: tuple[str, ...]) -> bool:
@@ -144,45 +139,6 @@ def _write_points(path: Path, content: Content, settings: FileSettings) -> Writt
     return Written((str(path),), (note,))
 
 
-def _read_poses(path: Path, settings: FileSettings) -> Content:
-    """Read the poses of bodies. Raises DataError."""
-    blocks = list(read_blocks(path, POSES))
-    body = np.array([name for block in blocks for name in block.strings('body')])
-    frame = np.concatenate([block.ids('exposure') for block in blocks])
-    line = np.concatenate([block.lines for block in blocks])
-    seconds, *columns = (
-        np.concatenate([block.floats_or_nan(name) for block in blocks]) for name in POSES[2:]
-    )
-    values = np.column_stack(columns)
-    for block in blocks:
-        for name in POSES[3:]:
-            block.require(name, ~np.isinf(block.floats_or_nan(name)), 'not a finite number')
-    names = list(dict.fromkeys(body.tolist()))
-    frames, row = np.unique(frame, return_inverse=True)
-    column = np.array([names.index(name) for name in body.tolist()])
-    repeated = first_repeated(row * len(names) + column)
-    if repeated is not None:
-        first, second = repeated
-        raise DataError(
-            f'{path}, row {line[second]}: exposure {frame[second]} of {body[second]} is already '
-            f'given in row {line[first]}'
-        )
-    known = ~np.isnan(values).any(axis=1)
-    wrong = known & ~(np.abs(np.linalg.norm(values[:, 3:], axis=1) - 1) < UNIT_TOLERANCE)
-    if wrong.any():
-        raise DataError(
-            f'{path}, row {line[np.argmax(wrong)]}: the quaternion does not have length one'
-        )
-    shape = (len(frames), len(names), 3)
-    translation = np.full(shape, np.nan)
-    rotation = np.full((*shape, 3), np.nan)
-    at = row[known], column[known]
-    translation[at] = values[known, :3]
-    rotation[at] = matrix_from_quaternion(values[known][:, [6, 3, 4, 5]])
-    rate = rate_of(frame, seconds * NS)
-    return Content(bodies=Bodies(tuple(names), frames, rotation, translation, rate))
-
-
 def _read_grid(path: Path, settings: FileSettings) -> Content:
     blocks = list(read_blocks(path, GRID))
     names = np.array([name for block in blocks for name in block.strings('fluoroscope')])
@@ -228,15 +184,6 @@ FORMATS = (
         read=_read_points,
         write=_write_points,
         looks_like=','.join(POINTS),
-    ),
-    Format(
-        'poses',
-        f'poses of bodies, {_OWN}',
-        parts=('bodies',),
-        recognise=lambda sample: _has_columns(sample, POSES),
-        read=_read_poses,
-        write=None,
-        looks_like=','.join(POSES),
     ),
     Format(
         'grid',

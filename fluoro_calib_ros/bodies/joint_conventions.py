@@ -12,7 +12,7 @@ those of `anatomical_frames`.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 
 import numpy as np
@@ -92,6 +92,35 @@ def _sequences() -> Iterator[Convention]:
         )
 
 
+def _isb(name: str, angles: str, translations: str, proximal: str, distal: str) -> Convention:
+    """Return a convention of the ISB: flexion about z, the floating x, rotation about y."""
+    first, second, third = angles.split()
+    lateral, anterior, along = translations.split()
+    return Convention(
+        name,
+        'zxy',
+        angles=(first, second, third),
+        translations=(lateral, anterior, along),
+        lateral=2,
+        proximal_landmarks=proximal,
+        distal_landmarks=distal,
+    )
+
+
+# Elevation is the negative rotation about x, in a plane turned about y.
+_SHOULDER = Convention(
+    'isb_glenohumeral',
+    'yxy',
+    angles=('plane_of_elevation', 'elevation', 'internal_rotation'),
+    translations=('translation_x', 'translation_y', 'translation_z'),
+    angle_signs=(1, -1, 1),
+    lateral=2,
+    along_axes=False,
+    branch=-1,
+    proximal_landmarks='scapula_isb',
+    distal_landmarks='humerus_isb',
+)
+_SHIFTS = 'lateral_shift anterior_shift proximal_shift'
 _CLINICAL = (
     # Flexion turns the distal end of the tibia back, against the right-hand rule about x.
     Convention(
@@ -105,67 +134,25 @@ _CLINICAL = (
         proximal_landmarks='femur_grood_suntay',
         distal_landmarks='tibia_grood_suntay',
     ),
-    Convention(
-        'isb_hip',
-        'zxy',
-        angles=('flexion', 'adduction', 'internal_rotation'),
-        translations=('lateral_shift', 'anterior_shift', 'proximal_shift'),
-        lateral=2,
-        proximal_landmarks='pelvis_isb',
-        distal_landmarks='femur_isb',
-    ),
+    _isb('isb_hip', 'flexion adduction internal_rotation', _SHIFTS, 'pelvis_isb', 'femur_isb'),
     # The frame of the calcaneus is that of the tibia in neutral position.
-    Convention(
+    _isb(
         'isb_ankle',
-        'zxy',
-        angles=('dorsiflexion', 'inversion', 'internal_rotation'),
-        translations=('lateral_shift', 'anterior_shift', 'compression'),
-        lateral=2,
-        proximal_landmarks='tibia_isb',
+        'dorsiflexion inversion internal_rotation',
+        'lateral_shift anterior_shift compression',
+        'tibia_isb',
+        '',
     ),
-    # Elevation is the negative rotation about x, in a plane turned about y.
-    Convention(
-        'isb_glenohumeral',
-        'yxy',
-        angles=('plane_of_elevation', 'elevation', 'internal_rotation'),
-        translations=('translation_x', 'translation_y', 'translation_z'),
-        angle_signs=(1, -1, 1),
-        lateral=2,
-        along_axes=False,
-        branch=-1,
-        proximal_landmarks='scapula_isb',
-        distal_landmarks='humerus_isb',
-    ),
-    Convention(
-        'isb_thoracohumeral',
-        'yxy',
-        angles=('plane_of_elevation', 'elevation', 'internal_rotation'),
-        translations=('translation_x', 'translation_y', 'translation_z'),
-        angle_signs=(1, -1, 1),
-        lateral=2,
-        along_axes=False,
-        branch=-1,
-        proximal_landmarks='thorax_isb',
-        distal_landmarks='humerus_isb',
-    ),
-    Convention(
-        'isb_elbow',
-        'zxy',
-        angles=('flexion', 'adduction', 'pronation'),
-        translations=('lateral_shift', 'anterior_shift', 'proximal_shift'),
-        lateral=2,
-        proximal_landmarks='humerus_isb',
-        distal_landmarks='forearm_isb',
-    ),
-    Convention(
+    _isb('isb_elbow', 'flexion adduction pronation', _SHIFTS, 'humerus_isb', 'forearm_isb'),
+    _isb(
         'isb_wrist',
-        'zxy',
-        angles=('flexion', 'ulnar_deviation', 'pronation'),
-        translations=('radial_shift', 'volar_shift', 'proximal_shift'),
-        lateral=2,
-        proximal_landmarks='radius_isb',
-        distal_landmarks='metacarpal_isb',
+        'flexion ulnar_deviation pronation',
+        'radial_shift volar_shift proximal_shift',
+        'radius_isb',
+        'metacarpal_isb',
     ),
+    _SHOULDER,
+    replace(_SHOULDER, name='isb_thoracohumeral', proximal_landmarks='thorax_isb'),
 )
 
 CONVENTIONS = {one.name: one for one in (*_sequences(), *_CLINICAL)}

@@ -148,8 +148,9 @@ def joint_motion(
     """Return the motion of a joint from the poses of its bodies.
 
     The errors of the anatomical frames themselves are not part of the covariance: they stay over
-    all trials of a person. before: angles (3,) [rad] to count full turns from, such as those of
-    the exposure before. Raises DataError for poses of other bodies or of other exposures.
+    all trials of a person. before: angles (3,) [rad] to count full turns from; live, the last ones
+    that are not GIMBAL give the numbers of the whole trial. Raises DataError for poses of other
+    bodies or of other exposures.
     """
     _check_poses(joint, proximal, distal)
     relative = _relative(joint, proximal, distal)
@@ -422,16 +423,15 @@ def angle_errors(of: Convention, angles: np.ndarray, true: np.ndarray) -> np.nda
     Close to gimbal lock the sum or difference of the first and the third angle is known well where
     each of them is not: full turns are taken from it, not from the third angle alone.
     """
-    turn = 2 * np.pi
     difference = angles - true
     i, j, _ = (AXES.index(axis) for axis in of.sequence)
     if of.is_euler:
         sign = np.where(np.cos(angles[..., 1]) > 0, 1, -1)
     else:
         sign = np.where(angles[..., 1] > 0, 1, -1) * (1 if (j - i) % 3 == 1 else -1)
-    first = difference[..., 0] - turn * np.round(difference[..., 0] / turn)
+    first = difference[..., 0] - 2 * np.pi * _turns(difference[..., 0])
     both = difference[..., 2] + sign * difference[..., 0]
-    third = both - turn * np.round(both / turn) - sign * first
+    third = both - 2 * np.pi * _turns(both) - sign * first
     return np.stack([first, difference[..., 1], third], axis=-1)
 
 
@@ -443,20 +443,26 @@ def _unwrapped(
     Near gimbal lock an angle may turn by noise; each is compared with the last one that is not.
     """
     known = np.isfinite(angles).all(axis=1)
-    firm = np.flatnonzero(known & ~locked)
-    start = np.zeros(3) if before is None else np.asarray(before, dtype=float)
-    # Without earlier angles the first ones are between -pi and pi.
-    chain = np.concatenate([start[None], angles[firm]])
-    if before is None and len(firm):
-        chain[0] = chain[1]
-    chain = np.unwrap(chain, axis=0)
-    last = np.cumsum(known & ~locked)
-    out = chain[last]
-    loose = np.flatnonzero(locked & known)
-    jump = angles[loose] - out[loose]
-    out[loose] += jump - 2 * np.pi * np.round(jump / (2 * np.pi))
+    firm = known & ~locked
+    chain = angles[firm]
+    # Whole turns are counted, so that one exposure after the other gives the same numbers.
+    turns = -np.cumsum(_turns(np.diff(chain, axis=0, prepend=chain[:1])), axis=0)
+    if before is not None:
+        start = np.asarray(before, dtype=float)
+        turns = turns - _turns(chain[:1] - start)
+    else:
+        start = chain[0] if len(chain) else np.zeros(3)
+    chain = chain + 2 * np.pi * turns
+    out = np.concatenate([start[None], chain])[np.cumsum(firm)]
+    loose = known & locked
+    out[loose] = angles[loose] - 2 * np.pi * _turns(angles[loose] - out[loose])
     out[~known] = np.nan
     return out
+
+
+def _turns(angle: np.ndarray) -> np.ndarray:
+    """Return the nearest numbers of full turns."""
+    return np.round(angle / (2 * np.pi))
 
 
 def _status(

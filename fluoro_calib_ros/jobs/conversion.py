@@ -164,7 +164,7 @@ def _read(request: ConversionRequest, settings: FileSettings) -> tuple[Content, 
     if own is None and source.is_file():
         found = registry.recognised(source)
         own = found.kind if found else ''
-    return content, own in ('observations', 'phantom', 'points', 'grid')
+    return content, own in ('observations', 'phantom', 'points', 'poses', 'grid')
 
 
 def _bag_content(source: Path, angles: AngleOptions) -> Content:

@@ -396,6 +396,35 @@ def test_angles_count_full_turns():
     np.testing.assert_allclose(motion.angles[-1], 0, atol=1e-9)
 
 
+def test_exposure_by_exposure_gives_the_numbers_of_the_trial():
+    """To the last bit, with turns, missing poses and gimbal lock."""
+    rng = np.random.default_rng(11)
+    count = 120
+    angles = np.column_stack(
+        [np.linspace(0, 25, count), np.linspace(-1.9, 1.9, count), np.linspace(3, -30, count)]
+    )
+    rotation = Rotation.from_euler('ZXY', angles).as_matrix()
+    rotation[rng.choice(count, 8, replace=False)] = np.nan
+    joint = Joint('j', 'p', 'd', 'cardan_zxy')
+    noise = np.diag([0.1] * 3 + [0.02] * 3) ** 2
+    p = poses('p', np.broadcast_to(np.eye(3), rotation.shape))
+    d = poses('d', rotation, noise=noise)
+    trial = joint_motion(joint, p, d)
+    assert {0, int(JointStatus.FAILED), int(JointStatus.GIMBAL)} == set(trial.status.tolist())
+    before = None
+    for t in range(count):
+        one = joint_motion(
+            joint,
+            poses('p', np.eye(3)),
+            poses('d', rotation[t], noise=noise),
+            before=before,
+        )
+        np.testing.assert_array_equal(one.angles[0], trial.angles[t])
+        assert one.status[0] == trial.status[t]
+        if one.status[0] == JointStatus.OK:
+            before = one.angles[0]
+
+
 def test_status_is_that_of_the_worse_body():
     states = [0, PoseStatus.WEAK, PoseStatus.FILLED, PoseStatus.FAILED, PoseStatus.AMBIGUOUS]
     count = len(states)

@@ -655,6 +655,46 @@ def test_joint_motion_that_cannot_be_written_is_refused(tmp_path):
     assert not path.exists()
 
 
+POSE_HEADER = 'body,exposure,time_s,x_mm,y_mm,z_mm,qx,qy,qz,qw,status\n'
+
+
+def test_poses_of_bodies_are_read(tmp_path):
+    """Any order of rows; a body without a pose in an exposure, or without a row."""
+    path = tmp_path / 'poses.csv'
+    half = repr(0.5**0.5)
+    path.write_text(
+        POSE_HEADER
+        + f'tibia,9,0.02,4,5,6,0,0,{half},{half},OK\n'
+        + 'femur,5,0,1,2,3,0,0,0,1,OK\n'
+        + 'tibia,5,0,,,,,,,,FAILED\n'
+    )
+    bodies = registry.read(path, FileSettings()).bodies
+    assert (bodies.names, bodies.frame.tolist()) == (('tibia', 'femur'), [5, 9])
+    assert bodies.rate_hz == 200
+    assert np.isnan(bodies.rotation[0, 0]).all() and np.isnan(bodies.translation_mm[1, 1]).all()
+    np.testing.assert_array_equal(bodies.rotation[0, 1], np.eye(3))
+    turned = [[0, -1, 0], [1, 0, 0], [0, 0, 1]]
+    np.testing.assert_allclose(bodies.rotation[1, 0], turned, atol=1e-15)
+    np.testing.assert_array_equal(
+        bodies.translation_mm[:, ::-1][[0, 1], [0, 1]], [[1, 2, 3], [4, 5, 6]]
+    )
+
+
+@pytest.mark.parametrize(
+    ('row', 'cause'),
+    [
+        ('femur,5,0,1,2,3,0,0,0,1,OK', 'row 3: exposure 5 of femur is already given in row 2'),
+        ('femur,6,0,1,2,3,0,0,1,1,OK', 'row 3: the quaternion does not have length one'),
+        ('femur,6,0,one,2,3,0,0,0,1,OK', "row 3: x_mm is 'one'"),
+        ('femur,6,0,inf,2,3,0,0,0,1,OK', "row 3: x_mm is 'inf'"),
+    ],
+)
+def test_wrong_poses_are_refused(tmp_path, row, cause):
+    path = tmp_path / 'poses.csv'
+    path.write_text(f'{POSE_HEADER}femur,5,0,1,2,3,0,0,0,1,OK\n{row}\n')
+    assert cause in refused(path)
+
+
 def test_poses_become_bodies():
     """The rate is that of the stamps, also where exposures are missing."""
     rotation = Rotation.random(3, random_state=np.random.default_rng(1)).as_matrix()

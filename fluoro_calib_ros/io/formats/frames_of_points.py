@@ -32,6 +32,7 @@ def named_targets(ids: Mapping[str, int]) -> dict[str, int]:
 
 
 MAX_FRAMES = 10**6
+NS = 1e9  # of a second
 
 
 @dataclass(frozen=True)
@@ -103,6 +104,19 @@ def bodies_of(bodies: Bodies, frames: Frames) -> Bodies:
     )
 
 
+def rate_of(frame: np.ndarray, stamp_ns: np.ndarray) -> float | None:
+    """Return the frames per second between the first and the last time stamp, None without."""
+    first = int(np.argmin(frame))
+    last = int(np.argmax(frame))
+    seconds = (stamp_ns[last] - stamp_ns[first]) / NS
+    if not seconds > 0:
+        return None
+    rate = (frame[last] - frame[first]) / seconds
+    whole = round(rate)
+    # Stamps are rounded to nanoseconds, clocks to some millionths.
+    return float(whole) if whole and abs(rate - whole) < 1e-5 * whole else float(rate)
+
+
 def bodies_of_poses(poses: Sequence[BodyPoses]) -> Bodies:
     """Return the poses of bodies as a part of a Content; the rate is that of their stamps.
 
@@ -110,14 +124,12 @@ def bodies_of_poses(poses: Sequence[BodyPoses]) -> Bodies:
     """
     if not poses or any(not np.array_equal(p.number, poses[0].number) for p in poses):
         raise DataError('poses of bodies are written of one body at least, and the same exposures')
-    number, stamp_ns = poses[0].number, poses[0].stamp_ns
-    span_s = (stamp_ns[-1] - stamp_ns[0]) / 1e9 if len(number) > 1 else 0.0
     return Bodies(
         tuple(p.body for p in poses),
-        number,
+        poses[0].number,
         np.stack([p.rotation for p in poses], axis=1),
         np.stack([p.position_mm for p in poses], axis=1),
-        rate_hz=float((number[-1] - number[0]) / span_s) if span_s > 0 else None,
+        rate_hz=rate_of(poses[0].number, poses[0].stamp_ns),
     )
 
 

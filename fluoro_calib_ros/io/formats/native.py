@@ -24,9 +24,9 @@ from ..phantom import read_named_phantom, write_phantom
 from ..reconstructed_points import COLUMNS as POINTS
 from ..reconstructed_points import NAME_COLUMN
 from .content import Content, FileSettings, Format, Points, Sample, Written
+from .frames_of_points import NS, rate_of
 
 GRID = ('fluoroscope', 'u', 'v', 'u_reference', 'v_reference')
-NS = 1e9
 
 
 def _has_columns(sample: Sample, columns: tuple[str, ...]) -> bool:
@@ -102,26 +102,13 @@ def _read_points(path: Path, settings: FileSettings) -> Content:
         xyz_mm=xyz,
         sd_mm=table(np.sqrt(sum(values**2 for values in sd))),
         residual_px=table(numbers.get('residual', unknown)),
-        rate_hz=_rate(frame, numbers.get('stamp_ns', unknown)),
+        rate_hz=rate_of(frame, numbers.get('stamp_ns', unknown)),
     )
     names = Names()
     if NAME_COLUMN in blocks[0]:
         cells = [cell for block in blocks for cell in block.strings(NAME_COLUMN)]
         names = Names(without_trivial({n: int(i) for n, i in zip(cells, target.tolist()) if n}))
     return Content(points=points, names=names)
-
-
-def _rate(frame: np.ndarray, stamp_ns: np.ndarray) -> float | None:
-    """Return the frames per second between the first and the last time stamp, None without."""
-    first = int(np.argmin(frame))
-    last = int(np.argmax(frame))
-    seconds = (stamp_ns[last] - stamp_ns[first]) / NS
-    if not seconds > 0:
-        return None
-    rate = (frame[last] - frame[first]) / seconds
-    whole = round(rate)
-    # Stamps are rounded to nanoseconds, clocks to some millionths.
-    return float(whole) if whole and abs(rate - whole) < 1e-5 * whole else float(rate)
 
 
 def _write_points(path: Path, content: Content, settings: FileSettings) -> Written:

@@ -59,8 +59,8 @@ def without_repeats(
             findings.append(
                 Finding(
                     Kind.REPEATED_POSE,
-                    f'{len(numbers)} exposures show the phantom in the pose of an earlier one, and '
-                    'count as one exposure with it',
+                    f'{len(numbers)} exposures show the phantom in the pose of an earlier one, '
+                    'and count as one exposure with it',
                     Place((name,), numbers, name=f'fluoroscope {name}'),
                     severity=Severity.NOTE,
                     numbers={'exposures': len(numbers)},

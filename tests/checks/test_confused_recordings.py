@@ -86,7 +86,7 @@ def frames():
 def scatter(of_frames):
     """Whether exposures give an orientation, and what is doubtful about it."""
     _, (pairs,) = orientation_and_scatter(of_frames, rig().phantom, calibrations())
-    return doubtful(pairs, SIZE)
+    return doubtful(pairs, SIZE, 0.3)
 
 
 def nudged(mm, rad, first, last=COUNT):
@@ -174,7 +174,7 @@ def scatter_on_an_arm(of_b=None, order=MIXED, changes=True):
         held = {name: turning(c, 90.0, 0.0) for name, c in held.items()}
     frames_on_arm = on_an_arm(seen(rig(), of_b), order)
     _, (pairs,) = orientation_and_scatter(frames_on_arm, rig().phantom, held)
-    return doubtful(pairs, SIZE)
+    return doubtful(pairs, SIZE, 0.3)
 
 
 @pytest.mark.parametrize('order', [MIXED, range(COUNT)])

@@ -61,7 +61,9 @@ CHECKS = [
     'precision',
     'beads',
     'distances',
+    'shape',
 ]
+OF_PHANTOM = ('beads', 'distances', 'shape')
 SIZE = (1024, 1024)
 LOCAL = {'model': 'local_linear'}
 
@@ -157,7 +159,7 @@ def test_good_calibration_passes():
     for check in found.checks:
         assert check.passed and 0 <= check.value <= check.limit and check.sentence
         assert check.severity is Severity.NOTE
-        assert check.place.fluoroscope == ('' if check.name in ('beads', 'distances') else 'a')
+        assert check.place.fluoroscope == ('' if check.name in OF_PHANTOM else 'a')
     assert found.calibration_id == {'a': calibrated('a').calibrations['a'].calibration_id}
 
 

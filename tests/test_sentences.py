@@ -330,9 +330,9 @@ MAKERS = {
     Kind.COPIED_EXPOSURE: lambda: _without_copies(
         {'a': [*frames(), replace(frames()[0], number=9)]}, ()
     )[1][0],
-    Kind.REPEATED_POSE: lambda: (
-        without_repeats({'a': [*frames(), replace(frames()[0], number=9)]})[1][0]
-    ),
+    Kind.REPEATED_POSE: lambda: without_repeats(
+        {'a': [*frames(), replace(frames()[0], number=9)]}
+    )[1][0],
     Kind.FALSE_MATCHES: false_matches,
     Kind.FEW_RAYS: lambda: _without_targets_of_few_rays(
         measured_network({'a': frames(5)}, PHANTOM)

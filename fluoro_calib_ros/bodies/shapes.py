@@ -222,9 +222,7 @@ class _Reduced:
     normal: np.ndarray
 
 
-def _adjust(
-    body: Body, places: BodyPlaces, start: tuple[np.ndarray, np.ndarray]
-) -> _Adjustment:
+def _adjust(body: Body, places: BodyPlaces, start: tuple[np.ndarray, np.ndarray]) -> _Adjustment:
     """Adjust coordinates and poses together, from first coordinates and exposures."""
     xyz, rows = start
     known = np.flatnonzero(np.isfinite(xyz).all(axis=1))

@@ -114,7 +114,9 @@ class BodyTracker:
         """The bodies that are followed."""
         return self.solver.bodies
 
-    def add(self, exposure: IntersectedViews, number: int, stamp_ns: int) -> TrackedExposure | None:
+    def add(
+        self, exposure: IntersectedViews, number: int, stamp_ns: int
+    ) -> TrackedExposure | None:
         """Take an exposure; return the one of `lag` exposures before, if there is one.
 
         An exposure that is not later than the one before is not taken.

@@ -166,7 +166,7 @@ def _check(found: RigFindings, pairs: PairScatter) -> Check:
         Kind.ORIENTATION,
         wrong[0].cause if wrong else cause,
         wrong[0].place if wrong else Place((a, b), name=ORIENTED),
-        CAPTURE,
+        '' if wrong and wrong[0].kind is Kind.RIG_MOVED else CAPTURE,  # its cause says so
         numbers={'ratio': float(pairs.unexplained), 'noise_px': found.noise_px},
         value=off,
         limit=max(found.noise_px, DOUBTFUL_GROWTH * predicted),

@@ -36,7 +36,10 @@ class Kind(str, Enum):
     GIVEN_INTERIOR = 'given_interior'
     HALVES = 'halves'
     HELD_OUT = 'held_out'
+    ORIENTATION = 'orientation'
     PRECISION = 'precision'
+    SHAPE = 'shape'
+    TAKEN_ON_TRUST = 'taken_on_trust'
     VALIDATION = 'validation'
     VARIATION = 'variation'
     WHITENESS = 'whiteness'
@@ -49,6 +52,7 @@ class Kind(str, Enum):
     FEW_TARGETS = 'few_targets'
     NOT_ORIENTED = 'not_oriented'
     POOR_FIT = 'poor_fit'
+    REPEATED_POSE = 'repeated_pose'
     SHARED_EXPOSURE = 'shared_exposure'
     STRAY_POINTS = 'stray_points'
 

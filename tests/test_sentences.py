@@ -22,6 +22,7 @@ from fluoro_calib_ros.bodies.shapes import BodyPlaces, _stability, _unseen, esti
 from fluoro_calib_ros.checks import given_interior, inputs, mixed_units
 from fluoro_calib_ros.checks import held_out as held_fit
 from fluoro_calib_ros.checks import inputs as plausibility
+from fluoro_calib_ros.checks import rig as rig_checks
 from fluoro_calib_ros.checks.drift_evidence import DriftEstimate
 from fluoro_calib_ros.checks.drift_options import ERROR, WARN
 from fluoro_calib_ros.checks.drift_watch import DriftWatch
@@ -39,6 +40,7 @@ from fluoro_calib_ros.estimation.initial_network import measured_network
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
 from fluoro_calib_ros.estimation.start_orientation import UNTILTED
 from fluoro_calib_ros.exposures.phantom import Phantom
+from fluoro_calib_ros.exposures.repeats import without_repeats
 from fluoro_calib_ros.exposures.strays import without_strays
 from fluoro_calib_ros.findings import Finding, Kind, Place
 from fluoro_calib_ros.images import detection, extraction, matching
@@ -48,7 +50,6 @@ from fluoro_calib_ros.images.marker_watch import doubt_in
 from fluoro_calib_ros.io.formats import registry
 from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.io.result_check import edited, exchanged
-from fluoro_calib_ros.jobs import calibration as calibrating
 from fluoro_calib_ros.jobs import orientation as orienting
 from fluoro_calib_ros.jobs import reconstruction as reconstructing
 from fluoro_calib_ros.jobs import report as comparing
@@ -185,7 +186,7 @@ def pairs(**changes):
 
 
 def about_pairs(**changes):
-    return doubtful(pairs(**changes), 1024)[1][0]
+    return doubtful(pairs(**changes), 1024, 0.25)[1][0]
 
 
 def orientation():
@@ -286,12 +287,18 @@ def in_one_folder_only():
         return comparing.compare_folders('one', 'two').findings[0]
 
 
+def of_rig():
+    return rig_checks.RigFindings(('a', 'b'), scatter=(pairs(),), noise_px=0.25)
+
+
 def no_orientation():
-    request = Fake(frames={'a': (), 'b': ()}, known_orientations={}, phantom=None)
-    result = Fake(calibrations={'a': None, 'b': None}, fluoroscopes={}, starts=None)
+    request = Fake(known_orientations={}, phantom=None)
+    result = Fake(fluoroscopes={}, starts=None)
+    calibrations = dict.fromkeys('ab', Fake(image_sd=0.25))
     error = DataError('fluoroscopes a and b: no exposures have the same number')
-    with mock.patch.object(calibrating, 'orientation_and_scatter', side_effect=error):
-        return calibrating._orientation(request, result, calibrating.Rig())[1][0]
+    with mock.patch.object(rig_checks, 'orientation_and_scatter', side_effect=error):
+        found = rig_checks.rig_findings(request, result, {'a': (), 'b': ()}, calibrations)
+    return found.doubts[0]
 
 
 def saved_note():
@@ -331,6 +338,7 @@ MAKERS = {
             Kind.HALVES,
             Kind.HELD_OUT,
             Kind.PRECISION,
+            Kind.SHAPE,
             Kind.VARIATION,
             Kind.WHITENESS,
             Kind.WORST_AREA,
@@ -340,6 +348,9 @@ MAKERS = {
     Kind.VALIDATION: no_validation,
     Kind.COPIED_EXPOSURE: lambda: _without_copies(
         {'a': [*frames(), replace(frames()[0], number=9)]}, ()
+    )[1][0],
+    Kind.REPEATED_POSE: lambda: without_repeats(
+        {'a': [*frames(), replace(frames()[0], number=9)]}
     )[1][0],
     Kind.FALSE_MATCHES: false_matches,
     Kind.FEW_RAYS: lambda: _without_targets_of_few_rays(
@@ -428,6 +439,8 @@ MAKERS = {
     Kind.RIG_MOVED: moved_rig,
     Kind.RIG_NOTE: saved_note,
     Kind.RIG_NOT_ORIENTED: no_orientation,
+    Kind.ORIENTATION: lambda: replace(rig_checks._check(of_rig(), pairs()), limit=-1.0),
+    Kind.TAKEN_ON_TRUST: lambda: rig_checks._trusted({'a': (), 'b': ()}, pairs(), 0.2),
     Kind.POSE_AMBIGUOUS: ambiguous,
     Kind.MARKER_FOUND_AGAIN: lambda: doubt_in(Kind.MARKER_FOUND_AGAIN, 7, 3, images=4),
     Kind.MARKER_MOVES_ALONE: lambda: doubt_in(Kind.MARKER_MOVES_ALONE, 7, 3),
@@ -515,6 +528,11 @@ SENTENCES = {
         '# px: it makes the errors of corrected points # % larger: choose another model '
         '(--model auto), or take # more exposures (there are #), or a phantom with more beads'
     ),
+    Kind.SHAPE: (
+        'the survey of the phantom is strained against the images by # % along (#, #, #), which '
+        'displaces beads by # mm (RMS): survey the phantom again, or give a larger sd, and '
+        'calibrate again'
+    ),
     Kind.VARIATION: (
         'fluoroscope a: the distortion differs between exposures by # px (chi2/dof #, constant '
         'up to #): a C-arm at another angle, a lens that was focused or zoomed, a source or '
@@ -545,6 +563,10 @@ SENTENCES = {
         'needed, # more have too few targets'
     ),
     Kind.COPIED_EXPOSURE: ('fluoroscope a, exposure #: the image points are those of exposure #'),
+    Kind.REPEATED_POSE: (
+        'fluoroscope a: # exposures show the phantom in the pose of an earlier one, and count '
+        'as one exposure with it'
+    ),
     Kind.FALSE_MATCHES: (
         'fluoroscope a, exposure #: only # % of the image points fit, the others are false matches'
     ),
@@ -704,6 +726,16 @@ SENTENCES = {
     Kind.RIG_NOTE: 'orientation of the rig: not from exposure #',
     Kind.RIG_NOT_ORIENTED: (
         'no orientation of the rig: fluoroscopes a and b: no exposures have the same number'
+    ),
+    Kind.ORIENTATION: (
+        'orientation of the rig: the relative orientation of fluoroscopes a and b differs '
+        'between the exposures by # px, # times its standard deviation: orient the rig from a '
+        'capture'
+    ),
+    Kind.TAKEN_ON_TRUST: (
+        'the orientation of fluoroscopes a and b takes on trust that frames of one number are of '
+        'one exposure, or that the phantom stands still (they have no stamps): a delay that is '
+        'always the same looks like another orientation where the phantom turns steadily'
     ),
     Kind.POSE_AMBIGUOUS: (
         'the pose is ambiguous: the phantom fits nearly as well in another one (# beads '

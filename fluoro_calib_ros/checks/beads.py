@@ -8,8 +8,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import chdtri
+from scipy.stats import binom
 
+from ..estimation.diagnostics import ResidualTable
 from ..findings import Kind, Place
 from .bead_intersection import Beads, distances, intersect, least_chi2_without_a_ray
 from .calibration_evidence import Evidence, Subject
@@ -24,6 +27,7 @@ SD_FACTOR = 1.1
 # Times the expectation, from simulated rigs with some 500 beads: docs/verdict.md. With few beads
 # the limit is that of a FALSE_ALARM.
 DISTANCES_LIMIT = 1.12
+MOST = 0.5  # part of the image points of a bead that are rejected, above which it is doubted
 
 
 def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
@@ -36,7 +40,45 @@ def check_beads(evidence: Evidence, names: Sequence[str]) -> list[Check]:
             evidence.result, evidence.frames, evidence.phantom, target_id
         )
 
-    return compare_with_survey(found, has_trend, least_chi2)
+    checks = compare_with_survey(found, has_trend, least_chi2)
+    doubted = rejected_beads(evidence.result.residuals)
+    if len(doubted) and not any(check.passed is False for check in checks):
+        checks[0] = _rejected(doubted).after_trend(has_trend)
+    return checks
+
+
+def rejected_beads(residuals: ResidualTable | None) -> NDArray[np.int64]:
+    """Return the target ids of beads of which most image points are rejected, and not by chance.
+
+    Too few rays of such a bead may agree to intersect it, but false matches are as frequent among
+    its image points as among those of the others.
+    """
+    if residuals is None or not len(residuals.target_id):
+        return np.zeros(0, dtype=np.int64)
+    target_id, bead = np.unique(residuals.target_id, return_inverse=True)
+    seen = np.bincount(bead)
+    rejected = np.bincount(bead, residuals.outlier)
+    chance = binom.sf(rejected - 1, seen, np.mean(residuals.outlier))
+    doubted = (rejected > MOST * seen) & (chance * len(target_id) < FALSE_ALARM)
+    return target_id[doubted]
+
+
+def _rejected(target_id: NDArray[np.int64]) -> Check:
+    """Return check 'beads' that fails because the image points of some beads are rejected."""
+    named = ', '.join(map(str, target_id[:MAX_NAMED]))
+    further = len(target_id) - MAX_NAMED
+    return Check(
+        Kind.BEADS,
+        f'most image points of bead {named}{f" and {further} more" if further > 0 else ""} are '
+        'rejected, more than false matches explain: its survey is wrong, or it is exchanged with '
+        'another',
+        Place(target_id=tuple(target_id.tolist())),
+        'survey again, and calibrate again',
+        numbers={'beads': len(target_id)},
+        value=len(target_id),
+        limit=0,
+        unit='beads',
+    )
 
 
 def compare_with_survey(

@@ -78,8 +78,7 @@ class Validation:
         Standard deviation of a coordinate of the correction that the checks confirm [px], by
         fluoroscope; whatever the verdict is, it says what the calibration is good for.
     notes : tuple of Finding
-        What a user has to know beside the verdict, such as what is doubtful about the orientation
-        of the rig, on which the verdict does not depend.
+        What a user has to know beside the verdict, such as what it takes on trust.
     """
 
     verdict: str

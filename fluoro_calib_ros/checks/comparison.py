@@ -1,24 +1,31 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""What changed between two calibrations of a fluoroscope: the interior orientation and the field.
+"""What changed between two calibrations of a fluoroscope: the field and the interior orientation.
 
 The corrections of two calibrations may differ by what shifts, turns and scales the image: their
 interior and exterior orientations absorb it (the gauge). What is left is compared with the
 standard deviations of both, which are taken as independent.
+
+Each interior orientation belongs to a gauge that depends on where the image points of its
+exposures were: a turn of the sensor by 10 mrad with its shift of the principal point, some 40 px,
+changes the corrections by less than a pixel. Interior orientations are therefore compared in one
+gauge, that of the area which both calibrations cover.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.special import chdtri
 
+from ..correction.base import Correction
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration, at_common_angle
 from ..errors import DataError
-from ..estimation.gauge import gauge_basis
+from ..estimation.gauge import interior_about
 from ..exposures.columns import cells_of
 
 # Comparison of two independent calibrations of one fluoroscope, and names of image areas.
@@ -101,13 +108,24 @@ def difference(
     both = ~(corrections[0].outside | corrections[1].outside)
     if both.sum() < MIN_POINTS:
         return None
-    uv = grid[both]
+    parts = [_part(correction, both) for correction in corrections]
+    return _difference(grid[both], (one.interior, other.interior), parts)
+
+
+def _part(correction: Correction, rows: np.ndarray) -> Correction:
+    return Correction(correction.duv[rows], correction.sd[rows], correction.outside[rows])
+
+
+def _difference(
+    uv: np.ndarray, interiors: Sequence[np.ndarray], corrections: Sequence[Correction]
+) -> FieldDifference:
+    """Return the first less the second prediction at pixels uv (n, 2)."""
     rays = [
-        (uv - correction.duv[both] - calibration.interior[:2]) / calibration.interior[2]
-        for calibration, correction in zip((one, other), corrections)
+        (uv - correction.duv - interior[:2]) / interior[2]
+        for interior, correction in zip(interiors, corrections)
     ]
-    c_mean = (one.interior[2] + other.interior[2]) / 2
-    variance = sum(correction.sd[both] ** 2 for correction in corrections)
+    c_mean = (interiors[0][2] + interiors[1][2]) / 2
+    variance = sum(correction.sd**2 for correction in corrections)
     sd = np.maximum(np.sqrt(variance), MIN_SD_PX)
     offset = c_mean * (rays[0] - rays[1])
     basis = orientation_fields((rays[0] + rays[1]) / 2)
@@ -146,7 +164,7 @@ class Comparison:
     fluoroscope : str
     image_size : (int, int)
     interior, interior_sd : (3,) ndarray
-        Difference of xp, yp, c [px] and its standard deviation.
+        Difference of xp, yp, c [px], both in one gauge, and its standard deviation.
     interior_test, interior_limit : float
         Weighted square sum of the difference, and its 99 % quantile; NaN where both were fixed.
     uv : (n, 2) ndarray
@@ -219,10 +237,12 @@ def compare_calibrations(
             f'fluoroscope {name}: the calibrated areas have hardly any image in common'
         )
     uv = uv[common]
-    duv = fields[1].duv[common] - fields[0].duv[common]
-    sd = np.hypot(fields[0].sd[common], fields[1].sd[common])
-    difference = second.interior - first.interior
+    parts = [_part(field, common) for field in fields]
+    found = _difference(uv, (first.interior, second.interior), parts)
     covariance = first.interior_covariance + second.interior_covariance
+    difference = second.interior - first.interior
+    if first.interior_estimated and second.interior_estimated:
+        difference = _interior_difference(uv, (first, second), parts)
     test, limit = _test(difference, covariance)
     return Comparison(
         name,
@@ -232,9 +252,23 @@ def compare_calibrations(
         interior_test=test,
         interior_limit=limit,
         uv=uv,
-        duv=_without_gauge(uv, duv, first.interior),
-        sd=sd,
+        duv=found.duv,  # a ray moves against its correction
+        sd=found.sd,
     )
+
+
+def _interior_difference(
+    uv: np.ndarray,
+    calibrations: Sequence[FluoroscopeCalibration],
+    fields: Sequence[Correction],
+) -> NDArray[np.float64]:
+    """Return second - first interior orientation (3,) in the gauge at pixels uv (n, 2)."""
+    centre = calibrations[0].interior[:2]
+    first, second = (
+        interior_about(centre, uv, field.duv, calibration.interior)
+        for calibration, field in zip(calibrations, fields)
+    )
+    return second - first
 
 
 def _cells(image_size: tuple[int, int]) -> np.ndarray:
@@ -243,13 +277,6 @@ def _cells(image_size: tuple[int, int]) -> np.ndarray:
     axes = [-0.5 + step / 2 + step * np.arange(max(1, round(size / step))) for size in image_size]
     u, v = np.meshgrid(*axes)
     return np.column_stack([u.ravel(), v.ravel()])
-
-
-def _without_gauge(uv: np.ndarray, duv: np.ndarray, interior: np.ndarray) -> np.ndarray:
-    """Return differences (n, 2) without their part in the gauge."""
-    basis = gauge_basis(uv, interior)
-    part, *_ = np.linalg.lstsq(basis.reshape(-1, basis.shape[2]), duv.ravel(), rcond=None)
-    return duv - basis @ part
 
 
 def _test(difference: np.ndarray, covariance: np.ndarray) -> tuple[float, float]:

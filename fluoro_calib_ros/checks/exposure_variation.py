@@ -15,9 +15,10 @@ from ..findings import Kind, Place
 from .calibration_evidence import Evidence, Subject
 from .check import Check, more_exposures, too_little_data
 
-# A change below it leaves corrections and verdict as they are: with 15 exposures it adds less than
-# 2 % to the errors (docs/how_good/pathologies.md).
-HARMLESS_PX = 0.1
+# Size of a change, over the standard deviation of residuals, up to which it is no fault. A later
+# exposure has it as an error beside its noise, which is larger than residuals: the errors of its
+# points are then up to 8 % larger.
+HARMLESS = 0.45
 # Range [rad] of angles in degrees that is not larger than a full turn in radians.
 LARGEST_RADIANS = np.deg2rad(2 * np.pi)
 
@@ -44,10 +45,11 @@ def _check(evidence: Evidence, name: str) -> Check:
         + _how_to_give_angles(evidence, name),
         numbers={
             'chi2_per_dof': found.chi2_per_dof,
+            'noise_px': found.noise_px,
             'angle_range_deg': float(np.rad2deg(np.ptp(angles_of(evidence.frames[name])))),
         },
         value=found.size_px,
-        limit=HARMLESS_PX,
+        limit=HARMLESS * found.noise_px,
         unit='px',
     ).after_trend(evidence.trends[name].is_significant)
 

@@ -10,12 +10,15 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..correction.models import no_correction
 from ..errors import DataError
 from ..estimation.result import CalibrationResult
 from ..findings import Finding, Kind, Place
+from ..photogrammetry.noise import INLIER_Q
 from .calibration_evidence import Evidence, Subject
 from .check import GOOD_EXPOSURES, Check, more_exposures, too_little_data
 from .residual_tests import residuals_of
@@ -125,7 +128,8 @@ MARGIN = (
 EXPOSURE_LIMIT = 1.6  # times the expectation
 # Robust standard deviations of the logarithms over all exposures that one of many exposures may
 # stand out by; n exposures add SCATTER_OF_FEW / n. Where the noise differs from exposure to
-# exposure, much of it in one is no fault of that one.
+# exposure, much of it in one is no fault of that one. But noise differs between neighbouring image
+# points, too: an exposure whose neighbours agree has a misfit, however much the others have.
 EXPOSURE_SCATTER = 4.0
 SCATTER_OF_FEW = 20.0
 MIN_NOISE = 0.05  # part of the squared residuals in sample that is noise, whatever the trend
@@ -145,6 +149,9 @@ class ExposureSums(NamedTuple):
         the same part of the residuals.
     predicted : float
         Predicted variance of the correction [px^2].
+    white : float
+        Half the squared differences of the residuals of nearest neighbours [px^2]: what is noise,
+        and no misfit of an area.
     """
 
     number: int
@@ -152,6 +159,7 @@ class ExposureSums(NamedTuple):
     outside: float
     inside: float
     predicted: float
+    white: float
 
 
 def check_held_out(evidence: Evidence, names: Sequence[str]) -> list[Check]:
@@ -205,15 +213,28 @@ def _hold_out(
                     squared_outside[points].sum(),
                     squared_inside[points].sum(),
                     predicted[points].sum(),
+                    _white(outside.uv[points], outside.r[points], sd[points]),
                 )
             )
     return out
 
 
+def _white(uv: np.ndarray, r: np.ndarray, sd: np.ndarray) -> float:
+    """Sum of half the squared differences (n, 2) [px] between neighbours, capped as residuals are.
+
+    Differences of independent residuals have twice their variance (von Neumann, "Distribution of
+    the ratio of the mean square successive difference to the variance", Annals of Mathematical
+    Statistics 12, 1941).
+    """
+    _, near = cKDTree(uv).query(uv, k=[min(2, len(uv))])
+    squares = np.sum((r - r[near[:, 0]]) ** 2, axis=1) / 2
+    return float(np.sum(np.minimum(squares, INLIER_Q * sd**2)))
+
+
 def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list[Check]:
     common = evidence.trends[name]
     count = len(evidence.frames[name])
-    number, n, outside, inside, predicted = (np.array(column) for column in zip(*sums))
+    number, n, outside, inside, predicted, white = (np.array(column) for column in zip(*sums))
     # A trend that is left in sample is not noise.
     noise = np.maximum(inside - 2 * n * common.trend.size**2, MIN_NOISE * inside)
     value = float(np.sqrt(outside.sum() / (2 * n.sum())))
@@ -232,8 +253,10 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
     )
     # Where something moved during an exposure, it does not fit in sample either. So the noise of
     # the others is expected of it.
-    ratio = np.sqrt(outside / (n * np.median(noise / n) + predicted))
-    worst = int(np.argmax(ratio))
+    expected_of_one = n * np.median(noise / n) + predicted
+    ratio = np.sqrt(outside / expected_of_one)
+    limits = exposure_limits(ratio, np.sqrt(white / expected_of_one))
+    worst = int(np.argmax(ratio / limits))
     exposures = Check(
         Kind.EXPOSURES,
         f'exposure {number[worst]} fits the calibration of the others worst, '
@@ -241,23 +264,25 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
         Place((name,), (int(number[worst]),), name=f'fluoroscope {name}'),
         'inspect it (phantom or fluoroscope moved, wrong ids), exclude it and calibrate again',
         value=ratio[worst],
-        limit=exposure_limit(ratio),
+        limit=limits[worst],
         unit='1',
     )
     return [check.after_trend(common.is_significant) for check in (held_out, exposures)]
 
 
-def exposure_limit(ratio: np.ndarray) -> float:
-    """Limit of the residuals of an exposure over their expectation.
+def exposure_limits(ratio: np.ndarray, white: np.ndarray) -> NDArray[np.float64]:
+    """Limits (m,) of the residuals of exposures over their expectation.
 
-    ratio (m,): of all exposures; half of them or fewer are at fault. The scatter of their
-    logarithms is the median absolute deviation, times 1.4826 (Huber, "Robust Statistics", 1981).
-    The largest of 6 to 100 normal deviates exceeds the limit in 0.5 to 1.5 % of samples.
+    ratio (m,): of all exposures; half of them or fewer are at fault. white (m,): the same of the
+    noise of each exposure alone, by which its limit may grow. The scatter of the logarithms is the
+    median absolute deviation, times 1.4826 (Huber, "Robust Statistics", 1981). The largest of 6 to
+    100 normal deviates exceeds the limit in 0.5 to 1.5 % of samples.
     """
     size = np.log(ratio)
     scatter = 1.4826 * np.median(np.abs(size - np.median(size)))
     factor = EXPOSURE_SCATTER + SCATTER_OF_FEW / len(ratio)
-    return float(max(EXPOSURE_LIMIT, np.exp(factor * scatter)))
+    of_noise = EXPOSURE_LIMIT * np.maximum(1.0, white)
+    return np.clip(np.exp(factor * scatter), EXPOSURE_LIMIT, of_noise)
 
 
 HELD_OUT = Subject(check_held_out, steps=FOLDS)

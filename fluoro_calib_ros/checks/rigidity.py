@@ -31,7 +31,6 @@ MAX_TURN_RAD = np.deg2rad(1.0)
 # it is 1.0 to 1.4, and 3 where the model does not follow the distortion at all.
 DOUBTFUL_GROWTH = 2.0
 MAX_GROWTH = 8.0  # above which there is no orientation, where the displacement is large as well
-MIN_DOUBT_PX = 0.3  # less displaces no point by more than its noise does
 MAX_OFF = 0.0025  # median displacement of image points over the longer side of the image
 MIN_PAIRS_MOVED = 6
 # What findings on the orientation of a rig are about.
@@ -125,19 +124,24 @@ def contradiction(
         'moved',
         Place(names, name=NOT_ORIENTED),
         severity=Severity.WARNING,
-        numbers={'shift_mm': off_mm, 'turn_deg': turn_deg},
+        numbers={
+            'shift_mm': off_mm,
+            'turn_deg': turn_deg,
+            'ratio': max(off_mm / limit, off_rad / MAX_TURN_RAD),
+        },
     )
 
 
-def doubtful(scatter: PairScatter, side_px: int) -> tuple[bool, list[Finding]]:
+def doubtful(scatter: PairScatter, side_px: int, noise_px: float) -> tuple[bool, list[Finding]]:
     """Return whether exposures give an orientation of a rig, and what is doubtful about it.
 
-    side_px is the longer side of the image. Without an orientation the finding says why.
+    side_px is the longer side of the image. noise_px: less displaces no point by more than its
+    noise does. Without an orientation the finding says why.
     """
     a, b = scatter.fluoroscopes
     off = float(np.median(scatter.off_px[scatter.used]))
     place = Place((a, b), name=ORIENTED)
-    if scatter.unexplained > DOUBTFUL_GROWTH and off >= MIN_DOUBT_PX:
+    if scatter.unexplained > DOUBTFUL_GROWTH and off >= noise_px:
         usable = off <= MAX_OFF * side_px or scatter.unexplained <= MAX_GROWTH
         kind, moved, why = _cause(scatter)
         found = Finding(
@@ -163,7 +167,7 @@ def doubtful(scatter: PairScatter, side_px: int) -> tuple[bool, list[Finding]]:
             numbers={'off_px': float(np.max(scatter.off_px[~scatter.used]))},
         )
         out.append(found)
-    if not scatter.corrected and scatter.angle_px >= MIN_DOUBT_PX:
+    if not scatter.corrected and scatter.angle_px >= noise_px:
         found = Finding(
             Kind.RIG_DEPENDS_ON_ANGLE,
             f'the relative orientation of fluoroscopes {a} and {b} changes with the angle of the '

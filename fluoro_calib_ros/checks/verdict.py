@@ -32,11 +32,13 @@ from .halves import HALVES
 from .held_out import HELD_OUT
 from .precision import PRECISION
 from .residual_trends import TRENDS
+from .rig import RigFindings, check_rig, rig_findings
+from .shape import SHAPE, trusted_shape
 
 Progress = Callable[[str, int, int], None]
 
 # A new check is a module with a Subject, and its entry here; docs/verdict.md describes it.
-SUBJECTS = (BEADS, HALVES, TRENDS, VARIATION, HELD_OUT, PRECISION)
+SUBJECTS = (BEADS, SHAPE, HALVES, TRENDS, VARIATION, HELD_OUT, PRECISION)
 
 
 def validate(
@@ -44,6 +46,7 @@ def validate(
     calibrations: Mapping[str, FluoroscopeCalibration],
     progress: Progress | None = None,
     raise_if_cancelled: Callable[[], None] | None = None,
+    rig: RigFindings | None = None,
 ) -> Validation:
     """Validate calibrations with the exposures that they were made from.
 
@@ -57,6 +60,8 @@ def validate(
         Called with the name of a step, the number of steps done and their total before each step.
     raise_if_cancelled : callable, optional
         Called before every step of an adjustment; may raise to stop.
+    rig : RigFindings, optional
+        What is known of the orientation of the rig; by default it is determined.
 
     Returns
     -------
@@ -90,12 +95,15 @@ def validate(
                 checks += subject.run(evidence, names)
     checks = with_given_interior(evidence, checks)
     checks = _by_fluoroscope(checks, [name for names in request.groups for name in names])
+    rig = rig or rig_findings(request, result, request.frames, calibrations)
+    checks += check_rig(rig)
     return Validation(
         verdict_of(checks),
         tuple(checks),
         _identities(calibrations),
         time.perf_counter() - began,
         {name: _achieved_sd(evidence, name, checks) for name in request.frames},
+        (*rig.notes, *trusted_shape(checks)),
     )
 
 
@@ -121,10 +129,11 @@ def validate_or_report(
     calibrations: Mapping[str, FluoroscopeCalibration],
     progress: Progress | None = None,
     raise_if_cancelled: Callable[[], None] | None = None,
+    rig: RigFindings | None = None,
 ) -> Validation:
     """Validate; where that raises DataError, the verdict is 'cannot tell' with its message."""
     try:
-        return validate(request, calibrations, progress, raise_if_cancelled)
+        return validate(request, calibrations, progress, raise_if_cancelled, rig)
     except DataError as error:
         check = Check(Kind.VALIDATION, f'the validation could not be made: {error}')
         return Validation('cannot tell', (check,), _identities(calibrations), 0.0)

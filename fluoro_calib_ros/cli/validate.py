@@ -62,12 +62,13 @@ def run(arguments: argparse.Namespace) -> None:
 
     Raises DataError, also for the verdict 'fail', after everything is written.
     """
+    from ..checks.rig import RigFindings
     from ..checks.verdict import validate
     from ..io.calibration_request import read_request
     from ..io.csv_table import read_names
-    from ..io.result_check import edited, exchanged, read_result
+    from ..io.result_check import edited, exchanged, read_result, used_exposures
     from ..io.result_document import validation_document, write_validation
-    from ..jobs.result_folder import saved_orientation, saved_rig_note
+    from ..jobs.result_folder import saved_orientation
     from ..jobs.sources import BagSelection, read_calibrations, read_source, read_survey
     from ..report.verdict import verdict_text
 
@@ -95,13 +96,19 @@ def run(arguments: argparse.Namespace) -> None:
         print_notes(survey.notes)
         phantom = survey.phantom
     request = read_request(arguments.directory, calibrations, frames, phantom)
-    notes = (edited(arguments.directory, document), saved_rig_note(arguments.directory))
-    validation = validate(request, calibrations, print_step)
-    validation = replace(validation, notes=tuple(filter(None, notes)))
+    request = request.with_exposures(used_exposures(document, request.frames))
+    orientation = saved_orientation(arguments.directory)
+    is_captured = orientation is not None and orientation.source == 'capture'
+    validation = validate(
+        request, calibrations, print_step, rig=RigFindings() if is_captured else None
+    )
+    note = edited(arguments.directory, document)
+    if note is not None:
+        validation = replace(validation, notes=(note, *validation.notes))
     write_validation(arguments.directory, validation)
     passed = validation.verdict == 'pass'
     following = ('reconstruct', 'MEASURED', '--calibration', arguments.directory)
-    if saved_orientation(arguments.directory) is None:
+    if orientation is None:
         following = ('correct', 'POINTS', '--calibration', arguments.directory)
     print_result(
         arguments,

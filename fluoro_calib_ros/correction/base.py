@@ -20,9 +20,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial import ConvexHull, QhullError, cKDTree
 
 from ..limits import MAX_CORNERS
+from .calibration_record import SD_GRID
 from .series import Series, packed
 
 # Status of a corrected image point.
@@ -36,6 +37,11 @@ class CorrectionStatus(IntEnum):
     INVALID = 2  # off the image, or not a number
 
 
+# Radius of an empty disc that is a hole, in mean spacings of the training points: where these fell
+# at random, a disc would be empty with the chance exp(-9 pi) (Poisson), and with exp(-pi) where
+# they are nine times less dense.
+HOLE_SPACINGS = 3.0
+HOLE_STEPS = 3  # centres of discs that are tried along a radius
 BULK_CHUNK = 2048  # pixels evaluated in one call of `evaluate_in_bulk`: some milliseconds
 
 
@@ -111,6 +117,7 @@ class CorrectionModel(ABC):
     bias_px: float = 0.0
     series: Series | None = None
     _hull: np.ndarray = field(init=False, repr=False, compare=False)
+    _holes: Holes | None = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         uv = np.ascontiguousarray(self.train_uv, dtype=float).reshape(-1, 2)
@@ -132,7 +139,8 @@ class CorrectionModel(ABC):
                 f'the calibrated area has {len(hull)} corners, more than the {MAX_CORNERS} that '
                 'are possible'
             )
-        self._set(train_uv=uv, train_duv=duv, _hull=hull)
+        holes = _holes_of(uv, hull) if self.keeps_training_points else None
+        self._set(train_uv=uv, train_duv=duv, _hull=hull, _holes=holes)
         self._prepare()
 
     def _set(self, **values: Any) -> None:
@@ -144,7 +152,7 @@ class CorrectionModel(ABC):
         """Derive from the content what predictions need; called once, by the constructor."""
 
     def _calibrated_points(self, uv: np.ndarray) -> np.ndarray:
-        """Points whose convex hull is the calibrated area."""
+        """Points whose convex hull bounds the calibrated area."""
         return uv
 
     @abstractmethod
@@ -187,9 +195,14 @@ class CorrectionModel(ABC):
         return float(len(uv)) * (1 if self.series is None else len(self.series.functions))
 
     def outside(self, uv: ArrayLike) -> np.ndarray:
-        """True (n,) where a pixel uv (n, 2) is beyond the convex hull of the training points."""
+        """True (n,) where a pixel uv (n, 2) is beyond the calibrated area.
+
+        It is beyond the convex hull of the training points, or in a hole between them: what a
+        correction does where no target was seen nobody has measured.
+        """
         uv = np.asarray(uv, dtype=float)
-        return (uv @ self._hull[:, :2].T + self._hull[:, 2] > 0).any(axis=1)
+        out = _beyond(self._hull, uv)
+        return out if self._holes is None else out | self._holes.contain(uv)
 
     def to_values(self) -> dict[str, Any]:
         """Values of the fields of a calibration's record that hold the model.
@@ -209,6 +222,47 @@ class CorrectionModel(ABC):
             'series_coefficients': coefficients,
             'series_sd': sd,
         }
+
+
+@dataclass(frozen=True)
+class Holes:
+    """Discs without training points: centres, and their common radius [px]."""
+
+    centres: cKDTree
+    radius: float
+
+    def contain(self, uv: np.ndarray) -> NDArray[np.bool_]:
+        """True (n,) where a pixel uv (n, 2) is in one of the discs."""
+        distance, _ = self.centres.query(uv, distance_upper_bound=self.radius)
+        return np.isfinite(distance)
+
+
+def _holes_of(uv: np.ndarray, hull: np.ndarray) -> Holes | None:
+    """Holes between training points uv (N, 2) within their hull; None: there are none.
+
+    Their union is what an alpha shape excludes (Edelsbrunner, Kirkpatrick and Seidel, "On the
+    shape of a set of points in the plane", IEEE Transactions on Information Theory 29, 1983). A
+    hole is no smaller than the distance of the nodes at which a standard deviation is stated.
+    """
+    try:
+        area = ConvexHull(uv).volume  # in the plane, the area
+    except (QhullError, ValueError):
+        return None
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    radius = max(
+        HOLE_SPACINGS * float(np.sqrt(area / len(uv))), float(np.max(high - low)) / (SD_GRID - 1)
+    )
+    u, v = (np.arange(a, b, radius / HOLE_STEPS) for a, b in zip(low, high))
+    tried = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    tried = tried[~_beyond(hull, tried)]
+    distance, _ = cKDTree(uv).query(tried, distance_upper_bound=radius)
+    empty = np.isinf(distance)
+    return Holes(cKDTree(tried[empty]), radius) if empty.any() else None
+
+
+def _beyond(hull: np.ndarray, uv: np.ndarray) -> NDArray[np.bool_]:
+    """True (n,) where a pixel uv (n, 2) is beyond half-planes (h, 3)."""
+    return (uv @ hull[:, :2].T + hull[:, 2] > 0).any(axis=1)
 
 
 def _half_planes(uv: np.ndarray) -> np.ndarray:

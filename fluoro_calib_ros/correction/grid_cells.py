@@ -339,7 +339,7 @@ def _exact_values(model: CorrectionModel, nodes: Nodes) -> np.ndarray:
 def _outside(model: CorrectionModel, nodes: Nodes) -> np.ndarray:
     """True (h - 1, w - 1) for cells with a corner beyond the calibrated area.
 
-    All other cells are wholly inside, as the area is convex.
+    All other cells are inside, but for less than a cell at the border of a hole.
     """
     columns, rows = nodes
     step = max(1, BULK_CHUNK // len(columns))

@@ -29,7 +29,7 @@ from ..photogrammetry.noise_estimation import SETTLED, estimate_noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import Precision, covariance_blocks, residual_covariance
 from .estimator import AdjustedTerms, RegressionStep
-from .initial_network import SINGULAR, Measured, adjusted_with_precision, with_additional
+from .initial_network import Measured, adjusted_with_precision, undetermined, with_additional
 from .options import CalibrationOptions
 from .rounds import History, Round, SelfCalibration
 
@@ -333,7 +333,7 @@ def _information(
             network, normal_equations(network, adjustment.parameters, correction, adjustment.noise)
         )
     except np.linalg.LinAlgError:
-        raise DataError(SINGULAR) from None
+        raise undetermined(network) from None
     blocks = covariance_blocks(matrix)
     information = np.linalg.inv(residual_covariance(network, adjustment, blocks))
     return information, estimate_noise(network, adjustment, blocks)

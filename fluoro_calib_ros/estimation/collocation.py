@@ -17,8 +17,8 @@ After each adjustment:
    the signal varies more in places, more of these.
 3. The number of sines becomes that which the image points can tell with this prior.
 4. Once the priors are steady, the residuals are searched for what the terms cannot follow yet, one
-   after the other: ripples; exposures that differ, or else a signal shorter than the sines; places
-   where the signal varies more.
+   after the other: ripples; rejected image points that agree; exposures that differ, or else a
+   signal shorter than the sines; places where the signal varies more.
 
 A change of 3 or 4 leads to another adjustment. After two renewals that change nothing, the priors
 stay as they are.
@@ -43,6 +43,7 @@ from .priors import Prior
 from .refinements import (
     SETTLED_PRIOR,
     START_MODES,
+    AgreeingOutliers,
     Change,
     MorePlaces,
     NumberOfSines,
@@ -128,6 +129,7 @@ class CollocationTerms(AdjustedTerms):
         self._refinements: list[Refinement] = [
             NumberOfSines(),
             Once(ripples),  # they may pass for a change between exposures
+            AgreeingOutliers(),  # and so may a dent whose image points are rejected
             Once(exposure_terms, short_sines),
             Once(places),
         ]
@@ -144,7 +146,7 @@ class CollocationTerms(AdjustedTerms):
             self._of_priors.append([ShortField(), MorePlaces()] if prior is None else [])
         self._start = tuple(start)
         # The ripples of the earlier series stay, and its number of sines is not the first.
-        self._refinements = [NumberOfSines(changes=1)]
+        self._refinements = [NumberOfSines(changes=1), AgreeingOutliers()]
         if earlier.is_varying:
             self._refinements.append(Once(exposure_terms, short_sines))
         if any(prior is None for prior in earlier.priors):

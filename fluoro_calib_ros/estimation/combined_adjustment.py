@@ -26,7 +26,7 @@ from ..photogrammetry.noise_estimation import estimate_noise
 from ..photogrammetry.normal_equations import normal_equations
 from ..photogrammetry.precision import Precision, covariance_blocks, precision
 from .estimator import AdjustedTerms, require_training
-from .initial_network import ADVICE, Measured, with_additional
+from .initial_network import Measured, undetermined, with_additional
 from .lack_of_fit import FittedPoints, sd_of_rejected, sd_with_lack_of_fit
 from .rounds import History, Round, SelfCalibration
 
@@ -100,10 +100,7 @@ def calibrate_by_adjustment(
             for f, name in enumerate(measured.fluoroscopes)
         }
     except np.linalg.LinAlgError:
-        raise DataError(
-            'the exposures do not determine orientation and distortion: '
-            f'the normal matrix is singular; {ADVICE}'
-        ) from None
+        raise undetermined(measured.network) from None
     measured = replace(measured, network=network)
     return SelfCalibration(
         measured=measured,

@@ -61,10 +61,13 @@ class Variation:
         Square sum of the terms of all exposures over its expectation for independent residuals.
     size_px : float
         RMS of a coordinate of the change [px], without what the noise contributes.
+    noise_px : float
+        Standard deviation of a coordinate of what the terms leave [px].
     """
 
     chi2_per_dof: float
     size_px: float
+    noise_px: float
 
     @property
     def is_varying(self) -> bool:
@@ -128,10 +131,11 @@ def variation(residuals: np.ndarray, exposure: np.ndarray, functions: np.ndarray
         dof_left += len(a) - a.shape[1] - EXTERIOR_SIZE
         points += len(a)
     if not dof or left <= 0:
-        return Variation(0.0, 0.0)
+        return Variation(0.0, 0.0, 0.0)
     noise = left / dof_left
     excess = max(explained - VARYING * dof * noise, 0.0)
-    return Variation(explained / (dof * noise), float(np.sqrt(excess / points)))
+    size = float(np.sqrt(excess / points))
+    return Variation(explained / (dof * noise), size, float(np.sqrt(noise)))
 
 
 class ExposureTerms:

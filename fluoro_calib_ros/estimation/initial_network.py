@@ -45,6 +45,11 @@ from .start_orientation import (
 
 START_GROSS = 0.01  # share of gross errors with which the estimation of the noise begins
 ADVICE = 'add exposures with the phantom turned and moved'
+TOO_FLAT = replace(
+    UNTILTED,
+    cause='the targets are flat and tilted too little, so that the principal distance cannot be '
+    'found',
+)
 SINGULAR = f'the exposures do not determine the unknowns: the normal matrix is singular; {ADVICE}'
 
 
@@ -113,7 +118,18 @@ def adjusted_with_precision(
             )
         return result, precision(network, result, correction)
     except np.linalg.LinAlgError:
-        raise DataError(SINGULAR) from None
+        raise undetermined(network) from None
+
+
+def undetermined(network: Network) -> DataError:
+    """Return the error of a network whose normal matrix is singular.
+
+    Of flat targets that are tilted a little, noise decides whether it is; the cause is that they
+    are flat.
+    """
+    if flatness(network.survey_mm) < MIN_FLATNESS:
+        return DataError(TOO_FLAT)
+    return DataError(SINGULAR, kind=Kind.UNDETERMINED)
 
 
 def with_additional(adjustment: Adjustment, values: tuple[np.ndarray, ...]) -> Adjustment:

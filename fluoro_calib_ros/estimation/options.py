@@ -6,8 +6,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Container, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any
 
 from ..correction.registry import neighbour_models, selectable_models
@@ -180,6 +180,14 @@ class CalibrationRequest:
     principal_distance: float | None = None
     names: Names = field(default_factory=Names)
     known_orientations: Mapping[str, KnownOrientation] = field(default_factory=dict)
+
+    def with_exposures(self, numbers: Mapping[str, Container[int]]) -> CalibrationRequest:
+        """Return the request with the exposures of these numbers, by fluoroscope, only."""
+        frames = {
+            name: [frame for frame in of_one if frame.number in numbers[name]]
+            for name, of_one in self.frames.items()
+        }
+        return replace(self, frames=frames)
 
     @property
     def groups(self) -> list[tuple[str, ...]]:

@@ -298,36 +298,61 @@ def exposure_terms(solution: Solution) -> Change | None:
 
 
 def short_sines(solution: Solution) -> Change | None:
-    """All sines where residuals show what the present ones are too long for.
-
-    They do so by an error that is common to all exposures, or by rejected image points that agree.
-    """
+    """All sines where residuals show an error that is common to all exposures."""
     modes = solution.modes
     priors = {}
-    coefficients = {}
-    for part, present in zip(solution.parts, solution.coefficients):
+    for part in solution.parts:
         f = part.number
-        taken_back = _agreeing(part, solution.adjustment)
-        back = len(taken_back) > 0
-        missing = modes[f] < MAX_MODES and (
-            back or has_common_error(part.inliers(solution.adjustment))
-        )
-        if missing:
-            signal = part.prior.signal.with_short_field(max(part.image_size))
-            priors[f] = replace(part.prior, signal=signal)
-            modes[f] = max(LOCAL_MODES if back else MAX_MODES, modes[f])
-        if back:
-            values = solution.adjustment.residuals[part.rows] + part.correction(present)
-            used = solution.adjustment.inliers[part.rows]
-            used[taken_back] = True
+        if modes[f] < MAX_MODES and has_common_error(part.inliers(solution.adjustment)):
+            priors[f] = _with_short_field(part)
+            modes[f] = MAX_MODES
+    return Change(modes, priors) if priors else None
+
+
+def _with_short_field(part: FluoroscopeTerms) -> Prior:
+    """Prior of a fluoroscope with a short field to start with."""
+    signal = part.prior.signal.with_short_field(max(part.image_size))
+    return replace(part.prior, signal=signal)
+
+
+class AgreeingOutliers:
+    """Rejected image points that agree: they are not false matches.
+
+    Weights that were found while only long waves were in the model reject the image points of a
+    dent, and at that solution they have no weight, however many they are. They are looked for at
+    every solution with steady priors: before, they may be too few. Those that have been taken back
+    once, and were rejected again, are not tried again.
+    """
+
+    def __init__(self) -> None:
+        self._tried: dict[int, set[int]] = {}
+
+    def propose(self, solution: Solution) -> Change | None:
+        """See `Refinement`."""
+        if not solution.is_steady:
+            return None
+        modes = solution.modes
+        priors = {}
+        coefficients = {}
+        adjustment = solution.adjustment
+        for part, present in zip(solution.parts, solution.coefficients):
+            f = part.number
+            rows = _agreeing(part, adjustment)
+            tried = self._tried.setdefault(f, set())
+            if tried.issuperset(rows.tolist()):
+                continue
+            tried.update(rows.tolist())
+            modes[f] = max(LOCAL_MODES, modes[f])
+            used = adjustment.inliers[part.rows]
+            used[rows] = True
             priors[f], coefficients[f] = _followed(
                 part,
-                (modes[f], priors.get(f, part.prior)),
-                values,
+                modes[f],
+                adjustment.residuals[part.rows] + part.correction(present),
                 used=used,
-                scale=solution.adjustment.noise.scale,
+                scale=adjustment.noise.scale,
             )
-    return Change(modes, priors, coefficients=coefficients) if priors else None
+        return Change(modes, priors, coefficients=coefficients) if priors else None
 
 
 def _agreeing(part: FluoroscopeTerms, adjustment: Adjustment) -> np.ndarray:
@@ -344,26 +369,26 @@ def _agreeing(part: FluoroscopeTerms, adjustment: Adjustment) -> np.ndarray:
 
 
 def _followed(
-    part: FluoroscopeTerms,
-    start: tuple[int, Prior],
-    values: np.ndarray,
-    used: np.ndarray,
-    scale: float,
+    part: FluoroscopeTerms, modes: int, values: np.ndarray, used: np.ndarray, scale: float
 ) -> tuple[Prior, np.ndarray]:
     """Prior and coefficients that follow the values (n, 2) [px] of the points used (n,).
 
     The robust adjustment goes on from there: at a solution that rejects image points they have no
-    weight, however many they are. Orientations are taken to be known, which is near enough to
-    start with. start: modes and prior; scale: of the noise.
+    weight, however many they are. A dent is a place where the signal varies more; where none is
+    shown, the signal is given a short field. Orientations are taken to be known, which is near
+    enough to start with. scale: of the noise.
     """
-    modes, prior = start
-    functions = part.functions_with(modes, prior)
+    functions = part.functions_with(modes, part.prior)
     at_points = functions(part.uv)
     gauge = part.gauge_of(at_points)
     weighted = part.weighted(at_points, scale) * used[:, None]
+    observed = part.weighted(values, scale) * used[:, None]
+    prior = with_shown_places(functions, weighted[used], observed[used], part.prior)
     information = block_diag(*[weighted.T @ weighted] * 2)
-    right = (weighted.T @ part.weighted(values, scale)).T.ravel()
-    prior = most_likely_prior(functions, information, right, gauge, prior=prior, search=True)
+    right = (weighted.T @ observed).T.ravel()
+    if prior.local is None:
+        prior = _with_short_field(part)
+        prior = most_likely_prior(functions, information, right, gauge, prior=prior, search=True)
     precision = information + gauge + prior_precision(functions, prior)
     return prior, np.linalg.solve(precision, right)
 

@@ -160,6 +160,14 @@ class CalibrationResult:
     solved: dict[str, SolvedNetwork] = field(default_factory=dict)
 
     @property
+    def used_exposures(self) -> dict[str, set[int]]:
+        """Numbers of the exposures that were not excluded, by fluoroscope."""
+        return {
+            name: {e.exposure for e in figures.exposures}
+            for name, figures in self.fluoroscopes.items()
+        }
+
+    @property
     def starts(self) -> StartValues:
         """Start values of other adjustments of the same exposures."""
         return StartValues(

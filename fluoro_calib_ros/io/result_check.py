@@ -12,15 +12,18 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
+from ..exposures.frame import Frame
 from ..findings import Finding, Kind, Place, Severity
 from .access import PathLike
 from .text_files import read_json, to_json_values
+
+Frames = Mapping[str, Sequence[Frame]]
 
 RESULT_NAME = 'result.json'
 DIGEST = 'digest'
@@ -50,6 +53,22 @@ def read_result(directory: PathLike) -> dict[str, Any]:
     """Read result.json of a folder, {} where there is none. Raises DataError."""
     path = Path(directory) / RESULT_NAME
     return read_json(path) if path.exists() else {}
+
+
+def used_exposures(document: Mapping[str, Any], frames: Frames) -> dict[str, set[int]]:
+    """Return the numbers of the exposures that were used, by fluoroscope.
+
+    document is the content of result.json. Where it does not tell, all frames were used.
+    """
+    entries = document.get('fluoroscopes')
+    out = {name: {int(frame.number) for frame in of_one} for name, of_one in frames.items()}
+    for name, numbers in out.items():
+        entry = entries.get(name) if isinstance(entries, Mapping) else None
+        rows = entry.get('exposures') if isinstance(entry, Mapping) else None
+        if isinstance(rows, list):
+            used = {row.get('exposure') for row in rows if isinstance(row, Mapping)}
+            out[name] = numbers & used or numbers
+    return out
 
 
 def exchanged(

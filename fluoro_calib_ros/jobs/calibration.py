@@ -31,7 +31,8 @@ from ..checks.inputs import (
     why_excluded,
 )
 from ..checks.mixed_units import mixed_units
-from ..checks.rigidity import NOT_ORIENTED, contradiction, doubtful, interchanged
+from ..checks.rig import RigFindings, rig_findings
+from ..checks.rigidity import interchanged
 from ..checks.verdict import validate_or_report
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
@@ -39,10 +40,10 @@ from ..estimation.calibrate import adjust_with_calibrations, calibrate_request
 from ..estimation.initial_network import MIN_EXPOSURES
 from ..estimation.options import CalibrationRequest
 from ..estimation.result import CalibrationResult
-from ..estimation.rig_orientation import orientation_and_scatter, orientation_of_known
 from ..estimation.rounds import Round
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
+from ..exposures.repeats import without_repeats
 from ..exposures.strays import frames_without_strays
 from ..findings import Finding, Kind, Place, Severity
 from ..photogrammetry.rig_orientation import RigOrientation
@@ -164,8 +165,9 @@ def run_calibration(
 ) -> CalibrationOutcome:
     """Self-calibrate the fluoroscopes of a request, and orient the rig.
 
-    Exposures that repeat an earlier one are excluded, and so are a few image points off the image
-    or of targets that the phantom does not have.
+    Exposures that repeat an earlier one are excluded, those of a phantom that stands still are
+    joined, and a few image points off the image or of targets that the phantom does not have are
+    excluded.
 
     Parameters
     ----------
@@ -198,7 +200,7 @@ def run_calibration(
     """
     validate_names((*request.frames, *(rig.frames if rig else ())))
     validate_magnitudes(request.frames, request.phantom)
-    request, excluded = _without_unusable(request)
+    request, excluded = without_unusable(request)
     wrong = _wrong_input(request)
     if wrong and not force:
         raise DataError(*wrong)
@@ -208,15 +210,15 @@ def run_calibration(
     if wrong and not force:
         raise DataError(*wrong)
     rig = rig or Rig()
-    orientation, doubts = _orientation(request, result, rig)
-    result = replace(result, findings=(*excluded, *doubts, *wrong))
+    of_rig = _findings_of_rig(request, result, rig)
+    result = replace(result, findings=(*excluded, *of_rig.doubts, *wrong))
     validation = None
     if validate:
+        used = request.with_exposures(result.used_exposures)
         validation = validate_or_report(
-            request, result.calibrations, report_step, raise_if_cancelled
+            used, result.calibrations, report_step, raise_if_cancelled, of_rig
         )
-        validation = replace(validation, notes=tuple(doubts))
-    return CalibrationOutcome(request, result, rig, orientation, validation)
+    return CalibrationOutcome(request, result, rig, of_rig.orientation, validation)
 
 
 def _wrong_input(request: CalibrationRequest) -> list[Finding]:
@@ -271,7 +273,7 @@ def _with_causes(request: CalibrationRequest, result: CalibrationResult) -> list
     return [found.explained_by(causes.get(found.place)) for found in result.findings]
 
 
-def _without_unusable(request: CalibrationRequest) -> tuple[CalibrationRequest, list[Finding]]:
+def without_unusable(request: CalibrationRequest) -> tuple[CalibrationRequest, list[Finding]]:
     """Return the request without stray points and repeated exposures, and what was excluded.
 
     Raises DataError where copies are many.
@@ -279,7 +281,10 @@ def _without_unusable(request: CalibrationRequest) -> tuple[CalibrationRequest, 
     frames, strays = frames_without_strays(request.frames, request.phantom)
     frames, copies = _without_copies(frames, request.known_orientations)
     frames, shared = _without_shared(frames)
-    return replace(request, frames=frames), [*strays, *copies, *shared]
+    joined, repeats = without_repeats(frames, request.known_orientations)
+    if any(len(of_one) < MIN_EXPOSURES for of_one in joined.values()):
+        joined, repeats = frames, []  # too few poses, which is said as such
+    return replace(request, frames=joined), [*strays, *copies, *shared, *repeats]
 
 
 def _without_copies(
@@ -358,40 +363,16 @@ def _interchanged(result: CalibrationResult) -> list[Finding]:
     return [one for one in found if one is not None]
 
 
-def _orientation(
+def _findings_of_rig(
     request: CalibrationRequest, result: CalibrationResult, rig: Rig
-) -> tuple[RigOrientation | None, list[Finding]]:
-    """Return the orientation of the rig and what is doubtful about it, or None and the reason.
-
-    A single fluoroscope is no rig, and needs no reason.
-    """
+) -> RigFindings:
+    """Return what the exposures say about the orientation of the rig."""
     frames = {**rig.frames, **request.frames}
     calibrations = {**rig.calibrations, **result.calibrations}
     names = [name for name in rig.fluoroscopes or calibrations if name in calibrations]
-    if len(names) < 2:
-        return None, []
-    if all(name in request.known_orientations for name in names):
-        known = request.known_orientations
-        return orientation_of_known(known, result.fluoroscopes, result.calibrations), []
-    calibrated = [name for name in names if name in result.fluoroscopes]
-    for name in calibrated[1:]:
-        first = calibrated[0]
-        found = contradiction((first, name), result.fluoroscopes[first], result.fluoroscopes[name])
-        if found is not None:
-            return None, [found]
-    try:
-        orientation, scatter = orientation_and_scatter(
-            {name: frames[name] for name in names},
-            request.phantom,
-            {name: calibrations[name] for name in names},
-            starts=result.starts,
-        )
-    except DataError as error:
-        why = f'{NOT_ORIENTED}: {error}'
-        return None, [Finding(Kind.RIG_NOT_ORIENTED, why, severity=Severity.WARNING)]
-    side = max(max(calibration.image_size) for calibration in calibrations.values())
-    found_of_pairs = [doubtful(pairs, side) for pairs in scatter]
-    refused = [one for usable, doubts in found_of_pairs for one in doubts if not usable]
-    if refused:
-        return None, refused
-    return orientation, [one for _, doubts in found_of_pairs for one in doubts]
+    return rig_findings(
+        request,
+        result,
+        {name: frames[name] for name in names if name in frames},
+        {name: calibrations[name] for name in names},
+    )

@@ -95,7 +95,7 @@ def _in_datum(
     matrix: FactorizedNormalMatrix, gauge: Gauge, blocks: CovarianceBlocks
 ) -> CovarianceBlocks:
     """Covariances in the datum of a free network, from those with other directions fixed."""
-    s = STransformation(gauge, _covariance_times_points(matrix, gauge.constraint))
+    s = STransformation(gauge, covariance_times_points(matrix, gauge.constraint))
 
     def exteriors(index: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return s.exteriors[0][index], s.exteriors[1][index]
@@ -116,8 +116,11 @@ def _in_datum(
     )
 
 
-def _covariance_times_points(matrix: FactorizedNormalMatrix, values: np.ndarray) -> UnknownVector:
-    """Products of the inverse normal matrix with columns of values (n, 3, d) of the points."""
+def covariance_times_points(matrix: FactorizedNormalMatrix, values: np.ndarray) -> UnknownVector:
+    """Products of the inverse normal matrix with columns of values (n, 3, d) of the points.
+
+    Of a free network they are those with other directions fixed than those of its datum.
+    """
     elimination = matrix.elimination
     solution = matrix.factor.solve(*elimination.right_side_of_points(values))
     return elimination.to_unknowns(*solution)

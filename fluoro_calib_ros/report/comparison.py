@@ -53,11 +53,11 @@ def comparison_text(comparison: Comparison, mm_per_px: float | None) -> str:
     return '\n'.join(
         [
             f'fluoroscope {comparison.fluoroscope}',
-            f'  interior orientation [px]: {", ".join(parts)}: '
-            f'{verdicts[comparison.interior_changed]}',
             f'  distortion: RMS {with_mm(comparison.rms_px)}, largest {with_mm(largest)} at '
             f'column {u:.0f}, row {v:.0f}',
             f'  significant in {share:.0f} % of the image: {verdicts[comparison.field_changed]}',
+            f'  interior orientation, both in one gauge [px]: {", ".join(parts)}: '
+            f'{verdicts[comparison.interior_changed]}',
         ]
     )
 
@@ -83,7 +83,9 @@ def _figure(comparisons: Sequence[Comparison]) -> Figure:
         axes.plot(*marked.T, '.', color=BLACK, markersize=2)
         keys = np.floor(comparison.uv / step).astype(int)
         _, first = np.unique(keys, axis=0, return_index=True)
-        factor = 0.8 * step / max(float(comparison.size.max()), 1e-9)
+        # A difference far below its standard deviation is shown as small as it is.
+        longest = max(float(comparison.size.max()), float(np.median(comparison.sd)))
+        factor = 0.8 * step / longest
         factor = float(f'{factor:.1g}')
         axes.quiver(
             *comparison.uv[first].T,

@@ -15,6 +15,7 @@ from fluoro_calib_ros.checks.comparison import compare_calibrations
 from fluoro_calib_ros.correction.registry import create_model
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.jobs.result_folder import save_result
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 
 NOISE_PX = 0.2
 PLACE = np.array([300.0, 700.0])
@@ -73,6 +74,30 @@ def test_change_of_the_interior_orientation_is_told():
     found = compare_calibrations(one, replace(one, interior=one.interior + [0, 0, 8 * sd[2]]))
     assert found.interior_changed and not found.field_changed
     np.testing.assert_allclose(found.interior_sd, np.sqrt(2) * sd)
+
+
+@functools.cache
+def turned(seed, rad=0.01):
+    """The same rays from a sensor that is turned, with its principal point elsewhere."""
+    one = calibration(seed)
+    interior = one.interior + [rad * one.interior[2], 0, 0]
+    uv = one.model.train_uv
+    rays = np.column_stack(
+        [(uv - one.model.train_duv - one.interior[:2]) / one.interior[2], np.ones(len(uv))]
+    )
+    rays = rays @ matrix_from_vector(np.array([0.0, -rad, 0.0])).T
+    ideal = interior[:2] + interior[2] * rays[:, :2] / rays[:, 2:]
+    model = replace(one.model, train_duv=uv - ideal)
+    return replace(one, interior=interior, model=model)
+
+
+def test_interior_orientations_in_other_gauges_are_the_same():
+    """The principal point moves by 40 px where the sensor turns by 10 mrad."""
+    for other in (turned(1), turned(2)):
+        found = compare_calibrations(calibration(1), other)
+        assert abs(other.interior[0] - calibration(1).interior[0]) > 30
+        assert not found.interior_changed and not found.field_changed
+        assert np.abs(found.interior[:2]).max() < 4 * found.interior_sd[:2].max()
 
 
 def test_other_image_sizes_are_not_compared():

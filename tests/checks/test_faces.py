@@ -9,7 +9,7 @@ import pytest
 from fluoro_calib_ros.checks.bead_intersection import Beads
 from fluoro_calib_ros.checks.beads import compare_with_survey
 from fluoro_calib_ros.checks.faces import displaced_layer
-from fluoro_calib_ros.checks.held_out import EXPOSURE_LIMIT, exposure_limit
+from fluoro_calib_ros.checks.held_out import EXPOSURE_LIMIT, exposure_limits
 
 SD_MM = 0.15
 
@@ -95,15 +95,28 @@ def test_noise_that_differs_between_exposures_accuses_none():
     """An exposure stands out only against the scatter of all."""
     rng = np.random.default_rng(4)
     same = np.exp(rng.normal(0, 0.04, 15))
-    assert exposure_limit(same) == EXPOSURE_LIMIT
+    assert np.all(exposure_limits(same, same) <= EXPOSURE_LIMIT * np.maximum(same, 1))
     moved = same.copy()
     moved[:3] = 2.5
-    assert exposure_limit(moved) == EXPOSURE_LIMIT < 2.5
+    assert np.all(exposure_limits(moved, moved) == EXPOSURE_LIMIT)
     for _ in range(20):
         ratio = np.exp(rng.uniform(np.log(0.1), np.log(0.6), 15))
         ratio /= np.median(ratio)
-        assert ratio.max() < exposure_limit(ratio)
+        assert np.all(ratio < exposure_limits(ratio, ratio))
     for count in (6, 15, 60):
         ratios = np.exp(rng.normal(0, 0.3, (2000, count)))
-        accused = [max(ratio) / np.median(ratio) > exposure_limit(ratio) for ratio in ratios]
+        ratios /= np.median(ratios, axis=1, keepdims=True)
+        accused = [np.any(ratio > exposure_limits(ratio, ratio)) for ratio in ratios]
         assert np.mean(accused) < 0.02
+
+
+def test_a_misfit_accuses_an_exposure_however_much_the_others_scatter():
+    """Its residuals agree with their neighbours, so that they are no noise of its own."""
+    rng = np.random.default_rng(5)
+    ratio = np.exp(rng.uniform(np.log(0.1), np.log(0.6), 15))
+    ratio /= np.median(ratio)
+    ratio[4] = 2.0
+    white = ratio.copy()
+    assert np.all(ratio < exposure_limits(ratio, white))
+    white[4] = 1.0
+    assert ratio[4] > exposure_limits(ratio, white)[4]

@@ -7,6 +7,7 @@ import functools
 import json
 import pathlib
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -20,7 +21,7 @@ from fluoro_calib_ros.checks.bead_intersection import (
     least_chi2_without_a_ray,
 )
 from fluoro_calib_ros.checks.beads import FALSE_ALARM as BEADS_FALSE_ALARM
-from fluoro_calib_ros.checks.beads import compare_with_survey
+from fluoro_calib_ros.checks.beads import compare_with_survey, rejected_beads
 from fluoro_calib_ros.checks.calibration_evidence import Evidence, Subject
 from fluoro_calib_ros.checks.check import Check, Validation, verdict_of
 from fluoro_calib_ros.checks.comparison import difference, orientation_fields, place_name
@@ -61,7 +62,9 @@ CHECKS = [
     'precision',
     'beads',
     'distances',
+    'shape',
 ]
+OF_PHANTOM = ('beads', 'distances', 'shape')
 SIZE = (1024, 1024)
 LOCAL = {'model': 'local_linear'}
 
@@ -157,7 +160,7 @@ def test_good_calibration_passes():
     for check in found.checks:
         assert check.passed and 0 <= check.value <= check.limit and check.sentence
         assert check.severity is Severity.NOTE
-        assert check.place.fluoroscope == ('' if check.name in ('beads', 'distances') else 'a')
+        assert check.place.fluoroscope == ('' if check.name in OF_PHANTOM else 'a')
     assert found.calibration_id == {'a': calibrated('a').calibrations['a'].calibration_id}
 
 
@@ -223,9 +226,9 @@ def test_joint_validation_reports_progress_and_can_be_cancelled():
     request = CalibrationRequest(frames, rig().phantom, options, joint=True)
     found = validate(request, job.calibrations, progress=lambda *step: steps.append(step))
     assert [(c.name, c.place.fluoroscope) for c in found.checks] == [
-        *((name, f) for f in 'ab' for name in CHECKS[:-2]),
-        ('beads', ''),
-        ('distances', ''),
+        *((name, f) for f in 'ab' for name in CHECKS[: -len(OF_PHANTOM)]),
+        *((name, '') for name in OF_PHANTOM),
+        ('orientation', 'a'),
     ]
     assert [done for _, done, _ in steps] == list(range(6)) and {total for *_, total in steps} == {
         6
@@ -464,6 +467,20 @@ def test_a_bead_that_one_ray_puts_out_of_place_is_not_accused():
     assert all(check.passed for check in checks)
 
 
+def test_a_bead_of_which_nearly_all_points_are_rejected_is_doubted():
+    """Unless false matches are so frequent that chance does it."""
+    target_id = np.repeat(np.arange(100), 4)
+    outlier = np.zeros(400, dtype=bool)
+    outlier[:5] = [True, True, True, False, True]  # three of bead 0, one of bead 1
+    table = SimpleNamespace(target_id=target_id, outlier=outlier)
+    assert rejected_beads(table).tolist() == [0]
+    rng = np.random.default_rng(1)
+    for share in (0.01, 0.2, 0.4):
+        for _ in range(20):
+            table = SimpleNamespace(target_id=target_id, outlier=rng.random(400) < share)
+            assert not len(rejected_beads(table))
+
+
 def test_errors_of_intersected_beads_agree_with_their_covariance():
     frames = {'a': exposures()['a']}
     held = adjust_with_calibrations(frames, rig().phantom, calibrated('a', **LOCAL).calibrations)
@@ -617,7 +634,7 @@ def test_command_fails_with_one_sentence_after_writing_the_verdict(
     bad = Check(Kind.DRIFT, 'it moved', Place(('a',)), value=1.0, limit=0.1, unit='px')
     monkeypatch.setattr(
         'fluoro_calib_ros.checks.verdict.validate',
-        lambda *_: Validation('fail', (bad, bad), {'a': 'a-1'}, 1.0),
+        lambda *_, **__: Validation('fail', (bad, bad), {'a': 'a-1'}, 1.0),
     )
     assert run('validate', place) == 1
     out, err = capsys.readouterr()

@@ -219,3 +219,23 @@ def test_dent_is_corrected_and_the_rest_stays_precise(middle, without_dent):
         np.sqrt(np.mean(one.models['a'].evaluate(uv[far]).sd ** 2)) for one in (run, without_dent)
     )
     assert claimed < 1.2 * before
+
+
+@pytest.mark.long
+@pytest.mark.parametrize('middle', [(450.0, 560.0), (620.0, 380.0)])
+def test_a_dent_whose_points_were_rejected_is_followed(middle):
+    """4 px high, 60 px in radius: weights that long waves have left reject its image points."""
+
+    def dent(uv):
+        square = np.sum((uv - middle) ** 2, axis=1, keepdims=True) / 60.0**2
+        return np.clip(1 - square, 0, None) ** 2 * [3.2, 2.4]
+
+    frames = [replace(f, uv=f.uv + dent(f.uv)) for f in rigs.exposures()['a']]
+    found = calibrate({'a': frames}, rigs.rig().phantom).calibrations['a']
+    plain = rigs.calibrated('a').calibrations['a']
+    axis = np.linspace(-50, 50, 21)
+    uv = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + middle
+    shown = found.model.predict(uv) - plain.model.predict(uv)
+    error = shown - dent(uv)
+    assert np.sqrt(np.mean(error**2)) < 0.5 * np.sqrt(np.mean(dent(uv) ** 2))
+    assert found.inliers > plain.inliers - 6

@@ -19,11 +19,13 @@ import argparse
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from fluoro_calib_ros.errors import DataError
@@ -38,6 +40,7 @@ DISTANCE_MM = 900.0
 STEEL_PER_MM = 0.55  # attenuation at some 70 keV
 ACRYLIC_PER_MM = 0.022
 BONE_PER_MM = 0.05
+SHEET_MM = 1.5
 SUB = 3  # points of a pixel in each direction
 WRONG_PX = 3.0  # an observation farther from its bead is that of another
 FOUND = 0.5  # share of the visible beads from which an image counts as found
@@ -64,7 +67,9 @@ class Row:
     gain : float
         Grey values of the unattenuated light; above 255 the background is clipped.
     plates : int
-        Acrylic plates, seen from the edge in some poses.
+        Acrylic plates in random places, seen from the edge in some poses.
+    faces : float
+        Half the distance between the six plates of a box [mm], 0 for none.
     jpeg : int
         Quality, 0 for none.
     unsharp : float
@@ -73,6 +78,10 @@ class Row:
     told : bool
         Diameters are known to the extraction.
     distortion_px : float
+    holes : bool
+        The places of the target are holes of a plate.
+    regular : bool
+        Any place on the lattice will do.
     tilt_deg : float
         Largest angle between the axis of the target and that of the fluoroscope; 180: any.
     """
@@ -81,10 +90,13 @@ class Row:
     photons: float = 1500.0
     gain: float = 200.0
     plates: int = 0
+    faces: float = 0.0
     jpeg: int = 0
     unsharp: float = 0.0
     bone: bool = False
     told: bool = False
+    holes: bool = False
+    regular: bool = False
     distortion_px: float = 8.0
     tilt_deg: float = 180.0
 
@@ -144,6 +156,21 @@ def sheet(count: int, pitch: float, hexagonal: bool, marks: int) -> Callable[...
     return drawn
 
 
+def frame(beads: int, side: float = 140.0, diameter: float = 2.0) -> Callable[..., Target]:
+    """Beads on the six faces of a cube."""
+
+    def drawn(rng: np.random.Generator) -> Target:
+        xyz = np.empty((0, 3))
+        while len(xyz) < beads:
+            new = rng.uniform(-side / 2, side / 2, 3)
+            new[rng.integers(3)] = rng.choice([-1, 1]) * side / 2
+            if not len(xyz) or np.linalg.norm(xyz - new, axis=1).min() > 2.5 * diameter:
+                xyz = np.vstack([xyz, new])
+        return Target(xyz, np.full(beads, diameter))
+
+    return drawn
+
+
 def nothing(_: np.random.Generator) -> Target:
     """No phantom."""
     return Target(np.empty((0, 3)), np.empty(0))
@@ -159,10 +186,24 @@ ROWS: dict[str, Row] = {
     'cube-36 JPEG 15': Row(cube(36), jpeg=15),
     'cube-36 unsharp': Row(cube(36), unsharp=1.5),
     'cube-36 plates': Row(cube(36), plates=5),
+    'frame-503 plates': Row(frame(503), photons=4000.0, faces=70.0, tilt_deg=12.0),
     'cube-36 bone': Row(cube(36), bone=True),
     'cube-48 three sizes': Row(three_sizes(48), told=True),
     'cube-48 three sizes untold': Row(three_sizes(48)),
-    'grid-20': Row(sheet(20, 5.0, False, 0), tilt_deg=15.0),
+    'grid of beads': Row(sheet(20, 5.0, False, 2), tilt_deg=15.0),
+    **{
+        f'{"hexagonal" if hexagonal else "square"} sheet {count} with {marks} marks': Row(
+            sheet(count, pitch, hexagonal, marks), holes=True, regular=not marks, tilt_deg=15.0
+        )
+        for hexagonal in (False, True)
+        for count, pitch, marks in (
+            (20, 6.0, 1),
+            (20, 6.0, 3),
+            (30, 6.0, 5),
+            (45, 6.0, 0),
+            (45, 4.5, 2),
+        )
+    },
     'nothing': Row(nothing),
     'bone without phantom': Row(nothing, bone=True),
 }
@@ -188,10 +229,12 @@ def render(row: Row, rng: np.random.Generator) -> Scene:
     light = np.ones((SIZE, SIZE))
     centres = (target.xyz - source) @ rotation.T
     uv = bend.observed(PRINCIPAL_PX * centres[:, :2] / centres[:, 2:] + (SIZE - 1) / 2)
-    for centre, place, diameter in zip(centres, uv, target.diameter):
+    if row.holes:
+        light *= _perforated(bend, rotation, source, target)
+    for centre, place, diameter in zip(centres, uv, target.diameter) if not row.holes else ():
         _add_sphere(light, hit, bend, centre, (place, diameter / 2))
-    for _ in range(row.plates):
-        depth += ACRYLIC_PER_MM * _plate(bend, rotation, source, rng)
+    for middle, half in _plates(row, rng):
+        depth += ACRYLIC_PER_MM * _plate(bend, rotation, source, (middle, half))
     if row.bone:
         depth += BONE_PER_MM * _bone(rng)
     light = light * np.exp(-depth) * _vignetting(rng)
@@ -272,15 +315,55 @@ def _add_sphere(
     hit[top:bottom, left:right] += (chord > 0).any(axis=-1)
 
 
+def _perforated(
+    bend: _Distortion, rotation: np.ndarray, source: np.ndarray, target: Target
+) -> np.ndarray:
+    """Light (h, w) behind a sheet of steel with holes, the mean over the points of pixels."""
+    holes = cKDTree(target.xyz[:, :2])
+    step = (np.arange(2) + 0.5) / 2 - 0.5
+    light = np.zeros((SIZE, SIZE))
+    reach = np.abs(target.xyz[:, :2]).max(axis=0) + target.diameter[0]
+    for b, a in product(step, step):
+        v, u = np.mgrid[:SIZE, :SIZE]
+        xy = (bend.undistorted(np.stack([u + a, v + b], -1)) - (SIZE - 1) / 2) / PRINCIPAL_PX
+        ray = np.concatenate([xy, np.ones((SIZE, SIZE, 1))], -1) @ rotation
+        metal = np.zeros((SIZE, SIZE))
+        for face in (-0.5, 0.5):
+            way = (face * SHEET_MM - source[2]) / ray[..., 2]
+            place = source[:2] + way[..., None] * ray[..., :2]
+            away, _ = holes.query(place, distance_upper_bound=target.diameter[0] / 2)
+            on_sheet = (np.abs(place) < reach).all(axis=-1)
+            metal += 0.5 * (on_sheet & ~np.isfinite(away))
+        slant = np.linalg.norm(ray, axis=-1) / np.abs(ray[..., 2])
+        light += np.exp(-STEEL_PER_MM * SHEET_MM * slant * metal) / 4
+    return light
+
+
+def _plates(row: Row, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield middles and half sizes (3,) of the plates of a row [mm]."""
+    for _ in range(row.plates):
+        axis = int(rng.integers(3))
+        half = np.full(3, 32.0)
+        half[axis] = rng.uniform(2, 4)
+        middle = np.zeros(3)
+        middle[axis] = rng.uniform(-30, 30)
+        yield middle, half
+    for axis, side in np.ndindex(3, 2) if row.faces else ():
+        half = np.full(3, row.faces)
+        half[axis] = 3.0
+        middle = np.zeros(3)
+        middle[axis] = (2 * side - 1) * row.faces
+        yield middle, half
+
+
 def _plate(
-    bend: _Distortion, rotation: np.ndarray, source: np.ndarray, rng: np.random.Generator
+    bend: _Distortion,
+    rotation: np.ndarray,
+    source: np.ndarray,
+    plate: tuple[np.ndarray, np.ndarray],
 ) -> np.ndarray:
     """Lengths (h, w) [mm] of rays in a plate of the phantom."""
-    axis = int(rng.integers(3))
-    half = np.full(3, 32.0)
-    half[axis] = rng.uniform(2, 4)
-    middle = np.zeros(3)
-    middle[axis] = rng.uniform(-30, 30)
+    middle, half = plate
     v, u = np.mgrid[:SIZE, :SIZE]
     xy = (bend.undistorted(np.stack([u, v], -1).astype(float)) - (SIZE - 1) / 2) / PRINCIPAL_PX
     ray = np.concatenate([xy, np.ones((SIZE, SIZE, 1))], -1) @ rotation
@@ -347,24 +430,32 @@ class Tally:
     visible: int = 0
     wrong: int = 0
     largest_px: float = 0.0
+    over_5_sd: int = 0
+    over_half_px: int = 0
     normalised: float = 0.0
     seconds: float = 0.0
     refusals: tuple[str, ...] = ()
 
-    def add(self, scene: Scene, result: Extraction | DataError, seconds: float) -> None:
+    def add(
+        self, scene: Scene, result: Extraction | DataError, seconds: float, any_place: bool
+    ) -> None:
+        """Count an image; with any_place, an observation belongs to the nearest target."""
         self.images += 1
         self.seconds += seconds
         self.visible += int(scene.visible.sum())
         if isinstance(result, DataError):
             self.refusals += (result.finding.kind.value,)
             return
-        error = result.uv - scene.uv[result.bead]
+        bead = cKDTree(scene.uv).query(result.uv)[1] if any_place else result.bead
+        error = result.uv - scene.uv[bead]
         off = np.linalg.norm(error, axis=1)
         right = off < WRONG_PX
         self.found += bool(right.sum() >= FOUND * scene.visible.sum())
-        self.beads += int(np.isin(result.bead[right], np.flatnonzero(scene.visible)).sum())
+        self.beads += int(np.isin(bead[right], np.flatnonzero(scene.visible)).sum())
         self.wrong += int((~right).sum())
         self.largest_px = max(self.largest_px, float(off[right].max(initial=0)))
+        self.over_5_sd += int((off[right] > 5 * result.sigma[right]).sum())
+        self.over_half_px += int((off[right] > 0.5).sum())
         squared = (error[right] / result.sigma[right, None]) ** 2
         self.normalised += float(np.sqrt(squared.mean())) if len(squared) else 0.0
 
@@ -373,7 +464,8 @@ class Tally:
         causes = {cause: self.refusals.count(cause) for cause in sorted(set(self.refusals))}
         return (
             f'| {name} | {self.found}/{self.images} | {self.beads}/{self.visible} | {self.wrong} '
-            f'| {self.largest_px:.2f} | {self.normalised / max(done, 1):.2f} '
+            f'| {self.largest_px:.2f} | {self.over_half_px} | {self.over_5_sd} '
+            f'| {self.normalised / max(done, 1):.2f} '
             f'| {self.seconds / self.images:.1f} | {causes or ""} |'
         )
 
@@ -399,9 +491,10 @@ def main() -> None:
     options = parser.parse_args()
     names = [name.strip() for name in options.rows.split(',') if name.strip()] or list(ROWS)
     print(
-        '| target | found | beads seen | wrong ids | error up to [px] | normalised | s | refused |'
+        '| target | found | beads seen | wrong ids | error up to [px] | > 0.5 px | > 5 sd '
+        '| normalised | s | refused |'
     )
-    print('| --- | --- | --- | --- | --- | --- | --- | --- |')
+    print('| --- | --- | --- | --- | --- | --- | --- | --- | --- | --- |')
     lens = Lens((SIZE, SIZE), PRINCIPAL_PX * 1.05)
     for name in names:
         tally = Tally()
@@ -410,13 +503,15 @@ def main() -> None:
             if not len(wanted.xyz):
                 wanted = other_phantom(np.random.default_rng(number))
             told = wanted.diameter if ROWS[name].told else None
-            model = PhantomModel.of(wanted.xyz, told)
+            model = PhantomModel.of(wanted.xyz, told, ROWS[name].regular)
             began = time.process_time()
             try:
                 result: Extraction | DataError = extract_beads(scene.image, model, lens)
             except DataError as error:
                 result = error
-            tally.add(scene, result, time.process_time() - began)
+            tally.add(
+                scene, result, seconds=time.process_time() - began, any_place=ROWS[name].regular
+            )
             if options.pictures:
                 options.pictures.mkdir(parents=True, exist_ok=True)
                 found = None if isinstance(result, DataError) else result

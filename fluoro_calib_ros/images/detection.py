@@ -13,7 +13,7 @@ strongest ones. Both hold for three beads as for thousands.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import cv2
@@ -92,7 +92,7 @@ def detect_beads(
     sight = _Sight.of(image, beads)
     found = sight.detections(max(radius_px / BLOB_RADIUS, 1.0), inverted)
     if found is None:
-        raise _nothing(image)
+        raise _nothing(image, sight)
     return found
 
 
@@ -103,17 +103,19 @@ def likely_detections(image: np.ndarray, beads: int) -> Iterator[Detections]:
     DataError where nothing is found with any.
     """
     sight = _Sight.of(image, beads)
-    number = 0
-    looks = sight.likely(sight.middle()) if beads >= MANY else []
-    for _, scale, inverted in sorted(looks or sight.likely(sight.grey), reverse=True):
-        found = sight.detections(scale, inverted)
-        if found is not None:
-            number += 1
-            yield found
-        if number == MAX_LIKELY:
+    # Where an image shows fewer beads than expected, the strongest blob tells their size.
+    for part in (sight, replace(sight, typical=1)):
+        number = 0
+        for scale, inverted in part.looks(whole=beads < MANY):
+            found = part.detections(scale, inverted)
+            if found is not None:
+                number += 1
+                yield found
+            if number == MAX_LIKELY:
+                return
+        if number:
             return
-    if not number:
-        raise _nothing(image)
+    raise _nothing(image, sight)
 
 
 @dataclass(frozen=True)
@@ -138,6 +140,12 @@ class _Sight:
         height, width = self.grey.shape
         return self.grey[height // 4 : height - height // 4, width // 4 : width - width // 4]
 
+    def looks(self, whole: bool = True) -> list[tuple[float, bool]]:
+        """Return scales and polarities of the strongest blobs, the strongest first."""
+        looks = [] if whole else self.likely(self.middle())
+        looks = sorted(looks or self.likely(self.grey), reverse=True)
+        return [(scale, inverted) for _, scale, inverted in looks]
+
     def likely(self, grey: np.ndarray) -> list[tuple[float, float, bool]]:
         """Return strength, scale and polarity of the strongest blobs of the image or a part.
 
@@ -148,10 +156,8 @@ class _Sight:
         for column, (scale, part, factor) in enumerate(_resolutions(grey), 1):
             if factor not in fields:
                 turned = float(part.max()) - part
-                fields[factor] = (
-                    field_of_view(part, FINE_SCALE),
-                    field_of_view(turned, FINE_SCALE),
-                )
+                lit = field_of_view(part, FINE_SCALE)
+                fields[factor] = lit, lit & field_of_view(turned, FINE_SCALE)
             both = _blobs(part, self.noise, scale / factor, factor)
             for row, blobs in enumerate(both):
                 inside = _inside(blobs.uv, fields[factor][row], factor)
@@ -163,14 +169,27 @@ class _Sight:
             for row, column in np.argwhere(peaks)
         ]
 
+    def blobs(self, scale: float, inverted: bool) -> _Blobs:
+        """Return the dark or bright blobs of the image."""
+        return next(islice(_blobs(self.grey, self.noise, scale), inverted, None))
+
+    def contrast(self) -> float:
+        """Return the contrast of the strongest blob, as a fraction of the light around it."""
+        looks = replace(self, typical=1).looks()
+        blobs = (self.blobs(scale, inverted) for scale, inverted in looks)
+        return max((float(one.relative.max(initial=0.0)) for one in blobs), default=0.0)
+
     def detections(self, scale: float, inverted: bool) -> Detections | None:
         """Return what is found with a scale and a polarity, None for nothing."""
         grey = self.grey
         light = float(grey.max()) - grey if inverted else grey
         low, high = clipped_at(light)
         field = field_of_view(light, scale)
+        if inverted:
+            # Holes of a sheet are bright, and there is no light beyond the field either.
+            field &= field_of_view(grey, scale)
         for wider in WIDER:
-            blobs = next(islice(_blobs(grey, self.noise, wider * scale), inverted, None))
+            blobs = self.blobs(wider * scale, inverted)
             uv = _beads(blobs, field, self.typical)
             if len(uv):
                 return Detections(
@@ -247,7 +266,7 @@ def _inside(uv: np.ndarray, field: NDArray[np.bool_], factor: int = 1) -> NDArra
     return field[row, column]
 
 
-def _nothing(image: np.ndarray) -> DataError:
+def _nothing(image: np.ndarray, sight: _Sight) -> DataError:
     """Return the error for an image in which nothing round rises above the noise."""
     low = image.min()
     high = image.max()
@@ -259,10 +278,14 @@ def _nothing(image: np.ndarray) -> DataError:
                 f'(grey value {value:.0f})'
             )
             return DataError(cause, kind=Kind.IMAGE_EMPTY, numbers={'share': share})
-    return DataError(
-        'there are no beads in the image, nothing round rises above the noise',
-        kind=Kind.FEW_BEADS,
-    )
+    contrast = sight.contrast()
+    cause = 'there are no beads in the image, nothing round rises above the noise'
+    if contrast:
+        cause = (
+            'there are no beads in the image: the contrast of what is round in it is at most '
+            f'{contrast:.1%}, at least {MIN_CONTRAST:.0%} are needed'
+        )
+    return DataError(cause, kind=Kind.FEW_BEADS, numbers={'contrast': contrast})
 
 
 def _check(image: np.ndarray) -> None:

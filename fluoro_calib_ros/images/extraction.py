@@ -26,7 +26,10 @@ from .view import Lens, View, fit_view
 MAX_SIGMA_PX = 0.3
 MAX_SIGMAS = 2.9  # times that of a usual bead of the image: an eighth of its weight
 MAX_MISFIT = 5.0
-DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for that of a typical one
+DEPTH = (0.55, 1.7)  # of the shadow of a bead, 1 for what is usual in such light
+MIN_CONTRASTS = 20  # beads that tell what is usual
+CONTRAST_STEPS = 8
+MIN_USUAL_DEPTH = 0.1
 RESIDUAL_SIGMAS = 4.5  # from the prediction by neighbours
 FIRST_RESIDUAL_PX = 2.5
 MIN_ACCEPTED = 0.5  # of the matched beads that are measured well
@@ -35,6 +38,7 @@ MIN_SCATTER_PX = 0.05
 LOST = Finding(Kind.BEAD_LOST, 'cut off, or lost while it was measured')
 DISTURBED = Finding(Kind.BEAD_DISTURBED, 'something else is beside it')
 HIDDEN = Finding(Kind.BEAD_HIDDEN, 'hidden by another bead')
+VAGUE = (Kind.BEAD_UNSURE, Kind.BEAD_HIDDEN)
 ALONE = Finding(Kind.BEAD_ALONE, 'its neighbours are not found')
 
 
@@ -230,7 +234,7 @@ def _measured(
             noise=noise,
             steps=steps,
         )
-        reasons = _reasons(beads, predicted[rows])
+        reasons = _reasons(beads, predicted[rows], _usual_depth(beads))
         good = np.array([reason is None for reason in reasons], dtype=bool)
         if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(found.bead)):
             measured_well = int(np.count_nonzero(good))
@@ -299,9 +303,14 @@ def _checked(
 
 
 def _with_support(extraction: Extraction, model: PhantomModel, rows: np.ndarray) -> Extraction:
-    """Exclude beads of which most neighbours among the predicted ones (n,) are refused."""
-    good = np.isin(rows, extraction.bead)
-    alone = rows[good & ~supported(model.xyz[rows], good)]
+    """Exclude beads of which most neighbours among the predicted ones (n,) are not found.
+
+    One that is found, but too vague to be observed, supports them as well.
+    """
+    observed = np.isin(rows, extraction.bead)
+    vague = [one.bead for one in extraction.refused if one.finding.kind in VAGUE]
+    good = observed | np.isin(rows, vague)
+    alone = rows[observed & ~supported(model.xyz[rows], good)]
     if not len(alone):
         return extraction
     kept = ~np.isin(extraction.bead, alone)
@@ -340,12 +349,36 @@ def _relative_radius(view: View, model: PhantomModel) -> np.ndarray:
     return np.clip(radius, 0.2, 5.0)
 
 
-def _reasons(beads: Beads, predicted: np.ndarray) -> list[Finding | None]:
+def _usual_depth(beads: Beads) -> np.ndarray:
+    """Depths (n,) of shadows that are usual where beads lie.
+
+    Beads take the same share of the direct light, and nothing of scattered light; a hole of a
+    sheet adds a share of the light behind the sheet. So a contrast is linear in the light beside
+    it, here by iteratively reweighted least squares (weights of Cauchy).
+    """
+    good = beads.measured & (beads.light > 0)
+    usual = np.ones(len(beads.uv))
+    if np.count_nonzero(good) < MIN_CONTRASTS:
+        return usual
+    light = beads.light / float(np.median(beads.light[good]))
+    rows = np.column_stack([light, np.ones_like(light)])[good]
+    contrast = (beads.depth * light)[good]
+    line = np.array([float(np.median(beads.depth[good])), 0.0])
+    for _ in range(CONTRAST_STEPS):
+        residual = contrast - rows @ line
+        scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-3)
+        weight = 1 / np.sqrt(1 + (residual / scale) ** 2)
+        line = np.linalg.lstsq(rows * weight[:, None], contrast * weight, rcond=None)[0]
+    usual[good] = np.maximum(line[0] + line[1] / light[good], MIN_USUAL_DEPTH)
+    return usual
+
+
+def _reasons(beads: Beads, predicted: np.ndarray, usual_depth: np.ndarray) -> list[Finding | None]:
     """Why beads are not observed, None for those that are."""
     away = np.linalg.norm(beads.uv - predicted, axis=1)
     out: list[Finding | None] = []
     for number in range(len(beads.uv)):
-        depth = float(beads.depth[number])
+        depth = float(beads.depth[number] / usual_depth[number])
         off = float(away[number])
         reason: Finding | None = None
         if not beads.measured[number]:

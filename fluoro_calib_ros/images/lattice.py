@@ -4,7 +4,9 @@
 """Poses of flat grids: beads are numbered along rows and columns in the image and in the phantom.
 
 Both numberings differ by a change of the basis of the lattice and a shift. All small changes of
-the basis are tried, and the shifts by which most beads of the image fall on beads of the phantom.
+the basis are tried, with the shifts that least speaks against: beads found where the phantom has
+none, and beads of the phantom that are missing where all around them are found. So one blocked
+hole of a sheet tells where it is.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from itertools import product
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.ndimage import binary_closing, binary_erosion
 from scipy.spatial import cKDTree
 
 from .growth import Match, Seen, settle
@@ -27,6 +30,7 @@ REACH = 0.3  # of the spacing, within which a bead lies at its place in the latt
 MIN_ANGLE = np.deg2rad(35.0)  # between the steps of a lattice, also in an oblique view
 STARTS = 8  # beads from which the numbering is tried
 MIN_NUMBERED = 0.6  # share of the beads that a numbering must reach
+GAP = 2  # missing beads side by side, twice
 SHIFTS = 6  # best shifts of each basis
 SETTLED = 12  # best candidates that are refined
 MIN_OVERLAP = 0.5  # of the numbered beads that fall on beads of the phantom
@@ -141,31 +145,80 @@ def _numbered(
     return number
 
 
-def grid_matches(grid: FlatGrid, xyz: np.ndarray, seen: Seen, lens: Lens) -> Iterator[Match]:
-    """Yield matches of a flat grid with what was found in an image, the likeliest first."""
+@dataclass(frozen=True)
+class GridPose:
+    """A pose of a flat grid.
+
+    Attributes
+    ----------
+    match : Match
+    against : int
+        Beads found where the grid has none, and beads of the grid that are missing among others.
+    numbered : int
+        Beads found in rows and columns.
+    """
+
+    match: Match
+    against: int
+    numbered: int
+
+
+def grid_poses(grid: FlatGrid, xyz: np.ndarray, seen: Seen, lens: Lens) -> Iterator[GridPose]:
+    """Yield poses of a flat grid, those that least speaks against first.
+
+    Among equal ones the least tilted comes first, then the one most upright, then the one whose
+    middle is nearest to that of the image.
+    """
     found = number_lattice(seen.uv)
     if found is None:
         return
-    candidates: list[tuple[int, np.ndarray, np.ndarray]] = []
+    missing = _missing(found.index)
+    middle = found.index[np.argmin(np.linalg.norm(seen.uv[found.row] - lens.centre, axis=1))]
+    image_steps = _steps(found.index, seen.uv[found.row])
+    grid_steps = _steps(grid.lattice.index, (xyz[grid.lattice.row] - grid.centre) @ grid.axes.T)
+    in_middle = np.argmin(np.linalg.norm(xyz[grid.lattice.row] - grid.centre, axis=1))
+    target = grid.lattice.index[in_middle]
+    candidates = []
     for change in _changes():
+        view = np.linalg.pinv(grid_steps) @ np.linalg.inv(change) @ image_steps
+        long, short = np.linalg.svd(view, compute_uv=False)
+        upright = (grid.axes.T @ view)[:2].trace() / (long + short)
         turned = found.index @ change
-        for shift, overlap in _shifts(turned, grid.lattice.index):
-            if overlap >= MIN_OVERLAP * len(turned):
-                candidates.append((overlap, change, shift))
-    candidates.sort(key=lambda candidate: -candidate[0])
+        shifts = _shifts(turned, missing @ change, grid.lattice.index, target - middle @ change)
+        for shift, against in shifts:
+            key = (against, -round(short / long, 1), -round(upright, 1))
+            candidates.append((key, change, shift))
+    candidates.sort(key=lambda candidate: candidate[0])
     row_at = {tuple(place): row for place, row in zip(grid.lattice.index, grid.lattice.row)}
     settled = 0
-    for _, change, shift in candidates:
+    for (against, *_), change, shift in candidates:
         places = found.index @ change + shift
         bead = np.array([row_at.get((int(a), int(b)), -1) for a, b in places])
         known = bead >= 0
+        if np.count_nonzero(known) < MIN_OVERLAP * len(known):
+            continue
         view = _view(grid, xyz[bead[known]], seen.uv[found.row[known]], lens)
         match = None if view is None else settle(view, xyz, seen)
         if match is not None:
-            yield match
+            yield GridPose(match, against, len(known))
             settled += 1
             if settled >= SETTLED:
                 return
+
+
+def _steps(index: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Mean steps (2, k) of a lattice with places (n, 2) of points (n, k)."""
+    centred = index - index.mean(axis=0)
+    return np.linalg.lstsq(centred, points - points.mean(axis=0), rcond=None)[0]
+
+
+def _missing(index: np.ndarray) -> np.ndarray:
+    """Places (k, 2) of a lattice where nothing is found, though it is all around them."""
+    corner = index.min(axis=0) - 2 * GAP
+    there = np.pad(_raster(index - corner), ((0, 2 * GAP), (0, 2 * GAP))) > 0
+    around = binary_closing(there, np.ones((3, 3)), iterations=GAP)
+    around = binary_erosion(around, np.ones((3, 3)))
+    return np.argwhere(around & ~there) + corner
 
 
 def _changes() -> Iterator[np.ndarray]:
@@ -176,25 +229,35 @@ def _changes() -> Iterator[np.ndarray]:
             yield change
 
 
-def _shifts(image: np.ndarray, phantom: np.ndarray) -> list[tuple[np.ndarray, int]]:
-    """Shifts (2,) of places (n, 2) that fall on most places (m, 2), with the number that does."""
-    corner = image.min(axis=0)
-    other = phantom.min(axis=0)
-    there = _raster(phantom - other)
-    here = _raster(image - corner)
+def _shifts(
+    found: np.ndarray, missing: np.ndarray, grid: np.ndarray, wanted: np.ndarray
+) -> list[tuple[np.ndarray, int]]:
+    """Shifts (2,) of places found (n, 2) onto a grid (m, 2), with what speaks against each.
+
+    Those nearest to a wanted shift (2,) come first where as much speaks against several.
+    """
+    corner = found.min(axis=0)
+    other = grid.min(axis=0)
+    there = _raster(grid - other)
+    here = _raster(found - corner)
+    gone = np.zeros_like(here)
+    gone[tuple((missing - corner).T)] = 1
     shape = tuple(np.array(there.shape) + here.shape - 1)
-    product = np.fft.rfft2(there, shape) * np.fft.rfft2(here[::-1, ::-1], shape)
-    overlap = np.rint(np.fft.irfft2(product, shape)).astype(int)
-    best = np.argsort(-overlap, axis=None, kind='stable')[:SHIFTS]
-    out = []
-    for place in np.column_stack(np.unravel_index(best, overlap.shape)):
-        shift = place - (np.array(here.shape) - 1) - corner + other
-        out.append((shift, int(overlap[tuple(place)])))
-    return out
+    # A bead that is found speaks for a shift, one that is missing against it.
+    both = np.fft.rfft2((here - gone)[::-1, ::-1], shape)
+    overlap = np.rint(np.fft.irfft2(np.fft.rfft2(there, shape) * both, shape)).astype(int)
+    start = other - corner - (np.array(here.shape) - 1)
+    i, j = np.indices(overlap.shape)
+    away = np.hypot(i + start[0] - wanted[0], j + start[1] - wanted[1])
+    best = np.lexsort((away.ravel(), -overlap.ravel()))[:SHIFTS]
+    return [
+        (np.array(place) + start, len(found) - int(overlap[tuple(place)]))
+        for place in np.column_stack(np.unravel_index(best, overlap.shape))
+    ]
 
 
 def _raster(places: np.ndarray) -> np.ndarray:
-    """Return an image with 1 at places (n, 2), which begin at 0."""
+    """Return an image with 1 at places (n, 2), which are not negative."""
     image = np.zeros(places.max(axis=0) + 1)
     image[tuple(places.T)] = 1
     return image

@@ -22,7 +22,7 @@ from ..errors import DataError
 from ..findings import Kind
 from ..photogrammetry.rotations import rotation_angle
 from .growth import Match, Seen, grow, settle, start_view
-from .lattice import FlatGrid, grid_matches
+from .lattice import FlatGrid, GridPose, grid_poses
 from .pose_search import Triples, local_poses, nearby_map, triples_of
 from .view import Lens, View, fit_view
 
@@ -57,6 +57,7 @@ CLIMBS = 12  # from a match to a better one by a symmetry
 RIVAL_STEPS = 3
 MIN_SIZES = 0.1  # relative difference of diameters from which sizes tell beads apart
 SIZE_MARGIN = 10.0  # log-likelihood by which sizes must prefer a pose
+GRID_MARGIN = 10.0  # log-likelihood by which a pose of a grid must exceed another one
 SIZE_TAIL = 6.0
 CLOSER = 2.0  # factor on the residuals of one pose from which another is the better one
 SYMMETRY_SHARE = 0.4  # of the beads that a symmetry takes near to a bead
@@ -168,7 +169,10 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
             kind=Kind.FEW_BEADS,
             numbers={'beads': len(seen.uv)},
         )
-    best: Match | None = None
+    best = _grid_match(model.grid, seen, model, lens) if model.grid is not None else None
+    if best is not None:
+        _check_evidence(best)
+        return best
     agreed = 0
     for candidate in _candidates(seen, model, lens):
         candidate = _improved(candidate, seen, model)
@@ -186,6 +190,52 @@ def match(seen: Seen, model: PhantomModel, lens: Lens) -> Match:
     best = unambiguous(best, seen, model)
     _check_evidence(best)
     return best
+
+
+def _grid_match(grid: FlatGrid, seen: Seen, model: PhantomModel, lens: Lens) -> Match | None:
+    """Return the match of a flat grid, None where it is not numbered.
+
+    Raises DataError where the grid fits elsewhere as well, unless any place will do.
+    """
+    best: GridPose | None = None
+    rivals: list[Match] = []
+    for pose in grid_poses(grid, model.xyz, seen, lens):
+        if best is None:
+            if _is_evident(pose.match):
+                best = pose
+            continue
+        if model.regular or not _could_be(pose, best):
+            break
+        if pose.match.scale_px * CLOSER < best.match.scale_px:
+            best = pose
+        elif pose.match.scale_px < CLOSER * best.match.scale_px:
+            rivals.append(pose.match)
+    if best is None or not rivals:
+        return None if best is None else best.match
+    by_size = _best_by_size([best.match, *rivals], seen, model)
+    if by_size is None:
+        raise _ambiguous(best.match, rivals[0])
+    return by_size
+
+
+def _could_be(pose: GridPose, best: GridPose) -> bool:
+    """Return whether a pose of a grid is too likely for the best one to be sure.
+
+    A bead is not found, or something else found in its place, with a probability that the best
+    pose shows (with one more, for what it does not show).
+    """
+    log_odds = np.log(best.numbered / (best.against + 1))
+    return bool((pose.against - best.against) * log_odds < GRID_MARGIN)
+
+
+def _ambiguous(best: Match, other: Match) -> DataError:
+    return DataError(
+        'the pose is ambiguous: the phantom fits nearly as well in another one '
+        f'({len(other.bead)} beads instead of {len(best.bead)}); mark it by beads '
+        'that break its symmetry',
+        kind=Kind.POSE_AMBIGUOUS,
+        numbers={'beads': len(best.bead), 'beads_of_other': len(other.bead)},
+    )
 
 
 def is_sure(best: Match) -> bool:
@@ -252,13 +302,7 @@ def unambiguous(best: Match, seen: Seen, model: PhantomModel, turn_rad: float = 
         return closest
     by_size = _best_by_size([first, *equal], seen, model)
     if by_size is None:
-        raise DataError(
-            'the pose is ambiguous: the phantom fits nearly as well in another one '
-            f'({len(equal[0].bead)} beads instead of {len(first.bead)}); mark it by beads '
-            'that break its symmetry',
-            kind=Kind.POSE_AMBIGUOUS,
-            numbers={'beads': len(first.bead), 'beads_of_other': len(equal[0].bead)},
-        )
+        raise _ambiguous(first, equal[0])
     return by_size
 
 
@@ -336,8 +380,6 @@ def _same(one: Match, other: Match) -> bool:
 
 def _candidates(seen: Seen, model: PhantomModel, lens: Lens) -> Iterator[Match]:
     """Yield matches of poses, the likeliest first."""
-    if model.grid is not None:
-        yield from grid_matches(model.grid, model.xyz, seen, lens)
     beads = nearby_map(seen.uv, lens.image_size, seen.tolerance_px)
     beads[~seen.field] = 2
     order = seeds_of(seen)

@@ -165,6 +165,8 @@ class _BeadFit(ShadowFit):
             moved = [self._step(rows, near, final=step == steps - 1) for rows, near in self.groups]
             if step == steps // 2:
                 self.disturbed = self.misfit > DISTURBED * self.typical()
+                if steps >= STEPS:
+                    self._add_texture(self.misfit > self.typical())
             for (rows, _), (uv, depth, background) in zip(self.groups, moved):
                 lost = np.linalg.norm(uv - self.start[rows], axis=1) > MAX_SHIFT_PX
                 self.usable[rows[lost]] = False

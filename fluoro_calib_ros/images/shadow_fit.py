@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from .light import Noise
 from .shadow_profile import Profile
+from .texture import Cosines
 
 MARGIN_PX = 2.0  # of background around the shadow
 TERMS = 6  # of the background: a polynomial of degree 2
@@ -50,6 +52,8 @@ class Beads:
         Standard deviation of a coordinate [px].
     depth : (n,) ndarray
         Of the shadow, 1 for the profile.
+    light : (n,) ndarray
+        Grey values in the middle without the beads.
     misfit : (n,) ndarray
         Mean squared residual over the noise, 1 where the model is right.
     overlapped : (n,) ndarray of bool
@@ -61,6 +65,7 @@ class Beads:
     uv: NDArray[np.float64]
     sigma: NDArray[np.float64]
     depth: NDArray[np.float64]
+    light: NDArray[np.float64]
     misfit: NDArray[np.float64]
     overlapped: NDArray[np.bool_]
     measured: NDArray[np.bool_]
@@ -206,6 +211,7 @@ class ShadowFit(ABC):
         self.low = -np.inf  # at which grey values are clipped
         self.high = np.inf
         self.crossing: np.ndarray | None = None
+        self.strength = np.zeros(n)  # of the background beyond the polynomial
         self.groups: list[Group] = []
 
     def _set_windows(self, grey: np.ndarray, valid: np.ndarray, bright: np.ndarray) -> None:
@@ -294,8 +300,8 @@ class ShadowFit(ABC):
         valid = self.valid[rows] & ~self._says_nothing(grey, light)
         weight = valid / self.noise.variance(light)
         squared = residual * residual * weight
-        self.misfit[rows] = squared.sum(axis=1) / np.maximum(valid.sum(axis=1) - OWN, 1)
-        disturbed = self._disturbed(rows, near, final)
+        total = squared.sum(axis=1)
+        disturbed = self._disturbed(rows, near, final) & (self.strength[rows] == 0)
         if disturbed.any():
             usual = self.typical() if self.settings.robust_relative else 1.0
             weight = weight / (1 + disturbed[:, None] * squared / (ROBUST**2 * usual))
@@ -307,7 +313,41 @@ class ShadowFit(ABC):
         right = (weighted @ residual.astype(dtype)[..., None])[..., 0].astype(float)
         expected = self.expected_depth[rows]
         right[:, TERMS + 2] -= prior[:, TERMS + 2] * (self.depth[rows] - expected)
+        textured = np.flatnonzero(self.strength[rows])
+        if len(textured):
+            taken = self.cosines.eliminated(
+                self.strength[rows[textured]],
+                relative=jacobian[textured, 0],
+                jacobian=jacobian[textured],
+                weight=weight[textured],
+                residual=residual[textured],
+            )
+            normal[textured] -= taken[0]
+            right[textured] -= taken[1]
+            total[textured] -= taken[2]
+        self.misfit[rows] = total / np.maximum(valid.sum(axis=1) - OWN, 1)
         return NormalEquations(normal, right, weighted)
+
+    def _add_texture(self, chosen: NDArray[np.bool_]) -> None:
+        """Give some beads (n,) a background beyond the polynomial, as strong as pixels say."""
+        for rows, near in self.groups:
+            rows, near = rows[chosen[rows]], near[chosen[rows]]
+            if not len(rows):
+                continue
+            light, jacobian = self._model(rows, near)
+            grey = self.grey[rows]
+            valid = self.valid[rows] & ~self._says_nothing(grey, light)
+            self.strength[rows] = self.cosines.strengths(
+                jacobian[:, 0],
+                jacobian=jacobian,
+                weight=valid / (self.noise.variance(light) * self.typical()),
+                residual=grey - light,
+            )
+
+    @cached_property
+    def cosines(self) -> Cosines:
+        """Background of a window beyond the polynomial."""
+        return Cosines(self.offset, self.settings.dtype)
 
     def _says_nothing(self, grey: np.ndarray, light: np.ndarray) -> NDArray[np.bool_]:
         """Return (g, m) where a clipped grey value agrees with the light that is expected."""
@@ -333,7 +373,7 @@ class ShadowFit(ABC):
         pooled_freedom = self.settings.pooled
         # The noise of one window is known to some 10 %; that of all windows helps.
         pooled = (self.misfit * pixels + typical * pooled_freedom) / (pixels + pooled_freedom)
-        factor = np.sqrt(np.maximum(pooled, typical) * inflation)
+        factor = np.sqrt(np.maximum(pooled, typical) * np.where(self.strength > 0, 1.0, inflation))
         # Where shadows cross, their model is less right than its noise says.
         touching = self.distance < 2 * self.profile.radius_px
         factor = np.where(touching, self.settings.crossed * factor, factor)
@@ -341,6 +381,7 @@ class ShadowFit(ABC):
             self.uv.copy(),
             self.sigma * factor,
             depth=self.depth.copy(),
+            light=self.background[:, 0].copy(),
             misfit=self.misfit / max(typical, 1e-12),
             overlapped=self.distance < 2 * self.profile.reach_px * OVERLAP,
             measured=measured,

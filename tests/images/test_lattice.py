@@ -75,6 +75,41 @@ def test_a_regular_grid_is_ambiguous_unless_any_place_will_do():
     assert np.allclose(np.linalg.norm(xyz[pairs[:, 0]] - xyz[pairs[:, 1]], axis=1), 10.0)
 
 
+@pytest.mark.parametrize('steps', [SQUARE, HEXAGONAL])
+@pytest.mark.parametrize('blocked', [1, 2, 5])
+def test_blocked_holes_tell_where_a_sheet_is(steps, blocked):
+    every = grid(steps)
+    # The first mark lies on no axis of symmetry: from behind, the sheet looks otherwise.
+    order = np.argsort(np.linalg.norm(every - (21.0, 9.0, 0.0), axis=1))
+    xyz = np.delete(every, order[:blocked], axis=0)
+    true = pixels(xyz, (0.1, -0.05, 2.0))
+    seen = seen_of(true)
+    found = match(seen, PhantomModel.of(xyz), LENS)
+    away = np.linalg.norm(seen.uv[found.detection] - true[found.bead], axis=1)
+    assert len(found.bead) > 0.97 * len(seen.uv)
+    assert away.max() < 1
+
+
+def test_a_mark_outside_of_the_image_does_not_tell_where_a_sheet_is():
+    xyz = grid(SQUARE, 27)
+    xyz = np.delete(xyz, 1, axis=0)
+    with refused(Kind.POSE_AMBIGUOUS):
+        match(seen_of(pixels(xyz, (0.2, 0.1, 0.5))), PhantomModel.of(xyz), LENS)
+
+
+def test_a_sheet_without_mark_is_indexed_from_the_middle():
+    xyz = grid(HEXAGONAL, 41)
+    seen = seen_of(pixels(xyz, (0.1, 0.05, 0.2)))
+    found = match(seen, PhantomModel.of(xyz, regular=True), LENS)
+    centre = found.bead[np.argmin(np.linalg.norm(xyz[found.bead], axis=1))]
+    at = seen.uv[found.detection[found.bead == centre]][0]
+    spacing = float(np.median(seen.tree.query(seen.uv, k=[2])[0]))
+    assert np.linalg.norm(xyz[centre]) == 0
+    assert np.linalg.norm(at - LENS.centre) < 0.7 * spacing
+    # Upright: what is to the right in the sheet is so in the image.
+    assert np.corrcoef(xyz[found.bead, 0], seen.uv[found.detection, 0])[0, 1] > 0.8
+
+
 def test_a_phantom_in_space_is_no_regular_grid():
     xyz = np.random.default_rng(2).uniform(-50, 50, (60, 3))
     with pytest.raises(DataError, match='no flat grid'):

@@ -20,7 +20,8 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from .access import PathLike
-from .text_files import read_json, to_json_values
+from .documents import read_json
+from .text_files import to_json_values
 
 RESULT_NAME = 'result.json'
 DIGEST = 'digest'

@@ -36,7 +36,20 @@ BYTES_OF_CALIBRATION = 2 * MEGABYTE  # in a message, at most, without training p
 BYTES_OF_IMAGE = MEGABYTE  # in a message, at most, without pixels
 MAX_JOINTS = 1000  # of a joints.toml
 # Texts [characters].
-MAX_TEXT = 4096  # of a parameter
+MAX_TEXT = 4096  # of a parameter, or in a request
+# Documents of other programs and people, by format: what a parser is given at once.
+DOCUMENT_BYTES = {
+    'TOML': MEGABYTE // 4,  # rig.toml, Anipose: some kB
+    'YAML': 2 * MEGABYTE,  # metadata.yaml of a bag with hundreds of topics: 0.5 MB
+    'JSON': 32 * MEGABYTE,  # result.json with 100,000 targets: 15 MB
+    'XML': 8 * MEGABYTE,  # projects of XMALab: below 1 MB
+}
+MAX_DEPTH = 100  # of what is nested in a document
+# Tables of text: a row takes up to 0.3 kB and 2.5 us, one of our own CSV files 0.05 kB and 1 us.
+MAX_ROWS = 2_000_000  # of other programs: a frame each, of two hours at 250 Hz
+MAX_ROWS_CSV = 20_000_000
+MAX_FRAMES = 2_000_000  # of a file of image points: 1 kB and 40 us each
+MAX_MEMBER = 64 * MEGABYTE  # of a text in an archive, unpacked
 
 
 @dataclass(frozen=True)

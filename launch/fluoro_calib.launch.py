@@ -13,7 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import yaml
-from ament_index_python.packages import get_package_share_directory
+from ament_index_python.packages import (
+    PackageNotFoundError,
+    get_package_prefix,
+    get_package_share_directory,
+)
 from launch import LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, Shutdown
 from launch_ros.actions import Node, SetParameter
@@ -23,6 +27,10 @@ from fluoro_calib_ros.io.rig_file import read_rig_file
 
 PACKAGE = 'fluoro_calib_ros'
 SWITCH = ['true', 'false']
+CLOCK_HZ = 100.0  # of the /clock that the player publishes
+# Arguments that are numbers, and those that are texts also where they read like a number.
+NUMBERS = ('rate', 'bag_rate', 'principal_distance', 'angle_max_age')
+TEXTS = ('phantom', 'calibration_directory', 'rig_frame', 'angle_joint', 'bag', 'record')
 
 
 @dataclass(frozen=True)
@@ -77,8 +85,18 @@ SWITCHES = (
     ),
     Argument('images', 'false', 'true: correct images, too', SWITCH),
     Argument('simulate', 'false', 'true: with the virtual rig', SWITCH),
-    Argument('rviz', 'false', 'true: show points and optical frames in RViz', SWITCH),
-    Argument('use_sim_time', 'false', 'true: take the time from /clock', SWITCH),
+    Argument(
+        'rviz',
+        'false',
+        'true: show points and optical frames in RViz; auto: where rviz2 is installed',
+        [*SWITCH, 'auto'],
+    ),
+    Argument(
+        'use_sim_time',
+        'false',
+        'true: take the time from /clock, which the player of a bag publishes',
+        SWITCH,
+    ),
     Argument('respawn', 'false', 'true: restart a node that has failed', SWITCH),
 )
 OTHERS = (
@@ -146,31 +164,56 @@ def with_rig(values):
     return {**values, **{name: text for name, text in found.items() if not values[name]}}
 
 
+def parameter_of(name, text):
+    """Return the parameter of a launch argument. Raises RuntimeError that names the argument."""
+    if name in TEXTS:
+        return text
+    expected = 'a number' if name in NUMBERS else 'YAML'
+    try:
+        return float(text) if name in NUMBERS else yaml.safe_load(text)
+    except (ValueError, yaml.YAMLError):
+        raise RuntimeError(f'{name}:={text} is not {expected}') from None
+
+
+def with_rviz(values):
+    """Return whether to start RViz. Raises RuntimeError where it is missing."""
+    if values['rviz'] == 'false':
+        return False
+    try:
+        get_package_prefix('rviz2')
+    except PackageNotFoundError:
+        if values['rviz'] == 'auto':
+            return False
+        raise RuntimeError(
+            'rviz:=true, but rviz2 is not installed: install the package rviz2, or start with '
+            'rviz:=false'
+        ) from None
+    return True
+
+
 def nodes_of_rig(context):
-    """Return the nodes with their parameters."""
+    """Return the nodes with their parameters.
+
+    Raises RuntimeError, before any node is started, for an argument that is wrong.
+    """
     values = {
         argument.name: context.launch_configurations[argument.name]
         for argument in (*PARAMETERS, *SWITCHES, *OTHERS)
     }
     values = with_rig(values)
+    shows = with_rviz(values)
     share = get_package_share_directory(PACKAGE)
     params_file = values['params_file'] or os.path.join(share, 'config', 'fluoro_calib.yaml')
+    if not os.path.isfile(params_file):
+        raise RuntimeError(f'params_file:={params_file}: there is no such file')
 
-    def node(executable, parameters, needed=False):
-        given = {name: yaml.safe_load(text) for name, text in parameters.items() if text}
-        for name in (
-            'phantom',
-            'calibration_directory',
-            'rig_frame',
-            'angle_joint',
-            'bag',
-            'folder',
-        ):
-            if name in given:
-                given[name] = parameters[name]  # also where it reads like a number
-        for name in ('rate', 'principal_distance', 'angle_max_age'):
-            if name in given:
-                given[name] = float(given[name])
+    def node(executable, parameters, fixed=None, needed=False):
+        given = {
+            parameter: parameter_of(argument, values[argument])
+            for parameter, argument in parameters.items()
+            if values[argument]
+        }
+        given.update(fixed or {})
         return Node(
             package=PACKAGE,
             executable=executable,
@@ -186,7 +229,7 @@ def nodes_of_rig(context):
         )
 
     def configured(executable, needed=False):
-        return node(executable, {name: values[name] for name in OF_NODE[executable]}, needed)
+        return node(executable, {name: name for name in OF_NODE[executable]}, needed=needed)
 
     actions = [SetParameter('use_sim_time', values['use_sim_time'] == 'true')]
     if values['calibration'] == 'true':
@@ -196,7 +239,7 @@ def nodes_of_rig(context):
     actions += [configured('correction_node'), configured('reconstruction_node')]
     if values['images'] == 'true':
         actions.append(configured('image_node'))
-    if values['rviz'] == 'true':
+    if shows:
         display = os.path.join(share, 'config', 'rig.rviz')
         actions.append(
             Node(
@@ -207,22 +250,18 @@ def nodes_of_rig(context):
             )
         )
     if values['record']:
-        recorded = {
-            'folder': values['record'],
-            'topics': values['record_topics'],
-            'angle_joint': values['angle_joint'],
-        }
+        recorded = {'folder': 'record', 'topics': 'record_topics', 'angle_joint': 'angle_joint'}
         actions.append(node('recorder_node', recorded))
     if values['bag']:
-        bag = {'bag': values['bag'], 'topics': values['bag_topics'], 'rate': values['bag_rate']}
+        played = {'bag': 'bag', 'topics': 'bag_topics', 'rate': 'bag_rate'}
         # Readers of target observations: the correction node, and those that are started with it.
         readers = 1 + (values['calibration'] == 'true') + bool(values['record'])
-        actions.append(node('player_node', {**bag, 'wait_for_readers': str(readers)}))
+        clock = CLOCK_HZ if values['use_sim_time'] == 'true' else 0.0
+        actions.append(node('player_node', played, {'wait_for_readers': readers, 'clock': clock}))
     if values['simulate'] == 'true':
-        simulated = {name: values[name] for name in ('fluoroscopes', 'scene', 'rate')}
-        if values['from_images'] == 'true':
-            simulated['images'] = 'clean'
-        actions.append(node('simulator_node', simulated))
+        simulated = {name: name for name in ('fluoroscopes', 'scene', 'rate')}
+        images = {'images': 'clean'} if values['from_images'] == 'true' else {}
+        actions.append(node('simulator_node', simulated, images))
     return actions
 
 

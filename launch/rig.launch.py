@@ -6,7 +6,7 @@
 ros2 launch fluoro_calib_ros rig.launch.py phantom:=/path/to/phantom.csv record:=/path/to/new_bag
 ros2 launch fluoro_calib_ros rig.launch.py --show-args
 
-All arguments of fluoro_calib.launch.py are passed on; rviz defaults to true.
+All arguments of fluoro_calib.launch.py are passed on. RViz is started where it is installed.
 """
 
 import os
@@ -30,9 +30,9 @@ def generate_launch_description():
             ),
             DeclareLaunchArgument(
                 'rviz',
-                default_value='true',
-                choices=['true', 'false'],
-                description='false: without RViz',
+                default_value='auto',
+                choices=['true', 'false', 'auto'],
+                description='false: without RViz; auto: where rviz2 is installed',
             ),
             IncludeLaunchDescription(
                 nodes,

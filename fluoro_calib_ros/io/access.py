@@ -80,6 +80,13 @@ def read_text(path: PathLike) -> str:
         ) from None
 
 
+def check_rows(text: str, most: int, where: object) -> None:
+    """Raise DataError for a text of more rows than that; where begins its message."""
+    rows = text.count('\n')
+    if rows > most:
+        raise DataError(f'{where}: {rows} rows, more than {most} are not read')
+
+
 def check_safe_name(name: str, where: object) -> None:
     """Raise DataError unless the name of a fluoroscope can be part of a file name.
 

@@ -19,11 +19,12 @@ from ..exposures.frame import Frame, validate_frame
 from ..exposures.phantom import Phantom
 from .access import PathLike
 from .csv_table import read_names, write_names
+from .documents import read_json
 from .known_orientation import read_known_orientations, write_known_orientations
 from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
 from .result_document import delete_validation
-from .text_files import read_json, write_json
+from .text_files import write_json
 
 OBSERVATIONS = 'observations.csv'
 PHANTOM = 'phantom.csv'

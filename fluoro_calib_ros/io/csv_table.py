@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 
 from ..errors import DataError
 from ..exposures.names import MAX_ID, Names, number_names
-from .access import PathLike, check_safe_name, os_error_reason, read_text
+from ..limits import MAX_ROWS_CSV
+from .access import PathLike, check_rows, check_safe_name, os_error_reason, read_text
 from .atomic import atomic_file
 
 BLOCK = 10_000  # rows converted at a time, to bound the memory
@@ -108,6 +109,7 @@ def read_blocks(path: PathLike, required: Sequence[str]) -> Iterator[Block]:
     and for a row with too few or too many cells.
     """
     text = read_text(path)
+    check_rows(text, MAX_ROWS_CSV, path)
     lines: Iterable[str] = io.StringIO(text, newline='')
     if '#' in text:  # a comment becomes a blank line, so that the numbers of the rows remain
         lines = ('\n' if line.lstrip().startswith('#') else line for line in lines)
@@ -154,12 +156,28 @@ class _RowReader:
     def read_header(self, required: Sequence[str]) -> list[str]:
         """Return the column names in the first row that is not blank. Raises DataError."""
         while not self.ended:
-            rows, lines = self.read(1)
-            if rows:
-                header = [name.strip() for name in rows[0]]
-                _check_header(f'{self._path}, row {lines[0]}', header, required)
+            before = self._reader.line_num
+            row = self._next()
+            if not _is_blank(row):
+                header = [name.strip() for name in row]
+                _check_header(f'{self._path}, row {before + 1}', header, required)
                 return header
         raise DataError(f'{self._path}: the file has no header, {",".join(required)} is expected')
+
+    def _next(self) -> list[str]:
+        """Return the next row, an empty one at the end. Raises DataError."""
+        try:
+            return next(self._reader)
+        except StopIteration:
+            self.ended = True
+            return []
+        except csv.Error as error:
+            self._fail(error)
+
+    def _fail(self, error: csv.Error) -> NoReturn:
+        raise DataError(
+            f'{self._path}, row {self._reader.line_num}: this is not CSV ({error})'
+        ) from None
 
     def read(self, count: int) -> tuple[list[list[str]], np.ndarray]:
         """Return those of the next `count` rows that are not blank, and their numbers."""
@@ -167,9 +185,7 @@ class _RowReader:
         try:
             rows = list(islice(self._reader, count))
         except csv.Error as error:
-            raise DataError(
-                f'{self._path}, row {self._reader.line_num}: this is not CSV ({error})'
-            ) from None
+            self._fail(error)
         self.ended = len(rows) < count
         lines = before + 1 + np.arange(len(rows))
         if self._reader.line_num - before > len(rows):  # some cells contain line ends

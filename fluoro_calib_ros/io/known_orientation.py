@@ -16,7 +16,7 @@ from ..errors import DataError
 from ..photogrammetry.known_orientation import KnownOrientation
 from .access import PathLike, read_text
 from .atomic import write_text
-from .text_files import parse_yaml
+from .documents import read_yaml
 
 VERSION = 1
 KEYS = ('K', 'R', 't_mm', 'interior_sd_px', 'exterior_sd')
@@ -34,10 +34,7 @@ def read_known_orientations(path: PathLike) -> dict[str, KnownOrientation]:
 
     Raises DataError with path and fluoroscope for a file that cannot be read or is wrong.
     """
-    try:
-        document = parse_yaml(read_text(path))
-    except yaml.YAMLError:
-        raise DataError(f'{path}: this is not a YAML file') from None
+    document = read_yaml(path)
     if not isinstance(document, Mapping) or not isinstance(document.get('fluoroscopes'), Mapping):
         raise DataError(f'{path}: there is no entry "fluoroscopes" with names and K, R, t_mm')
     version = document.get('format_version', VERSION)
@@ -66,7 +63,7 @@ def _orientation(entry: Any, where: str) -> KnownOrientation:
         return KnownOrientation.from_matrices(
             k, r, t, entry.get('interior_sd_px'), entry.get('exterior_sd')
         )
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         # DataError is a ValueError.
         sentence = error if isinstance(error, DataError) else 'a value is not a number'
         raise DataError(f'{where}: {sentence}') from None

@@ -26,6 +26,7 @@ from ..exposures.columns import first_repeated, is_positive
 from ..exposures.frame import MAX_ANGLE, Frame, angle_in_degrees, angles_of, points_on_image
 from ..exposures.names import Names, safe_names, without_trivial
 from ..exposures.strays import few
+from ..limits import MAX_FRAMES
 from .access import PathLike, check_safe_name
 from .atomic import atomic_file
 from .csv_table import Block, NamedColumn, format_float, read_blocks, write_rows
@@ -151,7 +152,9 @@ def _read(
     )
     names = columns.fluoroscopes()
     frames: dict[str, list[Frame]] = {name: [] for name in sorted(names)}
-    for of_frame in _by_frame(rows, names):
+    for number, of_frame in enumerate(_by_frame(rows, names)):
+        if number == MAX_FRAMES:
+            raise DataError(f'{path}: more than {MAX_FRAMES} frames are not read')
         name = names[of_frame.code[0]]
         frames[name].append(_frame(path, name, of_frame, image_size))
     return {name: of_one for name, of_one in frames.items() if of_one}, stray

@@ -21,7 +21,8 @@ from ..errors import DataError
 from ..exposures.frame import Frame
 from ..findings import Finding, Kind, Place, Severity
 from .access import PathLike
-from .text_files import read_json, to_json_values
+from .documents import read_json
+from .text_files import to_json_values
 
 Frames = Mapping[str, Sequence[Frame]]
 

@@ -15,18 +15,12 @@ All keys are optional; paths are relative to the folder of the file.
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from ..errors import DataError
-from .access import read_text
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
+from .documents import read_toml
 
 NAME = 'rig.toml'
 KEYS = (
@@ -68,10 +62,7 @@ class RigFile:
 
 def read_rig_file(path: Path) -> RigFile:
     """Read a rig.toml. Raises DataError that names file and key."""
-    try:
-        document = tomllib.loads(read_text(path))
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise DataError(f'{path}: this is no TOML ({error})') from None
+    document = read_toml(path)
     for key in document:
         if key not in KEYS:
             raise DataError(f'{path}, key {key}: unknown, there are {", ".join(KEYS)}')

@@ -25,6 +25,7 @@ from ..io.calibration import SUFFIX, load_calibrations
 from ..io.calibration_request import OBSERVATIONS
 from ..io.calibration_request import PHANTOM as PHANTOM_FILE
 from ..io.csv_table import read_names
+from ..io.documents import read_json
 from ..io.formats import registry
 from ..io.formats.content import (
     PARTS,
@@ -40,7 +41,6 @@ from ..io.observations import read_observations_csv
 from ..io.phantom import read_phantom
 from ..io.result_check import RESULT_NAME as RESULT
 from ..io.rig_orientation import load_orientation, orientation_path
-from ..io.text_files import read_json
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_quaternion
 from .result_folder import belongs_to

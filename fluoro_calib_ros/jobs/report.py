@@ -22,10 +22,10 @@ from ..io.atomic import write_text
 from ..io.calibration import load_calibrations
 from ..io.calibration_request import OPTIONS, read_request
 from ..io.csv_table import read_names
+from ..io.documents import read_json
 from ..io.result_check import RESULT_NAME as RESULT
 from ..io.result_check import edited, exchanged
 from ..io.result_document import VALIDATION_NAME as VALIDATION
-from ..io.text_files import read_json
 from ..report.html import ReportInput, report_html
 from .conversion import stations_of
 from .result_folder import REPORT, belongs_to, saved_orientation, saved_rig_note

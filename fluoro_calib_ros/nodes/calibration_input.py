@@ -26,6 +26,8 @@ from .runtime.streams import DECODING_ERRORS, latched_qos, publisher_conflict
 # Calls of release() after which an undisputed calibration is used, in case a second node that is
 # seen has died.
 HOLD_TICKS = 3
+# Held while a calibration is prepared: one at a time, also of inputs that were closed meanwhile.
+_PREPARING = threading.Lock()
 
 
 class CalibrationInput:
@@ -42,7 +44,8 @@ class CalibrationInput:
     names : iterable of str
         Fluoroscopes.
     prepare : callable
-        Called with a calibration in the thread; returns what current() returns from then on.
+        Called with a calibration in the thread; returns what current() returns from then on. It
+        does not need the node, which may be destroyed meanwhile.
     on_ready : callable
         Called with name and prepared calibration in the thread, once it is in use.
     on_refused : callable
@@ -67,7 +70,8 @@ class CalibrationInput:
         self._threads: dict[str, threading.Thread] = {}
         self._held: dict[str, dict[str, FluoroscopeCalibration]] = {name: {} for name in names}
         self._patience = dict.fromkeys(names, 0)
-        self._lock = threading.Lock()  # of _next and _threads
+        self._lock = threading.Lock()  # of _next, _threads, _closed and the use of the node
+        self._closed = False
         self._subscriptions = [
             node.create_subscription(
                 FluoroscopeCalibration,
@@ -84,15 +88,13 @@ class CalibrationInput:
         return self._current[name]
 
     def close(self) -> None:
-        """Unsubscribe, and wait for the calibrations in preparation: they need the node."""
+        """Unsubscribe; a calibration in preparation, which may take long, is not used any more."""
         for subscription in self._subscriptions:
             self._node.destroy_subscription(subscription)
         self._subscriptions = []
         with self._lock:
+            self._closed = True
             self._next.clear()
-            running = list(self._threads.values())
-        for thread in running:
-            thread.join()
 
     def begin_with(
         self, name: str, calibration: calibration_result.FluoroscopeCalibration
@@ -166,12 +168,13 @@ class CalibrationInput:
 
     def _work(self, name: str) -> None:
         while True:
-            with self._lock:
-                message = self._next.pop(name, None)
-                if message is None:
-                    self._threads.pop(name, None)
-                    return
-            self._use(name, message)
+            with _PREPARING:
+                with self._lock:
+                    message = self._next.pop(name, None)
+                    if message is None:
+                        self._threads.pop(name, None)
+                        return
+                self._use(name, message)
 
     def _use(self, name: str, message: FluoroscopeCalibration) -> None:
         try:
@@ -181,9 +184,16 @@ class CalibrationInput:
                     f'the calibration on topic {name}/calibration is of fluoroscope '
                     f'{calibration.fluoroscope}'
                 )
+            self._node.get_logger().info(
+                f'fluoroscope {name}: calibration {calibration.calibration_id} is being prepared'
+            )
             prepared = self._prepare(calibration)
         except Exception as error:  # a message may hold anything, and the stream has to go on
-            self._refuse(name, one_line(error))
+            with self._lock:
+                if not self._closed:
+                    self._refuse(name, one_line(error))
             return
-        self._current[name] = prepared
-        self._on_ready(name, prepared)
+        with self._lock:
+            if not self._closed:
+                self._current[name] = prepared
+                self._on_ready(name, prepared)

@@ -12,8 +12,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import rclpy
-from rclpy.clock import Clock as NodeClock
-from rclpy.clock import ClockType
 from rclpy.exceptions import NameValidationException
 from rclpy.publisher import Publisher
 from rclpy.time import Time
@@ -142,9 +140,7 @@ class PlayerNode(ParameterNode):
                 now_ns = self._start_ns + round(self._pace.position_s * 1e9)
                 output.publish(Clock(clock=Time(nanoseconds=now_ns).to_msg()))
 
-        # Steady, because the node's own clock may be the one that is published.
-        steady = NodeClock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(1 / self._settings.clock, publish, clock=steady)
+        self.create_timer(1 / self._settings.clock, publish)
 
     def _create_outputs(self, bag: str) -> dict[str, Publisher]:
         """Return the publishers of the topics to play. Raises StartError."""

@@ -89,6 +89,8 @@ CONDITIONS = (failed_recording, dropped_messages, running)
 class RecorderNode(ParameterNode):
     """Records the messages of topics as they are, from their first publisher on."""
 
+    end_s = 60.0  # to write what was received, see runtime.main
+
     def __init__(self) -> None:
         super().__init__('recorder_node')
         self._settings = _NODE.declare(self)

@@ -495,7 +495,7 @@ def test_sources_that_are_not_bags(tmp_path):
     (tmp_path / 'x.mcap').write_bytes(b'hello, this is a text and no bag')
     assert 'not an MCAP file' in said(tmp_path / 'x.mcap')
     (tmp_path / 'metadata.yaml').write_text('a: [')
-    assert 'not the metadata of a bag' in message_of(read_frames, tmp_path)
+    assert 'metadata.yaml, row 2: this is not YAML' in message_of(read_frames, tmp_path)
 
 
 @pytest.mark.parametrize(

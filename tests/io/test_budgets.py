@@ -20,8 +20,8 @@ from fluoro_calib_ros.io import access
 from fluoro_calib_ros.io.bags import reader as reader_module
 from fluoro_calib_ros.io.bags.reader import iterate_messages, read_frames
 from fluoro_calib_ros.io.calibration import load_calibration, save_calibration
+from fluoro_calib_ros.io.documents import parse_yaml
 from fluoro_calib_ros.io.known_orientation import read_known_orientations
-from fluoro_calib_ros.io.text_files import parse_yaml
 from fluoro_calib_ros.jobs.simulation import write_bag
 from fluoro_calib_ros.simulation.exposures import simulate_exposures
 
@@ -66,10 +66,10 @@ def test_arrays_that_would_be_giant_are_not_decompressed(tmp_path):
 def test_yaml_aliases_are_refused(tmp_path):
     lines = ['a0: &a0 [x, x]'] + [f'a{n}: &a{n} [*a{n - 1}, *a{n - 1}]' for n in range(1, 30)]
     (tmp_path / 'rig.yaml').write_text('\n'.join(lines))
-    assert 'not a YAML file' in refused(read_known_orientations, tmp_path / 'rig.yaml')
+    assert 'aliases are not allowed' in refused(read_known_orientations, tmp_path / 'rig.yaml')
     (tmp_path / 'rig.yaml').write_text('[' * 100_000)
-    assert 'not a YAML file' in refused(read_known_orientations, tmp_path / 'rig.yaml')
-    assert parse_yaml('a: [1, 2]') == {'a': [1, 2]}
+    assert 'nested too deeply' in refused(read_known_orientations, tmp_path / 'rig.yaml')
+    assert parse_yaml('a: [1, 2]', 'x') == {'a': [1, 2]}
 
 
 def test_chunk_that_would_be_giant_is_not_decompressed(tmp_path, monkeypatch):

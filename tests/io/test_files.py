@@ -28,6 +28,7 @@ from fluoro_calib_ros.io.calibration import (
     load_calibrations,
     save_calibration,
 )
+from fluoro_calib_ros.io.documents import read_json
 from fluoro_calib_ros.io.observations import (
     correct_points,
     read_observations_csv,
@@ -37,7 +38,7 @@ from fluoro_calib_ros.io.observations import (
 )
 from fluoro_calib_ros.io.phantom import read_phantom, write_phantom
 from fluoro_calib_ros.io.rig_orientation import load_orientation, save_orientation
-from fluoro_calib_ros.io.text_files import read_json, write_json
+from fluoro_calib_ros.io.text_files import write_json
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 
 SIZE = (1024, 960)

@@ -56,7 +56,7 @@ def test_what_is_written_is_read_again(tmp_path):
 
 
 WRONG = {
-    'no YAML': ('{', 'this is not a YAML file'),
+    'no YAML': ('{', 'row 2: this is not YAML'),
     'no entry': ('a: 1', 'there is no entry "fluoroscopes"'),
     'newer layout': ('format_version: 9' + FILE, 'layout version 9'),
     'unknown key': (FILE + '    c: 3\n', "'c' is unknown, an entry has K, R, t_mm"),

@@ -165,7 +165,10 @@ def test_markers_of_a_trial_are_read(tmp_path):
     [
         ({'project.xml': None}, 'the project does not contain project.xml'),
         ({'project.xml': '<Project>'}, 'project.xml, row 1: this is not XML'),
-        ({'project.xml': '<!DOCTYPE a><Project/>'}, 'a project has no document type'),
+        (
+            {'project.xml': '<!DOCTYPE a><Project/>'},
+            'a document type, entities and CDATA are not read',
+        ),
         (
             {'cam 1/data/i_PointsDetected.csv': '1,2\n'},
             '1 points and 5 inliers, but the calibration object has 5 beads',

@@ -121,15 +121,20 @@ def test_a_group_becomes_an_options_object(make_node):
     assert GROUP.declare(make_node()) == Options()
     values = GROUP.declare(make_node(length=2.5, count=3, kind='b', names=['y', 'z']))
     assert values == Options(2.5, 3, 'b', ('y', 'z'))
+    length = GROUP.declare(make_node(length=2)).length_m  # an integer
+    assert length == 2.0 and isinstance(length, float)
     assert list(parameters_of([GROUP])) == ['length', 'count', 'kind', 'names']
 
 
 @pytest.mark.parametrize(
     'values, sentence',
     [
-        ({'length': 11.0}, 'parameter length: '),
-        ({'length': 1}, 'parameter length: '),  # an integer, not 1.0
-        ({'count': 0}, 'parameter count: '),
+        ({'length': 11.0}, 'parameter length is between 0 and 10, not 11'),
+        ({'length': 11}, 'parameter length is between 0 and 10, not 11'),
+        ({'length': 'abc'}, "parameter length is a number, not 'abc'"),
+        ({'count': 0}, 'parameter count is 1 at least, not 0'),
+        ({'count': 1.5}, 'parameter count is a whole number, not 1.5'),
+        ({'names': 'x'}, r"parameter names is a list of texts, such as \[a, b\], not 'x'"),
         ({'count': 13}, 'parameter count: 13 brings bad luck'),
         ({'kind': 'c'}, "parameter kind is one of a, b, not 'c'"),
     ],
@@ -192,13 +197,15 @@ def test_settable_parameters_are_used_at_once(settings):
         [Parameter('length', value=3.0), Parameter('count', value=7)]
     )
     assert done.successful and settings.used[-1] == Options(length_m=3.0, count=7)
+    done = settings.set_parameters_atomically([Parameter('length', value=4)])  # an integer
+    assert done.successful and settings.used[-1].length_m == 4.0
 
 
 @pytest.mark.parametrize(
     'name, value, sentence',
     [
         ('length', 11.0, 'length'),
-        ('length', 1, 'type'),  # an integer, not 1.0
+        ('length', 'x', 'type'),
         ('count', 13, 'parameter count: 13 brings bad luck'),
         ('count', None, 'cannot be'),  # undeclared
         (

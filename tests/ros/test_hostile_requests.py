@@ -3,6 +3,9 @@
 
 """Requests of any peer that a node cannot handle: it refuses them, and goes on."""
 
+from functools import partial
+from pathlib import Path
+
 import pytest
 from fluoro_calib_msgs.srv import LoadCalibration, SaveCalibration
 from lifecycle_msgs.msg import State, Transition
@@ -41,11 +44,13 @@ def client(module_graph, tmp_path_factory):
     )
     for kind, service in FOLDERS.items():
         client.expect(kind, service)
+    client.logs = {}
     client.folder = tmp_path_factory.mktemp('rig') / 'calibrations'
     for node, parameters in {**MANAGED, **OTHERS}.items():
         if node == 'calibration_node':
             parameters = {**parameters, 'calibration_directory': str(client.folder)}
-        module_graph.start(node, parameters, wait=False)
+        process = module_graph.start(node, parameters, wait=False)
+        client.logs[node] = partial(Path.read_text, process.path)
     for node in (*MANAGED, *OTHERS):
         client.wait_until_known_to(node)
     return client
@@ -90,6 +95,17 @@ def test_every_request_of_a_burst_is_answered(client):
     answers = [client.burst.call_async(request) for _ in range(50)]
     client.wait_until(lambda: all(answer.done() for answer in answers), what='50 answers')
     assert not any(answer.result().success for answer in answers)
+
+
+@pytest.mark.parametrize('label', ['\n[FATAL] forged\x1b[2J', 'x' * 5_000_000])
+@pytest.mark.parametrize('node', MANAGED)
+def test_label_of_a_transition_cannot_forge_lines_of_the_log(client, node, label):
+    log = client.logs[node]
+    before = len(log())
+    answer = client.call(ChangeState, f'{node}/change_state', transition=Transition(label=label))
+    assert not answer.success
+    client.wait_until(lambda: 'label is printable text' in log()[before:], what='the refusal')
+    assert len(log()) - before < 1000 and 'forged' not in log()[before:]
 
 
 @pytest.mark.parametrize('kind', FOLDERS)

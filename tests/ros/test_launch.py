@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The shipped launch file on real launch, where that is installed: tests/ros/launch/."""
+"""The shipped launch files on real launch, where that is installed: tests/ros/launch/."""
 
 import os
 import subprocess
@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
-from ros_graph import ROOT
+from ros_graph import BAGS, ROOT
 
 FOLDER = Path(__file__).parent / 'launch'
 FILES = sorted(FOLDER.glob('*.py'))
@@ -18,7 +18,7 @@ import sys
 from launch import LaunchService
 from shipped import rig
 service = LaunchService()
-service.include_launch_description(rig(rig=sys.argv[1]))
+service.include_launch_description(rig('rig', **dict(a.split(':=') for a in sys.argv[1:])))
 sys.exit(service.run())
 """
 
@@ -50,11 +50,22 @@ def test_launch(run, path):
     assert not status, output[-6000:]
 
 
-def test_wrong_rig_file_ends_launch_in_a_sentence(run, tmp_path):
+@pytest.mark.parametrize(
+    'arguments, sentence',
+    [
+        (['rig:=RIG'], 'RIG, key angle_joint: a joint, such as "carm"'),
+        (['rviz:=true'], 'rviz:=true, but rviz2 is not installed'),
+        (['simulate:=true', 'rate:=abc'], 'rate:=abc is not a number'),
+        (['fluoroscopes:=[a'], 'fluoroscopes:=[a is not YAML'),
+        (['params_file:=RIG/none'], 'params_file:=RIG/none: there is no such file'),
+    ],
+)
+def test_wrong_argument_ends_launch_before_a_node_is_started(run, tmp_path, arguments, sentence):
     rig = tmp_path / 'rig.toml'
     rig.write_text('angle_joint = 3')
-    status, output = run('-c', LAUNCH_RIG, str(rig))
+    given = [f'phantom:={BAGS}/phantom.csv', *(a.replace('RIG', str(rig)) for a in arguments)]
+    status, output = run('-c', LAUNCH_RIG, *given)
     assert status == 1, output
-    assert f'{rig}, key angle_joint: a joint, such as "carm"' in output
+    assert sentence.replace('RIG', str(rig)) in output
     assert 'Traceback' not in output
     assert 'process started' not in output

@@ -96,7 +96,7 @@ PHANTOM = {'phantom': BAGS / 'phantom.csv'}
         (
             'calibration_node',
             {'phantom': BAGS / 'phantom.csv', 'still_px': -1.0},
-            'parameter still_px: ',
+            'parameter still_px is between',
         ),
         (
             'calibration_node',
@@ -169,9 +169,9 @@ PHANTOM = {'phantom': BAGS / 'phantom.csv'}
         ),
         (
             'player_node',
-            {'bag': BAGS / 'calibration', 'rate': 5},
-            'parameter rate: ',
-        ),  # an integer, not 5.0
+            {'bag': BAGS / 'calibration', 'rate': 'fast'},
+            "parameter rate is a number, not 'fast'",
+        ),
         (
             'player_node',
             {'bag': BAGS / 'tracking', 'strip_prefix': '/a/target_observations'},

@@ -15,7 +15,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, NamedTuple
 
-import yaml
 import zstandard
 from mcap.exceptions import EndOfFile
 from mcap.reader import SeekingReader
@@ -25,8 +24,8 @@ from mcap.summary import Summary
 
 from ...errors import DataError
 from ...limits import MAX_CHUNK, MAX_TOPICS
-from ..access import check_regular_file, os_error_reason, read_text
-from ..text_files import parse_yaml
+from ..access import check_regular_file, os_error_reason
+from ..documents import read_yaml
 from .metadata import to_yaml
 
 if TYPE_CHECKING:
@@ -308,10 +307,10 @@ def _natural_order(name: str) -> list[tuple[int, str]]:
 def _listed_files(source: PathLike, path: str) -> list[str]:
     """Return the files that metadata.yaml lists. Raises DataError."""
     try:
-        information = parse_yaml(read_text(path))['rosbag2_bagfile_information']
+        information = read_yaml(path)['rosbag2_bagfile_information']
         storage = str(information['storage_identifier'])
         names = list(information['relative_file_paths'])
-    except (yaml.YAMLError, KeyError, TypeError, AttributeError):
+    except (KeyError, TypeError, AttributeError):
         raise DataError(f'{path}: this is not the metadata of a bag, or it is damaged') from None
     if storage != 'mcap':
         raise DataError(
@@ -344,10 +343,10 @@ def is_foreign(source: PathLike) -> bool:
         if not os.path.isfile(path):
             return False
         try:
-            information = parse_yaml(read_text(path))['rosbag2_bagfile_information']
+            information = read_yaml(path)['rosbag2_bagfile_information']
             mode = str(information.get('compression_mode') or 'none').lower()
             return str(information['storage_identifier']) == 'sqlite3' or mode != 'none'
-        except (DataError, yaml.YAMLError, KeyError, TypeError, AttributeError):
+        except (DataError, KeyError, TypeError, AttributeError):
             return False  # the reader of MCAP bags says what is wrong
     if not os.path.isfile(source):
         return False

@@ -11,7 +11,8 @@ from typing import Any
 
 import yaml
 
-from ..text_files import parse_yaml
+from ...errors import DataError
+from ..documents import parse_yaml
 from .definitions import Definition
 
 # QoS profiles as bags contain them: YAML in a channel's metadata and in metadata.yaml.
@@ -69,8 +70,8 @@ def parse_profiles(value: Any) -> list[dict[str, Any]]:
     A text that cannot be parsed gives no profiles: a bag can be read without them.
     """
     try:
-        items = parse_yaml(value) if isinstance(value, str) else value
-    except yaml.YAMLError:
+        items = parse_yaml(value, 'QoS profiles') if isinstance(value, str) else value
+    except DataError:
         return []
     if not isinstance(items, list):
         return []

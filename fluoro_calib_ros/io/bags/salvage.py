@@ -24,7 +24,6 @@ from typing import NamedTuple
 
 import lz4.frame
 import numpy as np
-import yaml
 import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
@@ -32,8 +31,8 @@ from mcap.records import Channel, MessageIndex, Schema, Statistics
 
 from ...errors import DataError
 from ...limits import MAX_CHUNK
-from ..access import check_regular_file, os_error_reason, read_text
-from ..text_files import parse_yaml
+from ..access import check_regular_file, os_error_reason
+from ..documents import read_yaml
 from .definitions import PACKAGE, TARGET_OBSERVATIONS, Definition, fluoroscope_of_topic, typestore
 from .mcap_file import PathLike, candidate_files
 from .metadata import parse_profiles, profile
@@ -491,12 +490,12 @@ def _expected_of_metadata(source: PathLike) -> dict[str, int]:
     if not os.path.isdir(source) or not os.path.exists(path):
         return {}
     try:
-        information = parse_yaml(read_text(path))['rosbag2_bagfile_information']
+        information = read_yaml(path)['rosbag2_bagfile_information']
         return {
             str(entry['topic_metadata']['name']): int(entry['message_count'])
             for entry in information['topics_with_message_count']
         }
-    except (DataError, yaml.YAMLError, KeyError, TypeError, ValueError):
+    except (DataError, KeyError, TypeError, ValueError):
         return {}
 
 

@@ -10,7 +10,6 @@ are those of OpenCV. The unit is that of the calibration board, and the file doe
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,15 +18,11 @@ import numpy as np
 
 from ...errors import DataError
 from ...photogrammetry.rotations import matrix_from_vector, vector_from_matrix
-from ..access import PathLike, read_text
+from ..access import PathLike
 from ..atomic import write_text
+from ..documents import read_toml
 from .camera_files import check_matrix
 from .content import Camera, Content, FileSettings, Format, Sample, Written, from_units, in_units
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 
 def recognise(sample: Sample) -> bool:
@@ -39,10 +34,7 @@ def recognise(sample: Sample) -> bool:
 
 def read(path: Path, settings: FileSettings) -> Content:
     """Read the cameras. Raises DataError."""
-    try:
-        document = tomllib.loads(read_text(path))
-    except tomllib.TOMLDecodeError as error:
-        raise DataError(f'{path}: this is not TOML ({error})') from None
+    document = read_toml(path)
     tables = {key: document[key] for key in sorted(document) if key != 'metadata'}
     if not tables or not all(isinstance(t, Mapping) and 'matrix' in t for t in tables.values()):
         raise DataError(
@@ -79,7 +71,7 @@ def numbers_of(
         value = np.array(table[key], dtype=float)
     except KeyError:
         raise DataError(f'{where}: there is no {key}') from None
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise DataError(f'{where}: {key} does not consist of numbers') from None
     if shape is not None and value.shape != shape:
         raise DataError(f'{where}: {key} has {value.shape} numbers, not {shape}')

@@ -18,8 +18,7 @@ import numpy as np
 import yaml
 
 from ...errors import DataError
-from ..access import read_text
-from ..text_files import parse_yaml
+from ..documents import read_yaml
 from .anipose import numbers_of
 from .camera_files import check_matrix, write_cameras
 from .content import Camera, Content, FileSettings, Format, Sample, Written
@@ -38,12 +37,7 @@ def recognise(sample: Sample) -> bool:
 
 def read(path: Path, settings: FileSettings) -> Content:
     """Read a camera. Raises DataError."""
-    try:
-        document = parse_yaml(read_text(path))
-    except yaml.YAMLError as error:
-        mark = getattr(error, 'problem_mark', None)
-        row = '' if mark is None else f', row {mark.line + 1}'
-        raise DataError(f'{path}{row}: this is not YAML') from None
+    document = read_yaml(path)
     if not isinstance(document, Mapping):
         raise DataError(f'{path}: this is not a camera_info, it has no entries')
     matrix = _matrix(path, document, 'camera_matrix', (3, 3))

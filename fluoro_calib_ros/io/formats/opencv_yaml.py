@@ -17,6 +17,7 @@ import numpy as np
 
 from ...errors import DataError
 from ..access import read_text
+from ..documents import check_budget
 from .camera_files import check_matrix, check_rotation, name_of_file, write_cameras
 from .content import Camera, Content, FileSettings, Format, Sample, Written, from_units, in_units
 
@@ -35,6 +36,7 @@ def recognise(sample: Sample) -> bool:
 def read(path: Path, settings: FileSettings) -> Content:
     """Read a camera, which is called like the file. Raises DataError."""
     text = read_text(path)
+    check_budget('YAML', text, path)  # OpenCV crashes where it is nested deeply
     try:
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except (cv2.error, SystemError):

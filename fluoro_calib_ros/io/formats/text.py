@@ -15,7 +15,8 @@ from typing import NoReturn
 import numpy as np
 
 from ...errors import DataError
-from ..access import PathLike, read_text
+from ...limits import MAX_ROWS
+from ..access import PathLike, check_rows, read_text
 from ..csv_table import decimal_point
 
 MISSING = ('', 'nan', 'none', 'null', 'na', 'n/a')
@@ -87,6 +88,7 @@ def table_of(path: PathLike, text: str, separator: str | None = None) -> list[Ro
     """Return the rows of a text, as `read_table` does; path is for messages."""
     if '\0' in text:
         raise DataError(f'{path}: this is not text, it contains a byte 0')
+    check_rows(text, MAX_ROWS, path)
     if separator == ' ':
         rows = [Row(path, n, line.split()) for n, line in enumerate(text.splitlines(), 1)]
     else:

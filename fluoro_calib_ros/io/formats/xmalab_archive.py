@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import posixpath
+import sys
 import zipfile
 from pathlib import Path
 from xml.etree import ElementTree
@@ -13,8 +14,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ...errors import DataError
-from ...limits import read_limits
+from ...limits import MAX_MEMBER, read_limits
 from ..access import os_error_reason
+from ..documents import parse_xml
 from .text import Row, table_of
 
 DOCUMENT = 'project.xml'
@@ -59,25 +61,17 @@ class ProjectArchive:
         self._archive.close()
 
     def _document(self) -> ElementTree.Element:
-        text = self.member_text(DOCUMENT)
-        if '<!' in text.replace('<!--', ''):  # entities can make a small file huge
-            raise DataError(f'{self.path}, {DOCUMENT}: a project has no document type')
-        try:
-            root = ElementTree.fromstring(text)
-        except ElementTree.ParseError as error:
-            raise DataError(
-                f'{self.path}, {DOCUMENT}, row {error.position[0]}: this is not XML'
-            ) from None
+        root = parse_xml(self.member_text(DOCUMENT), f'{self.path}, {DOCUMENT}')
         if root.tag != 'Project':
             raise DataError(f'{self.path}, {DOCUMENT}: this is not a project of XMALab')
         return root
 
-    def member(self, name: str) -> bytes:
-        """Return a file of the archive."""
+    def member(self, name: str, most: int = sys.maxsize) -> bytes:
+        """Return a file of the archive, of at most so many bytes."""
         info = self._members.get(posixpath.normpath(name.replace('\\', '/')))
         if info is None:
             raise DataError(f'{self.path}: the project does not contain {name}')
-        if info.file_size > read_limits().max_file_bytes:
+        if info.file_size > min(most, read_limits().max_file_bytes):
             raise DataError(f'{self.path}: {name} is too large, {info.file_size} bytes')
         try:
             return self._archive.read(info)
@@ -86,7 +80,7 @@ class ProjectArchive:
 
     def member_text(self, name: str) -> str:
         """Return a file of the archive as text."""
-        return self.member(name).decode('utf-8', 'replace')
+        return self.member(name, MAX_MEMBER).decode('utf-8', 'replace')
 
     def numbers(self, name: str) -> np.ndarray:
         """Return a table of numbers; an error for rows of different lengths, too."""

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import DataError
-from ..access import check_safe_name, make_folder, read_text
+from ...limits import MAX_IMAGE_SIDE
+from ..access import check_rows, check_safe_name, make_folder, read_text
 from ..atomic import atomic_file
 from .camera_files import name_of_file
 from .content import Content, FileSettings, Format, Sample, Written
@@ -41,7 +42,10 @@ def recognise(sample: Sample) -> bool:
 def read(path: Path, settings: FileSettings) -> Content:
     """Read a table, of a fluoroscope that is called like the file. Raises DataError."""
     text = read_text(path)
+    check_rows(text, 2 * MAX_IMAGE_SIDE, path)
     lines = [(n, line) for n, line in enumerate(text.splitlines(), 1) if line.strip()]
+    if not lines:
+        raise DataError(f'{path}: the file has no rows')
     separator = separator_of(text)
     if separator == ';':
         lines = [(n, line.replace(',', '.')) for n, line in lines]

@@ -218,8 +218,11 @@ class Status:
     values: Mapping[str, object] = field(default_factory=dict)
 
 
+NO_CLOCK = 'use_sim_time is set, but nobody publishes /clock: what this node stamps has the time 0'
+
+
 class DiagnosticsPublisher:
-    """Publishes the statuses of a node on /diagnostics."""
+    """Publishes the statuses of a node on /diagnostics, and that its clock stands at 0."""
 
     def __init__(self, node: Node) -> None:
         self._node = node
@@ -228,7 +231,10 @@ class DiagnosticsPublisher:
     def publish(self, statuses: Iterable[Status]) -> None:
         """Publish statuses in one message."""
         array = DiagnosticArray()
-        array.header.stamp = self._node.get_clock().now().to_msg()
+        now = self._node.get_clock().now()
+        array.header.stamp = now.to_msg()
+        if not now.nanoseconds:
+            statuses = (*statuses, Status('clock', WARN, NO_CLOCK))
         node_name = self._node.get_fully_qualified_name()
         array.status = [
             DiagnosticStatus(

@@ -21,6 +21,7 @@ from rclpy.publisher import Publisher
 from rclpy.qos import QoSProfile
 from rclpy.service import Service
 
+from ...limits import MAX_TEXT
 from .diagnostics import DiagnosticsPublisher, RefusalLog, Status
 from .logging import USER_ERRORS, RateLimitedLogger, StartError, Trace, one_line
 from .parameters import ParameterNode
@@ -30,7 +31,7 @@ from .streams import FaultHandlers, StreamReader, best_effort_message, qos_overr
 #
 # rclpy raises from its own services where a transition does not fit the state of a managed node,
 # and where a parameter has an unknown type. Without a guard one such request of any peer ends the
-# node.
+# node. rcl logs the texts of a request as they are, such as the label of a transition.
 
 Callback = Callable[[Any, Any], Any]
 
@@ -49,17 +50,32 @@ def _guarded(node: Node, name: str, callback: Callback) -> Callback:
 
     def guarded(request: Any, response: Any) -> Any:
         try:
+            _check_texts(request)
             return callback(request, response)
         except Exception as error:  # a request may contain anything
             return refused(request, response, error)
 
     async def guarded_coroutine(request: Any, response: Any) -> Any:
         try:
+            _check_texts(request)
             return await callback(request, response)
         except Exception as error:
             return refused(request, response, error)
 
     return guarded_coroutine if inspect.iscoroutinefunction(callback) else guarded
+
+
+def _check_texts(value: Any, where: str = 'request') -> None:
+    """Raise ValueError unless all texts in a request, or a field of it, are lines of a log."""
+    if isinstance(value, str):
+        if len(value) > MAX_TEXT or not value.isprintable():
+            raise ValueError(f'{where} is printable text of at most {MAX_TEXT} characters')
+    elif isinstance(value, list):
+        for item in value:
+            _check_texts(item, where)
+    elif hasattr(value, 'get_fields_and_field_types'):
+        for name in value.get_fields_and_field_types():
+            _check_texts(getattr(value, name), name)
 
 
 def _refusal_of(request: Any, response: Any, reason: str) -> Any:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import gc
 import os
+import select
 import signal
 import sys
 import threading
@@ -16,6 +17,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
+from typing import NoReturn
 
 import rclpy
 from rclpy._rclpy_pybind11 import InvalidHandle, RCLError, UnknownROSArgsError
@@ -36,6 +38,9 @@ INTERRUPTED = 130  # exit status after a second interrupt
 # of processes and each of them, with SIGINT and SIGTERM.
 ONE_INTERRUPT_S = 1.0
 MAX_SIGNALS = 1000
+# Time in which a node ends after a signal; launch sends the next one, SIGTERM, after 5 s. A node
+# that has something to write has an attribute end_s.
+END_S = 4.0
 
 
 def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> None:
@@ -44,7 +49,8 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
     The exit status is 1, after one sentence, where the node cannot start, and where its flag
     `failed` is set; else 0. A node may have a method bring_up(), called before the loop, and a
     method stop(), which ends everything that its callbacks wait for. The callbacks end before the
-    context does: rclpy's own signal handlers would shut it down while they run.
+    context does: rclpy's own signal handlers would shut it down while they run. A node that has
+    not ended within its time (END_S) after a signal ends with exit status 1 and a sentence.
     """
     if asks_for_help(sys.argv[1:] if args is None else args):
         print(help_text(sys.modules[make_node.__module__]))
@@ -64,7 +70,7 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
                 executor.create_task(lambda: None)  # something to do, so that spin_once returns
             woken.set()
 
-        _call_on_interrupt(end)
+        _call_on_interrupt(end, lambda: getattr(node, 'end_s', END_S))
         node = _make(make_node)
         executor.add_node(node)
         for sentence in unknown_parameters(node):
@@ -90,7 +96,18 @@ def run(make_node: Callable[[], Node], args: Sequence[str] | None = None) -> Non
             node.destroy_node()
         gc.collect()
         rclpy.try_shutdown()
-    sys.exit(code)
+    _exit(code)
+
+
+def _exit(code: int) -> NoReturn:
+    """End the process without the end of its interpreter.
+
+    That takes long on a busy machine, does not handle signals, and waits for threads that still
+    compute what nobody needs any more.
+    """
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(code)
 
 
 def _spin(executor: SingleThreadedExecutor, node: Node, ended: threading.Event) -> None:
@@ -150,10 +167,11 @@ def _make(make_node: Callable[[], Node]) -> Node:
         raise
 
 
-def _call_on_interrupt(end: Callable[[], None]) -> None:
+def _call_on_interrupt(end: Callable[[], None], patience_s: Callable[[], float]) -> None:
     """Call end() from a thread at SIGINT or SIGTERM, whatever the main thread waits for.
 
-    A second one, more than a second later, ends the process at once.
+    A second one, more than a second later, ends the process at once, and so does the end of the
+    time that patience_s() returns.
     """
     reading, writing = os.pipe()
     os.set_blocking(writing, False)
@@ -168,8 +186,12 @@ def _call_on_interrupt(end: Callable[[], None]) -> None:
         os.set_blocking(reading, False)
         with suppress(BlockingIOError):  # no further signal has come
             os.read(reading, MAX_SIGNALS)
-        os.set_blocking(reading, True)
-        os.read(reading, 1)
-        os._exit(INTERRUPTED)
+        patience = patience_s()
+        if select.select([reading], [], [], patience - ONE_INTERRUPT_S)[0]:
+            os._exit(INTERRUPTED)
+        rclpy.logging.get_logger('fluoro_calib').fatal(
+            f'ended by force: the work in hand takes longer than {patience:g} s'
+        )
+        os._exit(1)
 
     threading.Thread(target=watch, daemon=True).start()

@@ -23,9 +23,12 @@ from rcl_interfaces.msg import (
     ParameterDescriptor,
     SetParametersResult,
 )
+from rclpy.callback_groups import CallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import ParameterException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+from rclpy.timer import Timer
 
 from ...errors import DataError, printable, shortened
 from ...limits import MAX_TEXT, ReadLimits, use_read_limits
@@ -38,7 +41,8 @@ MAX_INTEGER = 2**63 - 1
 FLUOROSCOPE_NAME = re.compile('[A-Za-z_][A-Za-z0-9_]{0,99}')
 
 # Names that ROS declares itself, in part only when they are needed.
-_OF_ROS = ('qos_overrides.', 'use_sim_time', 'start_type_description_service')
+SIM_TIME = 'use_sim_time'
+_OF_ROS = ('qos_overrides.', SIM_TIME, 'start_type_description_service')
 
 T = TypeVar('T')
 
@@ -78,20 +82,35 @@ class CalibratedParameters(ManagedParameters):
 class ParameterNode(Node):
     """Node that says what to do where one tries to set a parameter that is read-only.
 
-    Texts of its peers stay in their lines of its log.
+    Texts of its peers stay in their lines of its log. Its timers follow a steady clock: /clock may
+    stop, and whoever sets use_sim_time must not silence diagnostics.
     """
 
     def get_logger(self) -> Any:
         """Return the logger, for any text."""
         return PrintableLogger(super().get_logger())
 
+    def create_timer(
+        self,
+        timer_period_sec: float,
+        callback: Callable[[], object],
+        callback_group: CallbackGroup | None = None,
+        clock: Clock | None = None,
+        autostart: bool = True,
+    ) -> Timer:
+        """Make a timer of the steady clock, unless another one is given."""
+        clock = clock or Clock(clock_type=ClockType.STEADY_TIME)
+        return super().create_timer(timer_period_sec, callback, callback_group, clock, autostart)
+
     def set_parameters_atomically(
         self, parameter_list: Sequence[Parameter]
     ) -> SetParametersResult:
-        """Set parameters, all or none."""
+        """Set parameters, all or none; an integer stands for a number, too."""
+        parameter_list = [self._as_declared(parameter) for parameter in parameter_list]
         for parameter in parameter_list:
             name = parameter.name
-            if self.has_parameter(name) and self.describe_parameter(name).read_only:
+            is_declared = self.has_parameter(name)
+            if name == SIM_TIME or (is_declared and self.describe_parameter(name).read_only):
                 return SetParametersResult(
                     successful=False,
                     reason=f'parameter {name} is read when the node starts: set it in the '
@@ -105,6 +124,16 @@ class ParameterNode(Node):
                     f'at most {MAX_TEXT} characters',
                 )
         return super().set_parameters_atomically(parameter_list)
+
+    def _as_declared(self, parameter: Parameter) -> Parameter:
+        """Return a parameter as a number where it is an integer and a number was declared."""
+        name = parameter.name
+        is_number = (
+            parameter.type_ == Parameter.Type.INTEGER
+            and self.has_parameter(name)
+            and self.get_parameter(name).type_ == Parameter.Type.DOUBLE
+        )
+        return Parameter(name, value=float(parameter.value)) if is_number else parameter
 
 
 @dataclass(frozen=True)
@@ -199,8 +228,17 @@ def declare_read_limits(node: Node) -> None:
 
 
 def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -> Any:
-    """Declare a parameter and return its value. Raises StartError."""
+    """Declare a parameter and return its value. Raises StartError.
+
+    An integer is taken for a number.
+    """
     default = declaration.default
+    given = node._parameter_overrides.get(declaration.name)  # rclpy has no public access to them
+    if given is not None:
+        if isinstance(default, float) and given.type_ == Parameter.Type.INTEGER:
+            given = Parameter(declaration.name, value=float(given.value))
+            node._parameter_overrides[declaration.name] = given
+        _check_given(declaration, given)
     try:
         value = node.declare_parameter(
             declaration.name,
@@ -210,6 +248,30 @@ def declare_parameter(node: Node, declaration: Option, read_only: bool = True) -
     except ParameterException as error:
         raise StartError(f'parameter {declaration.name}: {error}') from None
     return _tuple_or_value(declaration, value)
+
+
+# What a value is called that has the type of a default.
+_WORDS = {
+    bool: 'true or false',
+    int: 'a whole number',
+    float: 'a number',
+    str: 'a text',
+    tuple: 'a list of texts, such as [a, b]',
+}
+
+
+def _check_given(declaration: Option, given: Parameter) -> None:
+    """Raise StartError for a value that a parameter cannot have, in the words of its option."""
+    default = declaration.default
+    listed = list(default) if isinstance(default, tuple) else default
+    empty = given.type_ == Parameter.Type.NOT_SET or given.value == []  # of any type
+    if not empty and given.type_ != Parameter.Type.from_parameter_value(listed):
+        value = printable(shortened(repr(given.value)))
+        raise StartError(f'parameter {declaration.name} is {_WORDS[type(default)]}, not {value}')
+    try:
+        declaration.validate(_tuple_or_value(declaration, given.value))
+    except ValueError as error:
+        raise StartError(f'parameter {error}') from None
 
 
 def _tuple_or_value(declaration: Option, value: Any) -> Any:

@@ -11,12 +11,12 @@ from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 from rclpy.callback_groups import CallbackGroup
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.service import Service
 from rclpy.task import Future
 
 from .lifecycle import guard_services
+from .parameters import ParameterNode
 from .streams import services_qos
 
 
@@ -66,10 +66,10 @@ class Requests:
 
 
 async def within(
-    node: Node, timeout_s: float, future: Future, give_up: Callable[[], object]
+    node: ParameterNode, timeout_s: float, future: Future, give_up: Callable[[], object]
 ) -> Any:
     """Return the result of a Future; give_up() is called when the time is up and has to set it."""
-    timer = node.create_timer(timeout_s, give_up, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    timer = node.create_timer(timeout_s, give_up)
     result = await future
     node.destroy_timer(timer)
     return result

@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""The shipped launch file with arguments, as part of a launch test."""
+"""The shipped launch files with arguments, as part of a launch test."""
 
 import os
 from pathlib import Path
@@ -17,9 +17,9 @@ FOLDER = Path(os.environ['LAUNCH_TEST_FOLDER'])  # of files that a test writes
 DEADLINE = 60.0  # seconds
 
 
-def rig(**arguments):
-    """Return a LaunchDescription of the shipped launch file, whose tests begin at once."""
-    source = PythonLaunchDescriptionSource(str(ROOT / 'launch' / 'fluoro_calib.launch.py'))
+def rig(name='fluoro_calib', /, **arguments):
+    """Return a LaunchDescription of a shipped launch file, whose tests begin at once."""
+    source = PythonLaunchDescriptionSource(str(ROOT / 'launch' / f'{name}.launch.py'))
     return LaunchDescription(
         [
             SetEnvironmentVariable('PYTHONUNBUFFERED', '1'),

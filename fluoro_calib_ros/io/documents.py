@@ -1,0 +1,197 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""TOML, YAML, JSON and XML of others: parsed within a budget of time and memory.
+
+A parser is given no more bytes than `limits.DOCUMENT_BYTES` and no structure for which its time or
+memory grows faster than the text: deep nesting, keys of many parts, aliases. Whole numbers have 64
+bits. Everything else is left to the parser of the library, whose time and memory then are a
+multiple of the bytes of the text.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from collections.abc import Callable
+from typing import Any, NoReturn
+from xml.etree import ElementTree
+
+import yaml
+
+from ..errors import DataError
+from ..limits import DOCUMENT_BYTES, MAX_DEPTH
+from .access import PathLike, read_text
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+MAX_WHOLE = 2**63
+MAX_DIGITS = 400  # of a number of YAML
+_NUMBERS = ('tag:yaml.org,2002:int', 'tag:yaml.org,2002:float')
+# Brackets of nested lists and tables; those in texts count, too.
+_BRACKETS = re.compile(r'[\[\]{}]')
+# Nested lists of YAML in one line, without brackets.
+_CHAIN = re.compile(rf'(?:[-?:][ \t]+){{{MAX_DEPTH}}}')
+# What TOML may contain that is neither key nor bracket: texts and comments, also without an end.
+_TOML_TEXT = re.compile(
+    r'"""(?:\\.|[^\\])*?(?:"""|\Z)'
+    r"|'''.*?(?:'''|\Z)"
+    r'|"(?:\\.|[^"\\\n])*"?'
+    r"|'[^'\n]*'?"
+    r'|#[^\n]*',
+    re.DOTALL,
+)
+_TOML_KEY = re.compile(rf'(?<![\w-])(?:[\w-]+[ \t]*\.[ \t]*){{{MAX_DEPTH}}}')
+
+
+def read_toml(path: PathLike) -> dict[str, Any]:
+    """Read a TOML file. Raises DataError."""
+    return parse_toml(read_text(path), path)
+
+
+def parse_toml(text: str, where: object) -> dict[str, Any]:
+    """Return the value of a TOML text. Raises DataError; where begins its message."""
+    _check_size('TOML', text, where)
+    structure = _TOML_TEXT.sub('x', text)
+    _check_depth('TOML', structure, where)
+    if _TOML_KEY.search(structure):  # the parser keeps a copy of each part of a key for the others
+        _fail_nested('TOML', where)
+    return _parsed('TOML', where, lambda: tomllib.loads(text))
+
+
+class _Loader(getattr(yaml, 'CSafeLoader', yaml.SafeLoader)):  # type: ignore[misc]
+    """Plain values only, each once: with aliases a small text becomes a large value."""
+
+    def construct_object(self, node: Any, deep: bool = False) -> Any:
+        if node in self.constructed_objects or node in self.recursive_objects:
+            self._refuse('aliases', node)
+        if node.tag in _NUMBERS and len(node.value) > MAX_DIGITS:  # of base 60: quadratic time
+            self._refuse(f'numbers of more than {MAX_DIGITS} characters', node)
+        return super().construct_object(node, deep)
+
+    def flatten_mapping(self, node: Any) -> None:
+        if any(key.tag == 'tag:yaml.org,2002:merge' for key, _ in node.value):
+            self._refuse('merged keys', node)
+
+    def _refuse(self, what: str, node: Any) -> NoReturn:
+        raise yaml.constructor.ConstructorError(
+            None, None, f'{what} are not allowed', node.start_mark
+        )
+
+
+def read_yaml(path: PathLike) -> Any:
+    """Read a YAML file. Raises DataError."""
+    return parse_yaml(read_text(path), path)
+
+
+def parse_yaml(text: str, where: object) -> Any:
+    """Return the value of a YAML text. Raises DataError; where begins its message."""
+    check_budget('YAML', text, where)
+    if _CHAIN.search(text):
+        _fail_nested('YAML', where)
+    return _parsed('YAML', where, lambda: yaml.load(text, Loader=_Loader))  # a safe loader
+
+
+def read_json(path: PathLike) -> dict[str, Any]:
+    """Read a JSON file of an object. Raises DataError that names the row of a fault."""
+    return parse_json(read_text(path), path)
+
+
+def parse_json(text: str, where: object) -> dict[str, Any]:
+    """Return the object of a JSON text. Raises DataError; where begins its message."""
+    _check_size('JSON', text, where)
+    document = _parsed(
+        'JSON', where, lambda: json.loads(text, parse_int=_whole, parse_constant=_not_finite)
+    )
+    if not isinstance(document, dict):
+        raise DataError(
+            f'{where}: this is not a result, it contains a {type(document).__name__} and no object'
+        )
+    return document
+
+
+def parse_xml(text: str, where: object) -> ElementTree.Element:
+    """Return the root of an XML text. Raises DataError; where begins its message."""
+    _check_size('XML', text, where)
+    if '<!' in text.replace('<!--', ''):  # entities make a small text a large one
+        raise DataError(f'{where}: a document type, entities and CDATA are not read')
+    return _parsed('XML', where, lambda: ElementTree.fromstring(text))
+
+
+def check_budget(kind: str, text: str, where: object) -> None:
+    """Raise DataError for a text of a format that is too large or nested too deeply."""
+    _check_size(kind, text, where)
+    _check_depth(kind, text, where)
+
+
+def _check_size(kind: str, text: str, where: object) -> None:
+    most = DOCUMENT_BYTES[kind]
+    if len(text) > most:
+        raise DataError(
+            f'{where}: the {kind} text has {len(text) / 1e6:.1f} MB, more than {most / 1e6:g} MB '
+            'are not read'
+        )
+
+
+def _check_depth(kind: str, text: str, where: object) -> None:
+    depth = 0
+    for bracket in _BRACKETS.finditer(text):
+        depth = max(depth + (1 if bracket[0] in '[{' else -1), 0)
+        if depth > MAX_DEPTH:
+            _fail_nested(kind, where)
+
+
+def _fail_nested(kind: str, where: object) -> NoReturn:
+    raise DataError(f'{where}: the {kind} text is nested too deeply')
+
+
+def _parsed(kind: str, where: object, parse: Callable[[], Any]) -> Any:
+    """Return what a parser returns; whatever it raises becomes a DataError with the row."""
+    try:
+        value = parse()
+        if kind in ('TOML', 'YAML'):
+            _check_whole(value)
+        return value
+    except RecursionError:
+        _fail_nested(kind, where)
+    except (ValueError, OverflowError, yaml.YAMLError, ElementTree.ParseError) as error:
+        cause = getattr(error, 'msg', None) or getattr(error, 'problem', None) or error
+        row = _row_of(error)
+        raise DataError(f'{where}{row}: this is not {kind} ({cause})') from None
+
+
+def _row_of(error: Exception) -> str:
+    """Return the place of a fault in words, '' where the parser does not tell it as a number."""
+    mark = getattr(error, 'problem_mark', None)
+    row = mark.line + 1 if mark is not None else getattr(error, 'lineno', None)
+    if isinstance(error, ElementTree.ParseError):
+        row = error.position[0]
+    return '' if row is None else f', row {row}'
+
+
+def _check_whole(value: Any) -> None:
+    """Raise ValueError for whole numbers beyond 64 bits in a value."""
+    if isinstance(value, int):
+        _whole(value)
+    elif isinstance(value, dict):
+        for key, item in value.items():
+            _check_whole(key)
+            _check_whole(item)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            _check_whole(item)
+
+
+def _whole(value: str | int) -> int:
+    number = int(value) if not isinstance(value, str) or len(value) < 20 else MAX_WHOLE + 1
+    if abs(number) > MAX_WHOLE:
+        raise ValueError('a whole number is too large')
+    return number
+
+
+def _not_finite(word: str) -> NoReturn:
+    raise ValueError(f'{word} is not a number of JSON')

@@ -40,8 +40,10 @@ from .termination import terminated_by_signals
 if TYPE_CHECKING:
     from ..io.rig_file import RigFile
 
+NOT_PASSED = 3  # exit status
 # A command is a module with NAME, HELP, EXAMPLE, add_arguments(parser), run(arguments) and, where
-# arguments depend on each other, check(arguments, error).
+# arguments depend on each other, check(arguments, error). One that gives a verdict has
+# --exit-zero, and its run returns whether it is pass.
 COMMANDS = (
     simulate,
     phantom,
@@ -133,8 +135,9 @@ def make_parser(command: str | None = None, rig: RigFile | None = None) -> argpa
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command line.
 
-    Exit status 0: done, 1: failed for a reason in the data, 2: wrong usage; 130 and 143 after
-    SIGINT and SIGTERM, which leave no unfinished output and no process behind.
+    Exit status 0: done, 1: failed for a reason in the data, 2: wrong usage, 3: done, but the
+    verdict is not pass; 130 and 143 after SIGINT and SIGTERM, which leave no unfinished output and
+    no process behind.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     # Without arguments, this process is the command.
@@ -154,7 +157,7 @@ def _run(words: list[str]) -> None:
         set_read_limits(options)
         if rig is not None:
             print_note(f'defaults of {rig.path}')
-        options.module.run(options)
+        passed = options.module.run(options)
     except (DataError, OSError) as error:
         known = command if command in [module.NAME for module in COMMANDS] else ''
         program = styled(f'fluoro-calib {known}'.rstrip() + ':', 'red', sys.stderr)
@@ -162,3 +165,5 @@ def _run(words: list[str]) -> None:
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)
+    if passed is False and not options.exit_zero:
+        sys.exit(NOT_PASSED)

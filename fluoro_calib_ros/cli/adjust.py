@@ -8,18 +8,33 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
+from ..findings import Kind
 from ..options import declared
 from .arguments import (
     add_bag_options,
     add_calibration,
     add_covariance,
+    add_exit_zero,
     add_option,
     add_phantom,
     add_source,
     bag_selection,
     file_settings,
 )
-from .output import print_findings, print_notes, print_result, print_unpaired
+from .output import (
+    print_findings,
+    print_notes,
+    print_result,
+    print_unpaired,
+    styled_verdict,
+)
+
+CONTRADICTIONS = (Kind.CORRECTED_ALREADY, Kind.POOR_CALIBRATION_FIT)
+HOLDS = 'The calibration holds for these exposures; its interior orientation was fixed.'
+DOES_NOT_HOLD = (
+    'The calibration does not hold for these exposures; its interior orientation was fixed. '
+    'Calibrate again, from exposures of the fluoroscopes as they are now.'
+)
 
 NAME = 'adjust'
 HELP = 'Adjust the exposures of a bag or CSV file with the calibration held (out-of-sample test).'
@@ -40,12 +55,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--out', required=True, type=Path, metavar='DIR', help='result folder to write'
     )
     add_covariance(parser)
+    add_exit_zero(parser)
     add_calibration(parser)
     add_option(parser, declared(CalibrationOptions)['loss'])
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Adjust and write the result folder. Raises DataError."""
+def run(arguments: argparse.Namespace) -> bool:
+    """Adjust and write the result folder; return whether the calibration holds.
+
+    Raises DataError.
+    """
     from ..io.csv_table import read_names
     from ..io.result_check import disagreements
     from ..jobs.calibration import adjust
@@ -74,4 +93,9 @@ def run(arguments: argparse.Namespace) -> None:
     result = adjust(frames, survey.phantom, calibrations, arguments.loss)
     save_result(arguments.out, result, covariance=arguments.covariance)
     print_findings(result.findings, 'doubtful: ')
-    print_result(arguments, written_document(result), summary_table(result))
+    holds = not any(found.kind in CONTRADICTIONS for found in result.findings)
+    text = HOLDS if holds else DOES_NOT_HOLD
+    verdict = styled_verdict(text, 'pass' if holds else 'fail')
+    document = {**written_document(result), 'holds': holds}
+    print_result(arguments, document, f'{summary_table(result).rstrip()}\n\n{verdict}')
+    return holds

@@ -111,6 +111,15 @@ def add_options(
         add_option(parser, options[name], **changes.get(name, {}))
 
 
+def add_exit_zero(parser: Parser) -> None:
+    """Add --exit-zero, for commands that give a verdict."""
+    parser.add_argument(
+        '--exit-zero',
+        action='store_true',
+        help='exit with status 0 whatever the verdict; by default with 3 unless it is pass',
+    )
+
+
 def options_of(kind: type[T], arguments: argparse.Namespace, **values: Any) -> T:
     """Return an options dataclass with the values of its arguments, and with other values.
 

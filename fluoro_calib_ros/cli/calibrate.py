@@ -16,6 +16,7 @@ from .arguments import (
     add_bag_options,
     add_collect,
     add_covariance,
+    add_exit_zero,
     add_option,
     add_phantom,
     add_scheduler,
@@ -83,6 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--figures', action='store_true', help='draw the figures of the paper into DIR/figures'
     )
     add_covariance(result)
+    add_exit_zero(result)
 
 
 def _add_adjustment(parser: argparse.ArgumentParser) -> None:
@@ -177,8 +179,11 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
         error('--interior-sd needs --principal-distance and --interior estimated')
 
 
-def run(arguments: argparse.Namespace) -> None:
-    """Self-calibrate and write the result folder. Raises DataError."""
+def run(arguments: argparse.Namespace) -> bool:
+    """Self-calibrate and write the result folder; return whether nothing speaks against it.
+
+    Raises DataError.
+    """
     from ..jobs.calibration import run_calibration
     from ..jobs.result_folder import check_result_folder, save_outcome, write_covariances
 
@@ -202,6 +207,7 @@ def run(arguments: argparse.Namespace) -> None:
 
     save_outcome(arguments.out, outcome, write_more=write_more)
     _print(arguments, outcome)
+    return outcome.validation is None or outcome.validation.verdict == 'pass'
 
 
 def _request(arguments: argparse.Namespace) -> CalibrationRequest:

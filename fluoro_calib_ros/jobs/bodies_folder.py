@@ -5,11 +5,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
+import numpy as np
+
+from ..bodies.joints import JointMotion
 from ..io.access import PathLike
 from ..io.bodies import write_bodies
 from ..io.folder import FolderKind, check_output_folder, replaced_folder
+from ..io.formats.opensim import write_joint_motion
 from ..io.joints import write_joints
 from ..io.poses import write_motion, write_poses
 from .bodies import BodiesOutcome
@@ -18,7 +22,8 @@ POSES = 'poses.csv'
 MOTION = 'motion.csv'
 SHAPES = 'shapes.csv'
 JOINTS = 'joints.csv'
-NAMES = (POSES, MOTION, SHAPES, JOINTS)
+OPENSIM = 'joints.mot'
+NAMES = (POSES, MOTION, SHAPES, JOINTS, OPENSIM)
 
 
 def _is_own(name: str) -> bool:
@@ -46,3 +51,11 @@ def save_bodies(directory: PathLike, outcome: BodiesOutcome) -> None:
         write_bodies(folder / SHAPES, outcome.bodies)
         if outcome.joints:
             write_joints(folder / JOINTS, outcome.joints, start_ns)
+        if _some_exposure_has_all(outcome.joints):
+            write_joint_motion(folder / OPENSIM, outcome.joints, start_ns)
+
+
+def _some_exposure_has_all(joints: Sequence[JointMotion]) -> bool:
+    """Return whether the motion of all joints is known in an exposure, as OpenSim needs it."""
+    known = [np.isfinite(motion.angles).all(axis=1) for motion in joints]
+    return bool(known) and bool(np.all(known, axis=0).any())

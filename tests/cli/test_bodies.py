@@ -49,7 +49,7 @@ def test_poses_and_joints_with_their_deviations(knee, tmp_path, capsys):
     document = json.loads(capsys.readouterr().out)
     assert set(document['bodies']) == {'femur', 'tibia'} and set(document['joints']) == {'knee'}
     names = sorted(path.name for path in (tmp_path / 'motion').iterdir())
-    assert names == ['joints.csv', 'motion.csv', 'poses.csv', 'shapes.csv']
+    assert names == ['joints.csv', 'joints.mot', 'motion.csv', 'poses.csv', 'shapes.csv']
     assert (tmp_path / 'motion' / 'poses.csv').read_text().splitlines()[0] == COLUMNS
     found = rows(tmp_path / 'motion' / 'joints.csv')
     true = rows(knee / 'truth' / 'walking_joints.csv')

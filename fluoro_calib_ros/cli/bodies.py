@@ -67,6 +67,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='take the coordinates of the markers as they are, do not estimate them anew',
     )
     parser.add_argument(
+        '--figures',
+        action='store_true',
+        help='draw joints and bodies over time, with bands, into DIR/figures',
+    )
+    parser.add_argument(
         '--rate',
         type=number_in(0.001, 1e6),
         metavar='HZ',
@@ -123,7 +128,7 @@ def run(arguments: argparse.Namespace) -> None:
             outcome = track_bodies(recording.frames, rig, bodies, joints, options, bar)
     except DataError as error:
         raise error.at(arguments.source) from None
-    save_bodies(arguments.out, outcome)
+    save_bodies(arguments.out, outcome, arguments.figures)
     print_unpaired(arguments.source, outcome.unpaired)
     print_findings(outcome.findings, 'doubtful: ')
     _print(arguments, outcome)

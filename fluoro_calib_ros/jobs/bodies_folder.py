@@ -23,7 +23,8 @@ MOTION = 'motion.csv'
 SHAPES = 'shapes.csv'
 JOINTS = 'joints.csv'
 OPENSIM = 'joints.mot'
-NAMES = (POSES, MOTION, SHAPES, JOINTS, OPENSIM)
+FIGURES = 'figures'
+NAMES = (POSES, MOTION, SHAPES, JOINTS, OPENSIM, FIGURES)
 
 
 def _is_own(name: str) -> bool:
@@ -42,8 +43,11 @@ def check_bodies_folder(directory: PathLike, inputs: Iterable[PathLike]) -> None
     check_output_folder(directory, BODIES_FOLDER, inputs)
 
 
-def save_bodies(directory: PathLike, outcome: BodiesOutcome) -> None:
-    """Write poses, motion, shapes and joints, all or nothing. Raises DataError."""
+def save_bodies(directory: PathLike, outcome: BodiesOutcome, figures: bool = False) -> None:
+    """Write poses, motion, shapes and joints, all or nothing; with pictures of them on request.
+
+    Raises DataError.
+    """
     start_ns = int(outcome.exposures[0].stamp_ns)
     with replaced_folder(directory, BODIES_FOLDER) as folder:
         write_poses(folder / POSES, outcome.poses, start_ns)
@@ -53,6 +57,10 @@ def save_bodies(directory: PathLike, outcome: BodiesOutcome) -> None:
             write_joints(folder / JOINTS, outcome.joints, start_ns)
         if _some_exposure_has_all(outcome.joints):
             write_joint_motion(folder / OPENSIM, outcome.joints, start_ns)
+        if figures:
+            from ..report.motion_figure import write_motion_figures
+
+            write_motion_figures(folder / FIGURES, outcome.joints, outcome.poses)
 
 
 def _some_exposure_has_all(joints: Sequence[JointMotion]) -> bool:

@@ -62,6 +62,14 @@ def test_poses_and_joints_with_their_deviations(knee, tmp_path, capsys):
     assert {row['status'] for row in found} == {'OK'}
 
 
+def test_pictures_of_joints_and_bodies(knee, tmp_path):
+    joints = ('--joints', knee / 'joints.toml', '--figures', '--smooth', 'lag')
+    assert bodies(knee, tmp_path / 'motion', *joints) == 0
+    pictures = sorted((tmp_path / 'motion' / 'figures').iterdir())
+    assert [p.name for p in pictures] == ['body_femur.png', 'body_tibia.png', 'joint_knee.png']
+    assert all(p.read_bytes().startswith(b'\x89PNG') for p in pictures)
+
+
 def test_without_smoothing_and_with_a_lag(knee, tmp_path):
     assert bodies(knee, tmp_path / 'none', '--smooth', 'none') == 0
     assert bodies(knee, tmp_path / 'lag', '--smooth', 'lag', '--lag', '3') == 0

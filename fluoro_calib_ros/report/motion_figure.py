@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Pictures of the motion of joints and bodies over time, with bands of two standard deviations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..bodies.body import BodyPoses, PoseStatus
+from ..bodies.joints import JointMotion
+from ..photogrammetry.rotations import vector_from_matrix
+from .style import BLUE, GREY, RED, STYLE, new_figure, png_bytes
+
+BAND = 2.0  # standard deviations, 95 %
+FILLED = 0.15  # opacity of the times without a marker
+
+
+def joint_figure(motion: JointMotion) -> Figure:
+    """Angles and translations of a joint."""
+    names = [
+        *(f'{name.replace("_", " ")} [°]' for name in motion.angle_names),
+        *(f'{name.replace("_", " ")} [mm]' for name in motion.translation_names),
+    ]
+    scale = np.repeat([180 / np.pi, 1.0], 3)
+    values = np.hstack([motion.angles, motion.translations]) * scale
+    return _series(motion.joint.name, names, motion, (values, motion.sd * scale))
+
+
+def body_figure(poses: BodyPoses) -> Figure:
+    """Position of a body, and its rotation from the first pose."""
+    known = np.flatnonzero(poses.known)
+    names = [
+        *(f'{axis} [mm]' for axis in 'xyz'),
+        *(f'rotation about {axis} [°]' for axis in 'xyz'),
+    ]
+    values = np.full((len(poses.number), 6), np.nan)
+    values[:, :3] = poses.position_mm
+    if len(known):
+        turned = poses.rotation[known] @ poses.rotation[known[0]].T
+        values[known, 3:] = np.degrees(vector_from_matrix(turned))
+    sd = poses.sd * np.repeat([1.0, 180 / np.pi], 3)
+    return _series(poses.body, names, poses, (values, sd))
+
+
+def _series(
+    title: str,
+    names: list[str],
+    source: JointMotion | BodyPoses,
+    series: tuple[np.ndarray, np.ndarray],
+) -> Figure:
+    """Six time series (T, 6) with their standard deviations."""
+    values, sd = series
+    time_s = (source.stamp_ns - source.stamp_ns[0]) / 1e9
+    filled = ~np.isin(source.status, (PoseStatus.OK, PoseStatus.WEAK))
+    with matplotlib.rc_context(STYLE):
+        figure = new_figure(10, 6, title)
+        axes = figure.subplots(2, 3, sharex=True)
+        for number, (name, each) in enumerate(zip(names, axes.ravel().tolist())):
+            _draw(each, time_s, values[:, number], sd[:, number])
+            each.set_title(name)
+            if filled.any():
+                each.fill_between(
+                    time_s,
+                    0,
+                    1,
+                    where=filled,
+                    transform=each.get_xaxis_transform(),
+                    color=GREY,
+                    alpha=FILLED,
+                    linewidth=0,
+                )
+        for each in axes[1]:
+            each.set_xlabel('time [s]')
+        figure.supxlabel(
+            f'band: {BAND:g} standard deviations of all errors'
+            + ('; grey: predicted, no marker was seen' if filled.any() else ''),
+            fontsize=9,
+        )
+    return figure
+
+
+def _draw(axes: Axes, time_s: np.ndarray, values: np.ndarray, sd: np.ndarray) -> None:
+    axes.fill_between(
+        time_s, values - BAND * sd, values + BAND * sd, color=RED, alpha=0.3, linewidth=0
+    )
+    axes.plot(time_s, values, color=BLUE, linewidth=1.2)
+
+
+def write_motion_figures(
+    directory: Path, joints: list[JointMotion], poses: list[BodyPoses]
+) -> None:
+    """Write a picture of each joint and body into a folder, which is made."""
+    directory.mkdir(exist_ok=True)
+    for motion in joints:
+        _write(directory / f'joint_{motion.joint.name}.png', joint_figure(motion))
+    for one in poses:
+        _write(directory / f'body_{one.body}.png', body_figure(one))
+
+
+def _write(path: Path, figure: Figure) -> None:
+    path.write_bytes(png_bytes(figure))

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, erfc
 
 from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
-from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
+from ..photogrammetry.rotations import cross_matrix, matrix_from_vector, vector_from_matrix
 from ..reconstruction.intersection import OK, OUTSIDE
 from ..reconstruction.reconstruct import IntersectedViews
 from .body import POSE_SIZE, Body
@@ -75,6 +75,8 @@ class FramePoses:
     centre_mm : (B, 3) ndarray
     alone : (B,) ndarray of bool
         Whether the exposure alone gives the pose.
+    ambiguous : (B,) ndarray of bool
+        Whether a second pose fits as well, and the prediction does not tell which is right.
     covariance_noise, covariance_fixed : (B, 6, 6) ndarray
         See BodyPoses. Where the exposure alone does not give the pose, by its prediction, too.
     rig_root : (B, 6, k) ndarray
@@ -91,6 +93,7 @@ class FramePoses:
     rotation: NDArray[np.float64]
     centre_mm: NDArray[np.float64]
     alone: NDArray[np.bool_]
+    ambiguous: NDArray[np.bool_]
     covariance_noise: NDArray[np.float64]
     covariance_fixed: NDArray[np.float64]
     rig_root: NDArray[np.float64]
@@ -196,7 +199,7 @@ class PoseSolver:
         self._depth_rows = rows[:, 2:]
         self._root = orientation.covariance_root().reshape(self._views, ORIENTATION_SIZE, -1)
         tail = erfc(reject / np.sqrt(2))
-        freedom = np.arange(2 * self._views + 1)
+        freedom = np.arange(max(2 * self._views, 3) + 1)
         self._limit = np.where(freedom > 0, chdtri(np.maximum(freedom, 1), tail), np.inf)
         self._ids: np.ndarray | None = None
         self._rows = np.zeros(0, dtype=int)
@@ -219,7 +222,47 @@ class PoseSolver:
                 break
             used[wrong, worst] = False
             rotation, centre = solution.rotation, solution.centre
-        return self._result(solution, points, used, test)
+        ambiguous = self._ambiguous(solution, points, used, prediction)
+        return self._result(solution, points, used, test, ambiguous)
+
+    def _ambiguous(
+        self, solution: _Solution, points: _Points, used: np.ndarray, prediction: Prediction
+    ) -> np.ndarray:
+        """Whether (B,) a body that one view sees alone fits in a second pose, too.
+
+        Under a weak perspective, markers near a plane look the same when the plane is tilted the
+        other way: R and S_l R S_n, where S reflects along the line of sight l and along the normal
+        n of the plane (Schweighofer and Pinz, "Robust pose estimation from a planar target", IEEE
+        PAMI 28, 2006).
+        """
+        by_view = (points.seen & used[..., None]).any(axis=1)
+        out = np.zeros(len(used), dtype=bool)
+        for row in np.flatnonzero(solution.alone & (by_view.sum(axis=1) == 1)).tolist():
+            sight = solution.centre[row] - self.orientation.position_mm[by_view[row].argmax()]
+            markers = self.xyz[row, used[row]]
+            normal = np.linalg.svd(markers - markers.mean(axis=0))[2][-1]
+            rotation = solution.rotation.copy()
+            rotation[row] = _mirror(sight) @ rotation[row] @ _mirror(normal)
+            # The centre of these markers stays where it is.
+            centre = solution.centre.copy()
+            centre[row] += (solution.rotation[row] - rotation[row]) @ markers.mean(axis=0)
+            only = used & (np.arange(len(used)) == row)[:, None]
+            second = self._converge((rotation, centre), points, only, 0 * solution.prior)
+            squares = [self._own_squares(one.marker)[row].sum() for one in (solution, second)]
+            turn = second.rotation[row] @ solution.rotation[row].T
+            away = float(np.linalg.norm(vector_from_matrix(turn)))
+            fits = squares[1] - squares[0] < self._limit[1] and away > LINEAR_RAD
+            out[row] = fits and not self._tells(prediction, row, second)
+        return out
+
+    def _tells(self, prediction: Prediction, row: int, second: _Solution) -> bool:
+        """Whether the prediction of a body excludes a second pose."""
+        if not prediction.known[row]:
+            return False
+        turn = second.rotation[row] @ prediction.rotation[row].T
+        w = vector_from_matrix(turn)
+        squares = w @ np.linalg.solve(prediction.covariance[row, 3:, 3:], w)
+        return bool(squares > self._limit[3])
 
     def _points(self, exposure: IntersectedViews) -> _Points:
         """Sort the image points of an exposure by bodies and their markers."""
@@ -442,7 +485,12 @@ class PoseSolver:
         return np.maximum(marker.squares - shape, 0.0)
 
     def _result(
-        self, solution: _Solution, points: _Points, used: np.ndarray, test: np.ndarray
+        self,
+        solution: _Solution,
+        points: _Points,
+        used: np.ndarray,
+        test: np.ndarray,
+        ambiguous: np.ndarray,
     ) -> FramePoses:
         """Return the poses with their covariances."""
         alone = solution.alone
@@ -459,6 +507,7 @@ class PoseSolver:
             np.where(alone[:, None, None], solution.rotation, np.nan),
             np.where(alone[:, None], solution.centre, np.nan),
             alone=alone,
+            ambiguous=ambiguous,
             covariance_noise=np.where(alone[:, None, None], noise, np.nan),
             covariance_fixed=fixed,
             rig_root=rig_root,
@@ -538,6 +587,12 @@ def _solved(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
     inverse = np.where(values > 1e-10, 1 / np.maximum(values, 1e-10), 0.0)
     reduced = np.swapaxes(vectors, 1, 2) @ (right / scale)[:, :, None]
     return (vectors @ (inverse[:, :, None] * reduced))[:, :, 0] / scale
+
+
+def _mirror(direction: np.ndarray) -> np.ndarray:
+    """Reflection (3, 3) along a direction (3,)."""
+    unit = direction / np.linalg.norm(direction)
+    return np.eye(3) - 2 * np.outer(unit, unit)
 
 
 def _small_vector(rotation: np.ndarray) -> np.ndarray:

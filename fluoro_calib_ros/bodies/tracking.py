@@ -180,6 +180,7 @@ class BodyTracker:
             PoseStatus.OK,
             np.where(frame.markers > 0, PoseStatus.WEAK, PoseStatus.FILLED),
         )
+        status = np.where(frame.ambiguous, PoseStatus.AMBIGUOUS, status)
         status = np.where(lost, PoseStatus.FAILED, status).astype(np.uint8)
 
         def kept(values: np.ndarray) -> np.ndarray:

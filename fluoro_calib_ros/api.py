@@ -28,6 +28,7 @@ from .exposures.moving_points import MovingPoints
 from .exposures.names import Names
 from .exposures.phantom import Phantom
 from .findings import Finding, Kind, Severity
+from .io.access import PathLike
 from .io.bodies import read_bodies, write_bodies
 from .io.calibration_request import read_request
 from .io.formats.content import FileSettings
@@ -35,7 +36,7 @@ from .io.joints import JointEntry, read_joints
 from .io.phantom import read_moving_points, read_phantom, write_phantom
 from .io.reconstructed_points import write_reconstruction
 from .io.rig_orientation import load_orientation, save_orientation
-from .jobs.bodies import BodiesOptions, BodiesOutcome, Rig, track_bodies
+from .jobs.bodies import BodiesOptions, BodiesOutcome, track_bodies
 from .jobs.bodies_folder import save_bodies
 from .jobs.calibration import CalibrationOutcome, adjust, run_calibration
 from .jobs.conversion import ConversionRequest, convert
@@ -88,7 +89,6 @@ __all__ = [
     'ReconstructionOptions',
     'ReconstructionOutcome',
     'Recording',
-    'Rig',
     'RigOrientation',
     'Severity',
     'SimulationOptions',
@@ -130,8 +130,8 @@ __all__ = [
 
 
 def calibrate(
-    frames: Mapping[str, Sequence[Frame]],
-    phantom: Phantom,
+    frames: Mapping[str, Sequence[Frame]] | PathLike,
+    phantom: Phantom | PathLike,
     options: CalibrationOptions | None = None,
     *,
     joint: bool = False,
@@ -143,10 +143,10 @@ def calibrate(
 
     Parameters
     ----------
-    frames : mapping of str to sequence of Frame
-        Exposures of the phantom by fluoroscope.
-    phantom : Phantom
-        Its survey.
+    frames : mapping of str to sequence of Frame, or path-like
+        Exposures of the phantom by fluoroscope; or a bag or file of them.
+    phantom : Phantom or path-like
+        Its survey, or the file of it.
     options : CalibrationOptions, optional
     joint : bool
         Whether all fluoroscopes are adjusted together; else one after the other.
@@ -170,6 +170,10 @@ def calibrate(
     ValueError
         For options that contradict each other.
     """
+    if not isinstance(phantom, Phantom):
+        phantom = read_survey(phantom).phantom
+    if not isinstance(frames, Mapping):
+        frames = read_source(frames, collect='auto').frames
     request = CalibrationRequest(
         frames,
         phantom,

@@ -84,7 +84,7 @@ def run(arguments: argparse.Namespace) -> None:
     from ..io.bodies import read_bodies
     from ..io.joints import read_joints
     from ..io.rig_orientation import load_orientation, orientation_path
-    from ..jobs.bodies import BodiesOptions, Rig, track_bodies
+    from ..jobs.bodies import BodiesOptions, track_bodies
     from ..jobs.bodies_folder import check_bodies_folder, save_bodies
     from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import is_bag, read_calibrated_source
@@ -124,8 +124,15 @@ def run(arguments: argparse.Namespace) -> None:
     )
     try:
         with ProgressBar('exposures') as bar:
-            rig = Rig(calibrations, orientation)
-            outcome = track_bodies(recording.frames, rig, bodies, joints, options, bar)
+            outcome = track_bodies(
+                recording.frames,
+                calibrations,
+                orientation,
+                bodies,
+                joints=joints,
+                options=options,
+                progress=bar,
+            )
     except DataError as error:
         raise error.at(arguments.source) from None
     save_bodies(arguments.out, outcome, arguments.figures)

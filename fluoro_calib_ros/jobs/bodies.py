@@ -96,17 +96,10 @@ class BodiesOutcome:
         return tuple(shape.body for shape in self.shapes)
 
 
-@dataclass(frozen=True)
-class Rig:
-    """Calibrated fluoroscopes: calibrations by name, and the orientation that belongs to them."""
-
-    calibrations: Mapping[str, FluoroscopeCalibration]
-    orientation: RigOrientation
-
-
 def track_bodies(
     frames: Mapping[str, Sequence[Frame]],
-    rig: Rig,
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation,
     bodies: Sequence[Body],
     joints: Sequence[JointEntry] = (),
     options: BodiesOptions | None = None,
@@ -118,7 +111,9 @@ def track_bodies(
     ----------
     frames : mapping of str to sequence of Frame
         By fluoroscope.
-    rig : Rig
+    calibrations : mapping of str to FluoroscopeCalibration
+    orientation : RigOrientation
+        That they belong to.
     bodies : sequence of Body
     joints : sequence of JointEntry
     options : BodiesOptions, optional
@@ -137,14 +132,14 @@ def track_bodies(
     """
     options = options or BodiesOptions()
     check_bodies(bodies)
-    names = [name for name in rig.orientation.fluoroscopes if name in frames]
+    names = [name for name in orientation.fluoroscopes if name in frames]
     if len(names) < 2:
         raise DataError(
             f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
-            f'orientation ({", ".join(rig.orientation.fluoroscopes)}) are needed'
+            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
         )
-    orientation = rig.orientation.subset(names)
-    exposures, unpaired = _intersected(frames, Rig(rig.calibrations, orientation), options)
+    orientation = orientation.subset(names)
+    exposures, unpaired = _intersected(frames, calibrations, orientation, options)
     shapes = _shapes(bodies, [one.views for one in exposures], options)
     usable = [shape.body for shape in shapes]
     _check_shapes(usable)
@@ -181,18 +176,21 @@ class _Exposure:
 
 
 def _intersected(
-    frames: Mapping[str, Sequence[Frame]], rig: Rig, options: BodiesOptions
+    frames: Mapping[str, Sequence[Frame]],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation,
+    options: BodiesOptions,
 ) -> tuple[list[_Exposure], dict[str, int]]:
     """Pair and intersect the frames of a recording. Raises DataError."""
-    names = rig.orientation.fluoroscopes
+    names = orientation.fluoroscopes
     paired, unpaired = pair_recording(frames, names, options.pair_by, options.pair_tolerance)
     if not paired:
         raise DataError(f'no frames of {" and ".join(names)} belong together by {options.pair_by}')
-    intersector = Intersector(rig.orientation, options.reject)
+    intersector = Intersector(orientation, options.reject)
     scatter = ObservedScatter()
     out = []
     for exposure in paired:
-        views, present = intersect_frames(exposure, rig.calibrations, intersector, scatter)
+        views, present = intersect_frames(exposure, calibrations, intersector, scatter)
         stamp = present[0].stamp_ns
         if options.rate is not None:
             stamp = 1 + round(present[0].number * NS_PER_S / options.rate)

@@ -143,6 +143,11 @@ class CalibrationOutcome:
     orientation: RigOrientation | None = None
     validation: Validation | None = None
 
+    def __repr__(self) -> str:
+        own = ', '.join(self.result.calibrations)
+        verdict = self.validation.verdict if self.validation else 'not validated'
+        return f'<CalibrationOutcome of {own}: {verdict}>'
+
     @property
     def calibrations(self) -> dict[str, FluoroscopeCalibration]:
         """Calibrations of all fluoroscopes of the rig, the new ones among them."""

@@ -56,6 +56,10 @@ class Recording:
     names: Names = field(default_factory=Names)
     notes: tuple[str, ...] = ()
 
+    def __repr__(self) -> str:
+        counts = ', '.join(f'{name}: {len(own)} frames' for name, own in self.frames.items())
+        return f'<Recording {counts or "empty"}>'
+
 
 @dataclass(frozen=True)
 class BagSelection:

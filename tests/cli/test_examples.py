@@ -47,6 +47,15 @@ def example(name, *arguments, place=ROOT):
     return done.stdout
 
 
+def test_paths_are_taken_and_shown_in_a_line():
+    recording = fc.read_source(ROOT / 'bags' / 'calibration')
+    assert repr(recording) == '<Recording a: 15 frames, b: 15 frames>'
+    options = fc.CalibrationOptions(model='none')
+    outcome = fc.calibrate(ROOT / 'bags' / 'calibration', ROOT / 'bags' / 'phantom.csv', options)
+    assert repr(outcome) == '<CalibrationOutcome of a, b: not validated>'
+    assert dir(fc) == sorted(fc.__all__)
+
+
 def test_public_names_are_those_of_the_api():
     assert sorted(fc.__all__) == sorted(api.__all__)
     for name in fc.__all__:

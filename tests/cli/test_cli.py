@@ -654,7 +654,8 @@ def test_exposures_that_are_left_out_are_reported(rig, tmp_path, capsys):
 @pytest.mark.long
 def test_calibrate_ends_with_verdict_and_report(rig, tmp_path, capsys):
     arguments = (rig / 'calibration', '--phantom', rig / 'phantom.csv', '--out', tmp_path / 'new')
-    assert run('calibrate', *arguments, '--fluoroscopes', 'a', '--model', 'none') == 0
+    options = ('--fluoroscopes', 'a', '--model', 'none')
+    assert run('calibrate', *arguments, *options) == 3
     *_, verdict, report = capsys.readouterr().out.strip().splitlines()
     found = json.loads((tmp_path / 'new' / 'validation.json').read_text())
     assert verdict.startswith(f'Verdict: {found["verdict"]}; ')

@@ -26,10 +26,12 @@ from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from .check import Check
 from .residual_tests import (
+    RejectedExposure,
     RejectedTrend,
     Residuals,
     ResidualTrend,
     common_trend,
+    rejected_exposure,
     rejected_trend,
     residuals_of,
 )
@@ -57,12 +59,15 @@ class CommonTrend:
         size is no fault.
     rejected : RejectedTrend or None
         What rejected image points have in common; None where they are few everywhere.
+    of_exposure : RejectedExposure or None
+        How far those of one exposure agree; None where they are few in all.
     """
 
     inliers: Residuals
     trend: ResidualTrend
     claimed_sd: float
     rejected: RejectedTrend | None = None
+    of_exposure: RejectedExposure | None = None
 
     @property
     def limit(self) -> float:
@@ -121,8 +126,14 @@ class Evidence:
             np.sqrt(np.mean(calibration.correction(inliers.uv, inliers.angle).sd ** 2))
         )
         size = calibration.image_size
-        rejected = rejected_trend(residuals.rejected(noise), inliers, size)
-        return CommonTrend(inliers, common_trend(inliers, size), claimed, rejected)
+        rejected = residuals.rejected(noise)
+        return CommonTrend(
+            inliers,
+            common_trend(inliers, size),
+            claimed,
+            rejected_trend(rejected, inliers, size),
+            rejected_exposure(rejected, inliers),
+        )
 
     @cached_property
     def starts(self) -> StartValues:

@@ -21,7 +21,7 @@ from ..findings import Finding, Kind, Place
 from ..photogrammetry.noise import INLIER_Q
 from .calibration_evidence import Evidence, Subject
 from .check import GOOD_EXPOSURES, Check, more_exposures, too_little_data
-from .residual_tests import residuals_of
+from .residual_tests import RejectedExposure, residuals_of
 
 # Doubts whether exposures fit calibrations that are fixed.
 #
@@ -267,7 +267,26 @@ def _checks(evidence: Evidence, name: str, sums: Sequence[ExposureSums]) -> list
         limit=limits[worst],
         unit='1',
     )
+    agreeing = common.of_exposure
+    if agreeing is not None and agreeing.agreement > agreeing.limit and exposures.passed:
+        exposures = _rejected_exposure(name, agreeing)
     return [check.after_trend(common.is_significant) for check in (held_out, exposures)]
+
+
+def _rejected_exposure(name: str, found: RejectedExposure) -> Check:
+    """Check that fails because rejected image points of an exposure agree with each other."""
+    return Check(
+        Kind.EXPOSURES,
+        f'{found.points} of {found.of} image points of exposure {found.number} are rejected as '
+        'false matches, but agree with their neighbours',
+        Place((name,), (found.number,), name=f'fluoroscope {name}'),
+        'the calibration does not hold in this exposure: inspect it (phantom, lens or fluoroscope '
+        'moved, wrong ids), exclude it and calibrate again',
+        numbers={'rejected_points': found.points, 'points': found.of},
+        value=found.agreement,
+        limit=found.limit,
+        unit='sd of chance',
+    )
 
 
 def exposure_limits(ratio: np.ndarray, white: np.ndarray) -> NDArray[np.float64]:

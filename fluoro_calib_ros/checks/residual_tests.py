@@ -151,6 +151,27 @@ class RejectedTrend(NamedTuple):
     points: int
 
 
+class RejectedExposure(NamedTuple):
+    """How far the rejected image points of one exposure agree with their neighbours.
+
+    Attributes
+    ----------
+    number : int
+        Of the exposure.
+    points, of : int
+        Rejected image points, and all.
+    agreement, limit : float
+        Sum of the products of neighbours, in its standard deviations if they have any direction;
+        what chance exceeds with FALSE_ALARM in any of the exposures.
+    """
+
+    number: int
+    points: int
+    of: int
+    agreement: float
+    limit: float
+
+
 @dataclass(frozen=True)
 class ResidualTrend:
     """A trend in residuals; without one, a limit is exceeded with the chance of its test.
@@ -272,6 +293,31 @@ def rejected_trend(
     return RejectedTrend(
         worst.size_px, worst.limit_px, rejected.uv[worst.rows].mean(axis=0), len(worst.rows)
     )
+
+
+def rejected_exposure(rejected: Residuals, inliers: Residuals) -> RejectedExposure | None:
+    """Test whether the rejected image points of an exposure agree with their neighbours.
+
+    The residuals of false matches have any direction, each its own. What an exposure that does not
+    fit leaves is alike in neighbouring image points. Returns the exposure where it is most
+    significant; None where no exposure has two rejected image points.
+    """
+    limit = float(special.ndtri(1 - FALSE_ALARM / len(rejected.numbers)))
+    found = []
+    for row, number in enumerate(rejected.numbers.tolist()):
+        own = rejected.exposure == row
+        if own.sum() < 2:
+            continue
+        r = rejected.r[own]
+        _, near = cKDTree(rejected.uv[own]).query(rejected.uv[own], k=[2])
+        pairs = np.unique(np.sort([np.arange(len(r)), near[:, 0]], axis=0), axis=1)
+        i, j = pairs[:, pairs[0] != pairs[1]]
+        squares = np.sum(r**2, axis=1)
+        sd = np.sqrt(np.sum(squares[i] * squares[j]) / 2)
+        agreement = float(np.sum(r[i] * r[j]) / sd) if sd > 0 else 0.0
+        total = len(r) + int(np.sum(inliers.exposure == row))
+        found.append(RejectedExposure(number, len(r), total, agreement, limit))
+    return max(found, key=lambda one: one.agreement, default=None)
 
 
 def _joins(residuals: Residuals, neighbours: int) -> Joins:

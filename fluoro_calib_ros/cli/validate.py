@@ -6,9 +6,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ..errors import DataError
 from .arguments import (
@@ -25,6 +26,11 @@ from .arguments import (
     result_folder,
 )
 from .output import print_notes, print_result, print_step, print_unpaired
+
+if TYPE_CHECKING:
+    from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+    from ..estimation.options import CalibrationRequest
+    from ..exposures.frame import Frame
 
 NAME = 'validate'
 HELP = 'Validate a calibration: pass, fail or cannot tell, and what to do.'
@@ -66,12 +72,10 @@ def run(arguments: argparse.Namespace) -> bool:
     """
     from ..checks.rig import RigFindings
     from ..checks.verdict import validate
-    from ..io.calibration_request import read_request
-    from ..io.csv_table import read_names
     from ..io.result_check import edited, exchanged, read_result, used_exposures
     from ..io.result_document import validation_document, write_validation
     from ..jobs.result_folder import saved_orientation
-    from ..jobs.sources import BagSelection, read_calibrations, read_source, read_survey
+    from ..jobs.sources import read_calibrations
     from ..report.verdict import verdict_text
 
     calibrations = read_calibrations(arguments.directory, arguments.fluoroscopes)
@@ -79,25 +83,7 @@ def run(arguments: argparse.Namespace) -> bool:
     mixed = exchanged(arguments.directory, document, calibrations)
     if mixed is not None:
         raise DataError(mixed)
-    frames = phantom = None
-    known = read_names(arguments.directory)
-    if arguments.source is not None:
-        recording = read_source(
-            arguments.source,
-            image_size=arguments.image_size or next(iter(calibrations.values())).image_size,
-            fluoroscopes=arguments.fluoroscopes,
-            collect=arguments.collect,
-            settings=file_settings(arguments, names=known),
-            selection=BagSelection(angles=angle_options(arguments)),
-        )
-        print_notes(recording.notes)
-        print_unpaired(arguments.source, recording.unpaired)
-        frames = recording.frames
-    if arguments.phantom is not None:
-        survey = read_survey(arguments.phantom, file_settings(arguments, names=known))
-        print_notes(survey.notes)
-        phantom = survey.phantom
-    request = read_request(arguments.directory, calibrations, frames, phantom)
+    request = _request(arguments, calibrations)
     request = request.with_exposures(used_exposures(document, request.frames))
     orientation = saved_orientation(arguments.directory)
     is_captured = orientation is not None and orientation.source == 'capture'
@@ -119,3 +105,40 @@ def run(arguments: argparse.Namespace) -> bool:
         (*following, '--out', 'points.csv') if passed else (),
     )
     return passed
+
+
+def _request(
+    arguments: argparse.Namespace, calibrations: Mapping[str, FluoroscopeCalibration]
+) -> CalibrationRequest:
+    """Read what the calibrations were made from, in the folder or where it is given."""
+    from ..estimation.options import CalibrationRequest
+    from ..io.calibration_request import PHANTOM, read_request
+    from ..io.csv_table import read_names
+    from ..io.phantom import read_phantom
+    from ..jobs.calibration import without_unusable
+    from ..jobs.sources import BagSelection, read_source, read_survey
+
+    frames: Mapping[str, Sequence[Frame]] | None = None
+    phantom = None
+    known = read_names(arguments.directory)
+    if arguments.source is not None:
+        recording = read_source(
+            arguments.source,
+            image_size=arguments.image_size or next(iter(calibrations.values())).image_size,
+            fluoroscopes=arguments.fluoroscopes,
+            collect=arguments.collect,
+            settings=file_settings(arguments, names=known),
+            selection=BagSelection(angles=angle_options(arguments)),
+        )
+        print_notes(recording.notes)
+        print_unpaired(arguments.source, recording.unpaired)
+        frames = recording.frames
+    if arguments.phantom is not None:
+        survey = read_survey(arguments.phantom, file_settings(arguments, names=known))
+        print_notes(survey.notes)
+        phantom = survey.phantom
+    saved = arguments.directory / PHANTOM
+    if frames is not None and (phantom is not None or saved.exists()):
+        given = CalibrationRequest(frames, phantom or read_phantom(saved))
+        frames = without_unusable(given)[0].frames  # as `calibrate` has taken them
+    return read_request(arguments.directory, calibrations, frames, phantom)

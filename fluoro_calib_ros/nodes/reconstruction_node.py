@@ -25,7 +25,7 @@ from ..reconstruction.intersection import OUTSIDE
 from ..reconstruction.mismatch import RecentMisses
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
 from .drift_monitor import DriftMonitor, DriftParameters
-from .frame_validation import CORRECTED_REFUSALS, validate_corrected
+from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
@@ -215,7 +215,7 @@ class ReconstructionNode(StreamNode):
                 f'{name}/{VIEWS}',
                 partial(self._on_view, name),
                 observations_qos(),
-                decode=decode_corrected_observations,
+                decode=with_limit(decode_corrected_observations, self._limits.max_points),
                 max_bytes=self._limits.max_bytes,
             )
 

@@ -230,7 +230,7 @@ class ReconstructionNode(StreamNode):
     def _on_camera_info(self, name: str, message: CameraInfo) -> None:
         """Take the image size of a fluoroscope, which the drift watch needs."""
         try:
-            size = image_size_of(message, f'{name}/camera_info')
+            size = image_size_of(message, f'{name}/camera_info', *self._rigs.camera_of(name))
         except DataError as error:
             self._refusals.note(f'camera_info ignored: {error}')
             return

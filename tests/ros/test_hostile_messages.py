@@ -102,8 +102,13 @@ def test_points_without_sigma_meet_the_limit_at_the_first_node(chain):
     uv = np.random.default_rng(2).uniform(0, 1000, (count, 2))
     frame = Frame('a', 1, np.arange(count), uv, (1024, 1024))
     client.publish_message('a', message_from_frame(frame))
-    for node in ('correction_node', 'calibration_node'):
-        client.wait_for_diagnostics(node, lambda s: value_of(s, 'refused: too large') == '1')
+    client.wait_for_diagnostics(
+        'correction_node', lambda s: value_of(s, 'refused: too large') == '1'
+    )
+    client.wait_until(
+        lambda: 'more than the parameter max_points' in chain.nodes['calibration_node'].log,
+        what='the refusal by the calibration node',
+    )
 
 
 def test_good_stream_goes_on_beside_a_flood(chain, tracking, tmp_path):

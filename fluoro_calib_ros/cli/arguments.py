@@ -20,6 +20,7 @@ from .rig import JointOfRig
 if TYPE_CHECKING:
     from ..exposures.angles import AngleOptions
     from ..io.formats.content import FileSettings
+    from ..jobs.scheduling import Cluster
     from ..jobs.sources import BagSelection
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
@@ -300,10 +301,34 @@ def add_scheduler(parser: argparse._ActionsContainer, task: str = 'extract the i
     """Add --scheduler, the address of a Dask cluster for images."""
     parser.add_argument(
         '--scheduler',
-        metavar='tcp://HOST:PORT',
+        metavar='tls://HOST:PORT',
         help=f'Dask scheduler whose workers {task}, in place of processes of this machine '
-        '(needs: pip install fluoro_calib_ros[cluster])',
+        '(needs: pip install fluoro_calib_ros[cluster]); scheduler and workers can run any code '
+        'here: tcp:// only on this machine, else with certificates',
     )
+    for name, what in (
+        ('ca', 'certificate of the authority of the cluster'),
+        ('cert', 'certificate of this process'),
+        ('key', 'its key'),
+    ):
+        parser.add_argument(
+            f'--tls-{name}', default='', metavar='FILE', help=f'with tls://: {what} (PEM)'
+        )
+    parser.add_argument(
+        '--trusted-network',
+        action='store_true',
+        help='allow tcp:// to another machine: whoever is in its network can run code here',
+    )
+
+
+def cluster_of(arguments: argparse.Namespace) -> Cluster | None:
+    """Return the cluster of the arguments of `add_scheduler`, None without one."""
+    from ..jobs.scheduling import Cluster
+
+    if arguments.scheduler is None:
+        return None
+    files = (arguments.tls_ca, arguments.tls_cert, arguments.tls_key)
+    return Cluster(arguments.scheduler, *files, arguments.trusted_network)
 
 
 def add_phantom(parser: Parser, **changes: Any) -> None:

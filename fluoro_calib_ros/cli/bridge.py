@@ -31,6 +31,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help='port of the WebSocket (default: 8765)',
     )
     parser.add_argument(
+        '--token',
+        default='',
+        help='what the address of a client ends with, ?token=... (default: a new one, printed)',
+    )
+    parser.add_argument(
+        '--origins',
+        type=names,
+        metavar='O,O',
+        help='web pages that may connect (default: https://app.foxglove.dev)',
+    )
+    parser.add_argument(
         '--topics', type=names, metavar='T,T', help='topics to show (default: all)'
     )
 
@@ -38,6 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(arguments: argparse.Namespace) -> None:
     """Become the bridge."""
     parameters = {'host': arguments.host, 'port': arguments.port}
+    if arguments.token:
+        parameters['token'] = arguments.token
+    if arguments.origins:
+        parameters['origins'] = arguments.origins
     if arguments.topics:
         parameters['topics'] = arguments.topics
     become_node('bridge_node', parameters)

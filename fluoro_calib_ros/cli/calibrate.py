@@ -23,6 +23,7 @@ from .arguments import (
     add_source,
     angle_options,
     bag_selection,
+    cluster_of,
     file_settings,
     number_in,
     options_of,
@@ -321,7 +322,7 @@ def _extracted(arguments: argparse.Namespace, survey: Survey | None) -> Recordin
             survey,
             arguments.fluoroscopes,
             arguments.principal_distance,
-            scheduler=arguments.scheduler,
+            scheduler=cluster_of(arguments),
             progress=bar,
             angles=ImageAngles(angle_options(arguments)),
         )

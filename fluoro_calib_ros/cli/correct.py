@@ -18,6 +18,7 @@ from .arguments import (
     add_scheduler,
     add_workers,
     angle_of,
+    cluster_of,
     file_settings,
 )
 from .output import ProgressBar, print_note, print_notes, print_result
@@ -167,7 +168,7 @@ def _correct_images(
         calibration=calibration,
         interpolation=arguments.interpolation,
         workers=arguments.workers,
-        scheduler=arguments.scheduler,
+        scheduler=cluster_of(arguments),
         recursive=arguments.recursive,
         keep_going=arguments.keep_going,
         angles=angles,

@@ -20,6 +20,7 @@ from .arguments import (
     add_workers,
     angle_of,
     angle_options,
+    cluster_of,
     file_settings,
     names,
     number_in,
@@ -195,7 +196,7 @@ def _run_phantom(arguments: argparse.Namespace) -> None:
         principal_distance_px=arguments.principal_distance,
         overlay=arguments.overlay,
         workers=arguments.workers,
-        scheduler=arguments.scheduler,
+        scheduler=cluster_of(arguments),
         regular_grid=arguments.regular_grid,
         angles=angles,
     )

@@ -23,13 +23,10 @@ from .documents import read_json
 from .known_orientation import read_known_orientations, write_known_orientations
 from .observations import read_observations_csv, write_observations_csv
 from .phantom import read_phantom, write_phantom
+from .result_check import KNOWN_ORIENTATION, OBSERVATIONS, OPTIONS, PHANTOM
 from .result_document import delete_validation
 from .text_files import write_json
 
-OBSERVATIONS = 'observations.csv'
-PHANTOM = 'phantom.csv'
-OPTIONS = 'options.json'
-KNOWN_ORIENTATION = 'known_orientation.yaml'  # only where there are any
 VERSION = 1  # of options.json
 
 

@@ -57,7 +57,8 @@ class Block:
 
     def strings(self, name: str) -> list[str]:
         """Return the cells of a column without surrounding blanks."""
-        return list(map(str.strip, map(itemgetter(self.header.index(name)), self.rows)))
+        cells = list(map(str.strip, map(itemgetter(self.header.index(name)), self.rows)))
+        return list(map(_from_text, cells)) if "'" in ''.join(cells) else cells
 
     def floats(self, name: str) -> np.ndarray:
         """Return a column (n,) of finite numbers. Raises DataError."""
@@ -136,7 +137,27 @@ def decimal_point(cell: str) -> str:
 
 def write_rows(file: IO[Any], rows: Iterable[Iterable[Any]]) -> None:
     """Write rows of cells to an open text file as CSV, with line feeds."""
-    csv.writer(file, lineterminator='\n').writerows(rows)
+    csv.writer(file, lineterminator='\n').writerows(map(_as_texts, rows))
+
+
+# A spreadsheet runs a cell that begins so. In a file of ours such a name begins with an
+# apostrophe, by which a spreadsheet takes it for text, and which is not read as a part of it.
+_FORMULA = frozenset('=+-@')
+_SUSPICIOUS = _FORMULA | {"'"}
+
+
+def as_text(cell: str) -> str:
+    """Return a cell, with an apostrophe before one that a spreadsheet would run."""
+    bare = cell.lstrip("'")
+    return f"'{cell}" if bare[:1] in _FORMULA and not _is_number(bare, float) else cell
+
+
+def _as_texts(row: Iterable[Any]) -> list[Any]:
+    return [as_text(c) if type(c) is str and c[:1] in _SUSPICIOUS else c for c in row]
+
+
+def _from_text(cell: str) -> str:
+    return cell[1:] if cell[:1] == "'" and as_text(cell[1:]) == cell else cell
 
 
 def format_float(value: float) -> str:

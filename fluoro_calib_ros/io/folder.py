@@ -150,6 +150,30 @@ def replaced_folder(path: PathLike, kind: FolderKind) -> Iterator[Path]:
         raise
 
 
+@contextmanager
+def temporary_folder(path: PathLike) -> Iterator[Path]:
+    """Yield a hidden folder beside a path, for files on their way there; it is deleted at the end.
+
+    So are those that killed runs have left. Raises DataError, which names the path, where it
+    cannot be made, and for an OSError in the block.
+    """
+    parent, name = os.path.split(os.path.abspath(path))
+    folder = ''
+    try:
+        for leftover in _leftovers(parent, name):
+            if leftover.endswith('.tmp') and not _is_locked(leftover):
+                shutil.rmtree(leftover)
+        folder, lock = _locked_folder(parent, name)
+        try:
+            yield Path(folder)
+        finally:
+            os.close(lock)
+    except OSError as error:
+        raise DataError(f'{path}: cannot be written ({os_error_reason(error)})') from None
+    finally:
+        _delete(folder)
+
+
 def clean_up(path: PathLike) -> None:
     """Finish or delete what killed runs left beside a folder; running ones are left alone.
 

@@ -9,10 +9,8 @@ A file appears under its name only once it is complete.
 from __future__ import annotations
 
 import os
-import secrets
-import shutil
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import cast
@@ -23,8 +21,9 @@ import numpy as np
 from ..errors import DataError
 from ..images.codec import encode
 from ..images.corrector import ImageCorrector
-from .access import make_folder, os_error_reason
+from .access import make_folder
 from .atomic import atomic_file, sync_folder, write_bytes
+from .folder import temporary_folder
 from .image_reading import (
     CINE_SUFFIXES,
     DICOM_SUFFIXES,
@@ -100,7 +99,8 @@ def _write_stack(out: Path, source: ImageSource, progress: Progress) -> int:
 def write_video(out: Path, source: ImageSource, progress: Progress) -> int:
     """Write a video; returns the number of frames. Raises as write_images."""
     _, image = next(source.images)
-    with temporary_path(out) as temporary:
+    with temporary_folder(out) as folder:
+        temporary = folder / out.name
         video = _open_video(out, temporary, image, cast(float, source.frame_rate))
         number = 0
         try:
@@ -165,25 +165,6 @@ def _check_written(out: Path, path: Path, count: int) -> None:
         raise DataError(f'{out}: cannot be written (is the disk full?)')
     with open(path, 'rb') as file:
         os.fsync(file.fileno())
-
-
-@contextmanager
-def temporary_path(out: Path) -> Iterator[Path]:
-    """Path next to a file or folder, with its suffix; whatever is there at the end is removed.
-
-    An OSError in the block becomes a DataError that names `out`.
-    """
-    path = out.absolute().parent / f'.{out.stem[:100]}.{secrets.token_hex(8)}.tmp{out.suffix}'
-    try:
-        yield path
-    except OSError as error:
-        raise DataError(f'{out}: cannot be written ({os_error_reason(error)})') from None
-    finally:
-        if path.is_dir():
-            shutil.rmtree(path, ignore_errors=True)
-        else:
-            with suppress(OSError):
-                path.unlink()
 
 
 # Correction of image files, stacks and videos.
@@ -367,8 +348,7 @@ def folder_like(out: Path, source: ImageFolder) -> Iterator[Path]:
         raise DataError(f'{out}: this is a file, but {source.path} is a folder')
     if source.path.resolve() in out.resolve().parents and source.recursive:
         raise DataError(f'{out}: this is inside of {source.path}, which is read with its folders')
-    with temporary_path(out) as temporary:
-        make_folder(temporary)
+    with temporary_folder(out) as temporary:
         folders = sorted({path.parent for path in source.files})
         for folder in folders:
             (temporary / folder).mkdir(parents=True, exist_ok=True)

@@ -1,18 +1,19 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Whether result.json and the calibration files in its folder belong together.
+"""Whether the files in a result folder belong together.
 
 result.json names the calibrations that it is about by their ids, which are digests of their
-content, and has a digest of its own content. Those of earlier versions have neither, and agree
-with everything.
+content, and has a digest of its own content. validation.json, the verdict, has digests of all
+files that it is about, and one of these and itself: one over the folder. Those of earlier versions
+have none, and agree with everything.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,24 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..exposures.frame import Frame
 from ..findings import Finding, Kind, Place, Severity
-from .access import PathLike
+from .access import PathLike, read_bytes
+from .calibration import SUFFIX
+from .csv_table import NAMES_FILE
 from .documents import read_json
 from .text_files import to_json_values
 
 Frames = Mapping[str, Sequence[Frame]]
 
 RESULT_NAME = 'result.json'
+VALIDATION_NAME = 'validation.json'  # the verdict
+OBSERVATIONS = 'observations.csv'
+PHANTOM = 'phantom.csv'
+OPTIONS = 'options.json'
+KNOWN_ORIENTATION = 'known_orientation.yaml'  # only where there are any
 DIGEST = 'digest'
+FILES = 'files'
+# What a verdict is about, beside the calibrations.
+_JUDGED = (RESULT_NAME, OBSERVATIONS, PHANTOM, OPTIONS, KNOWN_ORIENTATION, NAMES_FILE)
 
 
 def with_digest(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -38,21 +49,26 @@ def with_digest(document: Mapping[str, Any]) -> dict[str, Any]:
 def disagreements(
     directory: PathLike, calibrations: Mapping[str, FluoroscopeCalibration]
 ) -> list[Finding]:
-    """Return a finding for everything in result.json that contradicts the calibrations beside it.
+    """Return a finding for everything in result.json and the verdict that contradicts the files.
 
     There are none without result.json. A file that cannot be read is one.
     """
     try:
         document = read_result(directory)
+        verdict = read_result(directory, VALIDATION_NAME)
     except DataError as error:
         return [error.finding]
-    found = (exchanged(directory, document, calibrations), edited(directory, document))
+    found = (
+        exchanged(directory, document, calibrations),
+        edited(directory, document),
+        changed_since_verdict(directory, verdict),
+    )
     return [one for one in found if one is not None]
 
 
-def read_result(directory: PathLike) -> dict[str, Any]:
-    """Read result.json of a folder, {} where there is none. Raises DataError."""
-    path = Path(directory) / RESULT_NAME
+def read_result(directory: PathLike, name: str = RESULT_NAME) -> dict[str, Any]:
+    """Read a document of a folder, {} where there is none. Raises DataError."""
+    path = Path(directory) / name
     return read_json(path) if path.exists() else {}
 
 
@@ -70,6 +86,40 @@ def used_exposures(document: Mapping[str, Any], frames: Frames) -> dict[str, set
             used = {row.get('exposure') for row in rows if isinstance(row, Mapping)}
             out[name] = numbers & used or numbers
     return out
+
+
+def with_digests(
+    directory: PathLike, document: Mapping[str, Any], fluoroscopes: Iterable[str]
+) -> dict[str, Any]:
+    """Return a verdict with the digests of the files that it is about, and one of all.
+
+    Raises DataError for a file that cannot be read.
+    """
+    names = (*_JUDGED, *(name + SUFFIX for name in fluoroscopes))
+    files = {name: _digest_of_file(Path(directory) / name) for name in names}
+    return with_digest({**document, FILES: files})
+
+
+def changed_since_verdict(directory: PathLike, verdict: Mapping[str, Any]) -> Finding | None:
+    """Return a finding where a verdict, or a file that it is about, was changed afterwards."""
+    found = edited(directory, verdict, VALIDATION_NAME)
+    files = verdict.get(FILES)
+    if found is not None or not isinstance(files, Mapping):
+        return found
+    try:
+        changed = [n for n in files if _digest_of_file(Path(directory) / n) != files[n]]
+    except DataError as error:
+        return error.finding
+    return _edited(directory, changed[0], 'the verdict is not about it') if changed else None
+
+
+def _digest_of_file(path: Path) -> str:
+    """SHA-256 (hex) of a file, of the values of a JSON document; '' where there is none."""
+    if not path.exists():
+        return ''
+    if path.suffix == '.json':
+        return _digest(read_json(path))
+    return hashlib.sha256(read_bytes(path)).hexdigest()
 
 
 def exchanged(
@@ -102,18 +152,23 @@ def exchanged(
     )
 
 
-def edited(directory: PathLike, document: Mapping[str, Any]) -> Finding | None:
-    """Return a finding where result.json was changed after it was written."""
+def edited(
+    directory: PathLike, document: Mapping[str, Any], name: str = RESULT_NAME
+) -> Finding | None:
+    """Return a finding where a document with a digest was changed after it was written."""
     if DIGEST not in document:
         return None
     content = {key: value for key, value in document.items() if key != DIGEST}
     if document[DIGEST] == _digest(content):
         return None
+    return _edited(directory, name, 'its figures need not be those of the calibration')
+
+
+def _edited(directory: PathLike, name: str, consequence: str) -> Finding:
     return Finding(
         Kind.EDITED_RESULT,
-        'the file was changed after it was written, its figures need not be those of the '
-        'calibration',
-        Place(name=str(Path(directory) / RESULT_NAME)),
+        f'the file was changed after it was written, {consequence}',
+        Place(name=str(Path(directory) / name)),
         'restore it, or calibrate again',
         Severity.WARNING,
     )

@@ -23,6 +23,7 @@ from ..findings import Finding, Severity, sentences
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import quaternion_from_matrix
 from .access import PathLike, os_error_reason
+from .result_check import VALIDATION_NAME, with_digests
 from .text_files import write_json
 
 # 1 had neither version, date, units nor adjustments; 2 no ids, no note on the rig and no digest.
@@ -257,9 +258,6 @@ def drift_document(verdict: DriftVerdict | None, begin_ns: int) -> dict[str, Any
     return out
 
 
-VALIDATION_NAME = 'validation.json'  # the verdict, in the folder of the calibration
-
-
 def validation_document(validation: Validation) -> dict[str, Any]:
     """Return a Validation as the dict of validation.json."""
     return {
@@ -288,8 +286,10 @@ def _check_document(check: Check) -> dict[str, Any]:
 
 
 def write_validation(directory: PathLike, validation: Validation) -> None:
-    """Write validation.json into a folder. Raises DataError."""
-    write_json(Path(directory) / VALIDATION_NAME, validation_document(validation))
+    """Write validation.json into a folder, as its last file. Raises DataError."""
+    document = validation_document(validation)
+    document = with_digests(directory, document, validation.calibration_id)
+    write_json(Path(directory) / VALIDATION_NAME, document)
 
 
 def delete_validation(directory: PathLike) -> None:

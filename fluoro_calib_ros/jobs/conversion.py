@@ -22,8 +22,6 @@ from ..exposures.frame import Frame
 from ..images.corrector import ImageCorrector
 from ..io.bags.reader import read_frames, with_angles
 from ..io.calibration import SUFFIX, load_calibrations
-from ..io.calibration_request import OBSERVATIONS
-from ..io.calibration_request import PHANTOM as PHANTOM_FILE
 from ..io.csv_table import read_names
 from ..io.documents import read_json
 from ..io.formats import registry
@@ -39,6 +37,8 @@ from ..io.formats.content import (
 )
 from ..io.observations import read_observations_csv
 from ..io.phantom import read_phantom
+from ..io.result_check import OBSERVATIONS
+from ..io.result_check import PHANTOM as PHANTOM_FILE
 from ..io.result_check import RESULT_NAME as RESULT
 from ..io.rig_orientation import load_orientation, orientation_path
 from ..photogrammetry.rig_orientation import RigOrientation

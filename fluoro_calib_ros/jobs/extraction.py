@@ -31,7 +31,7 @@ from .image_sources import (
     open_sources,
 )
 from .live_extraction import Observations, PhantomSettings
-from .scheduling import Workers, open_workers
+from .scheduling import Cluster, Workers, open_workers
 from .sources import Recording, Survey
 
 FOLLOWED = 12  # images of a video after which the pose is searched for anew
@@ -77,8 +77,9 @@ class ExtractionRequest:
         Folder for pictures of what was found.
     workers : int
         Processes; 0: as many as there are cores.
-    scheduler : str or None
-        Address of a Dask scheduler whose workers extract, in place of processes.
+    scheduler : Cluster or str or None
+        A Dask cluster, or the address of its scheduler, whose workers extract, in place of
+        processes.
     regular_grid : bool
         The phantom is a regular flat grid. Its place and turn are arbitrary by whole steps.
     angles : ImageAngles
@@ -91,7 +92,7 @@ class ExtractionRequest:
     principal_distance_px: float | None = None
     overlay: Path | None = None
     workers: int = 0
-    scheduler: str | None = None
+    scheduler: Cluster | str | None = None
     regular_grid: bool = False
     angles: ImageAngles = field(default_factory=ImageAngles)
 
@@ -286,7 +287,7 @@ def recording_of_images(
     survey: Survey,
     fluoroscopes: Sequence[str] | None = None,
     principal_distance_px: float | None = None,
-    scheduler: str | None = None,
+    scheduler: Cluster | str | None = None,
     progress: Progress | None = None,
     angles: ImageAngles | None = None,
 ) -> Recording:
@@ -301,8 +302,8 @@ def recording_of_images(
     fluoroscopes : sequence of str, optional
         Names of those to read; needed for the images of a single one.
     principal_distance_px : float, optional
-    scheduler : str, optional
-        Address of a Dask scheduler.
+    scheduler : Cluster or str, optional
+        A Dask cluster, or the address of the scheduler of one.
     progress : callable, optional
     angles : ImageAngles, optional
         Angles of the C-arms.

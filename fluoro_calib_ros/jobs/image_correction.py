@@ -24,7 +24,7 @@ from ..io.image_writing import (
     folder_like,
     list_images,
 )
-from .scheduling import open_workers
+from .scheduling import Cluster, open_workers
 
 PER_PROCESS = 50  # images that are worth the start of a process
 
@@ -41,8 +41,9 @@ class ImageCorrectionRequest:
     interpolation : {'linear', 'cubic'}
     workers : int
         Processes for the files of a folder; 0: as many as there are cores, and as are worth it.
-    scheduler : str or None
-        Address of a Dask scheduler, in place of processes. Its workers read and write the same
+    scheduler : Cluster or str or None
+        A Dask cluster, or the address of its scheduler, in place of processes. Its workers read
+        and write the same
         folders under the same names.
     recursive : bool
         Whether the folders in a folder belong to it.
@@ -58,7 +59,7 @@ class ImageCorrectionRequest:
     calibration: FluoroscopeCalibration
     interpolation: str = 'linear'
     workers: int = 0
-    scheduler: str | None = None
+    scheduler: Cluster | str | None = None
     recursive: bool = False
     keep_going: bool = False
     angles: Mapping[int, float] | None = None

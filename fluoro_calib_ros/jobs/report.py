@@ -10,7 +10,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jinja2 import UndefinedError
@@ -20,12 +19,18 @@ from ..errors import DataError
 from ..findings import Finding, Kind, Place, Severity
 from ..io.atomic import write_text
 from ..io.calibration import load_calibrations
-from ..io.calibration_request import OPTIONS, read_request
+from ..io.calibration_request import read_request
 from ..io.csv_table import read_names
 from ..io.documents import read_json
+from ..io.result_check import (
+    OPTIONS,
+    VALIDATION_NAME,
+    changed_since_verdict,
+    edited,
+    exchanged,
+    read_result,
+)
 from ..io.result_check import RESULT_NAME as RESULT
-from ..io.result_check import edited, exchanged
-from ..io.result_document import VALIDATION_NAME as VALIDATION
 from ..report.html import ReportInput, report_html
 from .conversion import stations_of
 from .result_folder import REPORT, belongs_to, saved_orientation, saved_rig_note
@@ -140,6 +145,10 @@ def read_report_input(directory: str | os.PathLike[str]) -> ReportInput:
     orientation = saved_orientation(directory)
     if orientation is not None and not belongs_to(orientation, calibrations):
         orientation = None
+    verdict = read_result(directory, VALIDATION_NAME)
+    if verdict.get('calibration_id') != {n: c.calibration_id for n, c in present.items()}:
+        verdict = {}
+    changed = changed_since_verdict(directory, verdict)
     when = datetime.fromtimestamp((directory / RESULT).stat().st_mtime, timezone.utc)
     return ReportInput(
         directory.resolve().name,
@@ -148,19 +157,10 @@ def read_report_input(directory: str | os.PathLike[str]) -> ReportInput:
         frames=request.frames,
         phantom=request.phantom,
         settings=read_json(directory / OPTIONS),
-        validation=_validation(directory, {n: c.calibration_id for n, c in present.items()}),
+        validation=verdict if verdict and not changed else None,
         orientation=orientation,
         names=read_names(directory),
         written=when.strftime('%Y-%m-%d %H:%M UTC'),
         rig_note=saved_rig_note(directory),
-        edited=edited(directory, result),
+        edited=edited(directory, result) or changed,
     )
-
-
-def _validation(directory: Path, ids: Mapping[str, str]) -> dict[str, Any] | None:
-    """Return the verdict in a folder, None where there is none on these calibrations."""
-    path = directory / VALIDATION
-    if not path.exists():
-        return None
-    document = read_json(path)
-    return document if document.get('calibration_id') == ids else None

@@ -15,18 +15,19 @@ from ..errors import DataError
 from ..estimation.result import CalibrationResult
 from ..findings import Finding, Kind, Severity
 from ..io import csv_table as names
-from ..io import result_document as validation
 from ..io.calibration import SUFFIX, load_calibrations, save_calibration
-from ..io.calibration_request import (
+from ..io.calibration_request import write_request
+from ..io.folder import FolderKind, check_output_folder, replaced_folder
+from ..io.result_check import (
     KNOWN_ORIENTATION,
     OBSERVATIONS,
     OPTIONS,
     PHANTOM,
-    write_request,
+    VALIDATION_NAME,
+    read_result,
+    with_digest,
 )
-from ..io.folder import FolderKind, check_output_folder, replaced_folder
 from ..io.result_check import RESULT_NAME as RESULT
-from ..io.result_check import read_result, with_digest
 from ..io.result_document import result_document, write_validation
 from ..io.result_tables import NAMES as TABLES
 from ..io.result_tables import SUFFIX as COVARIANCE
@@ -47,7 +48,7 @@ _OWN = (
     KNOWN_ORIENTATION,
     ORIENTATION,
     names.NAMES_FILE,
-    validation.VALIDATION_NAME,
+    VALIDATION_NAME,
     *TABLES,
     'figures',
     REPORT,

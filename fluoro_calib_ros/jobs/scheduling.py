@@ -11,9 +11,13 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from ipaddress import ip_address
 from typing import Any, Protocol, TypeVar
+from urllib.parse import urlsplit
 
 from ..errors import DataError
+from ..io.access import read_bytes
 from ..limits import ReadLimits, read_limits, use_read_limits
 from ..processes import ProcessEnded, WorkerProcess, one_core
 
@@ -33,7 +37,7 @@ class Workers(Protocol):
 
 
 def open_workers(
-    count: int = 0, scheduler: str | None = None, tasks: int = 0
+    count: int = 0, scheduler: Cluster | str | None = None, tasks: int = 0
 ) -> AbstractContextManager[Workers]:
     """Return workers, as a context that ends them.
 
@@ -41,18 +45,19 @@ def open_workers(
     ----------
     count : int
         Processes; 0: as many as there are cores.
-    scheduler : str or None
-        Address of a Dask scheduler (tcp://host:port), in place of processes.
+    scheduler : Cluster or str or None
+        A Dask cluster, or the address of the scheduler of one, in place of processes.
     tasks : int
         How many there will be, 0 where it is not known. For a single one, no process is started.
 
     Raises
     ------
     DataError
-        Where the scheduler cannot be reached, or the package `distributed` is missing.
+        Where the scheduler cannot be reached or is not trusted, or the package `distributed` is
+        missing.
     """
     if scheduler is not None:
-        return DaskWorkers(scheduler)
+        return DaskWorkers(Cluster(scheduler) if isinstance(scheduler, str) else scheduler)
     return LocalWorkers(min(count or os.cpu_count() or 1, tasks or 2**31))
 
 
@@ -111,22 +116,86 @@ def _applied(function: Callable[[Task], Result], task: Task) -> Result:
     return function(task)
 
 
-class DaskWorkers:
-    """Workers of a Dask cluster.
+@dataclass(frozen=True)
+class Cluster:
+    """A Dask cluster: who it is, and why it is trusted.
 
-    A task whose worker dies runs again on another one. Functions and tasks travel as pickles
-    between this process and the cluster, which therefore has to be trusted.
+    Functions, tasks and results travel as pickles: scheduler and workers can run code here, and
+    whoever reaches them can run code there.
+
+    Attributes
+    ----------
+    scheduler : str
+        Address: tls://host:port, or tcp://host:port on this machine or in a trusted network.
+    tls_ca, tls_cert, tls_key : str
+        Files (PEM) of the authority that has signed the certificates of the cluster, and of the
+        certificate of this process and its key; '' for none.
+    trusted_network : bool
+        Whether all who reach the network of a tcp:// scheduler are trusted.
     """
 
-    def __init__(self, address: str) -> None:
+    scheduler: str
+    tls_ca: str = ''
+    tls_cert: str = ''
+    tls_key: str = ''
+    trusted_network: bool = False
+
+    def security(self) -> Any:
+        """Return what the client proves and demands, None for plain TCP. Raises DataError."""
+        from distributed.security import Security
+
+        files = (self.tls_ca, self.tls_cert, self.tls_key)
+        if self.scheduler.startswith('tls://'):
+            if not all(files):
+                raise DataError(
+                    f'{self.scheduler}: a scheduler with TLS needs the certificate of the '
+                    'authority, and one of this process with its key: --tls-ca, --tls-cert and '
+                    '--tls-key'
+                )
+            for path in files:
+                read_bytes(path)
+            return Security(
+                tls_ca_file=self.tls_ca,
+                tls_client_cert=self.tls_cert,
+                tls_client_key=self.tls_key,
+                require_encryption=True,
+            )
+        if any(files):
+            raise DataError(f'{self.scheduler}: certificates are for a scheduler tls://HOST:PORT')
+        if not self.trusted_network and not _is_of_this_machine(self.scheduler):
+            raise DataError(
+                f'{self.scheduler}: whoever reaches this scheduler can run code here; start it '
+                'with TLS (tls://HOST:PORT, --tls-ca, --tls-cert, --tls-key), or say that you '
+                'trust all of its network: --trusted-network'
+            )
+        return None
+
+
+def _is_of_this_machine(address: str) -> bool:
+    """Return whether an address is a loopback one, in numbers; a name may be that of another."""
+    host = urlsplit(address if '//' in address else f'//{address}').hostname or ''
+    try:
+        return host == 'localhost' or ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+class DaskWorkers:
+    """Workers of a Dask cluster. A task whose worker dies runs again on another one."""
+
+    def __init__(self, cluster: Cluster) -> None:
+        address = cluster.scheduler
         try:
             from distributed import Client
         except ImportError:
             raise DataError(
                 '--scheduler needs the package distributed: pip install distributed'
             ) from None
+        security = cluster.security()
         try:
-            self._client: Any = Client(address, timeout=CONNECT_S, set_as_default=False)
+            self._client: Any = Client(
+                address, timeout=CONNECT_S, set_as_default=False, security=security
+            )
         except (OSError, ValueError) as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
             raise DataError(f'there is no Dask scheduler at {address}: {reason}') from None

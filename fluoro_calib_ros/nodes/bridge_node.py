@@ -9,18 +9,21 @@ topic is subscribed only while somebody looks at it.
 
 from __future__ import annotations
 
+import secrets
 import threading
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
+from urllib.parse import quote
 
 from rclpy.qos import DurabilityPolicy
 from rclpy.subscription import Subscription
 
 from ..options import option
+from .bridge_gate import Admission, Gate, hidden_address
 from .recorder_node import adapted_qos, type_hash_text
-from .runtime.logging import StartError
+from .runtime.logging import RateLimitedLogger, StartError
 from .runtime.main import run
 from .runtime.parameters import ParameterGroup, ParameterNode
 from .runtime.streams import TopicDiscovery, definition_of, installed_type
@@ -35,11 +38,16 @@ class BridgeParameters:
 
     host: str = option(
         '127.0.0.1',
-        'address on which it listens: 127.0.0.1 for programs of this machine, 0.0.0.0 for all; '
-        'nobody is asked for a password',
+        'address on which it listens: 127.0.0.1 for programs of this machine, 0.0.0.0 for all',
     )
     port: int = option(8765, 'port of the WebSocket; 0: any free one', minimum=0, maximum=65535)
     topics: tuple[str, ...] = option(('',), 'topics to show; empty: all')
+    token: str = option(
+        '', 'what the address of a client ends with, ?token=...; empty: a new one at every start'
+    )
+    origins: tuple[str, ...] = option(
+        ('https://app.foxglove.dev',), 'web pages that may connect; others are refused'
+    )
 
 
 _NODE = ParameterGroup(BridgeParameters)
@@ -69,15 +77,16 @@ class BridgeNode(ParameterNode):
         self._lock = threading.Lock()
         self._readers: Counter[str] = Counter()  # by topic; changed by the server's threads
         self._newcomers: set[str] = set()  # topics with a reader who missed the latched message
-        self._server = self._start_server(settings)
+        self._limited_logger = RateLimitedLogger(self.get_logger())
+        self._token = settings.token or secrets.token_urlsafe(16)
+        self._server = self._start_server()
+        self._gate = self._open_gate(settings)
         self.create_timer(DISCOVERY_S, self._update)
-        self.get_logger().info(
-            f'open ws://{settings.host}:{self._server.port} in Foxglove; the layout is '
-            'config/foxglove.json'
-        )
+        address = f'ws://{settings.host}:{self._gate.port}/?token={quote(self._token)}'
+        self.get_logger().info(f'open {address} in Foxglove; the layout is config/foxglove.json')
 
-    def _start_server(self, settings: BridgeParameters) -> Any:
-        """Start the WebSocket server. Raises StartError."""
+    def _start_server(self) -> Any:
+        """Start the WebSocket server, on an address that only the gate knows."""
         node = self
 
         class Listener(self._foxglove.ServerListener):  # type: ignore[name-defined]
@@ -87,14 +96,29 @@ class BridgeNode(ParameterNode):
             def on_unsubscribe(self, client: Any, channel: Any) -> None:
                 node._count_reader(channel.topic, -1)
 
+        self._address = hidden_address()
+        return self._foxglove.start_server(
+            name=f'fluoro_calib_ros {self.get_namespace()}',
+            host=self._address,
+            port=0,
+            server_listener=Listener(),
+        )
+
+    def _open_gate(self, settings: BridgeParameters) -> Gate:
+        """Let clients through to the server. Raises StartError."""
+
+        def on_refused(client: str, reason: str) -> None:
+            self._limited_logger.warning(f'client {client} refused: {reason}')
+
         try:
-            return self._foxglove.start_server(
-                name=f'fluoro_calib_ros {self.get_namespace()}',
-                host=settings.host,
-                port=settings.port,
-                server_listener=Listener(),
+            return Gate(
+                settings.host,
+                settings.port,
+                (self._address, self._server.port),
+                admission=Admission(self._token, settings.origins),
+                on_refused=on_refused,
             )
-        except Exception as error:  # of the SDK, which has no common one
+        except OSError as error:
             raise StartError(
                 f'no WebSocket on {settings.host}:{settings.port} ({error}); parameter port '
                 'chooses another'
@@ -152,6 +176,7 @@ class BridgeNode(ParameterNode):
 
     def stop(self) -> None:
         """Close the WebSocket."""
+        self._gate.close()
         self._server.stop()
 
 

@@ -15,8 +15,8 @@ from fluoro_calib_msgs.srv import LoadCalibration, SaveCalibration
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, printable
 from ..io.calibration import SUFFIX, load_calibrations
-from ..io.calibration_request import PHANTOM as PHANTOM_FILE
 from ..io.phantom import read_phantom
+from ..io.result_check import PHANTOM as PHANTOM_FILE
 from ..io.result_check import disagreements
 from ..io.rig_orientation import load_orientation, orientation_path
 from ..jobs.calibration import CalibrationOutcome

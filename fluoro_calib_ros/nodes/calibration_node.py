@@ -37,6 +37,7 @@ from .calibration_settings import (
     read_rig,
 )
 from .exposure_input import ExposureInput
+from .frame_validation import with_limit
 from .messages.observations import NS_PER_S, ObservedFrame, decode_target_observations
 from .messages.status import FluoroscopeProgress
 from .runtime.diagnostics import Status, health_of
@@ -121,7 +122,7 @@ class CalibrationNode(StreamNode):
                 f'{name}/{OBSERVATIONS}',
                 partial(self._on_frame, name),
                 observations_qos(),
-                decode=decode_target_observations,
+                decode=with_limit(decode_target_observations, self._settings.limits.max_points),
                 max_bytes=self._settings.limits.max_bytes,
             )
 

@@ -13,7 +13,7 @@ from ..correction.angle_field import AngleField
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError, printable
 from ..exposures.angles import AngleOptions
-from ..io.calibration import load_calibrations
+from ..io.calibration import SUFFIX, load_calibrations
 from ..io.result_check import disagreements
 from .angle_input import AngleInput, beyond_text
 from .calibration_input import CalibrationInput
@@ -32,6 +32,8 @@ from .runtime.logging import one_line
 from .runtime.parameters import CalibratedParameters, expand_path
 from .runtime.stream import Stream, stream_faults
 from .runtime.streams import FaultHandlers
+
+FILES = f'*{SUFFIX}'
 
 
 class CorrectedStream(Stream):
@@ -223,9 +225,12 @@ class CorrectingNode(StreamNode):
             self._load_calibrations(self._directory)
 
     def _load_calibrations(self, text: str) -> None:
-        """Begin with the calibrations of a folder."""
+        """Begin with the calibrations of a folder; there may be none before the first one."""
         try:
             directory = expand_path(text)
+            if not directory.exists() or (directory.is_dir() and not any(directory.glob(FILES))):
+                self.get_logger().info(f'{directory} has no calibrations yet: waiting for them')
+                return
             loaded = load_calibrations(directory)
             missing = [name for name in self.names if name not in loaded]
             if missing:

@@ -19,7 +19,7 @@ from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.angles import AngleOptions
 from ..limits import StreamLimits
 from .correcting_node import CorrectedStream, CorrectingNode
-from .frame_validation import OBSERVED_REFUSALS, FrameValidator
+from .frame_validation import OBSERVED_REFUSALS, FrameValidator, with_limit
 from .messages.fluoroscope_calibration import message_of_corrected_stream
 from .messages.observations import (
     NS_PER_S,
@@ -96,7 +96,7 @@ class CorrectionNode(CorrectingNode):
                 f'{name}/target_observations',
                 partial(self._on_frame, name),
                 observations_qos(),
-                decode=decode_target_observations,
+                decode=with_limit(decode_target_observations, self._limits.max_points),
                 max_bytes=self._limits.max_bytes,
             )
 

@@ -5,12 +5,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import numpy as np
 
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..exposures.frame import image_size_error, length_error, repeated_target_error, sigma_error
 from .messages.observations import CorrectedFrame, ObservedFrame
 from .runtime.diagnostics import TOO_LARGE, Refused
+from .runtime.streams import TooLarge
 
 # Kinds of refusals.
 OBSERVED_REFUSALS = (
@@ -24,6 +28,24 @@ OBSERVED_REFUSALS = (
 )
 CORRECTED_ARRAYS = ('u', 'v', 'sigma', 'correction_sd', 'status')
 CORRECTED_REFUSALS = ('undecodable', TOO_LARGE, 'lengths', 'repeated target', 'sigma')
+
+
+Decoded = TypeVar('Decoded', ObservedFrame, CorrectedFrame)
+
+
+def with_limit(decode: Callable[[bytes], Decoded], most: int) -> Callable[[bytes], Decoded]:
+    """Return a function that decodes frames and raises TooLarge for more than so many points.
+
+    The same at every node: bytes tell it only for a message with all its columns.
+    """
+
+    def decode_limited(data: bytes) -> Decoded:
+        frame = decode(data)
+        if len(frame.u) > most:
+            raise TooLarge(f'{len(frame.u)} points')
+        return frame
+
+    return decode_limited
 
 
 class FrameValidator:

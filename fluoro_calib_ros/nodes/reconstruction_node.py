@@ -25,7 +25,7 @@ from ..reconstruction.intersection import OUTSIDE
 from ..reconstruction.mismatch import RecentMisses
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
 from .drift_monitor import DriftMonitor, DriftParameters
-from .frame_validation import CORRECTED_REFUSALS, validate_corrected
+from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
 from .messages.observations import NS_PER_S, CorrectedFrame, decode_corrected_observations
 from .messages.points import PointsContent
@@ -215,7 +215,7 @@ class ReconstructionNode(StreamNode):
                 f'{name}/{VIEWS}',
                 partial(self._on_view, name),
                 observations_qos(),
-                decode=decode_corrected_observations,
+                decode=with_limit(decode_corrected_observations, self._limits.max_points),
                 max_bytes=self._limits.max_bytes,
             )
 
@@ -230,7 +230,7 @@ class ReconstructionNode(StreamNode):
     def _on_camera_info(self, name: str, message: CameraInfo) -> None:
         """Take the image size of a fluoroscope, which the drift watch needs."""
         try:
-            size = image_size_of(message, f'{name}/camera_info')
+            size = image_size_of(message, f'{name}/camera_info', *self._rigs.camera_of(name))
         except DataError as error:
             self._refusals.note(f'camera_info ignored: {error}')
             return

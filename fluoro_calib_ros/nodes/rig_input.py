@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 from fluoro_calib_msgs.msg import RigOrientation
 
 from ..checks.rig_watch import RigDriftWatch
@@ -77,6 +78,14 @@ class RigInput:
     def newest(self) -> Rig | None:
         """The last one that has arrived."""
         return next(reversed(self._rigs.values()), None)
+
+    def camera_of(self, name: str) -> tuple[str, np.ndarray | None]:
+        """Return optical frame and interior orientation (3,) of the newest one, or '' and None."""
+        rig = self.newest
+        if rig is None:
+            return '', None
+        index = rig.orientation.fluoroscopes.index(name)
+        return rig.orientation.optical_frame_ids[index], rig.orientation.interior[index]
 
     def rig_of(self, calibration_ids: Mapping[str, str]) -> Rig | None:
         """Return the newest rig with the calibrations of some views, by fluoroscope."""

@@ -22,7 +22,12 @@ from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationR
 from fluoro_calib_ros.io import folder as folder_module
 from fluoro_calib_ros.io.calibration import load_calibrations
 from fluoro_calib_ros.io.calibration_request import read_request
-from fluoro_calib_ros.io.folder import FolderKind, check_output_file, replaced_folder
+from fluoro_calib_ros.io.folder import (
+    FolderKind,
+    check_output_file,
+    replaced_folder,
+    temporary_folder,
+)
 from fluoro_calib_ros.jobs.calibration import CalibrationOutcome
 from fluoro_calib_ros.jobs.result_folder import save_calibrations, save_outcome
 from fluoro_calib_ros.jobs.simulation import SimulationOptions, simulate
@@ -273,3 +278,16 @@ def test_output_file_that_is_an_input_is_refused(tmp_path):
     for name in ('bag/points3d.csv', 'new.csv'):
         check_output_file(tmp_path / name, inputs)
     assert np.all([p.exists() for p in inputs])
+
+
+def test_temporary_folder_of_a_killed_run_is_deleted_and_that_of_a_running_one_is_not(tmp_path):
+    left = tmp_path / '.out.0123456789abcdef.tmp'
+    left.mkdir()
+    (left / 'image.png').write_bytes(b'x')
+    with temporary_folder(tmp_path / 'out') as running:
+        assert not left.exists()
+        (running / 'file').write_bytes(b'x')
+        with temporary_folder(tmp_path / 'out') as second:
+            assert running.is_dir() and second != running
+        assert [path.name for path in tmp_path.iterdir()] == [running.name]
+    assert list(tmp_path.iterdir()) == []

@@ -3,11 +3,13 @@
 
 """The file names.csv of a result folder."""
 
+import io
+
 import pytest
 
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.exposures.names import Names
-from fluoro_calib_ros.io.csv_table import read_names, write_names
+from fluoro_calib_ros.io.csv_table import NAMES_FILE, read_names, write_names, write_rows
 
 NAMES = Names({'tib, lat': 4, 'fem "a"': 2}, {'trial 3.tif': 3}, {'Röntgen 1': 'R_ntgen_1'})
 
@@ -43,3 +45,20 @@ def test_wrong_names_name_the_row(tmp_path, row, sentence):
 def test_name_with_two_ids_is_refused():
     with pytest.raises(DataError, match="target 'a' has the id 1, and the id 2"):
         Names({'a': 1}).merged(Names({'a': 2}))
+
+
+@pytest.mark.parametrize(
+    'name', ['=cmd', '@x', '+1+1', "-in|cmd'!A1", '-0x', "'quoted", "'=quoted", '-1.5a']
+)
+def test_a_name_that_a_spreadsheet_would_run_is_written_as_text_and_read_again(tmp_path, name):
+    write_names(tmp_path, Names(targets={name: 7}))
+    text = (tmp_path / NAMES_FILE).read_text()
+    assert not any(line.rpartition(',')[2].startswith(tuple('=+-@')) for line in text.split())
+    assert read_names(tmp_path).targets == {name: 7}
+
+
+def test_numbers_are_written_as_they_are():
+    cells = [-1.5, '-1.5', '+2', '-inf', '-1e-05', 'nan', 'name', 3]
+    out = io.StringIO()
+    write_rows(out, [cells])
+    assert out.getvalue() == '-1.5,-1.5,+2,-inf,-1e-05,nan,name,3\n'

@@ -9,10 +9,13 @@ import shutil
 import pytest
 from rigs import calibrated, exposures, rig, run
 
+from fluoro_calib_ros.checks.check import Check, Validation
 from fluoro_calib_ros.estimation.options import CalibrationOptions, CalibrationRequest
+from fluoro_calib_ros.findings import Kind
 from fluoro_calib_ros.io.calibration import load_calibrations
 from fluoro_calib_ros.io.calibration_request import write_request
 from fluoro_calib_ros.io.result_check import disagreements
+from fluoro_calib_ros.io.result_document import write_validation
 from fluoro_calib_ros.jobs.result_folder import save_result
 from fluoro_calib_ros.report import html as html_report
 
@@ -90,6 +93,54 @@ def test_an_edited_result_is_named(folder, capsys):
     assert 'the file was changed after it was written' in capsys.readouterr().out.replace(
         '\n  ', ' '
     )
+
+
+@pytest.fixture
+def judged(folder):
+    """The folder with a verdict."""
+    checks = (Check(Kind.HALVES, 'halves', value=3.0, limit=2.0),)
+    ids = {'a': load_calibrations(folder)['a'].calibration_id}
+    write_validation(folder, Validation('fail', checks, ids, 0.0))
+    return folder
+
+
+def change_bytes(path):
+    path.write_bytes(path.read_bytes().replace(b'1', b'2', 1))
+
+
+def forge(path):
+    document = json.loads(path.read_text())
+    document['verdict'] = 'pass'
+    path.write_text(json.dumps(document))
+
+
+@pytest.mark.parametrize(
+    'name, change',
+    [
+        ('validation.json', forge),
+        ('observations.csv', change_bytes),
+        ('phantom.csv', change_bytes),
+        ('names.csv', lambda path: path.write_text('kind,id,name\n')),
+        ('options.json', lambda path: path.write_text('{}')),
+        ('options.json', lambda path: path.unlink()),
+        ('validation.json', lambda path: path.write_text('{')),
+    ],
+)
+def test_a_verdict_is_of_the_whole_folder(judged, name, change):
+    assert disagreements(judged, load_calibrations(judged)) == []
+    change(judged / name)
+    (found,) = disagreements(judged, load_calibrations(judged))
+    assert str(judged / name) in str(found)
+    assert found.kind in (Kind.EDITED_RESULT, Kind.DATA)
+
+
+def test_a_forged_verdict_is_not_reported(judged):
+    assert run('report', judged) == 0
+    assert 'Verdict: fail' in (judged / 'report.html').read_text()
+    forge(judged / 'validation.json')
+    assert run('report', judged) == 0
+    text = (judged / 'report.html').read_text()
+    assert 'Verdict: pass' not in text and 'the file was changed after it was written' in text
 
 
 def test_results_of_earlier_versions_are_read_as_before(folder, capsys):

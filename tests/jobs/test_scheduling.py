@@ -5,8 +5,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -22,7 +24,7 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.jobs import scheduling
 from fluoro_calib_ros.jobs.extraction import ExtractionRequest, run_extraction
 from fluoro_calib_ros.jobs.image_correction import ImageCorrectionRequest, run_image_correction
-from fluoro_calib_ros.jobs.scheduling import LocalWorkers, open_workers
+from fluoro_calib_ros.jobs.scheduling import Cluster, LocalWorkers, open_workers
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.bead_images import bead_image
 
@@ -116,7 +118,90 @@ def test_a_scheduler_that_is_not_there_is_told(monkeypatch):
     with pytest.raises(DataError, match=r'no Dask scheduler at tcp://127\.0\.0\.1:9'):
         open_workers(scheduler='tcp://127.0.0.1:9')
     with pytest.raises(DataError, match='no Dask scheduler at nonsense'):
-        open_workers(scheduler='nonsense')
+        open_workers(scheduler=Cluster('nonsense', trusted_network=True))
+
+
+def certificate(folder: Path, name: str, authority: str) -> Path:
+    """Make a certificate NAME.pem with its key NAME.key, signed by AUTHORITY.pem."""
+    pem = folder / f'{name}.pem'
+    command = ['openssl', 'req', '-x509', '-newkey', 'ec', '-pkeyopt', 'ec_paramgen_curve:P-256']
+    command += ['-nodes', '-subj', f'/CN={name}', '-days', '2', '-out', pem]
+    command += ['-keyout', folder / f'{name}.key']
+    if name != authority:
+        command += ['-CA', folder / f'{authority}.pem', '-CAkey', folder / f'{authority}.key']
+    subprocess.run(command, check=True, capture_output=True)
+    return pem
+
+
+def cluster_with(folder: Path, address: str, authority: str, name: str) -> Cluster:
+    files = [str(folder / f) for f in (f'{authority}.pem', f'{name}.pem', f'{name}.key')]
+    return Cluster(address, *files)
+
+
+def test_who_has_no_certificate_of_the_cluster_gets_and_gives_nothing(tmp_path, monkeypatch):
+    from distributed import LocalCluster, Worker
+    from distributed.security import Security
+
+    if shutil.which('openssl') is None:
+        pytest.skip('openssl is not installed')
+    monkeypatch.setattr(scheduling, 'CONNECT_S', 3)
+    for name, authority in (('ca', 'ca'), ('lab', 'ca'), ('other', 'other'), ('evil', 'other')):
+        certificate(tmp_path, name, authority)
+
+    def security(authority: str, name: str) -> Security:
+        pem, key = str(tmp_path / f'{name}.pem'), str(tmp_path / f'{name}.key')
+        files = {
+            f'tls_{of}_{what}': path
+            for of in ('client', 'worker', 'scheduler')
+            for what, path in (('cert', pem), ('key', key))
+        }
+        return Security(
+            tls_ca_file=str(tmp_path / f'{authority}.pem'), **files, require_encryption=True
+        )
+
+    settings = {'n_workers': 1, 'threads_per_worker': 1, 'dashboard_address': None}
+    settings |= {'protocol': 'tls://', 'processes': False, 'security': security('ca', 'lab')}
+    with LocalCluster(**settings) as cluster:
+        address = cluster.scheduler_address
+        assert address.startswith('tls://')
+        known = cluster_with(tmp_path, address, 'ca', 'lab')
+        with open_workers(scheduler=known) as workers:
+            assert list(workers.map(abs, [-1, -2])) == [1, 2]
+        with pytest.raises(DataError, match='no Dask scheduler'):
+            open_workers(scheduler=cluster_with(tmp_path, address, 'other', 'evil'))
+        with pytest.raises(DataError, match='no Dask scheduler'):  # the own authority is needed
+            open_workers(scheduler=cluster_with(tmp_path, address, 'ca', 'evil'))
+
+        async def join() -> None:
+            async with Worker(address, security=security('ca', 'evil'), death_timeout=2):
+                pass
+
+        with pytest.raises((OSError, TimeoutError, RuntimeError)):
+            asyncio.run(join())
+        assert len(cluster.scheduler.workers) == 1
+
+
+@pytest.mark.parametrize(
+    'address', ['tcp://10.0.0.7:8786', '10.0.0.7:8786', 'tcp://lab:8786', 'tcp://127.lab:1']
+)
+def test_plain_tcp_to_another_machine_needs_a_trusted_network(address):
+    with pytest.raises(DataError, match='whoever reaches this scheduler can run code here'):
+        open_workers(scheduler=address)
+    assert Cluster(address, trusted_network=True).security() is None
+
+
+@pytest.mark.parametrize('address', ['tcp://127.0.0.1:9', 'tcp://localhost:9', 'tcp://[::1]:9'])
+def test_plain_tcp_on_this_machine_is_allowed(address):
+    assert Cluster(address).security() is None
+
+
+def test_incomplete_certificates_are_told(tmp_path):
+    with pytest.raises(DataError, match='needs the certificate of the authority'):
+        Cluster('tls://lab:8786').security()
+    with pytest.raises(DataError, match='there is no such file'):
+        cluster_with(tmp_path, 'tls://lab:8786', 'ca', 'lab').security()
+    with pytest.raises(DataError, match='certificates are for a scheduler tls'):
+        cluster_with(tmp_path, 'tcp://lab:8786', 'ca', 'lab').security()
 
 
 def test_results_keep_the_order_of_their_tasks_and_few_tasks_are_in_memory():

@@ -59,6 +59,7 @@ def test_unknown_parameters_are_told_with_what_was_meant():
         has_parameter=known.__contains__,
         get_parameters_by_prefix=lambda prefix: known,
     )
+    given['still_px'] = None  # of another node: a file may give it to all
     assert unknown_parameters(node) == [
         'there is no parameter phantm, it has no effect; did you mean phantom?',
         'there is no parameter zzz, it has no effect; --help lists the parameters',

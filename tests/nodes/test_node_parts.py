@@ -118,7 +118,7 @@ class Inbox:
         node = SimpleNamespace(
             create_subscription=self._subscribe,
             destroy_subscription=lambda _: None,
-            get_logger=lambda: SimpleNamespace(error=lambda text: None),
+            get_logger=lambda: SimpleNamespace(info=lambda _: None, error=lambda _: None),
             resolve_topic_name=lambda topic: topic,
             get_publishers_info_by_topic=lambda topic: self.publishers,
         )
@@ -128,7 +128,7 @@ class Inbox:
             ['a'],
             self._prepare,
             self._take,
-            lambda name, sentence: self.refused.append(sentence),
+            self._refuse,
         )
 
     def _subscribe(self, kind, topic, callback, qos, raw):
@@ -137,6 +137,10 @@ class Inbox:
 
     def _take(self, name, kept):
         self.taken.append(kept)
+        self.ended.release()
+
+    def _refuse(self, name, sentence):
+        self.refused.append(sentence)
         self.ended.release()
 
     def _prepare(self, calibration):
@@ -160,9 +164,18 @@ def test_calibrations_are_prepared_one_at_a_time_and_the_last_one_stays(calibrat
     assert all(inbox.ended.acquire(timeout=60) for _ in range(2))  # what came last was next
     assert inbox.taken == [0, 49] and inbox.most == 1 and inbox.calibrations.current('a') == 49
     inbox.put(message_from_calibration(replace(calibration, stamp_ns=99)))
-    assert all(inbox.began.acquire(timeout=60) for _ in range(2))
-    inbox.calibrations.close()  # waits for what is being prepared
-    assert inbox.taken[-1] == 99
+    assert inbox.ended.acquire(timeout=60) and inbox.taken[-1] == 99
+
+
+def test_closing_does_not_wait_for_a_calibration_and_it_is_not_used(calibration):
+    inbox = Inbox()
+    inbox.put(message_from_calibration(calibration))
+    assert inbox.began.acquire(timeout=60)
+    (thread,) = inbox.calibrations._threads.values()
+    inbox.calibrations.close()
+    inbox.go.set()
+    thread.join(60)
+    assert not thread.is_alive() and not inbox.taken and not inbox.refused
 
 
 @pytest.mark.parametrize('fault', [MemoryError(), IndexError('of some line')])
@@ -170,8 +183,7 @@ def test_calibration_that_cannot_be_prepared_is_refused(calibration, fault):
     inbox = Inbox(fault)
     inbox.go.set()
     inbox.put(message_from_calibration(calibration))
-    assert inbox.began.acquire(timeout=60)
-    inbox.calibrations.close()
+    assert inbox.ended.acquire(timeout=60)
     assert (
         inbox.refused == [one_line(fault)]
         and not inbox.taken

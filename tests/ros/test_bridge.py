@@ -7,12 +7,16 @@ import asyncio
 import json
 import os
 import re
+import socket
 import struct
 import sys
 
+import pytest
 from fluoro_calib_msgs.msg import CalibrationStatus
 from rclpy.serialization import deserialize_message
 from ros_graph import NAMES, Process, entry_point
+
+PROTOCOL = ['foxglove.sdk.v1']
 
 
 def test_without_the_sdk_it_says_what_to_install(tmp_path, ros, monkeypatch):
@@ -32,12 +36,10 @@ def test_foxglove_receives_the_messages_with_their_definition(graph, tmp_path):
     bridge = graph.start('bridge_node', {'port': 0})
     topic = f'{graph.namespace}/a/calibration_status'
     client = graph.client
-    port = client.wait_until(lambda: re.search(r'ws://127.0.0.1:(\d+)', bridge.log))[1]
+    address = client.wait_until(lambda: re.search(r'ws://\S+', bridge.log))[0]
 
     async def foxglove():
-        async with connect(
-            f'ws://127.0.0.1:{port}', subprotocols=['foxglove.sdk.v1'], max_size=None
-        ) as socket:
+        async with connect(address, subprotocols=PROTOCOL, max_size=None) as socket:
             while True:
                 message = await asyncio.wait_for(socket.recv(), 60)
                 if isinstance(message, bytes):
@@ -58,3 +60,41 @@ def test_foxglove_receives_the_messages_with_their_definition(graph, tmp_path):
     assert channel['encoding'] == 'cdr' and channel['schemaEncoding'] == 'ros2msg'
     assert channel['schemaName'] == 'fluoro_calib_msgs/msg/CalibrationStatus'
     assert 'float64 coverage' in channel['schema']
+
+
+def test_only_who_knows_the_token_and_no_foreign_page_is_let_through(graph):
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    bridge = graph.start('bridge_node', {'port': 0, 'token': 'the token', 'topics': '[/x]'})
+    find = r'(ws://127.0.0.1:\d+/)(\S+)'
+    base, token = graph.client.wait_until(lambda: re.search(find, bridge.log)).groups()
+    assert token == '?token=the%20token'
+    page = 'https://app.foxglove.dev'
+    for origin in (None, page, 'file://'):
+        with connect(base + token, subprotocols=PROTOCOL, origin=origin) as socket:
+            assert json.loads(socket.recv())['op'] == 'serverInfo'
+    for query, origin in (
+        ('', None),
+        ('', page),
+        ('?token=the', None),
+        ('?token=the%20token%20', page),
+        (token, 'https://evil.example'),
+        (token, 'http://localhost:8080'),
+        (token, 'null'),
+    ):
+        with pytest.raises(InvalidStatus) as caught:
+            connect(base + query, subprotocols=PROTOCOL, origin=origin)
+        assert caught.value.response.status_code == 403
+    with socket_of(base) as raw:  # no request at all
+        raw.sendall(b'x' * 100_000)
+        assert not raw.recv(1000).startswith(b'HTTP/1.1 101')
+    assert bridge.log.count('refused: the token is missing or wrong') == 4
+    assert bridge.log.count('refused: its Origin is not allowed') == 3
+    assert bridge.end() == 0
+
+
+def socket_of(base):
+    """Return a connection with the host and port of an address."""
+    host, port = base.removeprefix('ws://').strip('/').split(':')
+    return socket.create_connection((host, int(port)), timeout=30)

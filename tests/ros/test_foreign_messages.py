@@ -21,6 +21,53 @@ from fluoro_calib_ros.nodes.runtime import diagnostics
 from fluoro_calib_ros.nodes.runtime.streams import latched_qos, observations_qos
 
 
+def drift_observations(status):
+    return int(value_of(status, 'observations') or 0)
+
+
+def test_camera_info_of_another_camera_does_not_restart_the_drift_watch(
+    graph, by_command, tracking
+):
+    """It is named, and the watch goes on with what it has seen."""
+    client = graph.client
+    node = graph.whole_chain(by_command)['reconstruction_node']
+    points = client.listen('reconstruction/points_with_covariance')
+    client.wait_until(
+        lambda: client.count_publishers('reconstruction/points_with_covariance'), what='the node'
+    )
+    client.wait_until_known_to('reconstruction_node')
+
+    def show(numbers):
+        for number in numbers:
+            for name in NAMES:
+                client.publish(tracking[name][number])
+            client.wait_until(lambda shown=number + 1: len(points) >= shown - 20, what='points')
+
+    show(range(180))
+    before = client.wait_for_diagnostics(
+        'reconstruction_node', lambda s: drift_observations(s) > 0, 'drift'
+    )
+    foreign = client.create_publisher(CameraInfo, 'a/camera_info', latched_qos())
+    client.wait_until(foreign.get_subscription_count, what='the reconstruction node')
+    webcam = CameraInfo(width=640, height=480)
+    webcam.header.frame_id = 'webcam'
+    near = CameraInfo(width=640, height=480)
+    near.header.frame_id = 'a_optical'
+    for info, told in (
+        (webcam, 'the camera_info is of frame webcam, not of a_optical'),
+        (near, 'the camera_info of 640 x 480 px has the principal distance 0 px'),
+    ):
+        foreign.publish(info)
+        client.wait_until(lambda told=told: told in node.log, what='the warning')
+    show(range(180, 360))
+    client.wait_for_diagnostics(
+        'reconstruction_node',
+        lambda s: drift_observations(s) > 1.5 * drift_observations(before),
+        'drift',
+    )
+    client.destroy_publisher(foreign)
+
+
 def test_camera_info_without_image_size_is_ignored(graph, by_command, tracking):
     """As the driver of an uncalibrated camera publishes it, on a topic of the same name."""
     client = graph.client
@@ -37,13 +84,15 @@ def test_camera_info_without_image_size_is_ignored(graph, by_command, tracking):
         what='the reconstruction node',
     )
     client.wait_until_known_to('reconstruction_node')
-    client.wait_until(lambda: 'size is 0 x 0 px' in node.log, what='the first warning')
 
-    def second_warning():
-        foreign.publish(CameraInfo(width=1024))  # that of the correction node may take its place
-        return '1024 x 0 px' in node.log
+    def warned(info, text):
+        foreign.publish(info)  # again: that of the correction node may take its place
+        return text in node.log
 
-    client.wait_until(second_warning, what='the second warning')
+    client.wait_until(lambda: warned(CameraInfo(), 'size is 0 x 0 px'), what='the first warning')
+    client.wait_until(
+        lambda: warned(CameraInfo(width=1024), '1024 x 0 px'), what='the second warning'
+    )
     for row in range(3):
         for name in NAMES:
             client.publish(replace(tracking[name][row], number=row))

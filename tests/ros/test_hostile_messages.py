@@ -15,6 +15,7 @@ from fluoro_calib_msgs.msg import FluoroscopeCalibration, RigOrientation
 from ros_graph import ROOT, Process, value_of
 
 from fluoro_calib_ros.correction.registry import create_model
+from fluoro_calib_ros.exposures.frame import Frame
 from fluoro_calib_ros.io.calibration import load_calibration
 from fluoro_calib_ros.nodes.messages.fluoroscope_calibration import message_from_calibration
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
@@ -94,6 +95,22 @@ def test_policy_of_sros2_covers_the_graph(chain, node):
     assert publishes == (node == 'calibration_node')
 
 
+def test_points_without_sigma_meet_the_limit_at_the_first_node(chain):
+    """20,000 are allowed; their bytes would allow 40,000, and the corrected ones not."""
+    client = chain.client
+    count = 30_000
+    uv = np.random.default_rng(2).uniform(0, 1000, (count, 2))
+    frame = Frame('a', 1, np.arange(count), uv, (1024, 1024))
+    client.publish_message('a', message_from_frame(frame))
+    client.wait_for_diagnostics(
+        'correction_node', lambda s: value_of(s, 'refused: too large') == '1'
+    )
+    client.wait_until(
+        lambda: 'more than the parameter max_points' in chain.nodes['calibration_node'].log,
+        what='the refusal by the calibration node',
+    )
+
+
 def test_good_stream_goes_on_beside_a_flood(chain, tracking, tmp_path):
     client = chain.client
     node = chain.nodes['correction_node']
@@ -102,7 +119,7 @@ def test_good_stream_goes_on_beside_a_flood(chain, tracking, tmp_path):
     chain.processes.append(flooder)
     try:
         client.wait_for_diagnostics(
-            'correction_node', lambda s: int(value_of(s, 'refused: too large')) >= 1
+            'correction_node', lambda s: int(value_of(s, 'refused: too large')) >= 2
         )
         before = len(chain.corrected)
         messages = [

@@ -19,6 +19,7 @@ import numpy as np
 
 from ...errors import DataError
 from ..atomic import atomic_file
+from ..csv_table import as_text
 from .content import (
     Bodies,
     Content,
@@ -107,7 +108,10 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     assert bodies is not None
     mm, notes = settings.unit_or('mm', str(path))
     matrices = homogeneous(bodies, mm)
-    header = ['Frame', *(f'{name}_{column}' for name in bodies.names for column in COLUMNS)]
+    header = [
+        'Frame',
+        *(f'{as_text(name)}_{column}' for name in bodies.names for column in COLUMNS),
+    ]
     with atomic_file(path, 'w') as file:
         file.write(','.join(header) + '\n')
         for number, of_frame in zip(bodies.frame.tolist(), matrices):

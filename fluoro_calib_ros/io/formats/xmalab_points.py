@@ -23,6 +23,7 @@ from ...errors import DataError
 from ...exposures.frame import Frame, points_on_image
 from ...exposures.names import Names, number_names
 from ..atomic import atomic_file
+from ..csv_table import as_text
 from .content import Content, FileSettings, Format, Sample, Written
 from .frames_of_points import default_name, named_targets
 from .text import Row, joined, read_table, require_width
@@ -169,7 +170,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     with atomic_file(path, 'w') as file:
         file.write(
             ','.join(
-                f'{name}_cam{camera}_{axis}'
+                f'{as_text(name)}_cam{camera}_{axis}'
                 for name in labels
                 for camera in range(1, len(cameras) + 1)
                 for axis in 'XY'

@@ -18,6 +18,7 @@ import numpy as np
 from ...errors import DataError
 from ...exposures.names import Names, number_names
 from ..atomic import atomic_file
+from ..csv_table import as_text
 from .content import (
     Content,
     FileSettings,
@@ -93,7 +94,7 @@ def write(path: Path, content: Content, settings: FileSettings) -> Written:
     mm, notes = settings.unit_or('mm', str(path))
     named = content.names.target_names()
     labels = [named.get(i, default_name(i)) for i in points.target_id.tolist()]
-    header = ['Frame', *(f'{name}_{axis}' for name in labels for axis in 'XYZ')]
+    header = ['Frame', *(f'{as_text(name)}_{axis}' for name in labels for axis in 'XYZ')]
     with atomic_file(path, 'w') as file:
         file.write(','.join(header) + '\n')
         for number, xyz in zip(points.frame.tolist(), in_units(points.xyz_mm, mm)):

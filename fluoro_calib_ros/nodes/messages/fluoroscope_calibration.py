@@ -7,8 +7,10 @@ CameraInfo of a corrected stream.
 
 from __future__ import annotations
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from fluoro_calib_msgs.msg import FluoroscopeCalibration
+from numpy.typing import ArrayLike
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import CameraInfo
 
@@ -49,6 +51,9 @@ def message_from_calibration(
     message.seconds = calibration.seconds
     set_fields(message, MESSAGE_FIELDS, calibration.to_values())
     return message
+
+
+SAME_PX = 1e-6  # rounding; both are copies of one calibration
 
 
 def calibration_from_message(
@@ -101,11 +106,30 @@ def message_of_corrected_stream(
     return info
 
 
-def image_size_of(message: CameraInfo, topic: str) -> tuple[int, int]:
-    """Return width and height [px]. Raises DataError where the message has none."""
+def image_size_of(
+    message: CameraInfo, topic: str, frame_id: str = '', interior: ArrayLike | None = None
+) -> tuple[int, int]:
+    """Return width and height [px] of the CameraInfo of a corrected stream.
+
+    Raises DataError where the message has none, and where it is of another camera than that of an
+    optical frame and an interior orientation xp, yp, c [px]; None and '' for unknown ones.
+    """
     if not message.width or not message.height:
         raise DataError(
             f'topic {topic}: the image size is {message.width} x {message.height} px, '
             'so this is not the camera_info of a correction node'
+        )
+    found = message.header.frame_id
+    if frame_id and found and found != frame_id:
+        raise DataError(
+            f'topic {topic}: the camera_info is of frame {found}, not of {frame_id}: it is of '
+            'another camera'
+        )
+    k = message.k[[2, 5, 0]]  # row by row: c, 0, xp, 0, c, yp, 0, 0, 1
+    if interior is not None and not np.allclose(k, interior, rtol=0, atol=SAME_PX):
+        raise DataError(
+            f'topic {topic}: the camera_info of {message.width} x {message.height} px has the '
+            f'principal distance {k[2]:g} px, the orientation {np.asarray(interior)[2]:g} px: it '
+            'is of another camera or calibration'
         )
     return message.width, message.height

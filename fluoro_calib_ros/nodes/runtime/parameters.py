@@ -17,6 +17,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, Generic, TypeVar
 
+from ament_index_python.packages import PackageNotFoundError, get_package_share_directory
 from rcl_interfaces.msg import (
     FloatingPointRange,
     IntegerRange,
@@ -31,6 +32,7 @@ from rclpy.parameter import Parameter
 from rclpy.timer import Timer
 
 from ...errors import DataError, printable, shortened
+from ...io.documents import read_yaml
 from ...limits import MAX_TEXT, ReadLimits, use_read_limits
 from ...options import Option, declared, option
 from .logging import PrintableLogger, StartError
@@ -324,16 +326,31 @@ def settable_parameters(groups: Iterable[ParameterGroup[Any]]) -> frozenset[str]
 def unknown_parameters(node: Node) -> list[str]:
     """Return a sentence for every given parameter that a node does not have.
 
-    ROS ignores them: a mistyped name would change nothing, and nobody would be told.
+    ROS ignores them: a mistyped name would change nothing, and nobody would be told. Those of the
+    other nodes of a rig have none: a file may give them to all nodes (/**).
     """
     sentences = []
+    others: frozenset[str] | None = None
     for name in node._parameter_overrides:  # rclpy has no public access to them
         if node.has_parameter(name) or name.startswith(_OF_ROS):
+            continue
+        others = _parameters_of_rig() if others is None else others
+        if name in others:
             continue
         close = get_close_matches(name, node.get_parameters_by_prefix(''), 1)
         hint = f'; did you mean {close[0]}?' if close else '; --help lists the parameters'
         sentences.append(f'there is no parameter {name}, it has no effect{hint}')
     return sentences
+
+
+def _parameters_of_rig() -> frozenset[str]:
+    """Return the names of the parameters in the installed configuration, none without one."""
+    try:
+        share = get_package_share_directory(__name__.partition('.')[0])
+        document = read_yaml(os.path.join(share, 'config', 'fluoro_calib.yaml'))
+        return frozenset(name for node in document.values() for name in node['ros__parameters'])
+    except (PackageNotFoundError, DataError):
+        return frozenset()
 
 
 def check_fluoroscopes(names: tuple[str, ...], minimum: int = 1) -> None:

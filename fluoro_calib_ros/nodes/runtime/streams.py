@@ -286,6 +286,10 @@ MAX_FIRST = 100  # messages of a topic that comes first that are handled at once
 DECODING_ERRORS = (ValueError, RCLError, RuntimeError, MemoryError)
 
 
+class TooLarge(ValueError):
+    """A message holds more than a limit allows; raised by what decodes it."""
+
+
 class _ReaderGroup(CallbackGroup):
     """Callback group whose subscriptions are ignored by executors."""
 
@@ -367,7 +371,8 @@ class StreamReader:
             source_timestamp [ns, system clock].
         qos : QoSProfile
         decode : callable, optional
-            Makes the message from its bytes, or raises ValueError; by default that of ROS.
+            Makes the message from its bytes, or raises ValueError, TooLarge for one that is
+            dropped and counted as such; by default that of ROS.
         max_bytes : int, optional
             Larger messages are dropped before they are decoded; by default those that are larger
             than an image may be.
@@ -531,6 +536,9 @@ class StreamReader:
             return
         try:
             message = route.decode(data)
+        except TooLarge:
+            self._drop(route.topic, len(data))
+            return
         except DECODING_ERRORS:
             self._faults.undecodable(route.topic)
             return

@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from threadpoolctl import ThreadpoolController
 
 from ..errors import DataError
 from ..findings import Finding, Kind
@@ -152,10 +154,19 @@ def extract_beads(
     DataError
         Where there is no phantom in the image, or its pose is not sure, with the reason.
     """
-    if near is not None:
-        followed = _followed(image, model, near)
-        if followed is not None:
-            return followed
+    # Small matrices take three times the time on several threads.
+    with _threads().limit(limits=1):
+        followed = None if near is None else _followed(image, model, near)
+        return followed or _searched(image, model, lens)
+
+
+@cache
+def _threads() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def _searched(image: np.ndarray, model: PhantomModel, lens: Lens) -> Extraction:
+    """Return the extraction by a search for the pose. Raises DataError."""
     first: DataError | None = None
     for detections in likely_detections(image, len(model.xyz)):
         seen = _seen(detections)

@@ -245,7 +245,7 @@ def _measured(
             noise=noise,
             steps=steps,
         )
-        reasons = _reasons(beads, predicted[rows], _usual_depth(beads))
+        reasons = _reasons(beads, predicted[rows])
         good = np.array([reason is None for reason in reasons], dtype=bool)
         if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(found.bead)):
             measured_well = int(np.count_nonzero(good))
@@ -384,9 +384,10 @@ def _usual_depth(beads: Beads) -> np.ndarray:
     return usual
 
 
-def _reasons(beads: Beads, predicted: np.ndarray, usual_depth: np.ndarray) -> list[Finding | None]:
+def _reasons(beads: Beads, predicted: np.ndarray) -> list[Finding | None]:
     """Why beads are not observed, None for those that are."""
     away = np.linalg.norm(beads.uv - predicted, axis=1)
+    usual_depth = _usual_depth(beads)
     out: list[Finding | None] = []
     for number in range(len(beads.uv)):
         depth = float(beads.depth[number] / usual_depth[number])

@@ -105,6 +105,7 @@ class Kind(str, Enum):
     # Images of the phantom.
     BEADS_NOT_MEASURED = 'beads_not_measured'
     FEW_BEADS = 'few_beads'
+    GRID_NOT_MARKED = 'grid_not_marked'
     IMAGE_ENCODING = 'image_encoding'
     IMAGE_EMPTY = 'image_empty'
     NO_POSE = 'no_pose'

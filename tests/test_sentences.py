@@ -43,7 +43,7 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.exposures.repeats import without_repeats
 from fluoro_calib_ros.exposures.strays import without_strays
 from fluoro_calib_ros.findings import Finding, Kind, Place
-from fluoro_calib_ros.images import detection, extraction, matching
+from fluoro_calib_ros.images import detection, extraction, lattice, matching
 from fluoro_calib_ros.images.codec import as_grey
 from fluoro_calib_ros.images.growth import Seen
 from fluoro_calib_ros.images.marker_watch import doubt_in
@@ -208,7 +208,15 @@ def trial(kind):
 
 def bead(**changes):
     """Why a predicted bead is not observed."""
-    beads = {'uv': 0.0, 'depth': 1.0, 'measured': True, 'misfit': 0.0, 'sigma': 0.1, **changes}
+    beads = {
+        'uv': 0.0,
+        'depth': 1.0,
+        'light': 1.0,
+        'measured': True,
+        'misfit': 0.0,
+        'sigma': 0.1,
+        **changes,
+    }
     beads = Fake(**{name: np.array([value]) for name, value in beads.items()})
     beads.uv = np.full((1, 2), beads.uv[0])
     return extraction._reasons(beads, np.zeros((1, 2)))[0]
@@ -451,6 +459,7 @@ MAKERS = {
     Kind.FEW_BEADS: lambda: raised(
         matching.match, Seen.of(np.zeros((3, 2)), np.ones((9, 9)), 3.0), None, None
     ),
+    Kind.GRID_NOT_MARKED: lambda: lattice.NOT_MARKED,
     Kind.IMAGE_ENCODING: lambda: raised(as_grey, np.zeros((9, 9))),
     Kind.IMAGE_EMPTY: lambda: raised(detection._check, np.zeros((200, 200), np.uint8)),
     Kind.NO_POSE: no_pose,
@@ -750,6 +759,10 @@ SENTENCES = {
         'cam.csv: this looks like MayaCam # (mayacam2), which has cameras, but a phantom is needed'
     ),
     Kind.FEW_BEADS: 'only # beads are found in the image, at least # are needed',
+    Kind.GRID_NOT_MARKED: (
+        'the grid is taken as one without marks: ids count from the hole nearest to the middle of '
+        'each image: this serves the distortion of one fluoroscope, not the orientation of two'
+    ),
     Kind.IMAGE_ENCODING: 'the image has pixels of float64, not of # or # bits',
     Kind.IMAGE_EMPTY: 'the image is empty: every pixel has the grey value #',
     Kind.NO_POSE: 'no pose of the phantom fits the beads in the image',

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import sys
 import urllib.request
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from textwrap import fill
@@ -136,9 +137,9 @@ SOURCES = (
 )
 
 
-def download(folder: Path) -> None:
+def download(folder: Path, sources: Sequence[Source] = SOURCES) -> None:
     """Fetch what is not yet in a folder."""
-    for source in SOURCES:
+    for source in sources:
         for name, address in source.addresses().items():
             target = folder / name
             if target.exists():
@@ -150,12 +151,12 @@ def download(folder: Path) -> None:
             target.write_bytes(content)
 
 
-def text_of_sources() -> str:
+def text_of_sources(sources: Sequence[Source] = SOURCES) -> str:
     """Return the sources as Markdown."""
     lines = (
         f'- [{one.repository}](https://github.com/{one.repository}) ({one.licence}; '
         f'`{one.commit[:7]}`): {one.about}.'
-        for one in SOURCES
+        for one in sources
     )
     return '\n'.join(
         fill(line, WIDTH, subsequent_indent='  ', break_long_words=False, break_on_hyphens=False)

@@ -19,6 +19,7 @@ from itertools import islice
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from ..errors import DataError
 from ..findings import Kind
@@ -30,6 +31,7 @@ BLOB_RADIUS = 1.25  # radius of a blurred disc over the scale at which its respo
 FINE_SCALE = 2.9  # from which half the resolution tells scales apart as well
 # Factors on the scale: the noise of a response decreases with the scale, but beads merge.
 WIDER = (1.0, 1.4, 1.9)
+LARGER = (1.4, 2.0, 2.8)  # factors on the scale, at which large beads are told
 # Of a response, in standard deviations of the second derivative. Those of the mean of both
 # eigenvalues are 1.22 times smaller (Gaussian noise), so that less than one of the 200,000 places
 # of a megapixel exceeds it by chance.
@@ -173,11 +175,44 @@ class _Sight:
         """Return the dark or bright blobs of the image."""
         return next(islice(_blobs(self.grey, self.noise, scale), inverted, None))
 
+    def merged(self, blobs: _Blobs, scale: float, inverted: bool) -> NDArray[np.float64]:
+        """Return places (n, 2) of beads, several in one large bead as one.
+
+        A large bead has several maxima at a small scale, and a larger response at its own one:
+        a blob is a maximum over places and scales (Lindeberg 1998).
+        """
+        uv = blobs.uv
+        if len(uv) < 2 or not cKDTree(uv).query_pairs(2 * LARGER[-1] * BLOB_RADIUS * scale):
+            return uv
+        merged = np.zeros(len(uv), dtype=bool)
+        large: list[np.ndarray] = []
+        for larger in LARGER:
+            factor = max(1, int(larger * scale / FINE_SCALE))
+            height, width = (size // factor for size in self.grey.shape)
+            part = cv2.resize(
+                self.grey[: height * factor, : width * factor],
+                (width, height),
+                interpolation=cv2.INTER_AREA,
+            )
+            wide = larger * scale
+            found = next(islice(_blobs(part, self.noise, wide / factor, factor), inverted, None))
+            for place, relative in zip(found.uv, found.relative):
+                inside = np.linalg.norm(uv - place, axis=1) < BLOB_RADIUS * wide
+                inside &= ~merged
+                if inside.sum() > 1 and relative > blobs.relative[inside].max():
+                    merged |= inside
+                    large.append(place)
+        return np.concatenate([uv[~merged], np.reshape(large, (-1, 2))])
+
     def contrast(self) -> float:
         """Return the contrast of the strongest blob, as a fraction of the light around it."""
-        looks = replace(self, typical=1).looks()
-        blobs = (self.blobs(scale, inverted) for scale, inverted in looks)
-        return max((float(one.relative.max(initial=0.0)) for one in blobs), default=0.0)
+        best = 0.0
+        for scale, inverted in replace(self, typical=1).looks():
+            blobs = self.blobs(scale, inverted)
+            light = blobs.response / blobs.relative
+            light = float(self.grey.max()) - light if inverted else light
+            best = max(best, float((blobs.response / light).max(initial=0.0)))
+        return best
 
     def detections(self, scale: float, inverted: bool) -> Detections | None:
         """Return what is found with a scale and a polarity, None for nothing."""
@@ -190,7 +225,7 @@ class _Sight:
             field &= field_of_view(grey, scale)
         for wider in WIDER:
             blobs = self.blobs(wider * scale, inverted)
-            uv = _beads(blobs, field, self.typical)
+            uv = self.merged(_beads(blobs, field, self.typical), wider * scale, inverted)
             if len(uv):
                 return Detections(
                     Light(light, field, low, high),
@@ -238,6 +273,10 @@ class _Blobs:
     uv: NDArray[np.float64]
     response: NDArray[np.float64]
     relative: NDArray[np.float64]
+
+    def chosen(self, mask: NDArray[np.bool_]) -> _Blobs:
+        """Return those of a mask (n,)."""
+        return _Blobs(self.uv[mask], self.response[mask], self.relative[mask])
 
 
 def _typical(values: np.ndarray, count: int) -> float:
@@ -382,15 +421,12 @@ def _found(
     return _Blobs(factor * (uv + 0.5) - 0.5, response[v, u], relative[v, u])
 
 
-def _beads(blobs: _Blobs, field: NDArray[np.bool_], count: int) -> NDArray[np.float64]:
-    """Centres (n, 2) of beads in the field, none where they are too weak."""
+def _beads(blobs: _Blobs, field: NDArray[np.bool_], count: int) -> _Blobs:
+    """Blobs in the field that are beads, none where they are too weak."""
     inside = _inside(blobs.uv, field)
-    uv = blobs.uv[inside]
-    values = blobs.relative[inside]
-    typical = _typical(values, min(count, max(len(values), 1)))
-    if typical < MIN_CONTRAST:
-        return np.empty((0, 2))
-    return uv[values > MIN_SHARE * typical]
+    values = np.where(inside, blobs.relative, 0)
+    typical = _typical(values[inside], min(count, max(int(inside.sum()), 1)))
+    return blobs.chosen(inside & (values > MIN_SHARE * typical) & (typical >= MIN_CONTRAST))
 
 
 def _strengths(light: np.ndarray, uv: NDArray[np.float64], scale: float) -> NDArray[np.float64]:

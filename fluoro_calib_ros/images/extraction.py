@@ -6,10 +6,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from threadpoolctl import ThreadpoolController
 
 from ..errors import DataError
 from ..findings import Finding, Kind
@@ -152,10 +154,19 @@ def extract_beads(
     DataError
         Where there is no phantom in the image, or its pose is not sure, with the reason.
     """
-    if near is not None:
-        followed = _followed(image, model, near)
-        if followed is not None:
-            return followed
+    # Small matrices take three times the time on several threads.
+    with _threads().limit(limits=1):
+        followed = None if near is None else _followed(image, model, near)
+        return followed or _searched(image, model, lens)
+
+
+@cache
+def _threads() -> ThreadpoolController:
+    return ThreadpoolController()
+
+
+def _searched(image: np.ndarray, model: PhantomModel, lens: Lens) -> Extraction:
+    """Return the extraction by a search for the pose. Raises DataError."""
     first: DataError | None = None
     for detections in likely_detections(image, len(model.xyz)):
         seen = _seen(detections)
@@ -234,7 +245,7 @@ def _measured(
             noise=noise,
             steps=steps,
         )
-        reasons = _reasons(beads, predicted[rows], _usual_depth(beads))
+        reasons = _reasons(beads, predicted[rows])
         good = np.array([reason is None for reason in reasons], dtype=bool)
         if np.count_nonzero(good) < max(4, MIN_ACCEPTED * len(found.bead)):
             measured_well = int(np.count_nonzero(good))
@@ -373,9 +384,10 @@ def _usual_depth(beads: Beads) -> np.ndarray:
     return usual
 
 
-def _reasons(beads: Beads, predicted: np.ndarray, usual_depth: np.ndarray) -> list[Finding | None]:
+def _reasons(beads: Beads, predicted: np.ndarray) -> list[Finding | None]:
     """Why beads are not observed, None for those that are."""
     away = np.linalg.norm(beads.uv - predicted, axis=1)
+    usual_depth = _usual_depth(beads)
     out: list[Finding | None] = []
     for number in range(len(beads.uv)):
         depth = float(beads.depth[number] / usual_depth[number])

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, binary_erosion
 from scipy.spatial import cKDTree
 
+from ..findings import Finding, Kind, Severity
 from .growth import Match, Seen, settle
 from .view import Lens, View, fit_view
 
@@ -36,6 +37,15 @@ SETTLED = 12  # best candidates that are refined
 MIN_OVERLAP = 0.5  # of the numbered beads that fall on beads of the phantom
 DEGREE = 3  # of the distortion while a candidate is refined
 STEPS = 3
+
+# What is said of images of a grid of which any place is taken.
+NOT_MARKED = Finding(
+    Kind.GRID_NOT_MARKED,
+    'the grid is taken as one without marks: ids count from the hole nearest to the middle of '
+    'each image',
+    advice='this serves the distortion of one fluoroscope, not the orientation of two',
+    severity=Severity.NOTE,
+)
 
 
 @dataclass(frozen=True)

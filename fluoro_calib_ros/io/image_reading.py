@@ -64,7 +64,7 @@ STACK_SUFFIXES = ('.tif', '.tiff')
 IMAGE_SUFFIXES = ('.png', *STACK_SUFFIXES, '.jpg', '.jpeg', '.bmp', '.pgm')
 # Read, but not written: recordings of Phantom cameras, and DICOM.
 CINE_SUFFIXES = ('.cine',)
-DICOM_SUFFIXES = ('.dcm', '.dicom')
+DICOM_SUFFIXES = ('.dcm', '.dicom', '.ima')
 LOSSLESS_CODEC = 'FFV1'
 SUPPORTS_16_BIT_VIDEOS = tuple(map(int, cv2.__version__.split('.')[:2])) >= (4, 7)
 # Codec by which videos are written. Players know MP4 with lossy codecs only.

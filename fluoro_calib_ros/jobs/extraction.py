@@ -17,7 +17,7 @@ from ..errors import DataError
 from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding, Kind, Place
-from ..images.lattice import FlatGrid
+from ..images.lattice import NOT_MARKED, FlatGrid
 from ..images.view import Lens, assumed_lens, may_be_found, shared_lens
 from ..io.access import check_safe_name, make_folder
 from ..io.atomic import write_bytes
@@ -103,7 +103,7 @@ class ExtractionOutcome:
 
     fluoroscope: str
     results: tuple[ImageResult, ...]
-    notes: tuple[str, ...] = ()
+    notes: tuple[str | Finding, ...] = ()
 
     @property
     def frames(self) -> list[Frame]:
@@ -201,7 +201,9 @@ def run_extraction(
         raise DataError(mirrored or _first_of(results, results[0].finding))
     results.sort(key=lambda result: result.exposure)
     angles = [result.frame.angle for result in results if result.frame is not None]
-    notes = request.angles.note(request.fluoroscope, angles)
+    notes: tuple[str | Finding, ...] = request.angles.note(request.fluoroscope, angles)
+    if request.regular_grid:
+        notes = (NOT_MARKED, *notes)
     return ExtractionOutcome(request.fluoroscope, tuple(results), notes)
 
 
@@ -344,7 +346,7 @@ def recording_of_images(
         outcome = run_extraction(request, progress)
         frames[name] = outcome.frames
         notes += [f'not used: {result.finding}' for result in outcome.refused]
-        notes += outcome.notes
+        notes += map(str, outcome.notes)
     return Recording(frames, {}, survey.names, tuple(notes))
 
 

@@ -26,6 +26,7 @@ from fluoro_calib_ros.images.measurement import measure_beads
 from fluoro_calib_ros.images.shadow_profile import Profile
 from fluoro_calib_ros.images.view import Lens, View, exponents, fit_view, may_be_found
 from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.simulation.bead_images import bead_image
 from fluoro_calib_ros.simulation.exposures import phantom_poses
 from fluoro_calib_ros.simulation.radiographs import HARD, Radiography
 from fluoro_calib_ros.simulation.rig import VirtualRig, virtual_rig
@@ -339,3 +340,35 @@ def test_an_image_without_beads_is_refused(image, kind):
     with refused(kind) as error:
         extract_beads(image, model(), LENS)
     assert not may_be_found(error.value.finding)
+
+
+def test_a_large_bead_among_small_ones_is_found_once():
+    rng = np.random.default_rng(8)
+    place = np.stack(np.meshgrid(np.arange(5), np.arange(4)), -1).reshape(-1, 2) * 70 + 60.0
+    place += rng.uniform(-8, 8, place.shape)
+    image = bead_image(place, (400, 400), noise=0.01).astype(float)
+    v, u = np.mgrid[:400, :400]
+    large = np.array([340.0, 340.0])
+    image[np.hypot(u - large[0], v - large[1]) < 10] *= 0.4
+    found = detect_beads(cv2.GaussianBlur(image, (0, 0), 1).astype(np.uint8), 21).uv
+    distance = np.linalg.norm(found - large, axis=1)
+    assert np.sum(distance < 20) == 1
+    assert distance.min() < 3
+    assert np.linalg.norm(place[:, None] - found, axis=2).min(axis=1).max() < 2
+
+
+def test_fewer_beads_than_expected_are_found():
+    found = detect_beads(bead_image([[100, 120], [300, 90]], (400, 400), noise=0.01), 60).uv
+    assert len(found) == 2
+
+
+def test_an_image_with_faint_beads_says_how_faint():
+    rng = np.random.default_rng(9)
+    plain = np.full((400, 400), 30000.0)
+    beads = bead_image(rng.uniform(20, 380, (30, 2)), (400, 400), noise=0).astype(float)
+    image = plain * (1 - 0.04 * (1 - beads / beads.max())) + rng.normal(0, 20, plain.shape)
+    with pytest.raises(DataError) as raised:
+        detect_beads(image.astype(np.uint16), 30, 4.0, False)
+    finding = raised.value.finding
+    assert finding.kind is Kind.FEW_BEADS
+    assert 0.005 < finding.numbers['contrast'] < 0.05

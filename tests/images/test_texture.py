@@ -1,0 +1,65 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Backgrounds of windows beyond a polynomial: eliminated as a covariance would, and estimated."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from fluoro_calib_ros.images.shadow_fit import window_offsets
+from fluoro_calib_ros.images.texture import Cosines
+
+OFFSET = window_offsets(8.0)
+COSINES = Cosines(OFFSET, np.float64)
+PIXELS = len(OFFSET)
+
+
+def windows(count: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Light behind beads (g, m), derivatives (g, 4, m) and weights (g, m)."""
+    rng = np.random.default_rng(seed)
+    x, y = OFFSET.T / 8
+    relative = np.broadcast_to(1 - 0.5 * np.exp(-4 * (x * x + y * y)), (count, PIXELS))
+    plane = np.stack([np.ones(PIXELS), x, y]) * relative[0]
+    jacobian = np.stack([np.vstack([plane, rng.normal(size=PIXELS)]) for _ in range(count)])
+    return relative, jacobian, rng.uniform(0.5, 2.0, (count, PIXELS))
+
+
+def test_elimination_is_weighting_by_the_covariance_of_the_background():
+    relative, jacobian, weight = windows(2, 1)
+    residual = np.random.default_rng(2).normal(size=(2, PIXELS))
+    strength = np.array([0.7, 20.0])
+    taken = COSINES.eliminated(
+        strength, relative=relative, jacobian=jacobian, weight=weight, residual=residual
+    )
+    for k in range(2):
+        waves = relative[k] * COSINES.waves
+        covariance = np.diag(1 / weight[k])
+        covariance += strength[k] * (waves.T * COSINES.variance) @ waves
+        inverse = np.linalg.inv(covariance)
+        left = (jacobian[k] * weight[k]) @ jacobian[k].T - taken[0][k]
+        right = jacobian[k] @ (weight[k] * residual[k]) - taken[1][k]
+        squared = residual[k] @ (weight[k] * residual[k]) - taken[2][k]
+        assert left == pytest.approx(jacobian[k] @ inverse @ jacobian[k].T, rel=1e-6)
+        assert right == pytest.approx(jacobian[k] @ inverse @ residual[k], rel=1e-6, abs=1e-6)
+        assert squared == pytest.approx(residual[k] @ inverse @ residual[k], rel=1e-6)
+
+
+@pytest.mark.parametrize('true', [1.0, 30.0])
+def test_strengths_are_those_of_the_backgrounds(true):
+    relative, jacobian, weight = windows(200, 3)
+    rng = np.random.default_rng(4)
+    amplitude = rng.normal(size=(200, len(COSINES.variance))) * np.sqrt(true * COSINES.variance)
+    residual = relative * (amplitude @ COSINES.waves) + rng.normal(size=relative.shape) / np.sqrt(
+        weight
+    )
+    found = COSINES.strengths(relative, jacobian=jacobian, weight=weight, residual=residual)
+    assert np.median(found) == pytest.approx(true, rel=0.5)
+
+
+def test_noise_alone_has_hardly_any_background():
+    relative, jacobian, weight = windows(200, 5)
+    residual = np.random.default_rng(6).normal(size=relative.shape) / np.sqrt(weight)
+    found = COSINES.strengths(relative, jacobian=jacobian, weight=weight, residual=residual)
+    assert np.median(found) < 0.1

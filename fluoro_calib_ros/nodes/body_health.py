@@ -57,6 +57,12 @@ def predicted_body(state: BodyState) -> Health | None:
     return warning(text if state.status == PoseStatus.FILLED else '')
 
 
+def ambiguous_body(state: BodyState) -> Health | None:
+    """Its markers fit in a second pose."""
+    text = 'its markers fit in a second pose, too'
+    return warning(text if state.status == PoseStatus.AMBIGUOUS else '')
+
+
 def tracked_body(state: BodyState) -> Health:
     """Nothing is wrong."""
     return Health(OK, 'tracked')
@@ -67,6 +73,7 @@ BODY_CONDITIONS = (
     unseen_body,
     lost_body,
     predicted_body,
+    ambiguous_body,
     tracked_body,
 )
 

@@ -15,7 +15,7 @@ from fluoro_calib_ros.io.bags.reader import iterate_messages
 from fluoro_calib_ros.io.bodies import read_bodies, write_bodies
 from fluoro_calib_ros.io.joints import joint_definition, read_joints
 from fluoro_calib_ros.io.rig_orientation import load_orientation, orientation_path
-from fluoro_calib_ros.jobs.bodies import BodiesOptions, Rig, track_bodies
+from fluoro_calib_ros.jobs.bodies import BodiesOptions, track_bodies
 from fluoro_calib_ros.jobs.sources import read_calibrations
 from fluoro_calib_ros.nodes.messages.observations import message_from_frame
 from fluoro_calib_ros.photogrammetry.rotations import vector_from_matrix
@@ -127,9 +127,11 @@ def offline(live, by_command):
     bodies = read_bodies(live.files['bodies'])
     joints = read_joints(live.files['joints'], [body.name for body in bodies])
     calibrations = read_calibrations(by_command)
-    rig = Rig(calibrations, load_orientation(orientation_path(by_command)))
+    orientation = load_orientation(orientation_path(by_command))
     options = BodiesOptions(smooth='lag', lag=0, estimate_shapes=False)
-    return track_bodies(live.frames, rig, bodies, joints, options)
+    return track_bodies(
+        live.frames, calibrations, orientation, bodies=bodies, joints=joints, options=options
+    )
 
 
 def received(live, form):

@@ -30,7 +30,10 @@ SWITCH = ['true', 'false']
 CLOCK_HZ = 100.0  # of the /clock that the player publishes
 # Arguments that are numbers, and those that are texts also where they read like a number.
 NUMBERS = ('rate', 'bag_rate', 'principal_distance', 'angle_max_age')
-TEXTS = ('phantom', 'calibration_directory', 'rig_frame', 'angle_joint', 'bag', 'record')
+TEXTS = (
+    *('phantom', 'calibration_directory', 'rig_frame', 'bodies', 'joints'),
+    *('angle_joint', 'bag', 'record'),
+)
 
 
 @dataclass(frozen=True)
@@ -63,6 +66,8 @@ PARAMETERS = (
         'fluoro_calib/<namespace> in $ROS_HOME or ~/.ros, for the calibration node)',
     ),
     Argument('rig_frame', '', 'name of the rig frame on /tf_static'),
+    Argument('bodies', '', 'bodies.csv with rigid bodies and their markers: poses, live'),
+    Argument('joints', '', 'joints.toml with joints between these bodies: angles, live'),
     Argument('principal_distance', '', 'principal distance, to some 10 %, for from_images [px]'),
     Argument(
         'angle_joint',
@@ -130,7 +135,7 @@ OF_NODE = {
     ),
     'calibration_node': ('phantom', *RIG, 'rig_frame', *ANGLE),
     'correction_node': (*RIG, *ANGLE),
-    'reconstruction_node': (*RIG, 'rig_frame'),
+    'reconstruction_node': (*RIG, 'rig_frame', 'bodies', 'joints'),
     'image_node': (*RIG, *ANGLE),
 }
 
@@ -236,7 +241,11 @@ def nodes_of_rig(context):
         actions.append(configured('calibration_node', needed=values['respawn'] == 'false'))
     if values['from_images'] == 'true':
         actions.append(configured('extraction_node', needed=values['respawn'] == 'false'))
-    actions += [configured('correction_node'), configured('reconstruction_node')]
+    has_bodies = bool(values['bodies'])
+    actions += [
+        configured('correction_node'),
+        configured('reconstruction_node', needed=has_bodies and values['respawn'] == 'false'),
+    ]
     if values['images'] == 'true':
         actions.append(configured('image_node'))
     if shows:

@@ -108,6 +108,37 @@ def check_bodies(bodies: Sequence[Body]) -> None:
             owners[marker] = body.name
 
 
+def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
+    """Return bodies without the markers whose place is unknown.
+
+    Raises DataError for a body with fewer than three known markers, and for a place without a
+    standard deviation.
+    """
+    out = []
+    for body in bodies:
+        known = body.known
+        if np.count_nonzero(known) < 3:
+            raise DataError(
+                f'body {body.name}: the places of {np.count_nonzero(known)} of its '
+                f'{len(body.target_id)} markers are known, a pose needs three'
+            )
+        loose = body.target_id[known & ~np.isfinite(body.sd_mm)]
+        if len(loose):
+            raise DataError(
+                f'body {body.name}: marker {loose[0]} has no standard deviation; it is estimated '
+                'from a recording, or given'
+            )
+        out.append(
+            replace(
+                body,
+                target_id=body.target_id[known],
+                xyz_mm=body.xyz_mm[known],
+                sd_mm=body.sd_mm[known],
+            )
+        )
+    return tuple(out)
+
+
 class PoseStatus(IntEnum):
     """How a pose was obtained; the values are those of the messages."""
 

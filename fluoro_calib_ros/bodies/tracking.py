@@ -232,6 +232,31 @@ def poses_of(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> li
     ]
 
 
+def twists_of(
+    bodies: Sequence[Body], exposure: TrackedExposure
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Velocities (B, 6) of bodies along their own axes, and covariances (B, 6, 6).
+
+    Of the origin of a body [mm/s], then of its rotation [rad/s]; by the random errors, NaN where a
+    body is lost. With the velocity v of the centre x of the markers and the angular velocity w,
+    both in the rig frame, they are R'v - R'w x x and R'w; a rotation error th changes R'v by
+    R'(v x th).
+    """
+    back = np.swapaxes(exposure.rotation, 1, 2)
+    velocity, spin = exposure.velocity[:, :3], exposure.velocity[:, 3:]
+    centre = cross_matrix(np.array([body.centre for body in bodies]))
+    turned = (back @ spin[:, :, None])[:, :, 0]
+    moved = (back @ velocity[:, :, None] + centre @ turned[:, :, None])[:, :, 0]
+    by_state = np.zeros((len(bodies), 6, exposure.covariance.shape[1]))
+    by_state[:, 3:, 3:6] = back @ cross_matrix(spin)
+    by_state[:, 3:, 9:12] = back
+    by_state[:, :3] = centre @ by_state[:, 3:]
+    by_state[:, :3, 3:6] += back @ cross_matrix(velocity)
+    by_state[:, :3, 6:9] = back
+    covariance = by_state @ exposure.covariance @ np.swapaxes(by_state, 1, 2)
+    return np.concatenate([moved, turned], axis=1), covariance
+
+
 def poses_alone(bodies: Sequence[Body], exposures: Sequence[TrackedExposure]) -> list[BodyPoses]:
     """Poses that each exposure gives alone, without a filter."""
     out = []

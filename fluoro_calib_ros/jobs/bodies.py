@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..bodies.body import Body, BodyPoses, check_bodies
+from ..bodies.body import Body, BodyPoses, check_bodies, solvable_bodies
 from ..bodies.butterworth import filtered_poses
 from ..bodies.joints import JointMotion, joint_motion, with_neutral
 from ..bodies.shapes import EstimatedShape, estimate_shape, places_of
@@ -141,8 +141,7 @@ def track_bodies(
     orientation = orientation.subset(names)
     exposures, unpaired = _intersected(frames, calibrations, orientation, options)
     shapes = _shapes(bodies, [one.views for one in exposures], options)
-    usable = [shape.body for shape in shapes]
-    _check_shapes(usable)
+    usable = solvable_bodies([shape.body for shape in shapes])
     lag = options.lag if options.smooth == 'lag' else None
     tracker = BodyTracker(orientation, usable, options.reject, lag)
     tracked = []
@@ -232,16 +231,6 @@ def _split(exposure: IntersectedViews) -> dict[str, np.ndarray]:
         'noise': (1 - share) * covariance,
         'fixed': share * covariance,
     }
-
-
-def _check_shapes(bodies: Sequence[Body]) -> None:
-    """Raise DataError for a body that is known by fewer than three markers."""
-    for body in bodies:
-        if np.count_nonzero(body.known) < 3:
-            raise DataError(
-                f'body {body.name}: the places of {np.count_nonzero(body.known)} of its '
-                f'{len(body.target_id)} markers are known, a pose needs three'
-            )
 
 
 def _poses(

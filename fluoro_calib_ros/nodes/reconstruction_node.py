@@ -1,7 +1,7 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""Node that intersects the corrected views of a rig: points in space with covariance, live."""
+"""Node that intersects the corrected views of a rig: points, bodies and joints, live."""
 
 from __future__ import annotations
 
@@ -24,6 +24,9 @@ from ..options import option
 from ..reconstruction.intersection import OUTSIDE
 from ..reconstruction.mismatch import RecentMisses
 from ..reconstruction.reconstruct import CorrectedView, intersect_exposure, watch_exposure
+from .bodies_output import BodiesOutput
+from .body_following import BodyFollower, BodyParameters, read_body_files
+from .body_health import statuses_of
 from .drift_monitor import DriftMonitor, DriftParameters
 from .frame_validation import CORRECTED_REFUSALS, validate_corrected, with_limit
 from .messages.fluoroscope_calibration import image_size_of
@@ -99,8 +102,9 @@ _DRIFT_OPTIONS = ParameterGroup(
     {'warn_interval_h': 'drift_warn_interval', 'error_interval_h': 'drift_error_interval'},
     settable=('drift_warn_interval', 'drift_error_interval'),
 )
+_BODIES = ParameterGroup(BodyParameters)
 _LIMITS = ParameterGroup(StreamLimits)
-PARAMETERS = (_NODE, _PAIRING, _DRIFT, _DRIFT_OPTIONS, _LIMITS, READ_LIMITS)
+PARAMETERS = (_NODE, _PAIRING, _BODIES, _DRIFT, _DRIFT_OPTIONS, _LIMITS, READ_LIMITS)
 
 
 @dataclass(frozen=True)
@@ -122,6 +126,7 @@ class ReconstructionNode(StreamNode):
         self._settings = _NODE.declare(self)
         self._limits = _LIMITS.declare(self)
         self._pairing = _PAIRING.declare(self)
+        self._body_parameters = _BODIES.declare(self)
         self.autostart = self._settings.autostart
         self._names = self._settings.fluoroscopes
         self._drift = DriftMonitor(
@@ -148,6 +153,7 @@ class ReconstructionNode(StreamNode):
         self._pairer = exposure_pairer(self._names, self._pairing)
         self._points = PointsCounter()
         self._misses = RecentMisses()
+        self._follower: BodyFollower | None = None
         self._exposures = 0
         self._reconstructed = 0
         self._without_orientation = 0
@@ -176,6 +182,7 @@ class ReconstructionNode(StreamNode):
     def create_outputs(self) -> None:
         """Make the outputs and subscribe to orientations."""
         self._output = PointsOutput(self)
+        self._create_bodies()
         drift = self.create_lifecycle_publisher(DriftStatus, 'reconstruction/drift', 10)
         self.own(drift, self.destroy_publisher, drift)
         collect_anew = self.create_client(Reset, 'collect_anew')
@@ -188,6 +195,14 @@ class ReconstructionNode(StreamNode):
         saved = self._rigs.saved(settings.orientation_file, settings.calibration_directory)
         if saved is not None:
             self._on_orientation(saved)
+
+    def _create_bodies(self) -> None:
+        """Read the files of bodies and joints, and make their outputs. Raises DataError."""
+        bodies, joints = read_body_files(self._body_parameters)
+        if bodies:
+            self._follower = BodyFollower(bodies, joints, self._body_parameters.body_lag)
+            names = [body.name for body in bodies]
+            self._bodies_output = BodiesOutput(self, names, bool(joints), self._settings.rig_frame)
 
     def _create_inputs(self) -> None:
         self.create_input(
@@ -258,7 +273,7 @@ class ReconstructionNode(StreamNode):
             self._latencies.add(time.time_ns() - info['received_timestamp'])
 
     def _reconstruct(self, rig: Rig, exposure: Mapping[str, _View]) -> None:
-        """Intersect the views of an exposure and publish the points."""
+        """Intersect the views of an exposure, publish the points, then bodies and joints."""
         views = [
             _corrected_view(exposure[name].frame) if name in exposure else None
             for name in self._names
@@ -281,13 +296,17 @@ class ReconstructionNode(StreamNode):
         self._output.publish_forms(
             content, self._settings.ellipsoid_sigmas, self._settings.ellipsoid_rate
         )
+        if self._follower is not None:
+            number = first.frame.frame_number
+            for bodies in self._follower.add(found, rig, number, first.stamp_ns):
+                self._bodies_output.publish(bodies)
         if rig.watch is not None:
             watch_exposure(rig.watch, first.stamp_ns, found)
 
     # -- diagnostics
 
     def diagnose(self) -> list[Status]:
-        """Return the status of the reconstruction and of the drift watch."""
+        """Return the status of the reconstruction, of bodies and joints, and of the watch."""
         state = ReconstructionState(
             node=self,
             topics=tuple(f'{name}/{VIEWS}' for name in self._names),
@@ -300,7 +319,8 @@ class ReconstructionNode(StreamNode):
             without_orientation=self._without_orientation,
         )
         status = Status('reconstruction', *health_of(state, CONDITIONS), self._values())
-        return [status, *self._drift.publish_state()]
+        bodies = [] if self._follower is None else statuses_of(self._follower)
+        return [status, *bodies, *self._drift.publish_state()]
 
     def _values(self) -> dict[str, object]:
         rig = self._rigs.newest

@@ -22,10 +22,12 @@ from action_msgs.msg import GoalStatus
 from diagnostic_msgs.msg import DiagnosticArray
 from fluoro_calib_msgs.action import SelfCalibrate
 from fluoro_calib_msgs.msg import (
+    BodyPoses,
     CalibrationStatus,
     CorrectedObservations,
     DriftStatus,
     FluoroscopeCalibration,
+    JointAngles,
     ReconstructedPoints,
     RigOrientation,
     TargetObservations,
@@ -38,13 +40,15 @@ from fluoro_calib_msgs.srv import (
     Reset,
     SaveCalibration,
 )
+from geometry_msgs.msg import PoseWithCovarianceStamped
+from nav_msgs.msg import Odometry
 from rcl_interfaces.srv import GetParameterTypes
 from rclpy.action import ActionClient
 from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, PointCloud2
+from sensor_msgs.msg import CameraInfo, JointState, PointCloud2
 from tf2_msgs.msg import TFMessage
 from visualization_msgs.msg import MarkerArray
 
@@ -70,6 +74,12 @@ TOPICS = {
     'points_with_covariance': (ReconstructedPoints, observations_qos()),
     'points': (PointCloud2, observations_qos()),
     'markers': (MarkerArray, observations_qos()),
+    'body_poses': (BodyPoses, observations_qos()),
+    'pose': (PoseWithCovarianceStamped, observations_qos()),
+    'odometry': (Odometry, observations_qos()),
+    'joint_angles': (JointAngles, observations_qos()),
+    'joint_states': (JointState, observations_qos()),
+    'tf': (TFMessage, observations_qos()),
     'drift': (DriftStatus, 10),
     'tf_static': (TFMessage, latched_qos()),
 }

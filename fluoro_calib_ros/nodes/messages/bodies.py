@@ -1,0 +1,164 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Poses of bodies and motion of joints in one exposure, in metres.
+
+Covariances of poses are about the fixed axes of the frame of the header, as REP 103 asks and
+robot_localization reads them: those of BodyPoses are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from fluoro_calib_msgs.msg import BodyPoses, JointAngles
+from geometry_msgs.msg import Pose, PoseWithCovarianceStamped, TransformStamped
+from nav_msgs.msg import Odometry
+from numpy.typing import NDArray
+from sensor_msgs.msg import JointState
+from std_msgs.msg import Header
+from tf2_msgs.msg import TFMessage
+
+from ...bodies import body as of_bodies
+from ...bodies.body import PoseStatus
+from ...bodies.joints import JointMotion, JointStatus
+from ...photogrammetry.rig_orientation import RigOrientation
+from ...photogrammetry.rotations import quaternion_from_matrix
+from .observations import float64_field, stamp_from_nanoseconds, uint8_field, uint32_field
+
+# Types without a status have measured poses only: nobody could tell a predicted one from them.
+MEASURED = (PoseStatus.OK, PoseStatus.WEAK)
+_TO_METRES = np.repeat([1e-3, 1.0], 3)  # position, then rotation
+_SCALE = _TO_METRES[:, None] * _TO_METRES
+_OF_JOINT = _SCALE[::-1, ::-1]  # angles, then translations
+
+
+class BodiesContent(NamedTuple):
+    """Poses of B bodies and motion of joints in one exposure.
+
+    Attributes
+    ----------
+    stamp_ns, frame_number : int
+        Those of the exposure.
+    orientation_id : str
+    orientation : RigOrientation
+        Orientation with which the poses were found.
+    poses : sequence of BodyPoses
+        Of this exposure.
+    twist, twist_covariance : np.ndarray
+        (B, 6), (B, 6, 6): see `bodies.tracking.twists_of`.
+    joints : sequence of JointMotion
+        Of this exposure.
+    """
+
+    stamp_ns: int
+    frame_number: int
+    orientation_id: str
+    orientation: RigOrientation
+    poses: Sequence[of_bodies.BodyPoses]
+    twist: NDArray[np.float64]
+    twist_covariance: NDArray[np.float64]
+    joints: Sequence[JointMotion]
+
+    def header(self, frame_id: str = '') -> Header:
+        """Return the header, by default with the frame of the orientation."""
+        return Header(
+            stamp=stamp_from_nanoseconds(self.stamp_ns),
+            frame_id=frame_id or self.orientation.frame_id,
+        )
+
+    def is_measured(self, row: int) -> bool:
+        """Whether the exposure shows a body."""
+        return bool(self.poses[row].status[0] in MEASURED)
+
+
+def message_from_bodies(content: BodiesContent) -> BodyPoses:
+    """Return the message of the poses of all bodies."""
+    poses = content.poses
+    message = BodyPoses(header=content.header(), frame_number=content.frame_number)
+    message.body = [one.body for one in poses]
+    position = np.array([one.position_mm[0] for one in poses]) / 1000
+    attitude = quaternion_from_matrix(np.array([one.rotation[0] for one in poses]))
+    for name, column in zip(('x', 'y', 'z'), position.T):
+        setattr(message, name, float64_field(column))
+    for name, column in zip(('qw', 'qx', 'qy', 'qz'), attitude.T):
+        setattr(message, name, float64_field(column))
+    message.covariance = float64_field(np.array([one.covariance[0] for one in poses]) * _SCALE)
+    message.status = uint8_field([one.status[0] for one in poses])
+    message.markers = uint32_field([one.markers[0] for one in poses])
+    message.orientation_id = content.orientation_id
+    message.calibration_id = list(content.orientation.calibration_ids)
+    return message
+
+
+def pose_of(message: BodyPoses, row: int) -> Pose:
+    """Return the pose of a body of a message."""
+    pose = Pose()
+    for name in 'xyz':
+        setattr(pose.position, name, getattr(message, name)[row])
+    for name in 'xyzw':
+        setattr(pose.orientation, name, getattr(message, f'q{name}')[row])
+    return pose
+
+
+def pose_with_covariance(message: BodyPoses, row: int) -> PoseWithCovarianceStamped:
+    """Return the pose of a body of a message with its covariance."""
+    out = PoseWithCovarianceStamped(header=message.header)
+    out.pose.pose = pose_of(message, row)
+    out.pose.covariance = np.array(message.covariance[36 * row : 36 * row + 36])
+    return out
+
+
+def odometry(content: BodiesContent, message: BodyPoses, row: int) -> Odometry:
+    """Return pose and velocities of a body; velocities are along its own axes."""
+    out = Odometry(header=message.header, child_frame_id=message.body[row])
+    out.pose = pose_with_covariance(message, row).pose
+    twist = (content.twist[row] * _TO_METRES).tolist()
+    linear, angular = out.twist.twist.linear, out.twist.twist.angular
+    linear.x, linear.y, linear.z, angular.x, angular.y, angular.z = twist
+    out.twist.covariance = (content.twist_covariance[row] * _SCALE).ravel()
+    return out
+
+
+def transforms_of_bodies(content: BodiesContent, message: BodyPoses, parent: str) -> TFMessage:
+    """Return the frames of the bodies that the exposure shows, as children of the rig frame."""
+    out = TFMessage()
+    for row, name in enumerate(message.body):
+        if not content.is_measured(row):
+            continue
+        stamped = TransformStamped(header=content.header(parent), child_frame_id=name)
+        pose = pose_of(message, row)
+        stamped.transform.rotation = pose.orientation
+        for axis in 'xyz':
+            setattr(stamped.transform.translation, axis, getattr(pose.position, axis))
+        out.transforms.append(stamped)
+    return out
+
+
+def message_from_joints(content: BodiesContent) -> JointAngles:
+    """Return the message of the motion of all joints."""
+    joints = content.joints
+    message = JointAngles(header=content.header(), frame_number=content.frame_number)
+    message.joint = [one.joint.name for one in joints]
+    message.convention = [one.joint.convention for one in joints]
+    message.angle_name = [name for one in joints for name in one.angle_names]
+    message.translation_name = [name for one in joints for name in one.translation_names]
+    message.angle = float64_field([one.angles[0] for one in joints])
+    message.translation = float64_field(np.array([one.translations[0] for one in joints]) / 1000)
+    message.covariance = float64_field(np.array([one.covariance[0] for one in joints]) * _OF_JOINT)
+    message.status = uint8_field([one.status[0] for one in joints])
+    message.orientation_id = content.orientation_id
+    message.calibration_id = list(content.orientation.calibration_ids)
+    return message
+
+
+def joint_state(content: BodiesContent) -> JointState:
+    """Return the angles of joints whose bodies the exposure shows, as <joint>_<angle>."""
+    out = JointState(header=content.header())
+    for one in content.joints:
+        if one.status[0] in (JointStatus.OK, JointStatus.WEAK):
+            out.name.extend(f'{one.joint.name}_{name}' for name in one.angle_names)
+            out.position.extend(one.angles[0].tolist())
+    return out

@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> bool:
     """
     from ..checks.rig import RigFindings
     from ..checks.verdict import validate
-    from ..io.result_check import edited, exchanged, read_result, used_exposures
+    from ..io.result_check import PHANTOM, edited, exchanged, read_result, used_exposures
     from ..io.result_document import validation_document, write_validation
     from ..jobs.result_folder import saved_orientation
     from ..jobs.sources import read_calibrations
@@ -112,7 +112,7 @@ def _request(
 ) -> CalibrationRequest:
     """Read what the calibrations were made from, in the folder or where it is given."""
     from ..estimation.options import CalibrationRequest
-    from ..io.calibration_request import PHANTOM, read_request
+    from ..io.calibration_request import read_request
     from ..io.csv_table import read_names
     from ..io.phantom import read_phantom
     from ..jobs.calibration import without_unusable

@@ -112,9 +112,10 @@ def _request(
 ) -> CalibrationRequest:
     """Read what the calibrations were made from, in the folder or where it is given."""
     from ..estimation.options import CalibrationRequest
-    from ..io.calibration_request import PHANTOM, read_request
+    from ..io.calibration_request import read_request
     from ..io.csv_table import read_names
     from ..io.phantom import read_phantom
+    from ..io.result_check import PHANTOM
     from ..jobs.calibration import without_unusable
     from ..jobs.sources import BagSelection, read_source, read_survey
 

@@ -115,6 +115,7 @@ def _request(
     from ..io.calibration_request import read_request
     from ..io.csv_table import read_names
     from ..io.phantom import read_phantom
+    from ..io.result_check import PHANTOM
     from ..jobs.calibration import without_unusable
     from ..jobs.sources import BagSelection, read_source, read_survey
 

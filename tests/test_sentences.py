@@ -263,7 +263,7 @@ def state(observations, learned):
 def no_pose():
     seen = Seen.of(np.random.default_rng(0).uniform(0, 900, (60, 2)), np.ones((1024, 1024)), 3.0)
     with mock.patch.object(matching, '_candidates', lambda *_: ()):
-        return raised(matching.match, seen, None, None)
+        return raised(matching.match, seen, Fake(grid=None), None)
 
 
 def principal_distance():

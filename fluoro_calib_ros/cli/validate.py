@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> bool:
     """
     from ..checks.rig import RigFindings
     from ..checks.verdict import validate
-    from ..io.result_check import PHANTOM, edited, exchanged, read_result, used_exposures
+    from ..io.result_check import edited, exchanged, read_result, used_exposures
     from ..io.result_document import validation_document, write_validation
     from ..jobs.result_folder import saved_orientation
     from ..jobs.sources import read_calibrations

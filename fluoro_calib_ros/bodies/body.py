@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -83,7 +84,7 @@ class Body:
         """Whether the place of a marker (m,) is known."""
         return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
 
-    @property
+    @cached_property
     def centre(self) -> NDArray[np.float64]:
         """Mean (3,) of the known markers [mm]."""
         return self.xyz_mm[self.known].mean(axis=0)

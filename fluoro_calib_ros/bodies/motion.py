@@ -56,6 +56,21 @@ MAX_STEP = 2.5  # of h in a round
 ADAPTATIONS = 4  # rounds of h in an exposure, live
 LOG_RANGE = (-20.0, 50.0)
 
+_EYE_3 = np.eye(3)
+_EYE_6 = np.eye(6)
+_EYE_STATE = np.eye(STATE)
+_POSE_ROWS = np.eye(6, STATE)
+# Of each element of the state its row in noise_factors, and of each kind the elements it moves.
+_FACTOR_ROWS = np.repeat(np.arange(3), 6)[:, None]
+_KIND_SHARES = np.array(
+    [
+        np.kron(np.ones((3, 3)), np.diag(np.isin(np.arange(6), np.arange(6)[kind])))
+        for kind in KINDS
+    ]
+)
+_POWERS = np.array([[5, 4, 3], [4, 3, 2], [3, 2, 1]])
+_DIVISORS = np.array([[20.0, 8, 6], [8, 3, 2], [6, 2, 1]])
+
 
 @dataclass(frozen=True)
 class PoseInformation:
@@ -125,8 +140,7 @@ class Motion:
 
 def noise_factors(dt_s: float) -> NDArray[np.float64]:
     """Covariance (3, 3) of position, velocity and acceleration after dt_s of white jerk."""
-    powers = np.array([[5, 4, 3], [4, 3, 2], [3, 2, 1]])
-    return dt_s**powers / np.array([[20.0, 8, 6], [8, 3, 2], [6, 2, 1]])
+    return dt_s**_POWERS / _DIVISORS
 
 
 class MotionFilter:
@@ -211,7 +225,7 @@ class MotionFilter:
         mean = step.mean + (gain @ step.z[:, :, None])[:, :, 0]
         covariance = step.covariance - gain @ step.m @ np.swapaxes(gain, 1, 2)
         if adapt:
-            kept = np.eye(STATE) - gain @ step.m @ np.eye(6, STATE)
+            kept = _EYE_STATE - gain @ step.m @ _POSE_ROWS
             self._slope = kept[:, None] @ self._slope @ np.swapaxes(kept, 1, 2)[:, None]
         self.rotation = matrix_from_vector(mean[:, 3:6]) @ step.reference
         mean[:, 3:6] = 0
@@ -286,7 +300,7 @@ class MotionFilter:
 
 def _weigh(step: _Step, normal: np.ndarray, right: np.ndarray) -> None:
     """Weigh an exposure (B, 6, 6), (B, 6) against its prediction."""
-    inner = np.linalg.inv(np.eye(6) + normal @ step.covariance[:, POSE, POSE])
+    inner = np.linalg.inv(_EYE_6 + normal @ step.covariance[:, POSE, POSE])
     step.z = (inner @ right[:, :, None])[:, :, 0]
     m = inner @ normal
     step.m = (m + np.swapaxes(m, 1, 2)) / 2
@@ -324,7 +338,7 @@ def _smooth(steps: Sequence[_Step]) -> tuple[Motion, _Scores]:
         step = steps[k]
         # L'F'r and L'F'N F L of the next step are in r and n already.
         gain = step.covariance[:, :, POSE]
-        kept = np.eye(STATE) - gain @ step.m @ np.eye(6, STATE)
+        kept = _EYE_STATE - gain @ step.m @ _POSE_ROWS
         back = np.swapaxes(kept, 1, 2)
         r = (back @ r[:, :, None])[:, :, 0]
         n = back @ n @ kept
@@ -436,24 +450,18 @@ def _variance_of_steps(banded: np.ndarray) -> NDArray[np.float64]:
 
 def _transition(dt_s: float, turn: np.ndarray) -> np.ndarray:
     """Transitions (B, 18, 18) over dt_s of bodies that turn by vectors (B, 3)."""
-    out = np.broadcast_to(np.eye(STATE), (len(turn), STATE, STATE)).copy()
-    eye = np.eye(3)
+    out = np.broadcast_to(_EYE_STATE, (len(turn), STATE, STATE)).copy()
     jacobian = left_jacobian(turn)
-    out[:, 0:3, 6:9] = dt_s * eye
-    out[:, 0:3, 12:15] = dt_s**2 / 2 * eye
+    out[:, 0:3, 6:9] = dt_s * _EYE_3
+    out[:, 0:3, 12:15] = dt_s**2 / 2 * _EYE_3
     out[:, 3:6, 3:6] = matrix_from_vector(turn)
     out[:, 3:6, 9:12] = dt_s * jacobian
     out[:, 3:6, 15:18] = dt_s**2 / 2 * jacobian
-    out[:, 6:12, 12:18] = dt_s * np.eye(6)
+    out[:, 6:12, 12:18] = dt_s * _EYE_6
     return out
 
 
 def _noise(dt_s: float, log_q: np.ndarray) -> np.ndarray:
     """Covariances (B, 2, 18, 18) of the noise of positions and of rotations over dt_s."""
-    factors = noise_factors(dt_s)
-    shares = np.zeros((2, STATE, STATE))
-    for kind, components in enumerate(KINDS):
-        chosen = np.zeros((6, 6))
-        chosen[components, components] = np.eye(3)
-        shares[kind] = np.kron(factors, chosen)
+    shares = noise_factors(dt_s)[_FACTOR_ROWS, _FACTOR_ROWS.T] * _KIND_SHARES
     return np.exp(log_q)[:, :, None, None] * shares

@@ -26,6 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +50,10 @@ LINEAR_RAD = 0.05
 # An exposure alone gives a pose if it determines the rotation so that derivatives hold at two
 # standard deviations.
 ALONE_SD_RAD = LINEAR_RAD / 2
+# Smallest eigenvalue of a normal matrix of unit diagonal that counts as regular.
+SINGULAR = 1e-11
+_EYE_3 = np.eye(3)
+_EYE_6 = np.eye(POSE_SIZE)
 
 
 @dataclass(frozen=True)
@@ -188,6 +193,7 @@ class PoseSolver:
             self.target_id[row, :count] = body.target_id
             self.xyz[row, :count] = body.xyz_mm - self.centre[row]
             self.variance[row, :count] = body.sd_mm**2
+        self._variance_3 = self.variance[..., None, None]
         self._views = len(orientation.fluoroscopes)
         camera = np.zeros((self._views, 3, 3))
         camera[:, 0, 0] = camera[:, 1, 1] = orientation.interior[:, 2]
@@ -211,7 +217,7 @@ class PoseSolver:
         used = points.seen.any(axis=2) & started[:, None]
         prior = np.where(
             prediction.known[:, None, None],
-            np.linalg.inv(prediction.covariance + 1e-12 * np.eye(POSE_SIZE)),
+            np.linalg.inv(prediction.covariance + 1e-12 * _EYE_6),
             0.0,
         )
         test = np.full(used.shape, np.nan)
@@ -325,18 +331,21 @@ class PoseSolver:
         holds what is not seen.
         """
         first_rotation, first_centre = rotation, centre = pose
-        variance = points.noise + points.correction
+        weight = _weight(points, used, points.noise + points.correction)
         for _ in range(MAX_STEPS):
             linear = self._linear(rotation, centre, points)
-            marker = self._marker(linear, points, used, variance)
+            marker = self._marker(linear, weight)
             normal, right = _sum(marker, linear.by_pose)
-            alone = _is_determined(normal)
-            held = np.where(alone[:, None, None], 0.0, prior)
+            parts = _eigen(normal)
+            alone = _is_determined(parts)
             turned = _small_vector(first_rotation @ np.swapaxes(rotation, 1, 2))
             away = np.concatenate([first_centre - centre, turned], axis=1)
-            normal = normal + held
-            right = right + (held @ away[:, :, None])[:, :, 0]
-            step = _solved(normal, right)
+            if not alone.all():
+                held = np.where(alone[:, None, None], 0.0, prior)
+                normal = normal + held
+                right = right + (held @ away[:, :, None])[:, :, 0]
+                parts = _eigen(normal)
+            step = _solved(parts, right)
             centre = centre + step[:, :3]
             rotation = matrix_from_vector(step[:, 3:]) @ rotation
             if not (np.sum(step * right, axis=1) > LAST_STEP).any():
@@ -344,7 +353,7 @@ class PoseSolver:
         # The derivatives hold; only the residuals change by the last step.
         moved = (linear.by_pose @ step[:, None, :, None])[:, :, None]
         linear = replace(linear, residual=linear.residual - (linear.by_place @ moved)[..., 0])
-        marker = self._marker(linear, points, used, variance)
+        marker = self._marker(linear, weight)
         return _Solution(
             rotation,
             centre,
@@ -368,7 +377,7 @@ class PoseSolver:
         residual = np.where(good[..., None], points.uv - uv, 0.0)
         by_place = np.where(good[..., None, None], by_place, 0.0)
         by_pose = np.zeros((*shape[:2], 3, POSE_SIZE))
-        by_pose[..., :3] = np.eye(3)
+        by_pose[..., :3] = _EYE_3
         by_pose[..., 3:] = -cross_matrix(arm)
         return _Linear(residual, by_place, uv, by_pose)
 
@@ -390,18 +399,11 @@ class PoseSolver:
         out[..., 1, 8] = y
         return np.nan_to_num(out)
 
-    def _marker(
-        self, linear: _Linear, points: _Points, used: np.ndarray, variance: np.ndarray
-    ) -> _Marker:
-        """Sum up the image points of each marker with weights by a variance (B, M, F)."""
-        weight = np.where(used[..., None] & points.seen, 1 / variance, 0.0)
-        weighted = (linear.by_place * weight[..., None, None]).reshape(*used.shape, -1, 3)
-        transposed = np.swapaxes(weighted, 2, 3)
-        s_matrix = transposed @ linear.by_place.reshape(*used.shape, -1, 3)
-        residual = linear.residual.reshape(*used.shape, -1, 1)
-        s_vector = (transposed @ residual)[..., 0]
+    def _marker(self, linear: _Linear, weight: np.ndarray) -> _Marker:
+        """Sum up the image points of each marker with weights (B, M, F)."""
+        s_matrix, s_vector = _sums(linear, weight)
         squares = np.sum(np.sum(linear.residual**2, axis=-1) * weight, axis=-1)
-        m = np.linalg.inv(np.eye(3) + self.variance[..., None, None] * s_matrix)
+        m = np.linalg.inv(_EYE_3 + self._variance_3 * s_matrix)
         return _Marker(
             weight,
             s_matrix,
@@ -428,7 +430,7 @@ class PoseSolver:
         # Markers are compared with each other. A prediction that they contradict is no reason to
         # reject them: the body may have been hit.
         normal = by_marker.sum(axis=1)
-        away = _solved(normal, gradient.sum(axis=1))[:, None, :, None]
+        away = _solved(_eigen(normal), gradient.sum(axis=1))[:, None, :, None]
         change = (by_marker @ away)[..., 0]
         own = self._own_squares(marker)
         own = own + np.sum((change - 2 * gradient) * away[..., 0], axis=-1)
@@ -444,7 +446,7 @@ class PoseSolver:
         scale = np.sqrt(np.maximum(np.diagonal(others, axis1=2, axis2=3), 1e-12))
         unit = others / (scale[..., :, None] * scale[..., None, :])
         predicted = np.linalg.eigvalsh(unit)[..., 0] > 1e-9
-        inverse = np.linalg.inv(np.where(predicted[..., None, None], unit, np.eye(POSE_SIZE)))
+        inverse = np.linalg.inv(np.where(predicted[..., None, None], unit, _EYE_6))
         reduced = gradient / scale
         gain = np.sum(reduced * (inverse @ reduced[..., None])[..., 0], axis=-1)
         excess = (own[suspect] + np.where(predicted, gain, 0.0)) / limit
@@ -454,7 +456,7 @@ class PoseSolver:
         # with the prediction, too.
         held = solution.prior[suspect]
         pulled = (held @ solution.away[suspect, :, None])[:, None, :, 0] - gradient
-        rest = np.linalg.inv(others + held[:, None] + 1e-9 * np.eye(POSE_SIZE))
+        rest = np.linalg.inv(others + held[:, None] + 1e-9 * _EYE_6)
         left = own[suspect] + np.sum(pulled * (rest @ pulled[..., None])[..., 0], axis=-1)
         worst = np.argmax(np.where(excess > 1, left, -np.inf), axis=1)
         wrong = np.flatnonzero((excess > 1).any(axis=1))
@@ -474,7 +476,7 @@ class PoseSolver:
         pulled = (np.swapaxes(by_place * weight[..., None, None], 3, 4) @ by_rig).sum(axis=2)
         d = linear.by_pose[rows]
         right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pulled).sum(axis=1)
-        regular = normal[rows] + 1e-9 * np.eye(POSE_SIZE)
+        regular = normal[rows] + 1e-9 * _EYE_6
         taken = by_place @ (d @ np.linalg.solve(regular, right)[:, None])[:, :, None]
         squares = np.sum((by_rig - taken) ** 2, axis=(3, 4)) * weight
         return 1 + squares.sum(axis=2) / np.maximum(2 * points.seen[rows].sum(axis=2), 1)
@@ -499,10 +501,10 @@ class PoseSolver:
         noise, fixed, rig_root = self._covariances(inverse, solution, points)
         # A filter takes shape and correction as they are: their errors stay.
         linear = solution.linear
-        random = self._marker(linear, points, used, points.noise)
+        s_matrix, s_vector = _sums(linear, _weight(points, used, points.noise))
         transposed = np.swapaxes(linear.by_pose, 2, 3)
-        information = (transposed @ random.s_matrix @ linear.by_pose).sum(axis=1)
-        right = (transposed @ random.s_vector[..., None])[..., 0].sum(axis=1)
+        information = (transposed @ s_matrix @ linear.by_pose).sum(axis=1)
+        right = (transposed @ s_vector[..., None])[..., 0].sum(axis=1)
         return FramePoses(
             np.where(alone[:, None, None], solution.rotation, np.nan),
             np.where(alone[:, None], solution.centre, np.nan),
@@ -558,6 +560,33 @@ def _sum(marker: _Marker, by_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (normal + np.swapaxes(normal, 1, 2)) / 2, right
 
 
+def _weight(points: _Points, used: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Weights (B, M, F) of image points by their variances; 0 for those that are not used."""
+    return np.where(used[..., None] & points.seen, 1 / variance, 0.0)
+
+
+def _sums(linear: _Linear, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """S (B, M, 3, 3) and s (B, M, 3) of markers."""
+    rows = weight.shape[:2]
+    weighted = (linear.by_place * weight[..., None, None]).reshape(*rows, -1, 3)
+    transposed = np.swapaxes(weighted, 2, 3)
+    s_matrix = transposed @ linear.by_place.reshape(*rows, -1, 3)
+    return s_matrix, (transposed @ linear.residual.reshape(*rows, -1, 1))[..., 0]
+
+
+class _Eigen(NamedTuple):
+    """Eigenvalues (B, 6) and vectors of normal matrices of unit diagonal, and scale (B, 6)."""
+
+    values: np.ndarray
+    vectors: np.ndarray
+    scale: np.ndarray
+
+
+def _eigen(normal: np.ndarray) -> _Eigen:
+    unit, scale = _scaled(normal)
+    return _Eigen(*np.linalg.eigh(unit), scale)
+
+
 def _scaled(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Matrices of unit diagonal, and the scale (B, 6)."""
     scale = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-30))
@@ -567,23 +596,24 @@ def _scaled(normal: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _inverse(normal: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Inverses (B, 6, 6) of those that are wanted (B,), else NaN."""
     unit, scale = _scaled(normal)
-    regular = wanted & (np.linalg.eigvalsh(unit)[:, 0] > 1e-11)
-    inverse = np.linalg.inv(np.where(regular[:, None, None], unit, np.eye(POSE_SIZE)))
+    regular = wanted & (np.linalg.eigvalsh(unit)[:, 0] > SINGULAR)
+    inverse = np.linalg.inv(np.where(regular[:, None, None], unit, _EYE_6))
     inverse = inverse / (scale[:, :, None] * scale[:, None, :])
     return np.where(regular[:, None, None], inverse, np.nan)
 
 
-def _is_determined(normal: np.ndarray) -> np.ndarray:
+def _is_determined(parts: _Eigen) -> np.ndarray:
     """Whether (B,) normal matrices determine a pose so that derivatives hold about it."""
-    inverse = _inverse(normal, np.ones(len(normal), dtype=bool))
-    variance = np.diagonal(inverse, axis1=1, axis2=2)[:, 3:]
-    return np.max(np.where(np.isnan(variance), np.inf, variance), axis=1) < ALONE_SD_RAD**2
+    values = np.maximum(parts.values, SINGULAR)
+    variance = (
+        np.sum(parts.vectors[:, 3:] ** 2 / values[:, None], axis=2) / parts.scale[:, 3:] ** 2
+    )
+    return (parts.values[:, 0] > SINGULAR) & (np.max(variance, axis=1) < ALONE_SD_RAD**2)
 
 
-def _solved(normal: np.ndarray, right: np.ndarray) -> np.ndarray:
+def _solved(parts: _Eigen, right: np.ndarray) -> np.ndarray:
     """Steps (B, 6); 0 in directions that are not determined."""
-    unit, scale = _scaled(normal)
-    values, vectors = np.linalg.eigh(unit)
+    values, vectors, scale = parts
     inverse = np.where(values > 1e-10, 1 / np.maximum(values, 1e-10), 0.0)
     reduced = np.swapaxes(vectors, 1, 2) @ (right / scale)[:, :, None]
     return (vectors @ (inverse[:, :, None] * reduced))[:, :, 0] / scale

@@ -184,6 +184,8 @@ class BodyTracker:
         status = np.where(lost, PoseStatus.FAILED, status).astype(np.uint8)
 
         def kept(values: np.ndarray) -> np.ndarray:
+            if not lost.any():
+                return values
             shape = (-1,) + (1,) * (values.ndim - 1)
             return np.where(lost.reshape(shape), np.nan, values)
 
@@ -292,11 +294,13 @@ def _poses(
     move = np.broadcast_to(np.eye(POSE_SIZE), (len(exposures), POSE_SIZE, POSE_SIZE)).copy()
     move[:, :3, 3:] = cross_matrix(arm)
     back = np.swapaxes(move, 1, 2)
-    axes = np.zeros_like(move)
-    axes[:, :3, :3] = axes[:, 3:, 3:] = rotation
-    of_frame = axes @ body.frame_covariance @ np.swapaxes(axes, 1, 2)
     noise = move @ covariances[0] @ back
-    fixed = move @ (covariances[1] + of_frame) @ back
+    fixed = covariances[1]
+    if body.frame_covariance.any():
+        axes = np.zeros_like(move)
+        axes[:, :3, :3] = axes[:, 3:, 3:] = rotation
+        fixed = fixed + axes @ body.frame_covariance @ np.swapaxes(axes, 1, 2)
+    fixed = move @ fixed @ back
     return BodyPoses(
         body.name,
         np.array([one.number for one in exposures]),

@@ -32,11 +32,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import chdtrc, chdtri, erfc
 
-from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
-from ..photogrammetry.rotations import cross_matrix, matrix_from_vector, vector_from_matrix
-from ..reconstruction.intersection import OK, OUTSIDE
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
 from ..reconstruction.reconstruct import IntersectedViews
 from .body import POSE_SIZE, Body
+from .image_points import Cameras, ImagePoints, Linear
 from .motion import PoseInformation
 from .rigid import fitted_pose
 
@@ -115,26 +115,6 @@ class FramePoses:
 
 
 @dataclass(frozen=True)
-class _Points:
-    """Image points (B, M, F): uv, variances of noise and of correction, and whether seen."""
-
-    uv: np.ndarray
-    noise: np.ndarray
-    correction: np.ndarray
-    seen: np.ndarray
-
-
-@dataclass(frozen=True)
-class _Linear:
-    """Image points at a pose: residuals (B, M, F, 2), and derivatives by place (B, M, F, 2, 3)."""
-
-    residual: np.ndarray
-    by_place: np.ndarray
-    uv: np.ndarray  # predicted
-    by_pose: np.ndarray  # (B, M, 3, 6), derivatives D of places by the pose
-
-
-@dataclass(frozen=True)
 class _Marker:
     """What markers tell: S, s, r'Wr (B, M), M, and M S, M s."""
 
@@ -158,7 +138,7 @@ class _Solution:
     centre: np.ndarray
     alone: np.ndarray
     normal: np.ndarray
-    linear: _Linear
+    linear: Linear
     marker: _Marker
     prior: np.ndarray
     away: np.ndarray
@@ -194,25 +174,14 @@ class PoseSolver:
             self.xyz[row, :count] = body.xyz_mm - self.centre[row]
             self.variance[row, :count] = body.sd_mm**2
         self._variance_3 = self.variance[..., None, None]
-        self._views = len(orientation.fluoroscopes)
-        camera = np.zeros((self._views, 3, 3))
-        camera[:, 0, 0] = camera[:, 1, 1] = orientation.interior[:, 2]
-        camera[:, :, 2] = np.column_stack([orientation.interior[:, :2], np.ones(self._views)])
-        rows = camera @ orientation.rotation
-        self._matrix = rows.reshape(-1, 3).T.copy()
-        self._shift = -(rows @ orientation.position_mm[:, :, None]).reshape(-1)
-        self._uv_rows = rows[:, :2]
-        self._depth_rows = rows[:, 2:]
-        self._root = orientation.covariance_root().reshape(self._views, ORIENTATION_SIZE, -1)
+        self.cameras = Cameras(orientation, self.target_id)
         tail = erfc(reject / np.sqrt(2))
-        freedom = np.arange(max(2 * self._views, 3) + 1)
+        freedom = np.arange(max(2 * len(orientation.fluoroscopes), 3) + 1)
         self._limit = np.where(freedom > 0, chdtri(np.maximum(freedom, 1), tail), np.inf)
-        self._ids: np.ndarray | None = None
-        self._rows = np.zeros(0, dtype=int)
 
     def solve(self, exposure: IntersectedViews, prediction: Prediction) -> FramePoses:
         """Solve for the poses of one exposure; the views are those of the orientation."""
-        points = self._points(exposure)
+        points = self.cameras.sorted(exposure)
         rotation, centre, started = self._start(exposure, prediction)
         used = points.seen.any(axis=2) & started[:, None]
         prior = np.where(
@@ -232,7 +201,7 @@ class PoseSolver:
         return self._result(solution, points, used, test, ambiguous)
 
     def _ambiguous(
-        self, solution: _Solution, points: _Points, used: np.ndarray, prediction: Prediction
+        self, solution: _Solution, points: ImagePoints, used: np.ndarray, prediction: Prediction
     ) -> np.ndarray:
         """Whether (B,) a body that one view sees alone fits in a second pose, too.
 
@@ -270,34 +239,6 @@ class PoseSolver:
         squares = w @ np.linalg.solve(prediction.covariance[row, 3:, 3:], w)
         return bool(squares > self._limit[3])
 
-    def _points(self, exposure: IntersectedViews) -> _Points:
-        """Sort the image points of an exposure by bodies and their markers."""
-        views = exposure.views
-        ids = views.target_id
-        if self._ids is None or len(ids) != len(self._ids) or (ids != self._ids).any():
-            order = np.argsort(ids)
-            found = np.searchsorted(ids[order], self.target_id.ravel())
-            rows = order[np.minimum(found, len(ids) - 1)] if len(ids) else found * 0 - 1
-            known = (ids[rows] == self.target_id.ravel()) if len(ids) else rows >= 0
-            self._rows = np.where(known, rows, len(ids))
-            self._ids = ids
-        shape = (*self.target_id.shape, self._views)
-        # One row more for markers that are not there.
-        padded = np.full((self._views, len(ids) + 1, 4), np.nan)
-        padded[:, :-1, :2] = views.uv
-        padded[:, :-1, 2] = views.sigma
-        padded[:, :-1, 3] = views.correction_sd
-        dropped = exposure.points.dropped_view
-        hit = np.flatnonzero(dropped >= 0)
-        padded[dropped[hit].astype(int), hit] = np.nan
-        sorted_ = padded[:, self._rows].transpose(1, 0, 2).reshape(*shape, 4)
-        seen = np.isfinite(sorted_).all(axis=-1)
-        sorted_ = np.where(seen[..., None], sorted_, 0.0)
-        total = sorted_[..., 2] ** 2
-        correction = np.minimum(sorted_[..., 3] ** 2, 0.99 * total)
-        noise = np.where(seen, total - correction, 1.0)
-        return _Points(sorted_[..., :2], noise, correction, seen)
-
     def _start(
         self, exposure: IntersectedViews, prediction: Prediction
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -307,10 +248,7 @@ class PoseSolver:
         started = prediction.known.copy()
         missing = np.flatnonzero(~started)
         if len(missing):
-            points = exposure.points
-            good = np.isin(points.status, (OK, OUTSIDE))
-            xyz = np.concatenate([np.where(good[:, None], points.xyz_mm, np.nan), [[np.nan] * 3]])
-            xyz = xyz[self._rows].reshape(*self.target_id.shape, 3)
+            xyz = self.cameras.places(exposure)
             for row in missing:
                 seen = np.isfinite(xyz[row]).all(axis=1)
                 if np.count_nonzero(seen) >= 3:
@@ -321,7 +259,7 @@ class PoseSolver:
     def _converge(
         self,
         pose: tuple[np.ndarray, np.ndarray],
-        points: _Points,
+        points: ImagePoints,
         used: np.ndarray,
         prior: np.ndarray,
     ) -> _Solution:
@@ -333,7 +271,7 @@ class PoseSolver:
         first_rotation, first_centre = rotation, centre = pose
         weight = _weight(points, used, points.noise + points.correction)
         for _ in range(MAX_STEPS):
-            linear = self._linear(rotation, centre, points)
+            linear = self.cameras.linear(self.xyz, (rotation, centre), points)
             marker = self._marker(linear, weight)
             normal, right = _sum(marker, linear.by_pose)
             parts = _eigen(normal)
@@ -365,41 +303,7 @@ class PoseSolver:
             away=away,
         )
 
-    def _linear(self, rotation: np.ndarray, centre: np.ndarray, points: _Points) -> _Linear:
-        """Residuals and derivatives of all image points at poses."""
-        shape = points.seen.shape
-        arm = self.xyz @ np.swapaxes(rotation, 1, 2)
-        image = ((arm + centre[:, None]) @ self._matrix + self._shift).reshape(*shape, 3)
-        depth = np.where(image[..., 2] > 0, image[..., 2], np.nan)
-        uv = image[..., :2] / depth[..., None]
-        by_place = (self._uv_rows - uv[..., None] * self._depth_rows) / depth[..., None, None]
-        good = points.seen & np.isfinite(depth)
-        residual = np.where(good[..., None], points.uv - uv, 0.0)
-        by_place = np.where(good[..., None, None], by_place, 0.0)
-        by_pose = np.zeros((*shape[:2], 3, POSE_SIZE))
-        by_pose[..., :3] = _EYE_3
-        by_pose[..., 3:] = -cross_matrix(arm)
-        return _Linear(residual, by_place, uv, by_pose)
-
-    def _by_orientation(self, linear: _Linear) -> np.ndarray:
-        """Derivatives (B, M, F, 2, 9) of image points by T, w, xp, yp, c, see collinearity."""
-        interior = self.orientation.interior
-        c = interior[:, 2]
-        x, y = np.moveaxis((linear.uv - interior[:, :2]) / c[:, None], -1, 0)
-        out = np.zeros((*x.shape, 2, ORIENTATION_SIZE))
-        out[..., :3] = -linear.by_place
-        out[..., 0, 3] = out[..., 1, 4] = c * x * y
-        out[..., 0, 3] *= -1
-        out[..., 0, 4] = c * (1 + x * x)
-        out[..., 0, 5] = -c * y
-        out[..., 1, 3] = -c * (1 + y * y)
-        out[..., 1, 5] = c * x
-        out[..., 0, 6] = out[..., 1, 7] = 1
-        out[..., 0, 8] = x
-        out[..., 1, 8] = y
-        return np.nan_to_num(out)
-
-    def _marker(self, linear: _Linear, weight: np.ndarray) -> _Marker:
+    def _marker(self, linear: Linear, weight: np.ndarray) -> _Marker:
         """Sum up the image points of each marker with weights (B, M, F)."""
         s_matrix, s_vector = _sums(linear, weight)
         squares = np.sum(np.sum(linear.residual**2, axis=-1) * weight, axis=-1)
@@ -415,7 +319,7 @@ class PoseSolver:
         )
 
     def _false_markers(
-        self, solution: _Solution, points: _Points, used: np.ndarray, test: np.ndarray
+        self, solution: _Solution, points: ImagePoints, used: np.ndarray, test: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Rows of bodies that contain a false marker, and its row in each; fill in the tests.
 
@@ -463,7 +367,7 @@ class PoseSolver:
         return suspect[wrong], worst[wrong]
 
     def _growth_by_rig(
-        self, solution: _Solution, points: _Points, normal: np.ndarray, rows: np.ndarray
+        self, solution: _Solution, points: ImagePoints, normal: np.ndarray, rows: np.ndarray
     ) -> np.ndarray:
         """Factor (S, M) of the expected squares of markers by errors of the rig's orientation.
 
@@ -472,7 +376,7 @@ class PoseSolver:
         linear = solution.linear
         weight = solution.marker.weight[rows]
         by_place = linear.by_place[rows]
-        by_rig = self._by_orientation(linear)[rows] @ self._root  # (S, M, F, 2, k)
+        by_rig = self.cameras.by_orientation(linear)[rows] @ self.cameras.root  # (S, M, F, 2, k)
         pulled = (np.swapaxes(by_place * weight[..., None, None], 3, 4) @ by_rig).sum(axis=2)
         d = linear.by_pose[rows]
         right = (np.swapaxes(d, 2, 3) @ solution.marker.m[rows] @ pulled).sum(axis=1)
@@ -489,7 +393,7 @@ class PoseSolver:
     def _result(
         self,
         solution: _Solution,
-        points: _Points,
+        points: ImagePoints,
         used: np.ndarray,
         test: np.ndarray,
         ambiguous: np.ndarray,
@@ -498,7 +402,9 @@ class PoseSolver:
         alone = solution.alone
         seen = used.any(axis=1)
         inverse = _inverse(solution.normal, np.asarray(seen))
-        noise, fixed, rig_root = self._covariances(inverse, solution, points)
+        noise, fixed, rig_root = _covariances(
+            inverse, solution, (points, self.variance), self.cameras
+        )
         # A filter takes shape and correction as they are: their errors stay.
         linear = solution.linear
         s_matrix, s_vector = _sums(linear, _weight(points, used, points.noise))
@@ -520,31 +426,35 @@ class PoseSolver:
             freedom=2.0 * np.sum(points.seen & used[..., None], axis=(1, 2)) - POSE_SIZE,
         )
 
-    def _covariances(
-        self, inverse: np.ndarray, solution: _Solution, points: _Points
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Covariances (B, 6, 6) of poses by noise and by what stays, and the root by the rig.
 
-        inverse (B, 6, 6): of the normal matrix.
-        """
-        marker = solution.marker
-        linear = solution.linear
-        gain = np.swapaxes(linear.by_pose, 2, 3) @ marker.m  # (B, M, 6, 3)
-        weighted = linear.by_place * marker.weight[..., None, None]
-        pulled = np.swapaxes(weighted, 3, 4)
-        rows = (*marker.weight.shape[:2], -1, 3)
-        by_noise = (weighted * points.noise[..., None, None]).reshape(rows)
-        by_correction = (weighted * points.correction[..., None, None]).reshape(rows)
-        flat = np.swapaxes(weighted.reshape(rows), 2, 3)
-        stays = flat @ by_correction + self.variance[..., None, None] * (
-            marker.s_matrix @ marker.s_matrix
-        )
-        back = np.swapaxes(gain, 2, 3)
-        noise = inverse @ (gain @ (flat @ by_noise) @ back).sum(axis=1) @ inverse
-        fixed = inverse @ (gain @ stays @ back).sum(axis=1) @ inverse
-        by_view = (gain[:, :, None] @ (pulled @ self._by_orientation(linear))).sum(axis=1)
-        rig_root = -inverse @ (by_view @ self._root).sum(axis=1)
-        return noise, fixed, rig_root
+def _covariances(
+    inverse: np.ndarray,
+    solution: _Solution,
+    observed: tuple[ImagePoints, np.ndarray],
+    cameras: Cameras,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Covariances (B, 6, 6) of poses by noise and by what stays, and the root by the rig.
+
+    inverse (B, 6, 6): of the normal matrix; observed: image points, and variances (B, M) of the
+    coordinates of the shape.
+    """
+    points, variance = observed
+    marker = solution.marker
+    linear = solution.linear
+    gain = np.swapaxes(linear.by_pose, 2, 3) @ marker.m  # (B, M, 6, 3)
+    weighted = linear.by_place * marker.weight[..., None, None]
+    pulled = np.swapaxes(weighted, 3, 4)
+    rows = (*marker.weight.shape[:2], -1, 3)
+    by_noise = (weighted * points.noise[..., None, None]).reshape(rows)
+    by_correction = (weighted * points.correction[..., None, None]).reshape(rows)
+    flat = np.swapaxes(weighted.reshape(rows), 2, 3)
+    stays = flat @ by_correction + variance[..., None, None] * (marker.s_matrix @ marker.s_matrix)
+    back = np.swapaxes(gain, 2, 3)
+    noise = inverse @ (gain @ (flat @ by_noise) @ back).sum(axis=1) @ inverse
+    fixed = inverse @ (gain @ stays @ back).sum(axis=1) @ inverse
+    by_view = (gain[:, :, None] @ (pulled @ cameras.by_orientation(linear))).sum(axis=1)
+    rig_root = -inverse @ (by_view @ cameras.root).sum(axis=1)
+    return noise, fixed, rig_root
 
 
 def misfit_probability(chi2: NDArray[np.float64], freedom: NDArray[np.float64]) -> np.ndarray:
@@ -560,12 +470,12 @@ def _sum(marker: _Marker, by_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return (normal + np.swapaxes(normal, 1, 2)) / 2, right
 
 
-def _weight(points: _Points, used: np.ndarray, variance: np.ndarray) -> np.ndarray:
+def _weight(points: ImagePoints, used: np.ndarray, variance: np.ndarray) -> np.ndarray:
     """Weights (B, M, F) of image points by their variances; 0 for those that are not used."""
     return np.where(used[..., None] & points.seen, 1 / variance, 0.0)
 
 
-def _sums(linear: _Linear, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _sums(linear: Linear, weight: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """S (B, M, 3, 3) and s (B, M, 3) of markers."""
     rows = weight.shape[:2]
     weighted = (linear.by_place * weight[..., None, None]).reshape(*rows, -1, 3)

@@ -1,0 +1,141 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Image points of bodies, sorted by body and marker, and their derivatives at poses."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
+from ..photogrammetry.rotations import cross_matrix
+from ..reconstruction.intersection import OK, OUTSIDE
+from ..reconstruction.reconstruct import IntersectedViews
+from .body import POSE_SIZE
+
+
+@dataclass(frozen=True)
+class ImagePoints:
+    """Image points (B, M, F): uv, variances of noise and of correction, and whether seen."""
+
+    uv: np.ndarray
+    noise: np.ndarray
+    correction: np.ndarray
+    seen: np.ndarray
+
+
+@dataclass(frozen=True)
+class Linear:
+    """Image points at a pose: residuals (B, M, F, 2), and derivatives by place (B, M, F, 2, 3)."""
+
+    residual: np.ndarray
+    by_place: np.ndarray
+    uv: np.ndarray  # predicted
+    by_pose: np.ndarray  # (B, M, 3, 6), derivatives D of places by the pose
+
+
+class Cameras:
+    """The fluoroscopes of a rig, as they see the markers of bodies.
+
+    Parameters
+    ----------
+    orientation : RigOrientation
+    target_id : (B, M) ndarray
+        Markers of B bodies, -1 where a body has fewer.
+    """
+
+    def __init__(self, orientation: RigOrientation, target_id: np.ndarray) -> None:
+        self.target_id = target_id
+        self._views = len(orientation.fluoroscopes)
+        self._interior = orientation.interior
+        camera = np.zeros((self._views, 3, 3))
+        camera[:, 0, 0] = camera[:, 1, 1] = orientation.interior[:, 2]
+        camera[:, :, 2] = np.column_stack([orientation.interior[:, :2], np.ones(self._views)])
+        rows = camera @ orientation.rotation
+        self._matrix = rows.reshape(-1, 3).T.copy()
+        self._shift = -(rows @ orientation.position_mm[:, :, None]).reshape(-1)
+        self._uv_rows = rows[:, :2]
+        self._depth_rows = rows[:, 2:]
+        # (F, 9, k): of the covariance of the orientation, by independent unknowns of variance one.
+        self.root = orientation.covariance_root().reshape(self._views, ORIENTATION_SIZE, -1)
+        self._ids: np.ndarray | None = None
+        self._rows = np.zeros(0, dtype=int)
+
+    def sorted(self, exposure: IntersectedViews) -> ImagePoints:
+        """Sort the image points of an exposure by bodies and their markers."""
+        views = exposure.views
+        ids = views.target_id
+        if self._ids is None or len(ids) != len(self._ids) or (ids != self._ids).any():
+            order = np.argsort(ids)
+            found = np.searchsorted(ids[order], self.target_id.ravel())
+            rows = order[np.minimum(found, len(ids) - 1)] if len(ids) else found * 0 - 1
+            known = (ids[rows] == self.target_id.ravel()) if len(ids) else rows >= 0
+            self._rows = np.where(known, rows, len(ids))
+            self._ids = ids
+        shape = (*self.target_id.shape, self._views)
+        # One row more for markers that are not there.
+        padded = np.full((self._views, len(ids) + 1, 4), np.nan)
+        padded[:, :-1, :2] = views.uv
+        padded[:, :-1, 2] = views.sigma
+        padded[:, :-1, 3] = views.correction_sd
+        dropped = exposure.points.dropped_view
+        hit = np.flatnonzero(dropped >= 0)
+        padded[dropped[hit].astype(int), hit] = np.nan
+        sorted_ = padded[:, self._rows].transpose(1, 0, 2).reshape(*shape, 4)
+        seen = np.isfinite(sorted_).all(axis=-1)
+        sorted_ = np.where(seen[..., None], sorted_, 0.0)
+        total = sorted_[..., 2] ** 2
+        correction = np.minimum(sorted_[..., 3] ** 2, 0.99 * total)
+        noise = np.where(seen, total - correction, 1.0)
+        return ImagePoints(sorted_[..., :2], noise, correction, seen)
+
+    def places(self, exposure: IntersectedViews) -> NDArray[np.float64]:
+        """Places (B, M, 3) of the markers of the exposure that was sorted last [mm], or NaN."""
+        points = exposure.points
+        good = np.isin(points.status, (OK, OUTSIDE))
+        xyz = np.concatenate([np.where(good[:, None], points.xyz_mm, np.nan), [[np.nan] * 3]])
+        return xyz[self._rows].reshape(*self.target_id.shape, 3)
+
+    def linear(
+        self, xyz: np.ndarray, pose: tuple[np.ndarray, np.ndarray], points: ImagePoints
+    ) -> Linear:
+        """Residuals and derivatives of all image points at poses.
+
+        xyz (B, M, 3): markers about the centre of their body; pose: rotations (B, 3, 3) and
+        centres (B, 3).
+        """
+        rotation, centre = pose
+        shape = points.seen.shape
+        arm = xyz @ np.swapaxes(rotation, 1, 2)
+        image = ((arm + centre[:, None]) @ self._matrix + self._shift).reshape(*shape, 3)
+        depth = np.where(image[..., 2] > 0, image[..., 2], np.nan)
+        uv = image[..., :2] / depth[..., None]
+        by_place = (self._uv_rows - uv[..., None] * self._depth_rows) / depth[..., None, None]
+        good = points.seen & np.isfinite(depth)
+        residual = np.where(good[..., None], points.uv - uv, 0.0)
+        by_place = np.where(good[..., None, None], by_place, 0.0)
+        by_pose = np.zeros((*shape[:2], 3, POSE_SIZE))
+        by_pose[..., :3] = np.eye(3)
+        by_pose[..., 3:] = -cross_matrix(arm)
+        return Linear(residual, by_place, uv, by_pose)
+
+    def by_orientation(self, linear: Linear) -> np.ndarray:
+        """Derivatives (B, M, F, 2, 9) of image points by T, w, xp, yp, c, see collinearity."""
+        interior = self._interior
+        c = interior[:, 2]
+        x, y = np.moveaxis((linear.uv - interior[:, :2]) / c[:, None], -1, 0)
+        out = np.zeros((*x.shape, 2, ORIENTATION_SIZE))
+        out[..., :3] = -linear.by_place
+        out[..., 0, 3] = out[..., 1, 4] = c * x * y
+        out[..., 0, 3] *= -1
+        out[..., 0, 4] = c * (1 + x * x)
+        out[..., 0, 5] = -c * y
+        out[..., 1, 3] = -c * (1 + y * y)
+        out[..., 1, 5] = c * x
+        out[..., 0, 6] = out[..., 1, 7] = 1
+        out[..., 0, 8] = x
+        out[..., 1, 8] = y
+        return np.nan_to_num(out)

@@ -73,7 +73,7 @@ def run(arguments: argparse.Namespace) -> bool:
     from ..checks.rig import RigFindings
     from ..checks.verdict import validate
     from ..io.result_check import edited, exchanged, read_result, used_exposures
-    from ..io.result_document import validation_document, write_validation
+    from ..io.result_document import write_validation
     from ..jobs.result_folder import saved_orientation
     from ..jobs.sources import read_calibrations
     from ..report.verdict import verdict_text
@@ -93,14 +93,14 @@ def run(arguments: argparse.Namespace) -> bool:
     note = edited(arguments.directory, document)
     if note is not None:
         validation = replace(validation, notes=(note, *validation.notes))
-    write_validation(arguments.directory, validation)
+    written = write_validation(arguments.directory, validation)
     passed = validation.verdict == 'pass'
     following = ('reconstruct', 'MEASURED', '--calibration', arguments.directory)
     if orientation is None:
         following = ('correct', 'POINTS', '--calibration', arguments.directory)
     print_result(
         arguments,
-        validation_document(validation),
+        written,
         verdict_text(validation),
         (*following, '--out', 'points.csv') if passed else (),
     )

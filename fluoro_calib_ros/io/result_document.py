@@ -285,11 +285,12 @@ def _check_document(check: Check) -> dict[str, Any]:
     }
 
 
-def write_validation(directory: PathLike, validation: Validation) -> None:
-    """Write validation.json into a folder, as its last file. Raises DataError."""
+def write_validation(directory: PathLike, validation: Validation) -> dict[str, Any]:
+    """Write validation.json into a folder, as its last file; return it. Raises DataError."""
     document = validation_document(validation)
     document = with_digests(directory, document, validation.calibration_id)
     write_json(Path(directory) / VALIDATION_NAME, document)
+    return document
 
 
 def delete_validation(directory: PathLike) -> None:

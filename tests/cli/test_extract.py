@@ -348,7 +348,14 @@ def test_calibrate_takes_the_angles_of_images_in_a_bag(folder):
     recording = recording_of_images(bag, survey, angles=angles)
     assert [f.angle for f in recording.frames['a']] == pytest.approx([0.1, 0.2, 0.2], abs=1e-8)
     words = ['calibrate', str(bag), '--phantom', str(folder / 'phantom.csv'), '--model', 'none']
-    words += ['--out', str(folder / 'result'), '--angle-max-age', '5', '--angle-joint']
+    words += [
+        '--out',
+        str(folder / 'result'),
+        '--angle-max-age',
+        '5',
+        '--exit-zero',
+        '--angle-joint',
+    ]
     main([*words, 'carm'])
     (folder / 'out.csv').write_bytes((folder / 'result' / 'observations.csv').read_bytes())
     assert angles_in_table(folder) == [5.7296, 11.4592, 11.4592]

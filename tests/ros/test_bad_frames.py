@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from ros_graph import value_of
 
 from fluoro_calib_ros.io.calibration import load_calibrations
 from fluoro_calib_ros.nodes.messages.observations import float64_field, message_from_frame
@@ -138,10 +139,10 @@ def test_bad_frames_are_counted_and_reported(rig):
     assert values['frames rejected'] == str(len(BAD)) and says(
         values['last fault'], rig.bad['empty']
     )
-    values = {v.key: v.value for v in client.statuses['correction_node: a'].values}
-    assert values['invalid points'] == str(len(ONE_POINT)) and values['frames received'] == str(
-        rig.published
+    status = client.wait_for_diagnostics(
+        'correction_node', lambda s: value_of(s, 'frames received') == str(rig.published)
     )
+    assert value_of(status, 'invalid points') == str(len(ONE_POINT))
 
 
 def says(sentence, number):

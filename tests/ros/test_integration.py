@@ -61,12 +61,14 @@ def test_streams_are_corrected_without_a_calibration_node(graph, calibrated, exp
     assert corrected[0].calibration_id == ids_of(calibrated)['a']
 
 
-def test_folder_without_calibrations_is_reported(graph, tmp_path):
-    graph.start('correction_node', {'calibration_directory': tmp_path})
+def test_folder_without_calibrations_is_named_and_waited_for(graph, tmp_path):
+    """Before the first calibration this is no fault: the log names the folder."""
+    node = graph.start('correction_node', {'calibration_directory': tmp_path})
     status = graph.client.wait_for_diagnostics(
-        'correction_node', lambda s: value_of(s, 'last fault')
+        'correction_node', lambda s: 'no calibration yet' in s.message
     )
-    assert value_of(status, 'last fault').startswith(f'{tmp_path}: ')
+    assert not value_of(status, 'last fault')
+    assert f'{tmp_path} has no calibrations yet' in node.log
 
 
 def test_calibration_node_without_phantom_serves_saved_calibrations(graph, calibrated):

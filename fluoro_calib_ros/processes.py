@@ -251,9 +251,11 @@ def _answer(
         raise  # the caller has gone
     except Exception as error:
         trace = ''.join(traceback.format_exception(error))
+        # The pipe pickles what these two processes exchange, in memory only. An error whose
+        # arguments are its own would fail at the receiver, so that is tried here.
         try:
             pickle.loads(pickle.dumps(error))
-        except Exception:  # an error with arguments of its own
+        except Exception:
             return _Failure(RuntimeError(repr(error)), trace)
         return _Failure(error, trace)
 

@@ -12,16 +12,20 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from ..errors import DataError
 from ..io.rig_file import NAME
 from ..limits import ReadLimits, use_read_limits
 from ..options import Option, declared
 from .rig import JointOfRig
 
 if TYPE_CHECKING:
+    from ..correction.fluoroscope_calibration import FluoroscopeCalibration
     from ..exposures.angles import AngleOptions
+    from ..io.access import PathLike
     from ..io.formats.content import FileSettings
     from ..jobs.scheduling import Cluster
-    from ..jobs.sources import BagSelection
+    from ..jobs.sources import BagSelection, Recording
+    from ..photogrammetry.rig_orientation import RigOrientation
 
 Parser = argparse.ArgumentParser | argparse._ArgumentGroup
 T = TypeVar('T')
@@ -110,6 +114,46 @@ def add_options(
     options = declared(kind)
     for name in only or options:
         add_option(parser, options[name], **changes.get(name, {}))
+
+
+def add_orientation(parser: Parser) -> None:
+    """Add --orientation, the file of the orientation of the rig."""
+    parser.add_argument(
+        '--orientation',
+        type=Path,
+        metavar='FILE',
+        help='orientation of the rig (default: rig_orientation.npz in the result folder)',
+    )
+
+
+def read_oriented_source(
+    arguments: argparse.Namespace, path: PathLike
+) -> tuple[Recording, dict[str, FluoroscopeCalibration], RigOrientation]:
+    """Read a recording, its calibrations and the orientation of the rig in path.
+
+    Raises DataError, also where the orientation belongs to other calibrations.
+    """
+    from ..io.rig_orientation import load_orientation
+    from ..jobs.reconstruction import check_orientation
+    from ..jobs.sources import read_calibrated_source
+
+    recording, calibrations = read_calibrated_source(
+        arguments.source,
+        arguments.calibration,
+        image_size=arguments.image_size,
+        fluoroscopes=arguments.fluoroscopes,
+        # A frame without points, or with an invalid one, must not reject a recording.
+        validate=False,
+        settings=file_settings(arguments),
+        selection=bag_selection(arguments, pairing=False),
+    )
+    orientation = load_orientation(path)
+    names = [name for name in orientation.fluoroscopes if name in recording.frames]
+    try:
+        check_orientation(orientation.subset(names) if names else orientation, calibrations)
+    except DataError as error:
+        raise error.at(path) from None
+    return recording, calibrations, orientation
 
 
 def add_exit_zero(parser: Parser) -> None:

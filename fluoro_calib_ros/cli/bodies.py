@@ -16,11 +16,11 @@ from .arguments import (
     add_bag_options,
     add_calibration,
     add_options,
+    add_orientation,
     add_source,
-    bag_selection,
-    file_settings,
     number_in,
     options_of,
+    read_oriented_source,
 )
 from .output import ProgressBar, print_findings, print_notes, print_result, print_unpaired
 
@@ -54,12 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         '--joints', type=Path, metavar='FILE', help='joints between the bodies, TOML'
     )
     parser.add_argument('--out', required=True, type=Path, metavar='DIR', help='folder to write')
-    parser.add_argument(
-        '--orientation',
-        type=Path,
-        metavar='FILE',
-        help='orientation of the rig (default: rig_orientation.npz in the result folder)',
-    )
+    add_orientation(parser)
     add_options(parser, BodiesOptions, reject={'metavar': 'S'})
     parser.add_argument(
         '--keep-shapes',
@@ -83,11 +78,10 @@ def run(arguments: argparse.Namespace) -> None:
     """Write poses and joints of a recording. Raises DataError."""
     from ..io.bodies import read_bodies
     from ..io.joints import read_joints
-    from ..io.rig_orientation import load_orientation, orientation_path
+    from ..io.rig_orientation import orientation_path
     from ..jobs.bodies import BodiesOptions, track_bodies
     from ..jobs.bodies_folder import check_bodies_folder, save_bodies
-    from ..jobs.reconstruction import check_orientation
-    from ..jobs.sources import is_bag, read_calibrated_source
+    from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)
     inputs = [arguments.source, arguments.calibration, path, arguments.bodies]
@@ -95,26 +89,13 @@ def run(arguments: argparse.Namespace) -> None:
     bodies = read_bodies(arguments.bodies)
     names = [body.name for body in bodies]
     joints = read_joints(arguments.joints, names) if arguments.joints else ()
-    recording, calibrations = read_calibrated_source(
-        arguments.source,
-        arguments.calibration,
-        image_size=arguments.image_size,
-        fluoroscopes=arguments.fluoroscopes,
-        validate=False,
-        settings=file_settings(arguments),
-        selection=bag_selection(arguments, pairing=False),
-    )
+    recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
     if arguments.rate is None and not is_bag(arguments.source):
         raise DataError(
             f'{arguments.source}: the file does not contain the times of its exposures; give '
             'their rate, --rate HZ'
         )
-    orientation = load_orientation(path)
-    try:
-        check_orientation(orientation, calibrations)
-    except DataError as error:
-        raise error.at(path) from None
     options = options_of(
         BodiesOptions,
         arguments,

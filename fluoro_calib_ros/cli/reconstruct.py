@@ -15,10 +15,10 @@ from .arguments import (
     add_bag_options,
     add_calibration,
     add_options,
+    add_orientation,
     add_source,
-    bag_selection,
-    file_settings,
     options_of,
+    read_oriented_source,
 )
 from .output import print_note, print_notes, print_result, print_unpaired
 
@@ -38,12 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_bag_options(parser, pairing=False)
     add_calibration(parser)
     parser.add_argument('--out', required=True, type=Path, metavar='OUT.csv', help='file to write')
-    parser.add_argument(
-        '--orientation',
-        type=Path,
-        metavar='FILE',
-        help='orientation of the rig (default: rig_orientation.npz in the result folder)',
-    )
+    add_orientation(parser)
     add_options(parser, ReconstructionOptions, reject={'metavar': 'S'})
     parser.add_argument(
         '--cluster',
@@ -82,25 +77,15 @@ def run(arguments: argparse.Namespace) -> None:
     """Write the points of a recording. Raises DataError."""
     from ..io.folder import check_output_file
     from ..io.reconstructed_points import write_reconstruction
-    from ..io.rig_orientation import load_orientation, orientation_path
-    from ..jobs.reconstruction import ReconstructionOptions, check_orientation, reconstruct
-    from ..jobs.sources import is_bag, read_calibrated_source
+    from ..io.rig_orientation import orientation_path
+    from ..jobs.reconstruction import ReconstructionOptions, reconstruct
+    from ..jobs.sources import is_bag
 
     path = arguments.orientation or orientation_path(arguments.calibration)
     check_output_file(arguments.out, (arguments.source, arguments.calibration, path))
-    recording, calibrations = read_calibrated_source(
-        arguments.source,
-        arguments.calibration,
-        image_size=arguments.image_size,
-        fluoroscopes=arguments.fluoroscopes,
-        # A frame without points, or with an invalid one, must not reject a recording.
-        validate=False,
-        settings=file_settings(arguments),
-        selection=bag_selection(arguments, pairing=False),
-    )
+    recording, calibrations, orientation = read_oriented_source(arguments, path)
     print_notes(recording.notes)
     frames = recording.frames
-    orientation = load_orientation(path)
     options = options_of(
         ReconstructionOptions,
         arguments,
@@ -109,11 +94,6 @@ def run(arguments: argparse.Namespace) -> None:
         has_stamps=is_bag(arguments.source),
         pair_tolerance=arguments.pair_tolerance,
     )
-    names = [name for name in orientation.fluoroscopes if name in frames]
-    try:
-        check_orientation(orientation.subset(names) if names else orientation, calibrations)
-    except DataError as error:
-        raise error.at(path) from None
     try:
         outcome = reconstruct(frames, calibrations, orientation, options)
     except DataError as error:

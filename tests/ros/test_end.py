@@ -23,7 +23,7 @@ SIDE = 8192  # px; the preparation of this calibration takes a minute
 POINTS = 200_000
 END_S = 30  # a tenth of it on an idle machine
 BUSY = """
-import sys, time
+import threading
 from rclpy.node import Node
 from fluoro_calib_ros.nodes.runtime.main import run
 
@@ -36,7 +36,7 @@ class Busy(Node):
 
     def work(self):
         print('at work', flush=True)
-        time.sleep(3600)
+        threading.Event().wait()  # for ever, as in a call that does not return
 
 run(Busy)
 """

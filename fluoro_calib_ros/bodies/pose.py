@@ -30,7 +30,7 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import chdtrc, chdtri, erfc
+from scipy.special import chdtri, erfc
 
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..photogrammetry.rotations import matrix_from_vector, vector_from_matrix
@@ -455,11 +455,6 @@ def _covariances(
     by_view = (gain[:, :, None] @ (pulled @ cameras.by_orientation(linear))).sum(axis=1)
     rig_root = -inverse @ (by_view @ cameras.root).sum(axis=1)
     return noise, fixed, rig_root
-
-
-def misfit_probability(chi2: NDArray[np.float64], freedom: NDArray[np.float64]) -> np.ndarray:
-    """Probability of a sum of squares as large as chi2, NaN without redundancy."""
-    return np.where(freedom > 0, chdtrc(np.maximum(freedom, 1), chi2), np.nan)
 
 
 def _sum(marker: _Marker, by_pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

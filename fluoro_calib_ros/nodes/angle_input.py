@@ -103,7 +103,11 @@ class AngleInput:
             elif faults.too_large is not None:
                 faults.too_large(topic, size)
 
-        return FaultHandlers(undecodable, callback_error, faults.reader_error, too_large)
+        def overrun(topic: str, count: int) -> None:
+            if topic != TOPIC and faults.overrun is not None:
+                faults.overrun(topic, count)
+
+        return FaultHandlers(undecodable, callback_error, faults.reader_error, too_large, overrun)
 
     def of_frame(self, name: str, stamp_ns: int, needed: bool) -> float | None:
         """Return the angle of an exposure [rad], None where it is unknown.

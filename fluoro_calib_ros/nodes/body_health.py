@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from ..bodies.body import STATUS_NAMES, Body, PoseStatus
 from ..bodies.joint_tracking import JointTracker
 from .body_following import BodiesState, BodyFollower
-from .runtime.diagnostics import OK, Health, Status, health_of, warning
+from .runtime.diagnostics import OK, Health, RecentCounts, Status, health_of, warning
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,7 @@ class BodyState:
     state: BodiesState
     row: int
     untimed: int
+    untimed_recently: int
 
     @property
     def status(self) -> PoseStatus:
@@ -36,8 +37,9 @@ class BodyState:
 
 def exposures_without_time(state: BodyState) -> Health | None:
     """Exposures have the stamp of the one before."""
-    count = state.untimed
-    return warning(f'{count} exposures have the stamp of the one before' if count else '')
+    count = state.untimed_recently
+    text = f'{count} exposures in the last minute have the stamp of the one before'
+    return warning(text if count else '')
 
 
 def unseen_body(state: BodyState) -> Health | None:
@@ -96,14 +98,13 @@ def followed_joint(joint: JointTracker) -> Health:
 JOINT_CONDITIONS = (failed_neutral, awaited_neutral, followed_joint)
 
 
-def statuses_of(follower: BodyFollower) -> list[Status]:
+def statuses_of(follower: BodyFollower, counts: RecentCounts) -> list[Status]:
     """Return a status for each body and each joint, nothing before the first exposure."""
     state = follower.state
     if state is None:
         return []
-    bodies = [
-        BodyState(body, state, row, follower.untimed) for row, body in enumerate(follower.bodies)
-    ]
+    untimed = follower.untimed, counts.growth('bodies', untimed=follower.untimed)['untimed']
+    bodies = [BodyState(body, state, row, *untimed) for row, body in enumerate(follower.bodies)]
     return [
         *(
             Status(f'body {one.body.name}', *health_of(one, BODY_CONDITIONS), _values(one))

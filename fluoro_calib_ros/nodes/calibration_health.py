@@ -15,7 +15,9 @@ from .runtime.conditions import (
     incompatible_publisher,
     lost_messages,
     missing_publisher,
+    overrun_input,
     refused_messages,
+    unpaired_frames,
 )
 from .runtime.diagnostics import OK, Health, fault, warning
 from .runtime.streams import publisher_conflict
@@ -69,12 +71,6 @@ def never_published(state: FluoroscopeState) -> Health | None:
     return None if state.stream.received else missing_publisher(state)
 
 
-def unpaired_frames(state: FluoroscopeState) -> Health | None:
-    """Other fluoroscopes did not see the same exposures."""
-    count = state.progress.collected.unpaired
-    return warning(f'{count} frames without partner of the other fluoroscopes' if count else '')
-
-
 def distant_stamps(state: FluoroscopeState) -> Health | None:
     """Frames of the same number are far apart in time."""
     return warning(state.disagreement)
@@ -103,6 +99,7 @@ CONDITIONS = (
     refused_calibration,
     inactive_node,
     never_published,
+    overrun_input,
     unpaired_frames,
     refused_messages,
     distant_stamps,

@@ -171,6 +171,12 @@ class CalibrationNode(StreamNode):
             topics=(f'{name}/{OBSERVATIONS}',),
             refusals=stream.refusals,
             incompatible=incompatible,
+            recent=self.recent.growth(
+                name,
+                refused=stream.refusals.total,
+                overrun=stream.overrun,
+                unpaired=progress.collected.unpaired,
+            ),
             stream=stream,
             subject='target observations',
             progress=progress,
@@ -180,6 +186,7 @@ class CalibrationNode(StreamNode):
         )
         values = {
             **progress.collected.values(),
+            'lost at the input': stream.overrun,
             'last fault': stream.refusals.last_fault,
             'calibration': progress.calibration_id,
             **self._angles.values(name),

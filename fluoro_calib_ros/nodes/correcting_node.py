@@ -23,6 +23,7 @@ from .runtime.conditions import (
     incompatible_publisher,
     lost_messages,
     missing_publisher,
+    overrun_input,
     refused_messages,
     stalled_stream,
 )
@@ -121,6 +122,7 @@ CONDITIONS = (
     inactive_node,
     missing_publisher,
     stalled_stream,
+    overrun_input,
     refused_messages,
     doubtful_angle,
     correcting,
@@ -266,6 +268,7 @@ class CorrectingNode(StreamNode):
             topics=tuple(f'{name}/{topic}' for topic in self.topics),
             refusals=stream.refusals,
             incompatible=incompatible,
+            recent=self.recent.growth(name, refused=stream.refusals.total, overrun=stream.overrun),
             stream=stream,
             subject=self.subject,
             item=self.item,
@@ -275,6 +278,7 @@ class CorrectingNode(StreamNode):
         )
         values = {
             f'{self.item}s received': stream.received,
+            'lost at the input': stream.overrun,
             f'{self.item}s corrected': stream.corrected,
             f'{self.item}s without calibration': stream.waiting,
             **stream.refusals.values(self.refusal_kinds),

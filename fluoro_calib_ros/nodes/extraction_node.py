@@ -178,6 +178,7 @@ class ExtractionNode(StreamNode):
             topics=tuple(f'{name}/{topic}' for _, topic in self._inputs),
             refusals=stream.refusals,
             incompatible=incompatible,
+            recent=self.recent.growth(name, refused=stream.refusals.total, overrun=stream.overrun),
             stream=stream,
             subject='images',
             angles=self._angles,
@@ -185,6 +186,7 @@ class ExtractionNode(StreamNode):
         health = health_of(state, CONDITIONS)
         values = {
             **stream.values(self._workers.waiting(name)),
+            'lost at the input': stream.overrun,
             **self._angles.values(name),
             **stream.latencies.values(),
         }

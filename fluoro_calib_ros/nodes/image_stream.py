@@ -20,6 +20,7 @@ from .runtime.conditions import (
     incompatible_publisher,
     lost_messages,
     missing_publisher,
+    overrun_input,
     refused_messages,
     stalled_stream,
 )
@@ -174,6 +175,7 @@ CONDITIONS = (
     inactive_node,
     missing_publisher,
     stalled_stream,
+    overrun_input,
     shed_images,
     empty_image,
     unknown_angle,

@@ -16,7 +16,9 @@ from .runtime.conditions import (
     inactive_node,
     incompatible_publisher,
     lost_messages,
+    overrun_input,
     refused_messages,
+    unpaired_frames,
 )
 from .runtime.diagnostics import OK, WARN, Health, fault, health_of, warning
 from .runtime.stream import Stream
@@ -38,15 +40,12 @@ class ReconstructionState(InputState):
     rigs : RigInput
     pairer : Pairer
     misses : RecentMisses
-    without_orientation : int
-        Number of exposures.
     """
 
     streams: Mapping[str, Stream]
     rigs: RigInput
     pairer: Pairer
     misses: RecentMisses
-    without_orientation: int
 
 
 def no_orientation(state: ReconstructionState) -> Health | None:
@@ -91,10 +90,10 @@ def silent_fluoroscopes(state: ReconstructionState) -> Health | None:
 
 def foreign_calibrations(state: ReconstructionState) -> Health | None:
     """Views were corrected with calibrations of no known orientation."""
-    count = state.without_orientation
+    count = state.recent['without_orientation']
     corrected = (
-        f'{count} exposures were corrected with calibrations to which no orientation of the rig '
-        'belongs'
+        f'{count} exposures in the last minute were corrected with calibrations to which no '
+        'orientation of the rig belongs'
     )
     return warning(corrected if count else '')
 
@@ -104,16 +103,11 @@ def distant_stamps(state: ReconstructionState) -> Health | None:
     return warning(state.pairer.stamps.disagreement())
 
 
-def unpaired_frames(state: ReconstructionState) -> Health | None:
-    """Frames have no partner."""
-    count = sum(state.pairer.unpaired.values())
-    return warning(f'{count} frames without partner of the other fluoroscopes' if count else '')
-
-
 def incomplete_exposures(state: ReconstructionState) -> Health | None:
     """Exposures have some of the views only."""
-    count = state.pairer.incomplete
-    return warning(f'{count} exposures without all fluoroscopes' if count else '')
+    count = state.recent['incomplete']
+    text = f'{count} exposures without all fluoroscopes in the last minute'
+    return warning(text if count else '')
 
 
 def reconstructing(state: ReconstructionState) -> Health:
@@ -128,6 +122,7 @@ STREAM_CONDITIONS = (
     foreign_calibrations,
     refused_messages,
     distant_stamps,
+    overrun_input,
     unpaired_frames,
     incomplete_exposures,
     reconstructing,

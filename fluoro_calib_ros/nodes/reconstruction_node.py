@@ -312,20 +312,31 @@ class ReconstructionNode(StreamNode):
             topics=tuple(f'{name}/{VIEWS}' for name in self._names),
             refusals=self._refusals,
             incompatible=self.incompatible_publishers(),
+            recent=self._recent(),
             streams=self._streams,
             rigs=self._rigs,
             pairer=self._pairer,
             misses=self._misses,
-            without_orientation=self._without_orientation,
         )
         status = Status('reconstruction', *health_of(state, CONDITIONS), self._values())
-        bodies = [] if self._follower is None else statuses_of(self._follower)
+        bodies = [] if self._follower is None else statuses_of(self._follower, self.recent)
         return [status, *bodies, *self._drift.publish_state()]
+
+    def _recent(self) -> dict[str, int]:
+        return self.recent.growth(
+            'reconstruction',
+            refused=self._refusals.total,
+            overrun=sum(stream.overrun for stream in self._streams.values()),
+            unpaired=sum(self._pairer.unpaired.values()),
+            incomplete=self._pairer.incomplete,
+            without_orientation=self._without_orientation,
+        )
 
     def _values(self) -> dict[str, object]:
         rig = self._rigs.newest
         return {
             **{f'frames received of {name}': s.received for name, s in self._streams.items()},
+            **{f'frames lost at the input of {n}': s.overrun for n, s in self._streams.items()},
             'exposures': self._exposures,
             'exposures reconstructed': self._reconstructed,
             'exposures incomplete': self._pairer.incomplete,

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -62,10 +63,11 @@ PARAMETERS = (_NODE, _RECORDING)
 
 
 class RecorderState(NamedTuple):
-    """Why nothing is written, and what was dropped; '' for nothing."""
+    """Why nothing is written, what was dropped, and what never arrived; '' for nothing."""
 
     fault: str
     loss: str
+    overrun: str
 
 
 def failed_recording(state: RecorderState) -> Health | None:
@@ -78,12 +80,17 @@ def dropped_messages(state: RecorderState) -> Health | None:
     return warning(state.loss)
 
 
+def overrun_input(state: RecorderState) -> Health | None:
+    """Messages were lost before they were taken: the recording has gaps."""
+    return warning(state.overrun)
+
+
 def running(state: RecorderState) -> Health:
     """Nothing is wrong."""
     return Health(OK, 'recording')
 
 
-CONDITIONS = (failed_recording, dropped_messages, running)
+CONDITIONS = (failed_recording, dropped_messages, overrun_input, running)
 
 
 class RecorderNode(ParameterNode):
@@ -108,6 +115,7 @@ class RecorderNode(ParameterNode):
             topics.append(JOINT_STATES)
         self._topics_of_graph = TopicDiscovery(self, topics)
         self._topics: dict[str, str] = {}  # type by topic
+        self._overrun: Counter[str] = Counter()  # messages lost at the input by topic
         self._limited_logger = RateLimitedLogger(self.get_logger())
         self._reader = StreamReader(
             self,
@@ -115,6 +123,7 @@ class RecorderNode(ParameterNode):
                 lambda topic: self._limited_logger.error(f'{topic}: a message cannot be taken'),
                 lambda topic, error: self._limited_logger.error(f'{topic}: {error!r}'),
                 self._on_reader_error,
+                overrun=self._on_overrun,
             ),
         )
         self._reader.start()
@@ -170,6 +179,14 @@ class RecorderNode(ParameterNode):
         cause = self._recording.fault or 'the disk is too slow'
         return f'messages are dropped, {cause}: {dropped}' if dropped else ''
 
+    def _on_overrun(self, topic: str, count: int) -> None:
+        self._overrun[topic] += count
+
+    def _lost_at_input(self) -> str:
+        """Return what was lost before it was taken."""
+        lost = lost_text(self._overrun)
+        return f'messages are lost at the input, they come too fast: {lost}' if lost else ''
+
     def _on_reader_error(self, text: str) -> None:
         self.failed = True
         self.get_logger().fatal(text)
@@ -182,21 +199,24 @@ class RecorderNode(ParameterNode):
         counts = {
             'messages': recording.counts.total(),
             'messages dropped': recording.dropped.total(),
+            'messages lost at the input': self._overrun.total(),
             'topics': len(self._topics),
             'files': recording.files,
             'waiting [MB]': f'{recording.waiting_bytes / MEGABYTE:.1f}',
         }
-        health = health_of(RecorderState(recording.fault, self._loss()), CONDITIONS)
-        self._diagnostics.publish([Status('recorder', *health, counts)])
+        state = RecorderState(recording.fault, self._loss(), self._lost_at_input())
+        self._diagnostics.publish([Status('recorder', *health_of(state, CONDITIONS), counts)])
 
     def stop(self) -> None:
         """Write what was received, and close the bag."""
-        self._reader.stop()
+        self._reader.stop(take_pending=True)
         self._recording.stop()
         loss = self._loss()
         if loss or self._recording.fault:
             self.failed = self.failed or bool(self._recording.fault)
             self.get_logger().error(loss or self._recording.fault)
+        if self._overrun:
+            self.get_logger().error(self._lost_at_input())
         missing = sorted(self._topics_of_graph.wanted - set(self._topics))
         if missing:
             self.get_logger().warning(f'nobody has published {", ".join(missing)}')

@@ -25,7 +25,7 @@ from fluoro_calib_ros.nodes.messages.bodies import (
     transforms_of_bodies,
 )
 from fluoro_calib_ros.nodes.rig_input import Rig
-from fluoro_calib_ros.nodes.runtime.diagnostics import OK, WARN
+from fluoro_calib_ros.nodes.runtime.diagnostics import OK, WARN, RecentCounts
 from fluoro_calib_ros.photogrammetry.noise import ObservedScatter
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
 from fluoro_calib_ros.reconstruction.intersection import Intersector
@@ -242,15 +242,15 @@ def test_exposure_with_the_stamp_of_the_one_before_is_counted():
     follower = BodyFollower(BODIES, (), lag=0)
     assert len(follow(follower, [0, 1])) == 2
     assert not follow(follower, [1]) and follower.untimed == 1
-    assert statuses_of(follower)[0].level == WARN
+    assert statuses_of(follower, RecentCounts())[0].level == WARN
 
 
 def test_diagnostics_of_a_body_from_unseen_to_lost():
     follower = BodyFollower(BODIES, (), lag=0)
-    assert statuses_of(follower) == []
+    assert statuses_of(follower, RecentCounts()) == []
 
     def tibia():
-        return next(s for s in statuses_of(follower) if s.name == 'body tibia')
+        return next(s for s in statuses_of(follower, RecentCounts()) if s.name == 'body tibia')
 
     follow(follower, range(3), visible=('femur',))
     assert (tibia().level, tibia().values['status']) == (WARN, 'FAILED')

@@ -4,6 +4,7 @@
 """Diagnostics as lists of conditions, and services that are guarded."""
 
 import asyncio
+from collections import Counter
 from types import SimpleNamespace
 
 import pytest
@@ -82,11 +83,9 @@ def reconstruction_state(stalled, **changes):
         'pairer': SimpleNamespace(
             stamps=SimpleNamespace(disagreement=lambda: ''),
             silent=frozenset(),
-            unpaired={},
-            incomplete=0,
         ),
         'misses': SimpleNamespace(message=lambda: ''),
-        'without_orientation': 0,
+        'recent': Counter(),
     }
     return reconstruction.ReconstructionState(**{**values, **changes})
 
@@ -102,14 +101,25 @@ def test_stopped_streams_stand_before_what_else_is_wrong():
     assert found == (ERROR, 'a: no frame for 2 s; the rays miss each other')
 
 
+def test_messages_lost_at_the_input_are_told_before_the_partners_that_they_leave_alone():
+    recent = Counter(unpaired=7, overrun=7)
+    found = health_of(reconstruction_state([('a', '')], recent=recent), reconstruction.CONDITIONS)
+    assert found.level == WARN and found.message.startswith('7 messages lost at the input')
+    recent = Counter(unpaired=3)
+    found = health_of(reconstruction_state([('a', '')], recent=recent), reconstruction.CONDITIONS)
+    assert found.level == WARN and found.message.startswith('3 frames without partner')
+
+
 def test_faults_are_counted_in_the_stream_of_their_topic():
     streams = {name: Stream(name, refusals()) for name in 'ab'}
     faults = stream_faults(streams, print)
     faults.undecodable('a/target_observations')
     faults.too_large('a/target_observations', 10**9)
     faults.callback_error('b/target_observations', IndexError('x'))
+    faults.overrun('b/target_observations', 3)
     a, b = streams.values()
     assert (a.received, a.refusals.total, b.received, b.refusals.failures) == (2, 2, 0, 1)
+    assert (a.overrun, b.overrun) == (0, 3)
     assert 'max_points' in a.refusals.last_fault
     a.refusals.refuse(Refused('sigma', 'no'))
     assert a.refusals.values(['sigma', 'too large'])['refused: too large'] == 1

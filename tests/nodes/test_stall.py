@@ -1,9 +1,9 @@
 # SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
 # SPDX-License-Identifier: Apache-2.0
 
-"""A stream that stops."""
+"""A stream that stops, and faults that are over."""
 
-from fluoro_calib_ros.nodes.runtime.diagnostics import StallDetector
+from fluoro_calib_ros.nodes.runtime.diagnostics import RECENT_S, RecentCounts, StallDetector
 
 
 class Clock:
@@ -45,3 +45,19 @@ def test_nothing_is_said_before_the_first_frame():
 
 def test_counts_that_start_again_are_no_stop():
     assert messages([250, 500, 20, 270])[2:] == ['', '']
+
+
+def test_what_was_counted_a_minute_ago_is_not_told_any_more():
+    clock = Clock()
+    recent = RecentCounts(clock)
+    assert recent.growth('a', refused=4, unpaired=0) == {'refused': 4, 'unpaired': 0}
+    clock.time += RECENT_S / 2
+    assert recent.growth('a', refused=9, unpaired=0)['refused'] == 9
+    assert recent.growth('b', refused=1) == {'refused': 1}
+    clock.time += RECENT_S / 2
+    assert recent.growth('a', refused=9, unpaired=2) == {'refused': 5, 'unpaired': 2}
+    clock.time += RECENT_S / 2
+    assert recent.growth('a', refused=9, unpaired=2)['refused'] == 0
+    clock.time += RECENT_S
+    assert recent.growth('a', refused=9, unpaired=2) == {'refused': 0, 'unpaired': 0}
+    assert recent.growth('a', refused=0)['refused'] == 0  # the node was reset

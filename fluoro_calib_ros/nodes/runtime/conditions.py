@@ -25,12 +25,15 @@ class InputState:
     refusals : RefusalLog
     incompatible : mapping of str to str
         Messages about publishers that are not received, by topic.
+    recent : mapping of str to int
+        What was counted within the last minute; see RecentCounts.
     """
 
     node: StreamNode
     topics: tuple[str, ...]
     refusals: RefusalLog
     incompatible: Mapping[str, str]
+    recent: Mapping[str, int]
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,24 @@ def inactive_node(state: InputState) -> Health | None:
 
 def refused_messages(state: InputState) -> Health | None:
     """Messages were refused."""
-    return warning(state.refusals.refusal())
+    return warning(state.refusals.refusal(state.recent['refused']))
+
+
+def overrun_input(state: InputState) -> Health | None:
+    """Messages were lost before the node took them."""
+    count = state.recent['overrun']
+    lost = (
+        f'{count} messages lost at the input in the last minute: they come faster than they are '
+        'taken, and the queue was full'
+    )
+    return warning(lost if count else '')
+
+
+def unpaired_frames(state: InputState) -> Health | None:
+    """Other fluoroscopes did not see the same exposures."""
+    count = state.recent['unpaired']
+    text = f'{count} frames without partner of the other fluoroscopes in the last minute'
+    return warning(text if count else '')
 
 
 def missing_publisher(state: StreamState) -> Health | None:

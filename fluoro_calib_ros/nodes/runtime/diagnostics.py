@@ -5,9 +5,10 @@
 
 from __future__ import annotations
 
+import math
 import time
 import traceback
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple, TypeAlias, TypeVar
@@ -118,9 +119,39 @@ class RefusalLog:
         lost = f'{count} {self._item}s lost by internal errors: {self._last_failure}'
         return lost if count else ''
 
-    def refusal(self) -> str:
-        """Return a message where messages were refused, else ''."""
-        return f'{self.total} {self._item}s refused: {self.last_fault}' if self.total else ''
+    def refusal(self, recent: int) -> str:
+        """Return a message where so many messages were refused recently, else '' for none."""
+        refused = f'{recent} {self._item}s refused in the last minute: {self.last_fault}'
+        return refused if recent else ''
+
+
+# Counts that tell what is wrong now: a fault that is over must not stay a warning for ever.
+
+RECENT_S = 60.0  # a warning stays so long: an operator looks up that often
+
+
+class RecentCounts:
+    """By how much counts have grown within the last minute.
+
+    now: returns the time [s], by default of the monotonic clock.
+    """
+
+    def __init__(self, now: Callable[[], float] = time.monotonic) -> None:
+        self._now = now
+        # Times and counts; the first one is the newest that is not recent.
+        self._history: dict[tuple[str, str], deque[tuple[float, int]]] = {}
+
+    def growth(self, subject: str, **counts: int) -> dict[str, int]:
+        """Return the growth of the counts of a subject; to be called periodically."""
+        now = self._now()
+        grown = {}
+        for name, count in counts.items():
+            history = self._history.setdefault((subject, name), deque([(-math.inf, 0)]))
+            history.append((now, count))
+            while history[1][0] <= now - RECENT_S:
+                history.popleft()
+            grown[name] = max(count - history[0][1], 0)
+        return grown
 
 
 # Detection of a stream that has stopped.

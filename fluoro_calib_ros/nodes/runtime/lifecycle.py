@@ -22,7 +22,7 @@ from rclpy.qos import QoSProfile
 from rclpy.service import Service
 
 from ...limits import MAX_TEXT
-from .diagnostics import DiagnosticsPublisher, RefusalLog, Status
+from .diagnostics import DiagnosticsPublisher, RecentCounts, RefusalLog, Status
 from .logging import USER_ERRORS, RateLimitedLogger, StartError, Trace, one_line
 from .parameters import ParameterNode
 from .streams import FaultHandlers, StreamReader, best_effort_message, qos_overrides
@@ -198,6 +198,7 @@ class StreamNode(ManagedNode):
         self.readers: list[StreamReader] = []
         self._resources = ExitStack()
         self._readiness = ''  # what was logged last
+        self.recent = RecentCounts()
 
     def create_outputs(self) -> None:
         """Make what exists while the node is configured, by create_output() and own()."""
@@ -322,4 +323,5 @@ class StreamNode(ManagedNode):
     def cleanup(self) -> None:
         """Destroy outputs and inputs, and forget what was received."""
         self._resources.close()
+        self.recent = RecentCounts()
         self.reset()

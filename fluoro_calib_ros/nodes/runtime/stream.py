@@ -21,6 +21,8 @@ class Stream:
         Fluoroscope.
     received : int
         Number of messages.
+    overrun : int
+        Number of messages that were lost at the input, because the queue was full.
     refusals : RefusalLog
         Streams whose messages are counted together share it.
     stall : StallDetector
@@ -31,6 +33,7 @@ class Stream:
     def __init__(self, name: str, refusals: RefusalLog) -> None:
         self.name = name
         self.received = 0
+        self.overrun = 0
         self.refusals = refusals
         self.stall = StallDetector()
         self.latencies = LatencyWindow()
@@ -65,4 +68,7 @@ def stream_faults(
         stream.received += 1
         stream.refusals.refuse_too_large(topic, size)
 
-    return FaultHandlers(undecodable, lost, reader_error, too_large)
+    def overrun(topic: str, count: int) -> None:
+        stream_of(topic).overrun += count
+
+    return FaultHandlers(undecodable, lost, reader_error, too_large, overrun)

@@ -307,10 +307,12 @@ class _Route(NamedTuple):
     """A subscription, what makes a message from its bytes, and what is called with it."""
 
     topic: str
+    name: str  # with namespace and remaps
     kind: type
     handle: Any
     decode: Callable[..., Any]
     callback: Callable[..., Any]
+    is_latched: bool
 
 
 @dataclass(frozen=True)
@@ -328,12 +330,33 @@ class FaultHandlers:
     too_large : callable or None
         Called with the topic of a message that is too large, and its size [bytes]; None:
         undecodable is called.
+    overrun : callable or None
+        Called with a topic and the number of its messages that were lost before they were taken:
+        by their sequence numbers, where the topic has one publisher and is not latched.
     """
 
     undecodable: Callable[[str], None]
     callback_error: Callable[[str, Exception], None]
     reader_error: Callable[[str], None]
     too_large: Callable[[str, int], None] | None = None
+    overrun: Callable[[str, int], None] | None = None
+
+
+def _route(
+    topic: str,
+    subscription: Subscription,
+    decode: Callable[..., Any],
+    callback: Callable[..., Any],
+) -> _Route:
+    return _Route(
+        topic,
+        subscription.topic_name,
+        subscription.msg_type,
+        subscription.handle,
+        decode=decode,
+        callback=callback,
+        is_latched=subscription.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL,
+    )
 
 
 class StreamReader:
@@ -347,6 +370,7 @@ class StreamReader:
         self._routes: list[tuple[str, Subscription, Callable[..., Any], Callable[..., Any]]] = []
         self._max_bytes: dict[str, int] = {}  # by topic
         self._first: set[str] = set()  # topics
+        self._sequence: dict[str, int] = {}  # number of the last message by topic
         self._stopping = threading.Event()
         self._thread: threading.Thread | None = None
 
@@ -458,9 +482,16 @@ class StreamReader:
         self._thread = threading.Thread(target=self._run, name='streams', daemon=True)
         self._thread.start()
 
-    def stop(self) -> None:
-        """Stop after the message that is being handled, and destroy the subscriptions."""
+    def stop(self, take_pending: bool = False) -> None:
+        """Stop after the message that is being handled, and destroy the subscriptions.
+
+        take_pending: whether the messages that have arrived before are handled, too.
+        """
         self._halt()
+        if take_pending:
+            self._stopping.clear()
+            for route in self._routes:
+                self._drain(_route(*route), [], route[1].qos_profile.depth)
         for _, subscription, *_ in self._routes:
             self._node.destroy_subscription(subscription)
         self._routes = []
@@ -488,7 +519,7 @@ class StreamReader:
         while not self._stopping.is_set() and self._node.context.ok():
             if len(self._routes) != served:  # a topic was added meanwhile
                 routes = {
-                    s.handle.pointer: _Route(topic, s.msg_type, s.handle, decode, callback)
+                    s.handle.pointer: _route(topic, s, decode, callback)
                     for topic, s, decode, callback in list(self._routes)
                 }
                 served = len(routes)
@@ -528,7 +559,18 @@ class StreamReader:
             for other in first:
                 if other is not route:
                     self._drain(other, [], MAX_FIRST)
+            self._count_overrun(route, received[1]['publication_sequence_number'])
             self._handle(route, *received)
+
+    def _count_overrun(self, route: _Route, number: int | None) -> None:
+        """Count the messages before one with that number that did not arrive."""
+        if self._faults.overrun is None or number is None or route.is_latched:
+            return
+        lost = number - self._sequence.get(route.topic, number - 1) - 1
+        self._sequence[route.topic] = number
+        # Each of several publishers has numbers of its own; so has one that was started again.
+        if lost > 0 and self._node.count_publishers(route.name) == 1:
+            self._faults.overrun(route.topic, lost)
 
     def _handle(self, route: _Route, data: bytes, info: dict[str, Any]) -> None:
         if len(data) > self._max_bytes[route.topic]:

@@ -139,6 +139,14 @@ class Kind(str, Enum):
     MARKER_MIGRATED = 'marker_migrated'
     MARKERS_EXCHANGED = 'markers_exchanged'
 
+    # What has changed in a rig, and whether that is known.
+    CAUSE_SURE = 'cause_sure'
+    CHANGE_IDENTIFIED = 'change_identified'
+    DISTORTION_CHANGED = 'distortion_changed'
+    FLUOROSCOPE_MOVED = 'fluoroscope_moved'
+    INTERIOR_CHANGED = 'interior_changed'
+    UNUSED_EXPOSURES = 'unused_exposures'
+
     # Files that do not belong together.
     EDITED_RESULT = 'edited_result'
     EXCHANGED_CALIBRATION = 'exchanged_calibration'

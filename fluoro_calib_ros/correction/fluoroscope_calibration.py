@@ -24,6 +24,7 @@ from .calibration_record import FIELDS
 from .grid import CorrectionGrid
 from .noise_profile import NoiseProfile, packed_profile, unpacked_profile
 from .registry import MODEL_FIELDS, model_from_values
+from .series import Functions, Series
 
 _ANGLES = ('angles', 'angle_coefficients', 'angle_variances')
 _SERIES = ('series_degree', 'series_modes', 'series_coefficients', 'series_sd')
@@ -216,6 +217,29 @@ class FluoroscopeCalibration:
             series=field.added_to(series, angle),
         )
         return replace(self, model=model, angle_field=None)
+
+    def with_drift(
+        self, functions: Functions, coefficients: np.ndarray, sd: np.ndarray
+    ) -> FluoroscopeCalibration:
+        """Return the calibration with a change of its correction.
+
+        functions, coefficients (2, n) [px]: of the change; sd (33, 33): its standard deviation, on
+        the grid of `Series`. Raises DataError for a model without a series, which cannot tell how
+        well the change is known.
+        """
+        series = self.model.series
+        if series is None:
+            raise DataError(
+                f'fluoroscope {self.fluoroscope}: the model {self.model.kind} has no field of '
+                'standard deviations, a change of the distortion cannot be added to it'
+            )
+        drift = Series(functions, coefficients, sd)
+        model = replace(
+            self.model,
+            train_duv=self.model.train_duv + drift.predict(self.model.train_uv),
+            series=series.plus(drift),
+        )
+        return replace(self, model=model)
 
     def correct(
         self,

@@ -235,6 +235,18 @@ class Series:
     coefficients: np.ndarray
     sd: np.ndarray
 
+    def plus(self, other: Series) -> Series:
+        """Return the sum with another series, whose errors are independent."""
+        mine, own = self.functions.as_polynomials(self.coefficients)
+        both = Functions(
+            mine.image_size,
+            max(mine.degree, other.functions.degree),
+            max(mine.modes, other.functions.modes),
+        )
+        total = both.converted(mine, own.ravel())
+        total += both.converted(other.functions, other.coefficients.ravel())
+        return Series(both, total.reshape(2, -1), np.hypot(self.sd, other.sd))
+
     def predict(self, uv: ArrayLike) -> NDArray[np.float64]:
         """Corrections (n, 2) [px] at pixels uv (n, 2)."""
         return self.functions(uv) @ self.coefficients.T

@@ -21,7 +21,7 @@ from .collinearity import project_with_jacobian
 from .rotations import cross_matrix, matrix_from_quaternion, quaternion_from_matrix
 
 ORIENTATION_SIZE = 9  # unknowns of a fluoroscope: T [mm], w [rad], xp, yp, c [px]
-SOURCES = ('capture', 'joint calibration')
+SOURCES = ('capture', 'joint calibration', 'healing')
 # Largest deviation of a rotation matrix from orthogonality that rounding explains.
 ORTHOGONALITY_TOLERANCE = 1e-6
 # Largest asymmetry of the correlation matrix, and its most negative eigenvalue.
@@ -54,9 +54,10 @@ class RigOrientation:
         left, R -> exp([w]x) R, as in collinearity.
     frame_id : str
         Name of the rig frame.
-    source : {'capture', 'joint calibration'}
+    source : {'capture', 'joint calibration', 'healing'}
         'capture': the phantom defines the rig frame. 'joint calibration': the optical frame of the
-        first fluoroscope is the rig frame.
+        first fluoroscope is the rig frame. 'healing': the rig frame is that of an earlier
+        orientation, which was changed.
     calibration_ids : tuple of str
         Calibrations that the orientation belongs to.
     stamp_ns : int

@@ -1,0 +1,419 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What has changed in a rig since it was calibrated, by the bodies that it sees.
+
+Bodies whose shapes were learned while the rig was healthy give scale and rigidity. Every cause
+widens the prior of some unknowns by what such a change may be. Causes are added one by one, the
+one with the largest evidence first, as long as the evidence grows (MacKay 2003, ch. 28). What the
+data do not identify keeps the covariance that it had, or that of the change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from enum import Enum
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import eigh
+
+from ..correction.series import Functions
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
+from .rig_adjustment import ObservedBodies, Poses, Prior, RigAdjustment, RigSolution
+
+MAX_CAUSES = 3
+# Probability below which a cause is not believed: another one explains the data, too.
+SURE = 0.95
+# Causes that are tried in full, of those that their derivatives make most likely.
+TRIED = 3
+
+
+class Cause(str, Enum):
+    """What may have changed; the values are written to files."""
+
+    ORIENTATION = 'orientation'  # a fluoroscope was moved
+    INTERIOR = 'interior'  # source and detector have moved against each other
+    DISTORTION = 'distortion'  # the image bends differently
+    MIGRATED = 'migrated'  # a marker is elsewhere in its body
+    EXCHANGED = 'exchanged'  # two markers of a body have each other's ids
+    LOOSE = 'loose'  # a marker moves against its body
+    SOFT = 'soft'  # the markers of a body move against each other
+
+
+# Of the rig; the others are of bodies, and leave its calibration as it is.
+OF_RIG = (Cause.ORIENTATION, Cause.INTERIOR, Cause.DISTORTION)
+# How large changes are: standard deviations of a knock [mm, rad], of principal point and principal
+# distance [px, relative], of a distortion [px], and of a marker [mm]. The evidence depends on
+# their logarithms.
+KNOCK_MM = 10.0
+KNOCK_RAD = 0.02
+SHIFT_PX = 10.0
+FOCUS = 0.01
+DRIFT_PX = 1.0
+MIGRATION_MM = 1.0
+# The same for small changes, relative to these: a drift need not be as large as a knock. The two
+# factors are those of principal point and principal distance, the first one that of all others.
+SIZES = ((1.0, 1.0), (0.125, 0.125))
+SIZES_OF_INTERIOR = (*SIZES, (1.0, 0.125), (0.125, 1.0))
+# Share of inliers below which the rig is so wrong that derivatives do not tell what has changed.
+LOST = 0.9
+
+
+@dataclass(frozen=True)
+class Change:
+    """A cause and its place: a fluoroscope, or body and markers, by their numbers."""
+
+    cause: Cause
+    fluoroscope: int = -1
+    body: int = -1
+    markers: tuple[int, ...] = ()
+    size: tuple[float, float] = field(default=SIZES[0], compare=False)  # of the change
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """What has changed.
+
+    Attributes
+    ----------
+    changes : tuple of Change
+        In the order of their evidence; none where nothing has changed.
+    probability : tuple of float
+        Of each against the causes that might stand in its place.
+    rivals : tuple of (Change or None)
+        The most likely of these, None where there is none.
+    observed : ObservedBodies
+        With the exchanged ids put right.
+    prior : Prior
+    solution : RigSolution
+    noise : float
+        Factor by which image points scatter more than claimed, at least 1.
+    rest : float
+        Probability that nothing else has changed.
+    """
+
+    changes: tuple[Change, ...]
+    probability: tuple[float, ...]
+    rivals: tuple[Change | None, ...]
+    observed: ObservedBodies
+    prior: Prior
+    solution: RigSolution
+    noise: float
+    rest: float
+
+    @property
+    def sure(self) -> bool:
+        """Whether no other cause explains the data nearly as well."""
+        return all(one > SURE for one in self.probability)
+
+
+@dataclass(frozen=True)
+class _Tried:
+    changes: tuple[Change, ...]
+    observed: ObservedBodies
+    prior: Prior
+    solution: RigSolution
+
+
+class Diagnostician:
+    """Decides what has changed.
+
+    Parameters
+    ----------
+    adjustment : RigAdjustment
+    shape_scale : float
+        Standard deviation of the scale of the shapes.
+    """
+
+    def __init__(self, adjustment: RigAdjustment, shape_scale: float) -> None:
+        self.adjustment = adjustment
+        bodies = adjustment.bodies
+        self._healthy = adjustment.healthy_prior(shape_scale)
+        views = len(adjustment.orientation.fluoroscopes)
+        # Of two views, only the orientation of one against the other can be seen.
+        self._moved = [views - 1] if views == 2 else list(range(views))
+        self._markers = [
+            (row, marker) for row, body in enumerate(bodies) for marker in range(len(body.sd_mm))
+        ]
+
+    def diagnose(self, observed: ObservedBodies, poses: Poses) -> Diagnosis:
+        """Say what has changed, from first poses of the bodies."""
+        adjustment = self.adjustment
+        zero = np.zeros(adjustment.size)
+        solution = adjustment.solve(observed, self._healthy, (zero, poses))
+        best = _Tried((), observed, self._healthy, solution)
+        probability: list[float] = []
+        rivals: list[Change | None] = []
+        rest = 1.0
+        while len(best.changes) < MAX_CAUSES:
+            tried = self._tried(best, poses)
+            chances = _probabilities([best, *tried])
+            rest = float(chances[0])
+            if rest > 1 - SURE:
+                break
+            winner, rival = (np.argsort(chances[1:])[::-1].tolist() + [-1])[:2]
+            rivals.append(tried[rival].changes[-1] if rival >= 0 else None)
+            best = tried[winner]
+            probability.append(float(chances[1:][winner]))
+        return Diagnosis(
+            best.changes,
+            tuple(probability),
+            tuple(rivals),
+            best.observed,
+            best.prior,
+            solution=best.solution,
+            noise=_noise(best.solution),
+            rest=rest,
+        )
+
+    # -- hypotheses
+
+    def _tried(self, best: _Tried, first: Poses) -> list[_Tried]:
+        """Solve for the causes that may be added, of those that the derivatives make likely."""
+        if np.nanmean(best.solution.inliers) < LOST:
+            changes = [change for change in self._of_rig() if change not in best.changes]
+        else:
+            changes = [*self._changes_of_unknowns(best), *self._scattering(best)]
+        changes += self._exchanges(best)
+        return [self._with(best, change, first) for change in changes]
+
+    def _of_rig(self) -> list[Change]:
+        """Return all changes of the rig."""
+        views = range(len(self.adjustment.functions))
+        moved = [Change(Cause.ORIENTATION, f) for f in self._moved]
+        return moved + [Change(cause, f) for cause in OF_RIG[1:] for f in views]
+
+    def _changes_of_unknowns(self, best: _Tried) -> list[Change]:
+        """Return the changes of rig and shapes with the largest expected evidence.
+
+        Of unknowns with the additional variances V, gradient g and information S without the
+        others, it is 1/2 g'(S + V^-1)^-1 g - 1/2 log det(I + SV).
+        """
+        adjustment = self.adjustment
+        normal, right = adjustment.normal_at(best.observed, best.prior, best.solution)
+        covariance = best.solution.covariance
+        places = self._of_rig()
+        places += [Change(Cause.MIGRATED, body=b, markers=(m,)) for b, m in self._markers]
+        gains: list[tuple[float, Change]] = []
+        for place in places:
+            if place in best.changes or _is_told(place, best.changes):
+                continue
+            of_sizes = []
+            for size in SIZES_OF_INTERIOR if place.cause is Cause.INTERIOR else SIZES:
+                change = replace(place, size=size)
+                sd = self.sd_of(change)
+                rows = np.flatnonzero(sd)
+                cross = normal[rows]
+                scaled = sd[rows, None] * (
+                    normal[np.ix_(rows, rows)] - cross @ covariance @ cross.T
+                )
+                whitened = np.eye(len(rows)) + scaled * sd[rows]
+                gradient = sd[rows] * right[rows]
+                gain = 0.5 * gradient @ np.linalg.solve(whitened, gradient)
+                gain -= 0.5 * np.linalg.slogdet(whitened)[1]
+                of_sizes.append((float(gain), change))
+            gains.append(max(of_sizes, key=lambda one: one[0]))
+        gains.sort(key=lambda one: -one[0])
+        return [change for gain, change in gains[:TRIED] if gain > 0]
+
+    def _scattering(self, best: _Tried) -> list[Change]:
+        """Return the marker and the body that scatter most, where that is worth an unknown.
+
+        With a variance s^2 of its own instead of 1, the likelihood of n squares grows by
+        n (s^2 - 1 - log s^2) / 2.
+        """
+        squares = best.solution.squares
+        freedom = best.solution.freedom
+        places = [Change(Cause.LOOSE, body=b, markers=(m,)) for b, m in self._markers]
+        places += [Change(Cause.SOFT, body=row) for row in range(len(squares))]
+        out: dict[Cause, tuple[float, Change]] = {}
+        for change in places:
+            rows = change.body, change.markers[0] if change.markers else slice(None)
+            n = float(freedom[rows].sum())
+            s2 = max(1.0, float(squares[rows].sum()) / max(n, 1.0))
+            gain = 0.5 * n * (s2 - 1 - np.log(s2)) - 0.5 * np.log(max(n, 1.0))
+            told = change in best.changes or _is_told(change, best.changes)
+            if not told and gain > max(0.0, out.get(change.cause, (0.0,))[0]):
+                out[change.cause] = gain, change
+        return [change for _, change in out.values()]
+
+    def _exchanges(self, best: _Tried) -> list[Change]:
+        """Return the exchanges of markers that do not fit in a body where most others do."""
+        inliers = best.solution.inliers
+        lost = [
+            (b, m)
+            for b, m in self._markers
+            if inliers[b, m] < 0.5 < np.nanmax(inliers[b], initial=0.0)
+        ]
+        lost.sort(key=lambda one: best.solution.inliers[one])
+        pairs = [
+            Change(Cause.EXCHANGED, body=b, markers=(min(m, n), max(m, n)))
+            for (b, m), (c, n) in combinations(lost[: TRIED + 1], 2)
+            if b == c
+        ]
+        return [change for change in pairs if change not in best.changes]
+
+    def _with(self, best: _Tried, change: Change, first: Poses) -> _Tried:
+        """Solve for a cause in addition to others."""
+        observed = best.observed
+        if change.cause is Cause.EXCHANGED:
+            observed = observed.exchanged(change.body, *change.markers)
+        prior = best.prior.widened(self.sd_of(change))
+        if change.cause in (Cause.LOOSE, Cause.SOFT):
+            prior = replace(prior, inflation=self._inflation(best, change))
+        found = best.solution
+        # A wrong hypothesis may have led some poses astray.
+        poses = found.poses.or_else(first, found.inliers_of_pose > 0.5)
+        start = found.values, poses
+        solution = self.adjustment.solve(observed, prior, start)
+        return _Tried((*best.changes, change), observed, prior, solution)
+
+    def sd_of(self, change: Change) -> NDArray[np.float64]:
+        """Standard deviations (K,) of the unknowns by a change."""
+        adjustment = self.adjustment
+        sd = np.zeros(adjustment.size)
+        first = ORIENTATION_SIZE * change.fluoroscope
+        of_rig = sd[adjustment.rig][first : first + ORIENTATION_SIZE]
+        if change.cause is Cause.ORIENTATION:
+            of_rig[:6] = [KNOCK_MM] * 3 + [KNOCK_RAD] * 3
+        elif change.cause is Cause.INTERIOR:
+            c = adjustment.orientation.interior[change.fluoroscope, 2]
+            of_rig[6:] = [SHIFT_PX, SHIFT_PX, FOCUS * c * change.size[1] / change.size[0]]
+        elif change.cause is Cause.DISTORTION:
+            drift = sd[adjustment.drift].reshape(len(adjustment.functions), -1)
+            drift[change.fluoroscope] = DRIFT_PX * adjustment.sd_of_drift(change.fluoroscope)
+        elif change.cause is Cause.MIGRATED:
+            shape = sd[adjustment.shape].reshape(adjustment.xyz.shape)
+            shape[change.body, change.markers[0]] = MIGRATION_MM
+        return sd * change.size[0]
+
+    def _inflation(self, best: _Tried, change: Change) -> NDArray[np.float64]:
+        """Return how much more the image points of a loose marker or a soft body scatter."""
+        solution = best.solution
+        rows = np.zeros(solution.squares.shape, dtype=bool)
+        rows[change.body, change.markers[0] if change.markers else slice(None)] = True
+        factor = np.sqrt(
+            solution.squares[rows].sum() / max(float(solution.freedom[rows].sum()), 1.0)
+        )
+        out = best.prior.inflation.copy()
+        out[rows] = max(1.0, float(factor))
+        return out
+
+
+def _is_told(change: Change, changes: Sequence[Change]) -> bool:
+    """Whether a change of a marker is part of another one: its body is soft, or it is loose."""
+    return change.body >= 0 and any(
+        one.body == change.body
+        and (
+            one.cause is Cause.SOFT or (one.cause is Cause.LOOSE and one.markers == change.markers)
+        )
+        for one in changes
+    )
+
+
+def _noise(solution: RigSolution) -> float:
+    """Factor by which image points scatter more than claimed; that of most bodies."""
+    by_body = solution.squares.sum(axis=1) / np.maximum(solution.freedom.sum(axis=1), 1)
+    return float(np.sqrt(max(1.0, np.median(by_body[by_body > 0])))) if by_body.any() else 1.0
+
+
+def _probabilities(tried: Sequence[_Tried]) -> NDArray[np.float64]:
+    """Probabilities of hypotheses, the first of which has a cause less.
+
+    Where image points scatter more than claimed, the evidence counts less. A loose marker or a
+    soft body has one more unknown, its scatter, known to 1/sqrt(2 n) of n squares.
+    """
+    found = np.array([one.solution.evidence for one in tried])
+    noise = _noise(tried[int(np.argmax(found))].solution)
+    log = found / noise**2
+    for row, one in enumerate(tried[1:], 1):
+        if one.changes[-1].cause in (Cause.LOOSE, Cause.SOFT):
+            change = one.changes[-1]
+            of_body = one.solution.freedom[change.body]
+            count = of_body[change.markers[0]] if change.markers else of_body.sum()
+            log[row] -= 0.5 * np.log(max(float(count), 1.0))
+    log = log - log.max()
+    # Nothing more has changed is as likely as that something has.
+    prior = np.array([0.5, *([0.5 / max(len(tried) - 1, 1)] * (len(tried) - 1))])
+    chance = prior * np.exp(log)
+    return chance / chance.sum()
+
+
+# The healed rig.
+
+
+@dataclass(frozen=True)
+class HealedRig:
+    """The orientation of a rig as it is now, and the drifts of its images.
+
+    Attributes
+    ----------
+    orientation : RigOrientation
+        With the ids of the calibrations as they were.
+    drift : mapping of int to (Functions, coefficients (2, n), covariance (2n, 2n))
+        By fluoroscope; to be added to its correction.
+    changes : (F, 9) ndarray
+        Of T [mm], w [rad], xp, yp, c [px].
+    sd : (F, 9) ndarray
+        Their standard deviations.
+    weakest : float
+        Standard deviation of the direction of the changes that is known worst, over that of a
+        large change as it may be: 1 where the data tell nothing of it.
+    """
+
+    orientation: RigOrientation
+    drift: Mapping[int, tuple[Functions, NDArray[np.float64], NDArray[np.float64]]]
+    changes: NDArray[np.float64]
+    sd: NDArray[np.float64]
+    weakest: float
+
+
+def healed_rig(
+    diagnostician: Diagnostician, diagnosis: Diagnosis, stamp_ns: int, exposures: int
+) -> HealedRig:
+    """Estimate what has changed, with the rest of the rig held as it was calibrated."""
+    adjustment = diagnostician.adjustment
+    changed = np.zeros(adjustment.size)
+    largest = np.zeros(adjustment.size)
+    for change in diagnosis.changes:
+        if change.cause in OF_RIG:
+            changed = np.hypot(changed, diagnostician.sd_of(change))
+            largest = np.hypot(largest, diagnostician.sd_of(replace(change, size=SIZES[0])))
+    solution = adjustment.held(
+        diagnosis.observed, diagnosis.prior, diagnosis.solution, changed > 0
+    )
+    covariance = solution.covariance[adjustment.rig, adjustment.rig]
+    views = len(adjustment.functions)
+    orientation = replace(
+        adjustment.rig_at(solution.values),
+        covariance=(covariance + covariance.T) / 2,
+        source='healing',
+        stamp_ns=stamp_ns,
+        exposures=exposures,
+    ).rounded()
+    drift = {}
+    for change in diagnosis.changes:
+        if change.cause is Cause.DISTORTION:
+            f = change.fluoroscope
+            number = np.arange(adjustment.size)[adjustment.drift].reshape(views, -1)[f]
+            drift[f] = (
+                adjustment.functions[f],
+                adjustment.drift_at(solution.values)[f],
+                solution.covariance[np.ix_(number, number)],
+            )
+    rows = np.flatnonzero(changed[adjustment.rig])
+    weakest = 0.0
+    if len(rows):
+        before = adjustment.orientation.covariance + np.diag(largest[adjustment.rig] ** 2)
+        of_rows = np.ix_(rows, rows)
+        weakest = float(np.sqrt(eigh(covariance[of_rows], before[of_rows], eigvals_only=True)[-1]))
+    return HealedRig(
+        orientation,
+        drift,
+        changes=solution.values[adjustment.rig].reshape(views, -1),
+        sd=np.sqrt(np.diagonal(covariance)).reshape(views, -1),
+        weakest=weakest,
+    )

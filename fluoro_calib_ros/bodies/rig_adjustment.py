@@ -1,0 +1,628 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""Adjustment of a rig by the bodies that it sees: orientation, interior, distortion and shapes.
+
+The unknowns have a normal prior: what is known of the rig and of the shapes, widened where a
+hypothesis says that something has changed. With L L' the covariance of the prior, the unknowns are
+L z, and poses are eliminated exposure by exposure (Foerstner and Wrobel, "Photogrammetric Computer
+Vision", Springer 2016, 4.2.6 and 15.3.3). With the reduced normal equations H, h, a step is
+
+    (I + L'HL) dz = L'h - z.
+
+An image point is an inlier with its own standard deviation, or a false match anywhere in the
+image (Hogg, Bovy and Lang, "Data analysis recipes: fitting a model to data", 2010, section 3). The
+evidence of a hypothesis is Laplace's approximation at the solution (MacKay, "Information Theory,
+Inference, and Learning Algorithms", Cambridge 2003, ch. 28):
+
+    log Z = -1/2 (loss + z'z) - 1/2 log det(I + L'HL).
+
+The correction of an image point has an error that stays while a marker stands still. It is taken
+to be the same for a marker and a view over the whole recording, the most that it can be.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..correction.series import MARGIN, Functions
+from ..photogrammetry.rig_orientation import ORIENTATION_SIZE, RigOrientation
+from ..photogrammetry.rotations import cross_matrix, matrix_from_vector
+from .body import POSE_SIZE, Body
+from .image_points import Cameras, ImagePoints
+
+FALSE_SHARE = 0.01  # of image points that are expected to be false matches
+MAX_STEPS = 20
+# Square of a step in standard deviations after which the iteration ends.
+LAST_STEP = 1e-2
+# Of a drift of the distortion: degree of the polynomials, half waves along the longer side.
+DRIFT_DEGREE = 3
+DRIFT_MODES = 4
+LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one where it is
+_EYE_6 = np.eye(POSE_SIZE)
+
+
+_BY_EXPOSURE = ('uv', 'pixel', 'variance', 'seen')
+
+
+@dataclass(frozen=True)
+class ObservedBodies:
+    """Image points of the markers (B, M) of bodies in T exposures and F views.
+
+    Attributes
+    ----------
+    uv : (T, B, M, F, 2) ndarray
+        Corrected [px].
+    pixel : (T, B, M, F, 2) ndarray
+        As observed [px].
+    variance : (T, B, M, F) ndarray
+        Of the noise [px^2].
+    correction : (B, M, F) ndarray
+        Of the errors of the correction that stay [px^2].
+    seen : (T, B, M, F) ndarray of bool
+    """
+
+    uv: NDArray[np.float64]
+    pixel: NDArray[np.float64]
+    variance: NDArray[np.float64]
+    correction: NDArray[np.float64]
+    seen: NDArray[np.bool_]
+
+    def exposures(self, chosen: NDArray[np.int64]) -> ObservedBodies:
+        """Return some exposures."""
+        return replace(self, **{name: getattr(self, name)[chosen] for name in _BY_EXPOSURE})
+
+    def changed(self, change: NDArray[np.float64]) -> ObservedBodies:
+        """Return the same with other corrected image points: change (T, B, M, F, 2) is added."""
+        return replace(self, uv=self.uv + change)
+
+    def without(self, rows: NDArray[np.bool_]) -> ObservedBodies:
+        """Return the same without the image points of some markers (B, M)."""
+        return replace(self, seen=self.seen & ~rows[..., None])
+
+    def exchanged(self, body: int, first: int, second: int) -> ObservedBodies:
+        """Return the same with two markers of a body exchanged."""
+        order = np.arange(self.uv.shape[2])
+        order[[first, second]] = second, first
+        arrays = {}
+        for name in _BY_EXPOSURE:
+            array = getattr(self, name).copy()
+            array[:, body] = array[:, body][:, order]
+            arrays[name] = array
+        return replace(self, **arrays)
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Rotations (T, B, 3, 3) and centres (T, B, 3) of bodies, known (T, B) where there are any."""
+
+    rotation: NDArray[np.float64]
+    centre_mm: NDArray[np.float64]
+    known: NDArray[np.bool_]
+
+    def or_else(self, other: Poses, fits: NDArray[np.bool_]) -> Poses:
+        """Return other poses where these (T, B) do not fit."""
+        chosen = fits[..., None]
+        return Poses(
+            np.where(chosen[..., None], self.rotation, other.rotation),
+            np.where(chosen, self.centre_mm, other.centre_mm),
+            self.known,
+        )
+
+
+@dataclass(frozen=True)
+class Prior:
+    """Prior of the unknowns.
+
+    Attributes
+    ----------
+    orientation : (9F, 9F) ndarray
+        Covariance of the orientation, as it was calibrated.
+    sd : (K,) ndarray
+        Standard deviations of changes in addition, and of the other unknowns.
+    inflation : (B, M) ndarray
+        Factor of the standard deviations of the image points of a marker.
+    """
+
+    orientation: NDArray[np.float64]
+    sd: NDArray[np.float64]
+    inflation: NDArray[np.float64]
+
+    def widened(self, sd: NDArray[np.float64]) -> Prior:
+        """Return the prior with further changes of the unknowns (K,)."""
+        return replace(self, sd=np.hypot(self.sd, sd))
+
+
+@dataclass(frozen=True)
+class RigSolution:
+    """Solution of a hypothesis.
+
+    Attributes
+    ----------
+    values : (K,) ndarray
+        Changes of the unknowns.
+    covariance : (K, K) ndarray
+    poses : Poses
+    evidence : float
+        Logarithm, up to a constant that all hypotheses share.
+    squares, freedom : (B, M) ndarray
+        Weighted squares of the residuals of the inliers of each marker, and their expectation.
+    inliers : (B, M) ndarray
+        Mean probability of the image points of a marker to be inliers; NaN for an unseen one.
+    inliers_of_pose : (T, B) ndarray
+        The same of the image points of a body in an exposure.
+    """
+
+    values: NDArray[np.float64]
+    covariance: NDArray[np.float64]
+    poses: Poses
+    evidence: float
+    squares: NDArray[np.float64]
+    freedom: NDArray[np.float64]
+    inliers: NDArray[np.float64]
+    inliers_of_pose: NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class _Normal:
+    """Reduced normal equations H (K, K), h (K,), and what gives the poses back by body."""
+
+    matrix: np.ndarray
+    right: np.ndarray
+    back: list[tuple[np.ndarray, np.ndarray]]  # columns (L,), N^-1 (D'J, D'r) (T, 6, L + 1)
+
+
+class RigAdjustment:
+    """Adjustment of one recording for any hypothesis.
+
+    Parameters
+    ----------
+    orientation : RigOrientation
+        As it was calibrated.
+    bodies : sequence of Body
+        With known places of all markers.
+    image_size : sequence of (int, int)
+        Of each fluoroscope [px].
+    """
+
+    def __init__(
+        self,
+        orientation: RigOrientation,
+        bodies: Sequence[Body],
+        image_size: Sequence[tuple[int, int]],
+    ) -> None:
+        self.orientation = orientation
+        self.bodies = tuple(bodies)
+        self.functions = [Functions(size, DRIFT_DEGREE, DRIFT_MODES) for size in image_size]
+        self._area = np.array([float(w * h) for w, h in image_size])
+        count = max(len(body.target_id) for body in bodies)
+        self.target_id = np.full((len(bodies), count), -1)
+        self.xyz = np.zeros((len(bodies), count, 3))
+        for row, body in enumerate(bodies):
+            own = len(body.target_id)
+            self.target_id[row, :own] = body.target_id
+            self.xyz[row, :own] = body.xyz_mm - body.centre
+        self._views = len(orientation.fluoroscopes)
+        sizes = [
+            ORIENTATION_SIZE * self._views,
+            2 * len(self.functions[0]) * self._views,
+            self.xyz.size,
+            1,
+            2 * self._views * self.target_id.size,
+        ]
+        ends = np.cumsum(sizes)
+        self.rig, self.drift, self.shape, self.scale, self.bias = (
+            slice(int(end - size), int(end)) for end, size in zip(ends, sizes)
+        )
+        self.size = int(ends[-1])
+
+    # -- the unknowns
+
+    def healthy_prior(self, shape_scale: float) -> Prior:
+        """Return the prior of a rig that has not changed.
+
+        shape_scale: standard deviation of the scale that all shapes have in common.
+        """
+        sd = np.zeros(self.size)
+        shape = sd[self.shape].reshape(self.xyz.shape)
+        for row, body in enumerate(self.bodies):
+            shape[row, : len(body.sd_mm)] = body.sd_mm[:, None]
+        sd[self.scale] = shape_scale
+        return Prior(self.orientation.covariance, sd, np.ones(self.target_id.shape))
+
+    def sd_of_drift(self, fluoroscope: int) -> NDArray[np.float64]:
+        """Return the standard deviations (2n,) of the coefficients of a drift of 1 px."""
+        return np.tile(_share_of_functions(self.functions[fluoroscope]), 2)
+
+    def root(self, prior: Prior, correction: np.ndarray) -> NDArray[np.float64]:
+        """Return L (K, k) of a prior; unknowns that are certain have no columns."""
+        sd = prior.sd.copy()
+        sd[self.bias] = np.repeat(np.sqrt(correction).ravel(), 2)
+        root = np.diag(sd)
+        covariance = prior.orientation + np.diag(sd[self.rig] ** 2)
+        root[self.rig, self.rig] = replace(
+            self.orientation, covariance=covariance
+        ).covariance_root()
+        return root[:, (root != 0).any(axis=0)]
+
+    def rig_at(self, values: np.ndarray) -> RigOrientation:
+        """Return the orientation, with the changes of the unknowns."""
+        change = values[self.rig].reshape(self._views, ORIENTATION_SIZE)
+        return replace(
+            self.orientation,
+            position_mm=self.orientation.position_mm + change[:, :3],
+            rotation=matrix_from_vector(change[:, 3:6]) @ self.orientation.rotation,
+            interior=self.orientation.interior + change[:, 6:],
+        )
+
+    def functions_at(self, observed: ObservedBodies) -> NDArray[np.float64]:
+        """Return the functions (T, B, M, F, n) of a drift at the observed pixels."""
+        pixel = np.where(observed.seen[..., None], observed.pixel, 0.0)
+        return np.stack(
+            [
+                functions(pixel[..., f, :].reshape(-1, 2)).reshape(*observed.seen.shape[:3], -1)
+                for f, functions in enumerate(self.functions)
+            ],
+            axis=3,
+        )
+
+    def drift_at(self, values: np.ndarray) -> NDArray[np.float64]:
+        """Return the coefficients (F, 2, n) of the drifts of the distortion [px]."""
+        return values[self.drift].reshape(self._views, 2, -1)
+
+    def shapes_at(self, values: np.ndarray) -> NDArray[np.float64]:
+        """Return the coordinates (B, M, 3) of the markers about their centres."""
+        return (self.xyz + values[self.shape].reshape(self.xyz.shape)) * (
+            1 + values[self.scale][0]
+        )
+
+    def normal_at(
+        self, observed: ObservedBodies, prior: Prior, solution: RigSolution
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the reduced normal equations H (K, K), h (K,) of all unknowns at a solution."""
+        linear = _Linear.of(self, observed, solution.values, solution.poses)
+        weight = _Mixture.of(self, linear, observed, prior).weight(1.0)
+        normal = self._normal(linear, weight, np.ones(self.size, dtype=bool))
+        return normal.matrix, normal.right
+
+    # -- the solution
+
+    def held(
+        self, observed: ObservedBodies, prior: Prior, solution: RigSolution, free: np.ndarray
+    ) -> RigSolution:
+        """Return the solution where unknowns of the rig change only if they are free (K,).
+
+        The others stay as they were calibrated, with their covariance C. The free ones are
+        estimated with these fixed, and get their errors, too: with the derivatives G of the free
+        unknowns by the fixed ones, G C G' is added, and G C is the covariance of both (consider
+        covariance analysis; Tapley, Schutz and Born, "Statistical Orbit Determination", 2004,
+        6.2).
+        """
+        fixed = np.zeros(self.size, dtype=bool)
+        fixed[self.rig] = ~free[self.rig]
+        only = replace(
+            prior,
+            orientation=np.where(
+                fixed[self.rig] | fixed[self.rig][:, None], 0.0, prior.orientation
+            ),
+        )
+        values = np.where(fixed, 0.0, solution.values)
+        found = self.solve(observed, only, (values, solution.poses))
+        normal, _ = self.normal_at(observed, only, found)
+        of_fixed = np.zeros((self.size, self.size))
+        of_fixed[self.rig, self.rig] = prior.orientation
+        of_fixed[~fixed] = 0.0
+        of_fixed[:, ~fixed] = 0.0
+        pulled = np.eye(self.size) - found.covariance @ np.where(fixed, normal, 0.0)
+        covariance = found.covariance + pulled @ of_fixed @ pulled.T
+        return replace(found, covariance=covariance)
+
+    def solve(
+        self, observed: ObservedBodies, prior: Prior, start: tuple[np.ndarray, Poses]
+    ) -> RigSolution:
+        """Solve for a hypothesis, from values (K,) of the unknowns and poses."""
+        root = self.root(prior, observed.correction)
+        values, poses = start
+        unsure = (root != 0).any(axis=1)
+        z = np.linalg.lstsq(root, values, rcond=None)[0]
+        widening = np.full((1, 1, 1, 1), np.inf)
+        for _ in range(MAX_STEPS):
+            values = root @ z
+            linear = _Linear.of(self, observed, values, poses)
+            terms = _Mixture.of(self, linear, observed, prior)
+            widening = np.clip(terms.scale, 1.0, np.maximum(widening / 2, 1.0))
+            weight = terms.weight(widening)
+            normal = self._normal(linear, weight, unsure)
+            whitened = np.eye(root.shape[1]) + root.T @ normal.matrix @ root
+            right = root.T @ normal.right - z
+            step = np.linalg.solve(whitened, right)
+            z = z + step
+            poses = _moved(poses, normal, root @ step)
+            if (widening == 1.0).all() and right @ step < LAST_STEP:
+                break
+        covariance = root @ np.linalg.solve(whitened, root.T)
+        evidence = -0.5 * (terms.loss + z @ z + np.linalg.slogdet(whitened)[1])
+        return RigSolution(
+            root @ z,
+            covariance,
+            poses,
+            evidence=float(evidence),
+            **terms.shares(),
+        )
+
+    def _normal(self, linear: _Linear, weight: np.ndarray, unsure: np.ndarray) -> _Normal:
+        """Sum up the image points with weights (T, B, M, F); poses are eliminated.
+
+        unsure (K,): unknowns that may change.
+        """
+        matrix = np.zeros((self.size, self.size))
+        right = np.zeros(self.size)
+        back = []
+        for row in range(len(self.bodies)):
+            root = np.sqrt(weight[:, row])[..., None]
+            columns, design = self._design(linear, row, unsure)
+            flat = (len(root), -1)
+            design = (design * root[..., None]).reshape(*flat, len(columns))
+            by_pose = (linear.by_pose(row) * root[..., None]).reshape(*flat, POSE_SIZE)
+            residual = (linear.residual[:, row] * root).reshape(*flat, 1)
+            both = np.concatenate([design, residual], axis=2)
+            transposed = np.swapaxes(by_pose, 1, 2)
+            cross = transposed @ both
+            normal = transposed @ by_pose
+            empty = ~linear.poses.known[:, row]
+            normal[empty] = _EYE_6
+            normal += LOOSEST * _EYE_6
+            solved = np.linalg.solve(normal, cross)
+            rows = both.reshape(-1, both.shape[2])
+            told = rows.T @ rows - cross.reshape(-1, both.shape[2]).T @ solved.reshape(
+                -1, both.shape[2]
+            )
+            matrix[np.ix_(columns, columns)] += told[:-1, :-1]
+            right[columns] += told[:-1, -1]
+            back.append((columns, solved))
+        return _Normal(matrix, right, back)
+
+    def _design(
+        self, linear: _Linear, row: int, unsure: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Unknowns (L,) that a body tells of, and the derivatives (T, M, F, 2, L) by them."""
+        shape = linear.residual[:, row].shape  # (T, M, F, 2)
+        _, markers, views, _ = shape
+        turned = linear.by_place[:, row] @ linear.poses.rotation[:, row, None, None]
+        by_rig = np.zeros((*shape, views, ORIENTATION_SIZE))
+        by_bias = np.zeros((*shape, markers, views, 2))
+        by_shape = np.zeros((*shape, markers, 3))
+        for f in range(views):
+            by_rig[:, :, f, :, f] = linear.by_orientation[:, row, :, f]
+            for m in range(markers):
+                by_bias[:, m, f, :, m, f] = np.eye(2)
+        for m in range(markers):
+            by_shape[:, m, :, :, m] = turned[:, m]
+        by_scale = turned @ linear.shape[row, :, None, :, None]
+        number = np.arange(self.size)
+        parts = [
+            (number[self.rig], by_rig),
+            (number[self.shape].reshape(*self.xyz.shape)[row], by_shape),
+            (number[self.scale], by_scale),
+            (number[self.bias].reshape(*self.target_id.shape, -1)[row], by_bias),
+        ]
+        if unsure[self.drift].any():
+            by_drift = np.zeros((*shape, views, 2, len(self.functions[0])))
+            for f in range(views):
+                for axis in range(2):
+                    by_drift[:, :, f, axis, f, axis] = linear.functions[:, row, :, f]
+            parts.append((number[self.drift], by_drift))
+        columns = np.concatenate([numbers.ravel() for numbers, _ in parts])
+        design = np.concatenate([part.reshape(*shape, -1) for _, part in parts], axis=-1)
+        keep = unsure[columns]
+        good = linear.good[:, row, ..., None, None]
+        return columns[keep], np.where(good, design[..., keep], 0.0)
+
+
+@dataclass(frozen=True)
+class _Linear:
+    """Image points (T, B, M, F) at values of the unknowns: residuals and derivatives."""
+
+    residual: np.ndarray  # (..., 2)
+    by_place: np.ndarray  # (..., 2, 3)
+    by_orientation: np.ndarray  # (..., 2, 9)
+    functions: np.ndarray  # (..., n), of a drift
+    place_by_pose: np.ndarray  # (T, B, M, 3, 6)
+    good: np.ndarray
+    shape: np.ndarray  # (B, M, 3)
+    poses: Poses
+
+    @classmethod
+    def of(
+        cls, adjustment: RigAdjustment, observed: ObservedBodies, values: np.ndarray, poses: Poses
+    ) -> _Linear:
+        """Linearise at values of the unknowns and at poses."""
+        grid = observed.seen.shape  # (T, B, M, F)
+        cameras = Cameras(adjustment.rig_at(values), adjustment.target_id)
+        shape = adjustment.shapes_at(values)
+        good = observed.seen & poses.known[:, :, None, None]
+        bias = values[adjustment.bias].reshape(*grid[1:], 2)
+        points = ImagePoints(
+            (observed.uv - bias).reshape(-1, *grid[2:], 2),
+            observed.variance.reshape(-1, *grid[2:]),
+            np.zeros((1, 1, 1)),
+            good.reshape(-1, *grid[2:]),
+        )
+        xyz = np.broadcast_to(shape, (grid[0], *shape.shape)).reshape(-1, *shape.shape[1:])
+        pose = poses.rotation.reshape(-1, 3, 3), poses.centre_mm.reshape(-1, 3)
+        linear = cameras.linear(xyz, pose, points)
+        by_orientation = cameras.by_orientation(linear)
+        turned = values[adjustment.rig].reshape(-1, ORIENTATION_SIZE)[:, 3:6]
+        by_orientation[..., 3:6] = by_orientation[..., 3:6] @ _by_vector(turned)
+        predicted = linear.uv.reshape(*grid, 2)
+        functions = adjustment.functions_at(observed)
+        drift = np.einsum('tbmfn,fan->tbmfa', functions, adjustment.drift_at(values))
+        residual = linear.residual.reshape(*grid, 2) - np.where(good[..., None], drift, 0.0)
+        return cls(
+            residual,
+            linear.by_place.reshape(*grid, 2, 3),
+            by_orientation.reshape(*grid, 2, ORIENTATION_SIZE),
+            functions,
+            place_by_pose=linear.by_pose.reshape(*grid[:3], 3, POSE_SIZE),
+            good=good & np.isfinite(predicted).all(axis=-1),
+            shape=shape,
+            poses=poses,
+        )
+
+    def by_pose(self, row: int) -> np.ndarray:
+        """Derivatives (T, M, F, 2, 6) of the image points of a body by its pose."""
+        return self.by_place[:, row] @ self.place_by_pose[:, row, :, None]
+
+
+@dataclass(frozen=True)
+class _Mixture:
+    """Squares of standardised residuals (T, B, M, F), and the density of false matches there."""
+
+    squares: np.ndarray
+    variance: np.ndarray
+    inflation: np.ndarray
+    false: np.ndarray  # density over that of a residual of 0
+    good: np.ndarray
+
+    @classmethod
+    def of(
+        cls, adjustment: RigAdjustment, linear: _Linear, observed: ObservedBodies, prior: Prior
+    ) -> _Mixture:
+        inflation = prior.inflation[..., None] ** 2
+        variance = observed.variance * inflation
+        squares = np.sum(linear.residual**2, axis=-1) / variance
+        false = FALSE_SHARE / (1 - FALSE_SHARE) * 2 * np.pi * observed.variance / adjustment._area
+        return cls(
+            squares, variance, np.broadcast_to(inflation, squares.shape), false, linear.good
+        )
+
+    @property
+    def scale(self) -> np.ndarray:
+        """Scales (T, B, 1, 1) of the standardised residuals of bodies, by their medians."""
+        squares = np.where(self.good, self.squares, np.nan).reshape(*self.good.shape[:2], -1)
+        seen = np.isfinite(squares).any(axis=2)
+        median = np.ones(seen.shape)
+        median[seen] = np.nanmedian(squares[seen], axis=1) / (2 * np.log(2))
+        return np.sqrt(median)[..., None, None]
+
+    def inlier(self, widening: np.ndarray | float = 1.0) -> np.ndarray:
+        """Probability to be an inlier, where standard deviations are larger by a factor."""
+        density = np.exp(-0.5 * self.squares / widening**2) / self.inflation
+        return np.where(self.good, density / (density + self.false), 0.0)
+
+    def weight(self, widening: np.ndarray | float) -> np.ndarray:
+        """Weights of the image points."""
+        return self.inlier(widening) / self.variance
+
+    @property
+    def loss(self) -> float:
+        """Minus twice the logarithm of the likelihood."""
+        density = np.exp(-0.5 * self.squares) / self.inflation + self.false
+        return float(-2 * np.log(density[self.good]).sum())
+
+    def shares(self) -> dict[str, np.ndarray]:
+        """Squares and their expectation by marker, and shares of inliers."""
+        inlier = self.inlier()
+        # A pose takes up six of the residuals of its body, in proportion to their number.
+        count = 2 * inlier.sum(axis=(2, 3))
+        share = np.where(count > 2 * POSE_SIZE, 1 - POSE_SIZE / np.maximum(count, 1), 0.0)
+        weighted = inlier * (share > 0)[..., None, None]
+        with np.errstate(invalid='ignore', divide='ignore'):
+            of_marker = inlier.sum(axis=(0, 3)) / self.good.sum(axis=(0, 3))
+            of_pose = inlier.sum(axis=(2, 3)) / self.good.sum(axis=(2, 3))
+        return {
+            'squares': (weighted * self.squares * self.inflation).sum(axis=(0, 3)),
+            'freedom': (2 * weighted * share[..., None, None]).sum(axis=(0, 3)),
+            'inliers': of_marker,
+            'inliers_of_pose': of_pose,
+        }
+
+
+def _share_of_functions(functions: Functions) -> np.ndarray:
+    """Standard deviations (n,) of coefficients that give a field of variance one.
+
+    The mean square of a product of two sines over their rectangle is 1 / (4 extent_u extent_v).
+    Polynomials have 1 px at the edges.
+    """
+    extent = MARGIN * np.asarray(functions.image_size) / 2
+    sines = len(functions) - functions.trend
+    out = np.ones(len(functions))
+    out[functions.trend :] = np.sqrt(4 * np.prod(extent) / sines)
+    return out
+
+
+def _by_vector(w: np.ndarray) -> np.ndarray:
+    """Derivatives (F, 3, 3) of a further small rotation by the vectors (F, 3) of rotations.
+
+    exp([w + dw]x) = exp([J dw]x) exp([w]x) with J = sum [w]x^n / (n + 1)! (Chirikjian, "Stochastic
+    Models, Information Theory, and Lie Groups", vol. 2, 2012, 10.6); changes are small.
+    """
+    cross = cross_matrix(w)
+    return np.eye(3) + cross @ (np.eye(3) / 2 + cross @ (np.eye(3) / 6 + cross / 24))
+
+
+def _moved(poses: Poses, normal: _Normal, step: np.ndarray) -> Poses:
+    """Move the poses by what they gain from a step (K,) of the other unknowns."""
+    rotation = poses.rotation.copy()
+    centre = poses.centre_mm.copy()
+    for row, (columns, solved) in enumerate(normal.back):
+        of_pose = solved[:, :, -1] - solved[:, :, :-1] @ step[columns]
+        of_pose = np.where(poses.known[:, row, None], of_pose, 0.0)
+        centre[:, row] += of_pose[:, :3]
+        rotation[:, row] = matrix_from_vector(of_pose[:, 3:]) @ rotation[:, row]
+    return replace(poses, rotation=rotation, centre_mm=centre)
+
+
+@dataclass(frozen=True)
+class RigErrors:
+    """Errors of points by those of a rig, relative to each other.
+
+    Attributes
+    ----------
+    scale : float
+        Standard deviation of the scale.
+    place_mm : float
+        Of a coordinate, where all points move together freely.
+    """
+
+    scale: float
+    place_mm: float
+
+
+def rig_errors(orientation: RigOrientation, points_mm: NDArray[np.float64]) -> RigErrors:
+    """Return the errors of points (n, 3) by the errors of an orientation.
+
+    The points move by -(A'A)^-1 A'B do (see `intersection`). Their scale is what they have in
+    common with a similarity about their centre, the rest what a rigid motion leaves.
+    """
+    cameras = Cameras(orientation, np.zeros((1, len(points_mm)), dtype=int))
+    views = len(orientation.fluoroscopes)
+    shape = (1, len(points_mm), views)
+    empty = ImagePoints(
+        np.zeros((*shape, 2)), np.ones(shape), np.zeros(shape), np.ones(shape, dtype=bool)
+    )
+    linear = cameras.linear(points_mm[None], (np.eye(3)[None], np.zeros((1, 3))), empty)
+    by_place = linear.by_place[0].reshape(len(points_mm), -1, 3)
+    by_rig = np.zeros((len(points_mm), views, 2, views, ORIENTATION_SIZE))
+    by_orientation = cameras.by_orientation(linear)[0]
+    for f in range(views):
+        by_rig[:, f, :, f] = by_orientation[:, f]
+    flat = by_rig.reshape(len(points_mm), -1, ORIENTATION_SIZE * views)
+    transposed = np.swapaxes(by_place, 1, 2)
+    moved = -np.linalg.solve(transposed @ by_place, transposed @ flat).reshape(
+        3 * len(points_mm), -1
+    )
+    moved = moved @ orientation.covariance_root()
+    arm = points_mm - points_mm.mean(axis=0)
+    rigid = np.concatenate([np.broadcast_to(np.eye(3), (len(arm), 3, 3)), -cross_matrix(arm)], 2)
+    rigid = rigid.reshape(-1, POSE_SIZE)
+    similar = np.column_stack([rigid, arm.ravel()])
+    scale = np.linalg.pinv(similar)[-1] @ moved
+    rest = moved - rigid @ (np.linalg.pinv(rigid) @ moved)
+    return RigErrors(
+        float(np.sqrt(scale @ scale)), float(np.sqrt(np.mean(np.sum(rest**2, axis=1))))
+    )

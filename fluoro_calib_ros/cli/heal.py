@@ -1,0 +1,131 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""fluoro-calib heal."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .arguments import (
+    add_bag_options,
+    add_calibration,
+    add_exit_zero,
+    add_options,
+    add_orientation,
+    add_source,
+    options_of,
+    read_oriented_source,
+)
+from .output import ProgressBar, print_findings, print_notes, print_result, styled_verdict
+
+if TYPE_CHECKING:
+    from ..jobs.healing import HealingOutcome
+
+NAME = 'heal'
+HELP = 'Find out from ordinary markers what has changed in a rig, and calibrate that anew.'
+EXAMPLE = (
+    'fluoro-calib heal rig/walking --calibration result --bodies learned/shapes.csv --out healed'
+)
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    from ..jobs.healing import HealingOptions
+
+    add_source(parser, 'image size of a file [px] (default: that of the calibration)')
+    add_bag_options(parser, pairing=False)
+    add_calibration(parser)
+    parser.add_argument(
+        '--bodies',
+        required=True,
+        type=Path,
+        metavar='FILE',
+        help='shapes of the bodies as they were learned while the rig was healthy: shapes.csv of '
+        'fluoro-calib bodies',
+    )
+    parser.add_argument(
+        '--out',
+        required=True,
+        type=Path,
+        metavar='DIR',
+        help='folder to write: calibrations and orientation as they are now, healing.json',
+    )
+    add_orientation(parser)
+    add_options(parser, HealingOptions)
+    add_exit_zero(parser)
+
+
+def run(arguments: argparse.Namespace) -> bool:
+    """Heal a rig; return whether the verdict is pass. Raises DataError."""
+    from ..errors import DataError
+    from ..io.bodies import read_bodies
+    from ..io.rig_orientation import orientation_path
+    from ..jobs.healing import HealingOptions, heal_rig
+    from ..jobs.healing_folder import check_healing_folder, healing_document, save_healing
+
+    path = arguments.orientation or orientation_path(arguments.calibration)
+    check_healing_folder(
+        arguments.out, [arguments.source, arguments.calibration, path, arguments.bodies]
+    )
+    bodies = read_bodies(arguments.bodies)
+    recording, calibrations, orientation = read_oriented_source(arguments, path)
+    print_notes(recording.notes)
+    options = options_of(HealingOptions, arguments, pair_tolerance=arguments.pair_tolerance)
+    try:
+        with ProgressBar('steps') as bar:
+            outcome = heal_rig(
+                recording.frames, calibrations, orientation, bodies, options, progress=bar
+            )
+    except DataError as error:
+        raise error.at(arguments.source) from None
+    if outcome.healed is not None:
+        save_healing(arguments.out, outcome, orientation)
+    print_findings(outcome.findings, 'changed: ')
+    document = healing_document(outcome, orientation)
+    print_result(arguments, document, '\n'.join(_lines(arguments, outcome)))
+    return outcome.verdict == 'pass'
+
+
+def _lines(arguments: argparse.Namespace, outcome: HealingOutcome) -> list[str]:
+    """Return what has changed by how much, and what that is good for."""
+    lines = []
+    healed = outcome.healed
+    if healed is None:
+        lines.append('the rig is as it was calibrated, nothing is written')
+    else:
+        for f, name in enumerate(outcome.orientation.fluoroscopes):
+            if healed.changes[f].any():
+                lines.append(f'{name}: {_change(healed.changes[f], healed.sd[f])}')
+            if f in healed.drift:
+                lines.append(f'{name}: its correction has changed')
+        after, before = (
+            f'{errors.place_mm:.3f} mm, scale {1e6 * errors.scale:.0f} ppm'
+            for errors in (outcome.after, outcome.before)
+        )
+        lines.append(f'points relative to each other: sd {after} (as calibrated {before})')
+        lines.append(f'written to {arguments.out}')
+    lines += [check.sentence for check in outcome.checks if not check.passed]
+    lines.append(styled_verdict(f'Verdict: {outcome.verdict}', outcome.verdict))
+    return lines
+
+
+def _change(value: np.ndarray, sd: np.ndarray) -> str:
+    """Return changes of an orientation with their standard deviations."""
+    parts = []
+    if value[:6].any():
+        shift = ', '.join(f'{v:.2f} (sd {s:.2f})' for v, s in zip(value[:3], sd[:3]))
+        turn = ', '.join(
+            f'{v:.3f} (sd {s:.3f})' for v, s in zip(np.degrees(value[3:6]), np.degrees(sd[3:6]))
+        )
+        parts.append(f'source moved by {shift} mm, sensor turned by {turn} degrees')
+    if value[6:8].any():
+        shift = ', '.join(f'{v:.2f} (sd {s:.2f})' for v, s in zip(value[6:8], sd[6:8]))
+        parts.append(f'principal point moved by {shift} px')
+    if value[8]:
+        parts.append(f'principal distance changed by {value[8]:.1f} (sd {sd[8]:.1f}) px')
+    return '; '.join(parts)

@@ -1,0 +1,419 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""The job of healing: what has changed in a rig, from a recording of bodies, and the rig as it is.
+
+Blocks of the recording are used in turn for the diagnosis and for its verdict. The healed rig
+passes where no block that was not used tells of a further change.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..bodies.body import Body, check_bodies, solvable_bodies
+from ..bodies.healing import (
+    OF_RIG,
+    Cause,
+    Change,
+    Diagnosis,
+    Diagnostician,
+    HealedRig,
+    healed_rig,
+)
+from ..bodies.rig_adjustment import ObservedBodies, Poses, RigAdjustment, RigErrors, rig_errors
+from ..bodies.rigid import fitted_pose
+from ..checks.check import Check, verdict_of
+from ..correction.base import CorrectionStatus
+from ..correction.fluoroscope_calibration import FluoroscopeCalibration
+from ..correction.series import sd_over_image
+from ..errors import DataError
+from ..exposures.frame import Frame
+from ..exposures.pairing import PAIR_BY, PairingOptions
+from ..findings import Finding, Kind, Place, Severity
+from ..options import option, validate_options
+from ..photogrammetry.rig_orientation import RigOrientation
+from ..reconstruction.intersection import OK, OUTSIDE, Intersector
+from ..reconstruction.reconstruct import pair_recording
+
+BLOCKS = 10  # of a recording, used in turn for the diagnosis and for its verdict
+MAX_EXPOSURES = 200  # of a recording that are used for each, evenly spread
+MIN_EXPOSURES = 10
+# Standard deviation of a direction of a change, relative to that of a change as it may be, above
+# which the data do not identify it: they have told less than half of it.
+IDENTIFIED = 0.5
+
+
+@dataclass(frozen=True)
+class HealingOptions:
+    """Options of healing. Raises ValueError for a value that an option cannot have."""
+
+    pair_by: str = option(
+        'frame_number', 'what the frames of one exposure have in common', choices=PAIR_BY
+    )
+    pair_tolerance: float = PairingOptions.tolerance_s
+
+    def __post_init__(self) -> None:
+        validate_options(self)
+
+
+@dataclass(frozen=True)
+class HealingOutcome:
+    """What has changed in a rig, and the rig as it is now.
+
+    Attributes
+    ----------
+    diagnosis : Diagnosis
+    healed : HealedRig or None
+        None where nothing of the rig has changed.
+    calibrations : mapping of str to FluoroscopeCalibration
+        Of the healed rig.
+    orientation : RigOrientation
+        Of the healed rig.
+    before, after : RigErrors
+        Errors of points where the bodies were.
+    verdict : {'pass', 'fail', 'cannot tell'}
+    checks : tuple of Check
+    findings : tuple of Finding
+        What has changed.
+    exposures : int
+        That were used for the diagnosis.
+    """
+
+    diagnosis: Diagnosis
+    healed: HealedRig | None
+    calibrations: Mapping[str, FluoroscopeCalibration]
+    orientation: RigOrientation
+    before: RigErrors
+    after: RigErrors
+    verdict: str
+    checks: tuple[Check, ...]
+    findings: tuple[Finding, ...]
+    exposures: int
+
+
+def heal_rig(
+    frames: Mapping[str, Sequence[Frame]],
+    calibrations: Mapping[str, FluoroscopeCalibration],
+    orientation: RigOrientation,
+    bodies: Sequence[Body],
+    options: HealingOptions | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> HealingOutcome:
+    """Find out what has changed in a rig since it was calibrated, and estimate it.
+
+    Parameters
+    ----------
+    frames : mapping of str to sequence of Frame
+        Observed image points of the markers of bodies, by fluoroscope.
+    calibrations : mapping of str to FluoroscopeCalibration
+    orientation : RigOrientation
+        As they were before.
+    bodies : sequence of Body
+        With their shapes as they were learned while the rig was healthy.
+    options : HealingOptions, optional
+    progress : callable, optional
+        Called with the number of the steps that are done, and of all.
+
+    Returns
+    -------
+    HealingOutcome
+
+    Raises
+    ------
+    DataError
+        For frames that cannot be paired or corrected, bodies without learned shapes, and too few
+        exposures that show bodies.
+    """
+    options = options or HealingOptions()
+    step = progress or (lambda done, total: None)
+    check_bodies(bodies)
+    usable = solvable_bodies(bodies)
+    names = [name for name in orientation.fluoroscopes if name in frames]
+    if len(names) < 2:
+        raise DataError(
+            f'there are image points of {", ".join(frames)}, but two fluoroscopes of the '
+            f'orientation ({", ".join(orientation.fluoroscopes)}) are needed'
+        )
+    orientation = orientation.subset(names)
+    paired, _ = pair_recording(frames, names, options.pair_by, options.pair_tolerance)
+    used, unused = _chosen(len(paired))
+    rig = _Rig(calibrations, orientation, usable)
+    observed, poses = rig.observe([paired[row] for row in used])
+    seen = int(poses.known.any(axis=1).sum())
+    if seen < MIN_EXPOSURES:
+        raise DataError(
+            f'{seen} of {len(used)} exposures show three markers of a body in two views, '
+            f'{MIN_EXPOSURES} are needed'
+        )
+    step(1, 4)
+    places = poses.centre_mm[poses.known]
+    before = rig_errors(orientation, places)
+    diagnostician = Diagnostician(rig.adjustment(), before.scale)
+    diagnosis = diagnostician.diagnose(observed, poses)
+    step(2, 4)
+    changed = [change for change in diagnosis.changes if change.cause in OF_RIG]
+    healed = None
+    after = before
+    now = rig
+    if changed:
+        stamp_ns = max(frame.stamp_ns for frame in paired[used[-1]].values())
+        healed = healed_rig(diagnostician, diagnosis, stamp_ns, len(used))
+        now = rig.healed(healed)
+        after = rig_errors(now.orientation, places)
+    step(3, 4)
+    checks = [_identified(healed), _sure(diagnosis, rig)]
+    halves = [unused[: len(unused) // 2], unused[len(unused) // 2 :]]
+    for number, half in enumerate(halves, 1):
+        rest = now.diagnose([paired[row] for row in half], diagnosis, before.scale)
+        checks.append(_unused(rest, number, rig))
+    step(4, 4)
+    return HealingOutcome(
+        diagnosis,
+        healed,
+        calibrations=now.calibrations,
+        orientation=now.orientation,
+        before=before,
+        after=after,
+        verdict=verdict_of(checks),
+        checks=tuple(checks),
+        findings=tuple(_finding(change, rig, diagnosis) for change in diagnosis.changes),
+        exposures=len(used),
+    )
+
+
+def _chosen(count: int) -> tuple[list[int], list[int]]:
+    """Exposures for the diagnosis and for its verdict, from alternating blocks."""
+    block = np.arange(count) * BLOCKS // max(count, 1)
+    out: list[list[int]] = []
+    for part in (0, 1):
+        rows = np.flatnonzero(block % 2 == part)
+        few = np.unique(np.linspace(0, len(rows) - 1, MAX_EXPOSURES).astype(int))
+        out.append(rows[few[few >= 0]].tolist())
+    return out[0], out[1]
+
+
+@dataclass(frozen=True)
+class _Rig:
+    """A rig at a time, and the bodies that it sees."""
+
+    calibrations: Mapping[str, FluoroscopeCalibration]
+    orientation: RigOrientation
+    bodies: tuple[Body, ...]
+
+    def adjustment(self) -> RigAdjustment:
+        """Return the adjustment of this rig."""
+        sizes = [self.calibrations[name].image_size for name in self.orientation.fluoroscopes]
+        return RigAdjustment(self.orientation, self.bodies, sizes)
+
+    def observe(self, exposures: Sequence[Mapping[str, Frame]]) -> tuple[ObservedBodies, Poses]:
+        """Correct the image points of exposures, and return first poses of the bodies."""
+        target_id = self.adjustment().target_id
+        names = self.orientation.fluoroscopes
+        # u, v as observed and corrected, standard deviations in all and of the correction
+        values = np.full((len(exposures), *target_id.shape, len(names), 6), np.nan)
+        flat = values.reshape(len(exposures), target_id.size, len(names), 6)
+        for f, name in enumerate(names):
+            for row, exposure in enumerate(exposures):
+                if name in exposure:
+                    own, found = _corrected(target_id, exposure[name], self.calibrations[name])
+                    flat[row, own, f] = found
+        pixel = values[..., :2]
+        uv = values[..., 2:4]
+        sigma, correction = np.moveaxis(values[..., 4:], -1, 0)
+        seen = np.isfinite(values).all(axis=-1)
+        count = np.maximum(seen.sum(axis=0), 1)
+        fixed = np.where(seen, correction, 0.0) ** 2
+        noise = np.where(seen, np.maximum(sigma**2 - correction**2, 0.01 * sigma**2), 1.0)
+        observed = ObservedBodies(uv, pixel, noise, fixed.sum(axis=0) / count, seen)
+        return observed, self._first_poses(uv, sigma)
+
+    def _first_poses(self, uv: np.ndarray, sigma: np.ndarray) -> Poses:
+        """Return poses that take the bodies to their markers in space, which may be false."""
+        shape = uv.shape[:3]
+        views = uv.shape[3]
+        points = Intersector(self.orientation, None).intersect(
+            uv.reshape(-1, views, 2).transpose(1, 0, 2), sigma.reshape(-1, views).T
+        )
+        good = np.isin(points.status, (OK, OUTSIDE)).reshape(shape)
+        xyz = points.xyz_mm.reshape(*shape, 3)
+        known = good.sum(axis=2) >= 3
+        rotation = np.tile(np.eye(3), (*shape[:2], 1, 1))
+        centre = np.zeros((*shape[:2], 3))
+        own = self.adjustment().xyz
+        for t, b in np.argwhere(known):
+            rows = np.flatnonzero(good[t, b])
+            pose = fitted_pose(own[b, rows], xyz[t, b, rows])
+            misfit = np.linalg.norm(own[b, rows] @ pose[0].T + pose[1] - xyz[t, b, rows], axis=1)
+            near = misfit <= 3 * np.median(misfit)
+            if near.sum() >= 3:
+                pose = fitted_pose(own[b, rows[near]], xyz[t, b, rows[near]])
+            rotation[t, b], centre[t, b] = pose
+        return Poses(rotation, centre, known)
+
+    def healed(self, healed: HealedRig) -> _Rig:
+        """Return the rig with what was healed."""
+        calibrations = dict(self.calibrations)
+        names = self.orientation.fluoroscopes
+        for f, name in enumerate(names):
+            one = calibrations[name]
+            if f in healed.drift:
+                functions, coefficients, covariance = healed.drift[f]
+                sd = sd_over_image(functions, covariance)
+                one = one.with_drift(functions, coefficients, sd)
+            if healed.changes[f, 6:].any():
+                rows = healed.orientation.covariance_rows([f])[6:]
+                one = replace(
+                    one,
+                    interior=healed.orientation.interior[f],
+                    interior_covariance=healed.orientation.covariance[np.ix_(rows, rows)],
+                )
+            calibrations[name] = one
+        orientation = replace(
+            healed.orientation,
+            calibration_ids=tuple(calibrations[name].calibration_id for name in names),
+        )
+        return replace(self, calibrations=calibrations, orientation=orientation)
+
+    def diagnose(
+        self, exposures: Sequence[Mapping[str, Frame]], known: Diagnosis, shape_scale: float
+    ) -> Diagnosis | None:
+        """Say what has changed beside what is known of the bodies; None for too few exposures."""
+        if len(exposures) < MIN_EXPOSURES:
+            return None
+        observed, poses = self.observe(exposures)
+        left_out = np.zeros(observed.seen.shape[1:3], dtype=bool)
+        for change in known.changes:
+            if change.cause is Cause.EXCHANGED:
+                observed = observed.exchanged(change.body, *change.markers)
+            elif change.cause not in OF_RIG:
+                left_out[change.body, list(change.markers) or slice(None)] = True
+        observed = observed.without(left_out)
+        if poses.known.any(axis=1).sum() < MIN_EXPOSURES:
+            return None
+        return Diagnostician(self.adjustment(), shape_scale).diagnose(observed, poses)
+
+
+def _corrected(
+    target_id: np.ndarray, frame: Frame, calibration: FluoroscopeCalibration
+) -> tuple[np.ndarray, np.ndarray]:
+    """Rows (n,) of the markers of a frame in target_id, and their values (n, 6).
+
+    Image points beyond the calibrated area are left out.
+    """
+    _, own, given = np.intersect1d(target_id.ravel(), frame.target_id, return_indices=True)
+    observed = frame.uv[given]
+    sigma = None if frame.sigma is None else frame.sigma[given]
+    u, v, total, sd, status = calibration.correct_arrays(
+        observed[:, 0], observed[:, 1], sigma, frame.angle
+    )
+    inside = status == CorrectionStatus.OK
+    return own[inside], np.column_stack([observed, u, v, total, sd])[inside]
+
+
+# What is said of it.
+
+_KINDS = {
+    Cause.ORIENTATION: Kind.FLUOROSCOPE_MOVED,
+    Cause.INTERIOR: Kind.INTERIOR_CHANGED,
+    Cause.DISTORTION: Kind.DISTORTION_CHANGED,
+    Cause.MIGRATED: Kind.MARKER_MIGRATED,
+    Cause.EXCHANGED: Kind.MARKERS_EXCHANGED,
+    Cause.LOOSE: Kind.MARKER_LOOSE,
+    Cause.SOFT: Kind.BODY_NOT_RIGID,
+}
+
+
+def _place_of(change: Change, rig: _Rig) -> Place:
+    if change.fluoroscope >= 0:
+        return Place((rig.orientation.fluoroscopes[change.fluoroscope],))
+    body = rig.bodies[change.body]
+    markers = tuple(int(body.target_id[m]) for m in change.markers)
+    return Place(target_id=markers, name=f'body {body.name}')
+
+
+def _finding(change: Change, rig: _Rig, diagnosis: Diagnosis) -> Finding:
+    """Return what a change is, in a sentence."""
+    return Finding(
+        _KINDS[change.cause],
+        _cause_text(change, rig),
+        place=_place_of(change, rig),
+        severity=Severity.WARNING,
+        numbers={'probability': diagnosis.probability[diagnosis.changes.index(change)]},
+    )
+
+
+def _cause_text(change: Change, rig: _Rig) -> str:
+    views = len(rig.orientation.fluoroscopes)
+    ids = ' and '.join(str(i) for i in _place_of(change, rig).target_id)
+    return {
+        Cause.ORIENTATION: 'it has moved'
+        if views > 2
+        else 'it has moved against the other fluoroscope, or that one against it',
+        Cause.INTERIOR: 'source and detector have moved against each other',
+        Cause.DISTORTION: 'the distortion has changed',
+        Cause.MIGRATED: f'marker {ids} has migrated',
+        Cause.EXCHANGED: f'the ids of markers {ids} are exchanged',
+        Cause.LOOSE: f'marker {ids} moves against the others',
+        Cause.SOFT: 'its markers move against each other: it is not rigid',
+    }[change.cause]
+
+
+def _identified(healed: HealedRig | None) -> Check:
+    """Check that the bodies tell all of the change."""
+    return Check(
+        Kind.CHANGE_IDENTIFIED,
+        'the direction of the change that is known worst has a standard deviation of '
+        f'{100 * (healed.weakest if healed else 0.0):.0f} % of what such a change may be',
+        advice='record bodies that move through more of the field of view',
+        value=healed.weakest if healed else 0.0,
+        limit=IDENTIFIED,
+    )
+
+
+def _sure(diagnosis: Diagnosis, rig: _Rig) -> Check:
+    """Check that no other cause explains the data nearly as well."""
+    doubt = max([1 - one for one in diagnosis.probability], default=0.0)
+    limit = 0.05
+    text = 'no other cause explains the recording as well'
+    if doubt > limit:
+        worst = int(np.argmin(diagnosis.probability))
+        rival = diagnosis.rivals[worst]
+        found = _finding(diagnosis.changes[worst], rig, diagnosis)
+        text = f'{found.place}: {found.cause}'
+        if rival is not None:
+            text += f'; or {_place_of(rival, rig)}: {_cause_text(rival, rig)}'
+        text += '; the recording does not tell which'
+    return Check(
+        Kind.CAUSE_SURE,
+        text,
+        advice='record more motion, or calibrate with the phantom',
+        value=doubt,
+        limit=limit,
+    )
+
+
+def _unused(rest: Diagnosis | None, half: int, rig: _Rig) -> Check:
+    """Check that exposures that were not used tell of no further change of the rig."""
+    part = f'the {("first", "second")[half - 1]} half of the exposures that were not used'
+    if rest is None:
+        return Check(
+            Kind.UNUSED_EXPOSURES,
+            f'{part} shows too little of the bodies',
+            advice='take a longer recording',
+        )
+    changes = [change for change in rest.changes if change.cause in OF_RIG]
+    text = f'{part} tells of no further change'
+    if changes:
+        text = f'{part}: {_place_of(changes[0], rig)}: {_cause_text(changes[0], rig)}'
+    return Check(
+        Kind.UNUSED_EXPOSURES,
+        text,
+        advice='the rig changes while it is recorded: take another recording, or calibrate with '
+        'the phantom',
+        value=float(len(changes)),
+        limit=0.0,
+    )

@@ -1,0 +1,208 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""What has changed in a rig, by the bodies that it sees; views are made without the package."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from body_views import orientation, project
+from scipy.spatial.transform import Rotation
+
+from fluoro_calib_ros.bodies.body import Body
+from fluoro_calib_ros.bodies.healing import Cause, Diagnostician, healed_rig
+from fluoro_calib_ros.bodies.rig_adjustment import (
+    ObservedBodies,
+    Poses,
+    RigAdjustment,
+    _Linear,
+    rig_errors,
+)
+
+NOISE_PX = 0.2
+SHAPE_SD_MM = 0.01
+EXPOSURES = 24
+BODIES = 3
+MARKERS = 5
+SIZE = (1024, 1024)
+# What a healthy rig does not know of itself: T [mm], w [rad], xp, yp, c [px].
+RIG_SD = np.array([0.02] * 3 + [2e-5] * 3 + [0.1, 0.1, 0.3])
+
+
+class Scene:
+    """Bodies that move through a rig, some of whose errors have changed."""
+
+    def __init__(self, seed):
+        self.rng = rng = np.random.default_rng(seed)
+        self.covariance = np.diag(np.concatenate([np.zeros(6), RIG_SD[6:], RIG_SD]) ** 2)
+        self.rig = replace(orientation(2), covariance=self.covariance)
+        self.errors = rng.normal(0, 1, 18) * np.sqrt(np.diagonal(self.covariance))
+        self.shapes = rng.uniform(-20, 20, (BODIES, MARKERS, 3))
+        learned = self.shapes + rng.normal(0, SHAPE_SD_MM, self.shapes.shape)
+        self.bodies = [
+            Body(f'bone{k}', 10 * k + np.arange(MARKERS), xyz, np.full(MARKERS, SHAPE_SD_MM))
+            for k, xyz in enumerate(learned)
+        ]
+        angle = 2 * np.pi * np.arange(EXPOSURES)[:, None, None] / EXPOSURES
+        turn = rng.uniform(-0.5, 0.5, (BODIES, 3)) * np.sin(angle + rng.uniform(0, 6, (BODIES, 3)))
+        self.rotation = Rotation.from_rotvec(turn.reshape(-1, 3)).as_matrix()
+        self.rotation = self.rotation.reshape(EXPOSURES, BODIES, 3, 3)
+        self.centre = rng.uniform(-50, 50, (BODIES, 3)) + 30 * np.sin(
+            angle + rng.uniform(0, 6, (BODIES, 3))
+        )
+
+    def observe(self, changed=np.zeros(18), scatter_mm=()):
+        """Image points of the rig with changes (18,); bodies whose markers scatter [mm]."""
+        points = self.shapes @ np.swapaxes(self.rotation, 2, 3) + self.centre[:, :, None]
+        for body, markers, sd in scatter_mm:
+            points[:, body, markers] += self.rng.normal(0, sd, points[:, body, markers].shape)
+        uv = project(self.rig, points.reshape(-1, 3), self.errors + changed)
+        uv = uv.transpose(1, 0, 2).reshape(EXPOSURES, BODIES, MARKERS, 2, 2)
+        uv = uv + self.rng.normal(0, NOISE_PX, uv.shape)
+        false = self.rng.random(uv.shape[:4]) < 0.01
+        uv[false] = self.rng.uniform(0, 1023, (np.count_nonzero(false), 2))
+        variance = np.full(uv.shape[:4], NOISE_PX**2)
+        correction = np.full(uv.shape[1:4], 0.01**2)
+        return ObservedBodies(uv, uv, variance, correction, np.ones(uv.shape[:4], bool))
+
+    def poses(self):
+        """First poses, off by a millimetre and a degree."""
+        turn = Rotation.from_rotvec(self.rng.normal(0, 0.02, (EXPOSURES * BODIES, 3))).as_matrix()
+        return Poses(
+            turn.reshape(self.rotation.shape) @ self.rotation,
+            self.centre + self.rng.normal(0, 1, self.centre.shape),
+            np.ones((EXPOSURES, BODIES), dtype=bool),
+        )
+
+    def diagnostician(self):
+        adjustment = RigAdjustment(self.rig, self.bodies, [SIZE, SIZE])
+        scale = rig_errors(self.rig, self.centre.reshape(-1, 3)).scale
+        return Diagnostician(adjustment, scale)
+
+
+def test_derivatives_are_those_of_differences():
+    scene = Scene(1)
+    adjustment = scene.diagnostician().adjustment
+    observed = scene.observe()
+    poses = scene.poses()
+    rng = np.random.default_rng(2)
+    values = rng.normal(0, 1e-3, adjustment.size)
+
+    def residual(at, of=poses):
+        return _Linear.of(adjustment, observed, at, of).residual
+
+    linear = _Linear.of(adjustment, observed, values, poses)
+    everything = np.ones(adjustment.size, dtype=bool)
+    for row in range(BODIES):
+        columns, design = adjustment._design(linear, row, everything)
+        for column in rng.choice(len(columns), 40, replace=False):
+            step = np.zeros(adjustment.size)
+            step[columns[column]] = 1e-5
+            found = (residual(values - step) - residual(values + step))[:, row] / 2e-5
+            np.testing.assert_allclose(design[..., column], found, atol=2e-3, rtol=2e-3)
+        for axis in range(3):
+            step = np.zeros(3)
+            step[axis] = 1e-4
+            ahead = replace(poses, centre_mm=poses.centre_mm + step)
+            back = replace(poses, centre_mm=poses.centre_mm - step)
+            found = (residual(values, back) - residual(values, ahead))[:, row] / 2e-4
+            np.testing.assert_allclose(linear.by_pose(row)[..., axis], found, atol=1e-5)
+
+
+def test_healthy_rig_has_not_changed():
+    scene = Scene(3)
+    found = scene.diagnostician().diagnose(scene.observe(), scene.poses())
+    assert found.changes == () and found.rest > 0.95 and found.sure
+    assert found.noise < 1.1
+
+
+def test_moved_fluoroscope_is_found_and_estimated_with_its_deviations():
+    """Over rigs: the change of b is what was done to it, as its covariance claims."""
+    squares = []
+    for seed in range(4, 9):
+        scene = Scene(seed)
+        moved = np.zeros(18)
+        moved[9:15] = [4.0, -3.0, 2.0, 0.006, -0.004, 0.005]
+        diagnostician = scene.diagnostician()
+        observed = scene.observe(moved)
+        found = diagnostician.diagnose(observed, scene.poses())
+        assert [(one.cause, one.fluoroscope) for one in found.changes] == [(Cause.ORIENTATION, 1)]
+        assert found.sure
+        healed = healed_rig(diagnostician, found, 7, EXPOSURES)
+        assert healed.orientation.source == 'healing' and healed.orientation.stamp_ns == 7
+        assert healed.weakest < 0.5 and not healed.drift
+        assert not healed.changes[0].any() and not healed.changes[1, 6:].any()
+        error = (healed.changes[1] - moved[9:] - scene.errors[9:])[:6]
+        covariance = healed.orientation.covariance[9:15, 9:15]
+        squares.append(error @ np.linalg.solve(covariance, error))
+        # The fixed unknowns keep the covariance that they had.
+        np.testing.assert_allclose(
+            healed.orientation.covariance[15:, 15:], scene.covariance[15:, 15:], rtol=1e-6
+        )
+    # chi-square with 30 degrees of freedom
+    assert 13 < np.sum(squares) < 54
+
+
+@pytest.mark.parametrize('view', [0, 1])
+def test_changed_interior_is_told_from_a_moved_fluoroscope(view):
+    scene = Scene(20 + view)
+    changed = np.zeros(18)
+    changed[9 * view + 6 : 9 * view + 9] = [0.0, 6.0, 60.0]
+    found = scene.diagnostician().diagnose(scene.observe(changed), scene.poses())
+    assert (found.changes[0].cause, found.changes[0].fluoroscope) == (Cause.INTERIOR, view)
+
+
+def test_markers_and_bodies_that_have_changed_are_named():
+    scene = Scene(30)
+    scene.shapes[1, 2] += [0.3, -0.3, 0.3]
+    found = scene.diagnostician().diagnose(scene.observe(), scene.poses())
+    assert [(o.cause, o.body, o.markers) for o in found.changes] == [(Cause.MIGRATED, 1, (2,))]
+    scene = Scene(31)
+    scatter = scene.observe(scatter_mm=[(2, slice(None), 0.15)])
+    found = scene.diagnostician().diagnose(scatter, scene.poses())
+    assert [(one.cause, one.body) for one in found.changes] == [(Cause.SOFT, 2)]
+    scene = Scene(32)
+    found = scene.diagnostician().diagnose(scene.observe(scatter_mm=[(0, 3, 0.2)]), scene.poses())
+    assert [(o.cause, o.body, o.markers) for o in found.changes] == [(Cause.LOOSE, 0, (3,))]
+    scene = Scene(33)
+    exchanged = scene.observe().exchanged(1, 0, 4)
+    found = scene.diagnostician().diagnose(exchanged, scene.poses())
+    assert [(o.cause, o.body, o.markers) for o in found.changes] == [(Cause.EXCHANGED, 1, (0, 4))]
+
+
+def test_errors_of_points_by_the_rig_are_those_of_random_rigs():
+    """Scale and places of points that random errors of the rig move, by a Monte Carlo run."""
+    scene = Scene(40)
+    covariance = np.diag(np.tile(RIG_SD, 2) ** 2)
+    rig = replace(scene.rig, covariance=covariance)
+    points = scene.rng.uniform(-60, 60, (20, 3))
+    claimed = rig_errors(rig, points)
+    scales = []
+    squares = []
+    for _ in range(400):
+        errors = scene.rng.normal(0, 1, 18) * np.tile(RIG_SD, 2)
+        uv = project(rig, points, errors)
+        moved = np.array([_intersection(rig, uv[:, k]) for k in range(len(points))])
+        arm = points - points.mean(axis=0)
+        change = moved - moved.mean(axis=0) - arm
+        motion = np.stack([np.cross(axis, arm).ravel() for axis in np.eye(3)], axis=1)
+        scales.append(np.linalg.lstsq(np.c_[motion, arm.ravel()], change.ravel())[0][-1])
+        squares.append(
+            np.mean((change.ravel() - motion @ np.linalg.lstsq(motion, change.ravel())[0]) ** 2)
+        )
+    assert np.std(scales) == pytest.approx(claimed.scale, rel=0.12)
+    assert np.sqrt(np.mean(squares)) == pytest.approx(claimed.place_mm, rel=0.12)
+
+
+def _intersection(rig, uv):
+    """Point (3,) nearest to two rays, by linear least squares of the image equations."""
+    rows = []
+    right = []
+    for f in range(2):
+        xp, yp, c = rig.interior[f]
+        for axis, value in enumerate((uv[f, 0] - xp, uv[f, 1] - yp)):
+            row = c * rig.rotation[f][axis] - value * rig.rotation[f][2]
+            rows.append(row)
+            right.append(row @ rig.position_mm[f])
+    return np.linalg.lstsq(np.array(rows), np.array(right))[0]

@@ -27,7 +27,7 @@ from .rig_adjustment import ObservedBodies, Poses, Prior, RigAdjustment, RigSolu
 MAX_CAUSES = 3
 # Probability below which a cause is not believed: another one explains the data, too.
 SURE = 0.95
-# Causes that are tried in full, of those that their derivatives make most likely.
+# Markers that are tried in full, of those that their derivatives make most likely.
 TRIED = 3
 
 
@@ -58,8 +58,6 @@ MIGRATION_MM = 1.0
 # factors are those of principal point and principal distance, the first one that of all others.
 SIZES = ((1.0, 1.0), (0.125, 0.125))
 SIZES_OF_INTERIOR = (*SIZES, (1.0, 0.125), (0.125, 1.0))
-# Share of inliers below which the rig is so wrong that derivatives do not tell what has changed.
-LOST = 0.9
 
 
 @dataclass(frozen=True)
@@ -131,7 +129,7 @@ class Diagnostician:
     def __init__(self, adjustment: RigAdjustment, shape_scale: float) -> None:
         self.adjustment = adjustment
         bodies = adjustment.bodies
-        self._healthy = adjustment.healthy_prior(shape_scale)
+        self._shape_scale = shape_scale
         views = len(adjustment.orientation.fluoroscopes)
         # Of two views, only the orientation of one against the other can be seen.
         self._moved = [views - 1] if views == 2 else list(range(views))
@@ -143,8 +141,9 @@ class Diagnostician:
         """Say what has changed, from first poses of the bodies."""
         adjustment = self.adjustment
         zero = np.zeros(adjustment.size)
-        solution = adjustment.solve(observed, self._healthy, (zero, poses))
-        best = _Tried((), observed, self._healthy, solution)
+        healthy = adjustment.healthy_prior(observed, self._shape_scale)
+        solution = adjustment.solve(observed, healthy, (zero, poses))
+        best = _Tried((), observed, healthy, solution)
         probability: list[float] = []
         rivals: list[Change | None] = []
         rest = 1.0
@@ -173,10 +172,7 @@ class Diagnostician:
 
     def _tried(self, best: _Tried, first: Poses) -> list[_Tried]:
         """Solve for the causes that may be added, of those that the derivatives make likely."""
-        if np.nanmean(best.solution.inliers) < LOST:
-            changes = [change for change in self._of_rig() if change not in best.changes]
-        else:
-            changes = [*self._changes_of_unknowns(best), *self._scattering(best)]
+        changes = [*self._changes_of_unknowns(best), *self._scattering(best)]
         changes += self._exchanges(best)
         return [self._with(best, change, first) for change in changes]
 
@@ -187,10 +183,12 @@ class Diagnostician:
         return moved + [Change(cause, f) for cause in OF_RIG[1:] for f in views]
 
     def _changes_of_unknowns(self, best: _Tried) -> list[Change]:
-        """Return the changes of rig and shapes with the largest expected evidence.
+        """Return the changes of rig and shapes that may have evidence.
 
-        Of unknowns with the additional variances V, gradient g and information S without the
-        others, it is 1/2 g'(S + V^-1)^-1 g - 1/2 log det(I + SV).
+        If one is expected to have some, they are all changes of the rig, which may be far from
+        where the derivatives hold, and the likeliest ones of markers. Of unknowns with the
+        additional variances V, gradient g and information S without the others, the evidence is
+        expected to be 1/2 g'(S + V^-1)^-1 g - 1/2 log det(I + SV).
         """
         adjustment = self.adjustment
         normal, right = adjustment.normal_at(best.observed, best.prior, best.solution)
@@ -217,7 +215,11 @@ class Diagnostician:
                 of_sizes.append((float(gain), change))
             gains.append(max(of_sizes, key=lambda one: one[0]))
         gains.sort(key=lambda one: -one[0])
-        return [change for gain, change in gains[:TRIED] if gain > 0]
+        if not gains or gains[0][0] <= 0:
+            return []
+        of_rig = [change for _, change in gains if change.cause in OF_RIG]
+        of_markers = [one for one in gains if one[1].cause is Cause.MIGRATED][:TRIED]
+        return of_rig + [change for gain, change in of_markers if gain > 0]
 
     def _scattering(self, best: _Tried) -> list[Change]:
         """Return the marker and the body that scatter most, where that is worth an unknown.
@@ -264,10 +266,10 @@ class Diagnostician:
         prior = best.prior.widened(self.sd_of(change))
         if change.cause in (Cause.LOOSE, Cause.SOFT):
             prior = replace(prior, inflation=self._inflation(best, change))
-        found = best.solution
-        # A wrong hypothesis may have led some poses astray.
-        poses = found.poses.or_else(first, found.inliers_of_pose > 0.5)
-        start = found.values, poses
+        start = np.zeros(self.adjustment.size), first
+        if best.changes:  # else a rig that is wrong may have led values and poses astray
+            found = best.solution
+            start = found.values, found.poses.or_else(first, found.inliers_of_pose > 0.5)
         solution = self.adjustment.solve(observed, prior, start)
         return _Tried((*best.changes, change), observed, prior, solution)
 

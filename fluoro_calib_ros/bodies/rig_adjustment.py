@@ -17,8 +17,10 @@ Inference, and Learning Algorithms", Cambridge 2003, ch. 28):
 
     log Z = -1/2 (loss + z'z) - 1/2 log det(I + L'HL).
 
-The correction of an image point has an error that stays while a marker stands still. It is taken
-to be the same for a marker and a view over the whole recording, the most that it can be.
+The correction of an image point has an error that stays while a marker stands still. How far it
+reaches is not known. Twice it is taken for the most that it can be: as a smooth field over the
+image, which all markers have in common, and as the same for a marker and a view over the whole
+recording.
 """
 
 from __future__ import annotations
@@ -222,7 +224,7 @@ class RigAdjustment:
 
     # -- the unknowns
 
-    def healthy_prior(self, shape_scale: float) -> Prior:
+    def healthy_prior(self, observed: ObservedBodies, shape_scale: float) -> Prior:
         """Return the prior of a rig that has not changed.
 
         shape_scale: standard deviation of the scale that all shapes have in common.
@@ -232,6 +234,11 @@ class RigAdjustment:
         for row, body in enumerate(self.bodies):
             shape[row, : len(body.sd_mm)] = body.sd_mm[:, None]
         sd[self.scale] = shape_scale
+        seen = observed.seen.sum(axis=0)
+        drift = sd[self.drift].reshape(self._views, -1)
+        for f in range(self._views):
+            of_view = observed.correction[..., f] * seen[..., f]
+            drift[f] = self.sd_of_drift(f) * np.sqrt(of_view.sum() / max(seen[..., f].sum(), 1))
         return Prior(self.orientation.covariance, sd, np.ones(self.target_id.shape))
 
     def sd_of_drift(self, fluoroscope: int) -> NDArray[np.float64]:

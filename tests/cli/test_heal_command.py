@@ -1,0 +1,107 @@
+# SPDX-FileCopyrightText: 2026 fluoro_calib_ros maintainers
+# SPDX-License-Identifier: Apache-2.0
+
+"""fluoro-calib heal: a virtual rig is bumped, and calibrated anew from a walking knee."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from rigs import run
+
+from fluoro_calib_ros.io.rig_orientation import load_orientation
+from fluoro_calib_ros.jobs.simulation import write_knee_recording
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
+from fluoro_calib_ros.simulation.knee import simulate_knee, virtual_knee, walking
+from fluoro_calib_ros.simulation.rig import virtual_rig
+
+pytestmark = pytest.mark.long
+
+SEED = 1
+MOVED_MM = [3.0, -2.0, 3.0]
+TURNED_RAD = [0.005, -0.004, 0.003]
+
+
+@pytest.fixture(scope='module')
+def rig(tmp_path_factory):
+    """A calibrated rig with learned shapes, and a knee that walks after b was bumped."""
+    folder = tmp_path_factory.mktemp('healing') / 'rig'
+    simulate = ('simulate', '--out', folder, '--bodies', '--exposures', '8', '--seconds', '1')
+    assert run(*simulate, '--seed', SEED) == 0
+    calibrate = ('calibrate', folder / 'calibration', '--phantom', folder / 'phantom.csv')
+    assert run(*calibrate, '--fast', '--out', folder / 'result') == 0
+    bodies = ('bodies', folder / 'walking', '--bodies', folder / 'bodies.csv')
+    calibration = ('--calibration', folder / 'result')
+    assert run(*bodies, *calibration, '--out', folder / 'learned') == 0
+    virtual = virtual_rig(SEED)
+    a, b = virtual.fluoroscopes
+    moved = replace(
+        b,
+        rotation=matrix_from_vector(TURNED_RAD) @ b.rotation,
+        position_mm=b.position_mm + MOVED_MM,
+    )
+    knee = virtual_knee(SEED)
+    motion = walking(knee, np.arange(120) / 120)
+    write_knee_recording(
+        folder, 'bumped', simulate_knee(replace(virtual, fluoroscopes=(a, moved)), knee, motion)
+    )
+    return folder
+
+
+def heal(rig, recording, out, *more):
+    return run(
+        *('heal', rig / recording, '--bodies', rig / 'learned' / 'shapes.csv'),
+        *('--calibration', rig / 'result', '--out', out, *more),
+    )
+
+
+def test_bumped_rig_is_healed_and_its_points_are_right_again(rig, tmp_path, capsys):
+    healed = tmp_path / 'healed'
+    assert heal(rig, 'bumped', healed, '--json') == 0
+    document = json.loads(capsys.readouterr().out)
+    assert document == json.loads((healed / 'healing.json').read_text())
+    assert document['verdict'] == 'pass'
+    assert [one['kind'] for one in document['findings']] == ['fluoroscope_moved']
+    assert set(document['changes']) == {'b'}
+    before = load_orientation(rig / 'result' / 'rig_orientation.npz')
+    after = load_orientation(healed / 'rig_orientation.npz')
+    assert document['parent_orientation_id'] == before.orientation_id
+    assert document['orientation_id'] == after.orientation_id and after.source == 'healing'
+    # Nothing but the orientation of b has changed: the calibrations are the same.
+    assert after.calibration_ids == before.calibration_ids
+    change = document['changes']['b']
+    np.testing.assert_array_less(
+        np.abs(np.radians(change['rotation_deg']) - TURNED_RAD),
+        4 * np.radians(change['rotation_sd_deg']),
+    )
+    poses = {}
+    for name, folder in (('before', rig / 'result'), ('after', healed)):
+        bodies = ('bodies', rig / 'bumped', '--bodies', rig / 'learned' / 'shapes.csv', '--json')
+        out = ('--keep-shapes', '--calibration', folder, '--out', tmp_path / name)
+        assert run(*bodies, *out) == 0
+        poses[name] = json.loads(capsys.readouterr().out)['bodies']['femur']['poses']
+    assert poses['after'] == 120
+
+
+def test_rig_that_has_not_changed_is_left_as_it_is(rig, tmp_path, capsys):
+    assert heal(rig, 'walking', tmp_path / 'healed') == 0
+    assert 'as it was calibrated' in capsys.readouterr().out
+    assert not (tmp_path / 'healed').exists()
+
+
+def test_what_cannot_be_healed_is_refused(rig, tmp_path, capsys):
+    shapes = rig / 'learned' / 'shapes.csv'
+    unknown = tmp_path / 'unknown.csv'
+    lines = shapes.read_text().splitlines()
+    unknown.write_text(
+        '\n'.join([lines[0], *(f'{",".join(x.split(",")[:2])},,,,' for x in lines[1:])])
+    )
+    base = ('heal', rig / 'bumped', '--calibration', rig / 'result', '--out', tmp_path / 'out')
+    assert run(*base, '--bodies', unknown) == 1
+    assert 'body femur: the places of 0 of its 4 markers are known' in capsys.readouterr().err
+    assert run(*base, '--bodies', shapes, '--orientation', tmp_path / 'none.npz') == 1
+    inside = ('heal', rig / 'bumped', '--calibration', rig / 'result', '--bodies', shapes)
+    assert run(*inside, '--out', rig / 'result') == 1
+    assert 'would be overwritten' in capsys.readouterr().err
+    assert not (tmp_path / 'out').exists()

@@ -42,6 +42,8 @@ from .jobs.calibration import CalibrationOutcome, adjust, run_calibration
 from .jobs.conversion import ConversionRequest, convert
 from .jobs.extraction import ExtractionOutcome, ExtractionRequest
 from .jobs.extraction import run_extraction as extract
+from .jobs.healing import HealingOptions, HealingOutcome, heal_rig
+from .jobs.healing_folder import save_healing
 from .jobs.orientation import OrientationOutcome, orient
 from .jobs.reconstruction import ReconstructionOptions, ReconstructionOutcome, reconstruct
 from .jobs.result_folder import save_outcome, save_result
@@ -76,6 +78,8 @@ __all__ = [
     'Finding',
     'FluoroscopeCalibration',
     'Frame',
+    'HealingOptions',
+    'HealingOutcome',
     'Joint',
     'JointEntry',
     'JointMotion',
@@ -102,6 +106,7 @@ __all__ = [
     'convert',
     'correct',
     'extract',
+    'heal_rig',
     'load_orientation',
     'orient',
     'read_bodies',
@@ -116,6 +121,7 @@ __all__ = [
     'reconstruct',
     'run_calibration',
     'save_bodies',
+    'save_healing',
     'save_orientation',
     'save_outcome',
     'save_result',

@@ -18,6 +18,7 @@ import pytest
 from rigs import calibrated, exposures, rig, small_network, true_calibrations, true_orientation
 
 from fluoro_calib_ros.bodies.body import Body
+from fluoro_calib_ros.bodies.healing import Cause, Change
 from fluoro_calib_ros.bodies.shapes import BodyPlaces, _stability, _unseen, estimate_shape
 from fluoro_calib_ros.checks import given_interior, inputs, mixed_units
 from fluoro_calib_ros.checks import held_out as held_fit
@@ -50,10 +51,10 @@ from fluoro_calib_ros.images.marker_watch import doubt_in
 from fluoro_calib_ros.io.formats import registry
 from fluoro_calib_ros.io.formats.content import FileSettings
 from fluoro_calib_ros.io.result_check import edited, exchanged
+from fluoro_calib_ros.jobs import healing, result_folder
 from fluoro_calib_ros.jobs import orientation as orienting
 from fluoro_calib_ros.jobs import reconstruction as reconstructing
 from fluoro_calib_ros.jobs import report as comparing
-from fluoro_calib_ros.jobs import result_folder
 from fluoro_calib_ros.jobs.calibration import _without_copies, _without_shared
 from fluoro_calib_ros.jobs.live_markers import MarkerFollower, _wrong_start
 from fluoro_calib_ros.jobs.sources import read_content
@@ -334,6 +335,26 @@ def wrong_format():
         return raised(read_content, 'cam.csv', FileSettings(), 'survey', 'phantom')
 
 
+HEALED = Fake(orientation=Fake(fluoroscopes=('a', 'b')), bodies=())
+
+
+def changed_rig(cause):
+    """Diagnosis of a rig with a changed fluoroscope a, or perhaps a moved b."""
+    rival = Change(Cause.ORIENTATION, fluoroscope=1)
+    return Fake(changes=(Change(cause, fluoroscope=0),), probability=(0.7,), rivals=(rival,))
+
+
+def changed(cause):
+    """Finding about fluoroscope a."""
+    diagnosis = changed_rig(cause)
+    return healing._finding(diagnosis.changes[0], HEALED, diagnosis)
+
+
+def unsure_cause():
+    """Check of a diagnosis with a rival."""
+    return healing._sure(changed_rig(Cause.INTERIOR), HEALED)
+
+
 MAKERS = {
     Kind.DATA: lambda: DataError('the file is empty', at='phantom.csv').finding,
     **{
@@ -491,6 +512,12 @@ MAKERS = {
     Kind.MARKER_LOOSE: lambda: shape(moves=0.5),
     Kind.MARKER_MIGRATED: lambda: shape(lambda given: given + np.eye(5, 3)),
     Kind.MARKERS_EXCHANGED: lambda: shape(lambda given: given[[1, 0, 2, 3, 4]]),
+    Kind.CAUSE_SURE: unsure_cause,
+    Kind.CHANGE_IDENTIFIED: lambda: healing._identified(Fake(weakest=0.7)),
+    Kind.DISTORTION_CHANGED: lambda: changed(Cause.DISTORTION),
+    Kind.FLUOROSCOPE_MOVED: lambda: changed(Cause.ORIENTATION),
+    Kind.INTERIOR_CHANGED: lambda: changed(Cause.INTERIOR),
+    Kind.UNUSED_EXPOSURES: lambda: healing._unused(changed_rig(Cause.INTERIOR), 1, HEALED),
     Kind.NO_MARKERS: lambda: state(0, 0),
     Kind.OTHER_VIEW_MISSING: other_view_missing,
     Kind.NOT_WATCHED: lambda: (
@@ -822,6 +849,25 @@ SENTENCES = {
         'it has migrated, or is another one'
     ),
     Kind.MARKERS_EXCHANGED: 'body femur: markers # and # are exchanged in CT or in the images',
+    Kind.CAUSE_SURE: (
+        'fluoroscope a: source and detector have moved against each other; or fluoroscope b: it '
+        'has moved against the other fluoroscope, or that one against it; the recording does not '
+        'tell which: record more motion, or calibrate with the phantom'
+    ),
+    Kind.CHANGE_IDENTIFIED: (
+        'the direction of the change that is known worst has a standard deviation of # % of what '
+        'such a change may be: record bodies that move through more of the field of view'
+    ),
+    Kind.DISTORTION_CHANGED: 'fluoroscope a: the distortion has changed',
+    Kind.FLUOROSCOPE_MOVED: (
+        'fluoroscope a: it has moved against the other fluoroscope, or that one against it'
+    ),
+    Kind.INTERIOR_CHANGED: 'fluoroscope a: source and detector have moved against each other',
+    Kind.UNUSED_EXPOSURES: (
+        'the first half of the exposures that were not used: fluoroscope a: source and detector '
+        'have moved against each other: the rig changes while it is recorded: take another '
+        'recording, or calibrate with the phantom'
+    ),
     Kind.NO_MARKERS: 'no markers were seen',
     Kind.OTHER_VIEW_MISSING: 'the other view is missing',
     Kind.NOT_WATCHED: (

@@ -44,6 +44,7 @@ LAST_STEP = 1e-2
 # Of a drift of the distortion: degree of the polynomials, half waves along the longer side.
 DRIFT_DEGREE = 3
 DRIFT_MODES = 4
+MAX_NOISE_PX = 10.0  # of image points that are no false matches
 LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one where it is
 _EYE_6 = np.eye(POSE_SIZE)
 
@@ -266,15 +267,15 @@ class RigAdjustment:
             interior=self.orientation.interior + change[:, 6:],
         )
 
-    def functions_at(self, observed: ObservedBodies) -> NDArray[np.float64]:
-        """Return the functions (T, B, M, F, n) of a drift at the observed pixels."""
-        pixel = np.where(observed.seen[..., None], observed.pixel, 0.0)
+    def functions_at(self, pixel: np.ndarray) -> NDArray[np.float64]:
+        """Return the functions (..., F, n) of a drift at pixels (..., F, 2)."""
+        shape = pixel.shape[:-2]
         return np.stack(
             [
-                functions(pixel[..., f, :].reshape(-1, 2)).reshape(*observed.seen.shape[:3], -1)
+                functions(pixel[..., f, :].reshape(-1, 2)).reshape(*shape, -1)
                 for f, functions in enumerate(self.functions)
             ],
-            axis=3,
+            axis=-2,
         )
 
     def drift_at(self, values: np.ndarray) -> NDArray[np.float64]:
@@ -466,9 +467,15 @@ class _Linear:
         turned = values[adjustment.rig].reshape(-1, ORIENTATION_SIZE)[:, 3:6]
         by_orientation[..., 3:6] = by_orientation[..., 3:6] @ _by_vector(turned)
         predicted = linear.uv.reshape(*grid, 2)
-        functions = adjustment.functions_at(observed)
-        drift = np.einsum('tbmfn,fan->tbmfa', functions, adjustment.drift_at(values))
-        residual = linear.residual.reshape(*grid, 2) - np.where(good[..., None], drift, 0.0)
+        residual = linear.residual.reshape(*grid, 2)
+        coefficients = adjustment.drift_at(values)
+        # The drift where the model has the image point: at the observed pixel, which has noise, a
+        # drift that shrinks the image would shrink the noise, too, and be preferred for it.
+        pixel = np.where(good[..., None], observed.pixel, 0.0)
+        drift = _drift(adjustment.functions_at(pixel), coefficients)
+        noise = np.clip(residual - drift, -MAX_NOISE_PX, MAX_NOISE_PX)
+        functions = adjustment.functions_at(pixel - np.where(good[..., None], noise, 0.0))
+        residual = residual - np.where(good[..., None], _drift(functions, coefficients), 0.0)
         return cls(
             residual,
             linear.by_place.reshape(*grid, 2, 3),
@@ -483,6 +490,11 @@ class _Linear:
     def by_pose(self, row: int) -> np.ndarray:
         """Derivatives (T, M, F, 2, 6) of the image points of a body by its pose."""
         return self.by_place[:, row] @ self.place_by_pose[:, row, :, None]
+
+
+def _drift(functions: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Drift (T, B, M, F, 2) of functions (T, B, M, F, n) with coefficients (F, 2, n)."""
+    return np.asarray((coefficients @ functions[..., None])[..., 0])
 
 
 @dataclass(frozen=True)

@@ -118,6 +118,7 @@ def test_healthy_rig_has_not_changed():
     assert found.noise < 1.1
 
 
+@pytest.mark.long
 def test_moved_fluoroscope_is_found_and_estimated_with_its_deviations():
     """Over rigs: the change of b is what was done to it, as its covariance claims."""
     squares = []
@@ -145,6 +146,7 @@ def test_moved_fluoroscope_is_found_and_estimated_with_its_deviations():
     assert 13 < np.sum(squares) < 54
 
 
+@pytest.mark.long
 @pytest.mark.parametrize('view', [0, 1])
 def test_changed_interior_is_told_from_a_moved_fluoroscope(view):
     scene = Scene(20 + view)
@@ -154,6 +156,7 @@ def test_changed_interior_is_told_from_a_moved_fluoroscope(view):
     assert (found.changes[0].cause, found.changes[0].fluoroscope) == (Cause.INTERIOR, view)
 
 
+@pytest.mark.long
 def test_markers_and_bodies_that_have_changed_are_named():
     scene = Scene(30)
     scene.shapes[1, 2] += [0.3, -0.3, 0.3]
@@ -172,6 +175,7 @@ def test_markers_and_bodies_that_have_changed_are_named():
     assert [(o.cause, o.body, o.markers) for o in found.changes] == [(Cause.EXCHANGED, 1, (0, 4))]
 
 
+@pytest.mark.long
 def test_errors_of_points_by_the_rig_are_those_of_random_rigs():
     """Scale and places of points that random errors of the rig move, by a Monte Carlo run."""
     scene = Scene(40)

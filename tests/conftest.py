@@ -25,7 +25,21 @@ SHARING = (
     'tests/estimation/test_orientation.py',
     'tests/estimation/test_grid.py',
     'tests/images/test_undistortion.py',
+    'tests/estimation/test_collocation.py',
     'tests/checks/test_validation.py',
+)
+# Other files that take more than 20 s of CPU time. Short files fill the gaps at the end.
+LENGTHY = (
+    'tests/estimation/test_survey.py',
+    'tests/report/test_experiment.py',
+    'tests/test_lint.py',
+    'tests/checks/test_wrong_input.py',
+    'tests/io/test_documents.py',
+    'tests/cli/test_cli.py',
+    'tests/reconstruction/test_reconstruct_recording.py',
+    'tests/checks/test_confused_recordings.py',
+    'tests/jobs/test_scheduling.py',
+    'tests/report/test_report.py',
 )
 
 if LoadFileScheduling is not None:
@@ -54,7 +68,7 @@ if LoadFileScheduling is not None:
 
         def _assign_work_unit(self, node) -> None:
             """Begin with what takes longest."""
-            for scope in reversed((*ROS, SHARING[0])):
+            for scope in reversed((*ROS, SHARING[0], *LENGTHY)):
                 if scope in self.workqueue:
                     self.workqueue.move_to_end(scope, last=False)
             super()._assign_work_unit(node)

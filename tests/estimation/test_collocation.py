@@ -834,10 +834,12 @@ def error_with_known_distortion():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize('model, most', [('auto', 1.1), ('hybrid', 1.15), ('parametric', 1.8)])
-def test_out_of_sample_error_is_near_that_of_known_distortion(model, most):
+@pytest.mark.parametrize(
+    'options, most', [({}, 1.1), ({'model': 'hybrid'}, 1.15), ({'model': 'parametric'}, 1.8)]
+)
+def test_out_of_sample_error_is_near_that_of_known_distortion(options, most):
     """40 unused exposures: 3-D error of the object points relative to known distortion."""
-    found = point_error(unused().frames['a'], rigs.calibrated('a', model=model))
+    found = point_error(unused().frames['a'], rigs.calibrated('a', **options))
     assert found < most * error_with_known_distortion()
 
 
@@ -851,7 +853,7 @@ def test_errors_agree_with_standard_deviations():
     """
     from benchmarks.precision import normalised
 
-    results = [normalised(seed, exposures=10) for seed in range(4)]
+    results = [normalised(seed, exposures=10) for seed in range(3)]
     assert 0.9 < np.mean([r['object points'] for r in results]) < 1.1
     assert (
         0.3 < np.mean([r['T'] for r in results]) < 2.5

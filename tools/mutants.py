@@ -52,6 +52,7 @@ SWAPPED: dict[type, type] = {
     ast.Or: ast.And,
 }
 NAMES = {'min': 'max', 'max': 'min', 'argmin': 'argmax', 'argmax': 'argmin', 'sin': 'cos'}
+COMMUTATIVE = ('min', 'max', 'minimum', 'maximum', 'hypot', 'allclose', 'array_equal')
 LEAVING = (ast.Raise, ast.Return, ast.Continue)
 
 
@@ -98,7 +99,9 @@ def bugs_of(node: ast.AST) -> Iterator[tuple[str, ast.AST, ast.AST]]:
         elif node.attr in NAMES:
             yield 'function', node, changed(attr=NAMES[node.attr])
     elif isinstance(node, ast.Call) and len(node.args) >= 2:
-        if not any(isinstance(a, (ast.Starred, ast.GeneratorExp)) for a in node.args):
+        name = ast.unparse(node.func).split('.')[-1]
+        starred = any(isinstance(a, (ast.Starred, ast.GeneratorExp)) for a in node.args)
+        if name not in COMMUTATIVE and not starred:
             first, second, *others = node.args
             yield 'arguments', node, changed(args=[second, first, *others])
     elif isinstance(node, ast.If) and not node.orelse and isinstance(node.body[-1], LEAVING):
@@ -299,7 +302,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     candidates: dict[str, list[Bug]] = defaultdict(list)
     for file, lines in recorded['lines'].items():
         executed = {int(line) for line, tests in lines.items() if tests}
-        if executed and (ROOT / file).exists():
+        if executed and file.endswith('.py') and (ROOT / file).exists():
             candidates[room_of(file)] += bugs_in(ROOT / file, executed)
     os.environ['PYTHONDONTWRITEBYTECODE'] = '1'
     sys.dont_write_bytecode = True

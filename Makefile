@@ -2,7 +2,7 @@
 
 SHELL := /bin/sh
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test oldest lint docs fuzz lock audit bench online endurance validation precision convergence pathologies real-data bags bag-readers faults clean
+.PHONY: help setup demo test oldest lint docs fuzz lock audit bench online endurance validation precision convergence pathologies real-data bags bag-readers faults mutants clean
 .NOTPARALLEL:
 
 RUN := .venv/bin/python
@@ -33,6 +33,7 @@ help:
 	@echo 'make bags         regenerate the bags in bags/'
 	@echo 'make bag-readers  read bags of all kinds with mcap, rosbags and the npm packages of Foxglove (needs npm)'
 	@echo 'make faults       kill, interrupt and cut off programs, damage bags, join hosts: docs/reliability.md (2 h)'
+	@echo 'make mutants      put single bugs into the code and count those that the quick tests catch, by room (1 h)'
 	@echo 'make clean        delete .venv, .build and caches'
 	@echo
 	@echo 'PYTHON=python3.12 make setup        selects the Python version (3.10 to 3.13)'
@@ -112,6 +113,9 @@ bag-readers: setup
 
 faults: setup
 	@$(RUN) -m benchmarks.faults $(ARGS)
+
+mutants: setup
+	@$(RUN) -m tools.mutants $(ARGS)
 
 clean:
 	rm -rf .venv .oldest .fuzz .audit .build demo_result .pytest_cache .mypy_cache .ruff_cache docs/_build *.egg-info

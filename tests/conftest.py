@@ -19,13 +19,32 @@ for _name in ('OMP_NUM_THREADS', 'OPENBLAS_NUM_THREADS'):
     os.environ.setdefault(_name, '1')
 
 ROS = ('tests/ros 1', 'tests/ros 2')
-# Files whose tests share the calibrations of tests/rigs.py, so that one worker makes them once.
+# Files whose tests share the calibrations of tests/rigs.py or tests/turning_rig.py, so that one
+# worker makes them once.
 SHARING = (
     'tests/estimation/test_calibration.py',
     'tests/estimation/test_orientation.py',
     'tests/estimation/test_grid.py',
     'tests/images/test_undistortion.py',
+    'tests/estimation/test_collocation.py',
+    'tests/estimation/test_local_signal.py',
+    'tests/estimation/test_angle_field.py',
+    'tests/images/test_angle_maps.py',
+    'tests/checks/test_turning.py',
     'tests/checks/test_validation.py',
+)
+# Other files that take more than 20 s of CPU time. Short files fill the gaps at the end.
+LENGTHY = (
+    'tests/estimation/test_survey.py',
+    'tests/report/test_experiment.py',
+    'tests/test_lint.py',
+    'tests/checks/test_wrong_input.py',
+    'tests/cli/test_examples.py',
+    'tests/cli/test_cli.py',
+    'tests/reconstruction/test_reconstruct_recording.py',
+    'tests/checks/test_confused_recordings.py',
+    'tests/jobs/test_scheduling.py',
+    'tests/report/test_report.py',
 )
 
 if LoadFileScheduling is not None:
@@ -54,7 +73,7 @@ if LoadFileScheduling is not None:
 
         def _assign_work_unit(self, node) -> None:
             """Begin with what takes longest."""
-            for scope in reversed((*ROS, SHARING[0])):
+            for scope in reversed((*ROS, SHARING[0], *LENGTHY)):
                 if scope in self.workqueue:
                     self.workqueue.move_to_end(scope, last=False)
             super()._assign_work_unit(node)

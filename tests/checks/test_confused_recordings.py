@@ -15,6 +15,8 @@ import numpy as np
 import pytest
 from rigs import calibrated, kinds, refused, run, true_calibrations, true_orientation, turning
 
+from fluoro_calib_ros.checks import verdict as verdict_module
+from fluoro_calib_ros.checks.precision import PRECISION
 from fluoro_calib_ros.checks.rig import RigFindings, check_rig, rig_findings
 from fluoro_calib_ros.checks.rigidity import doubtful
 from fluoro_calib_ros.errors import DataError
@@ -525,6 +527,8 @@ def test_what_is_doubtful_about_the_rig_stays_with_the_result(
     change, sentence, verdict, tmp_path, capsys, monkeypatch
 ):
     monkeypatch.setattr(html_report, '_base64', lambda figure: '')
+    if change:  # a good rig passes every check; here those of the rig matter
+        monkeypatch.setattr(verdict_module, 'SUBJECTS', (PRECISION,))
     write_phantom(tmp_path / 'phantom.csv', rig().phantom)
     source = tmp_path / 'observations.csv'
     write_observations_csv(source, seen(rig(), change))

@@ -10,6 +10,8 @@ import pytest
 from rigs import rig
 from turning_rig import recording, turning
 
+from fluoro_calib_ros.checks import verdict as verdict_module
+from fluoro_calib_ros.checks.exposure_variation import VARIATION
 from fluoro_calib_ros.checks.verdict import validate
 from fluoro_calib_ros.estimation.options import CalibrationRequest
 from fluoro_calib_ros.findings import Kind
@@ -29,7 +31,8 @@ def test_calibration_with_known_angles_passes():
 
 
 @pytest.mark.long
-def test_calibration_with_unknown_angles_fails_and_is_told_to_give_them():
+def test_calibration_with_unknown_angles_fails_and_is_told_to_give_them(monkeypatch):
+    monkeypatch.setattr(verdict_module, 'SUBJECTS', (VARIATION,))
     found = verdict(known=False)
     assert found.verdict == 'fail'
     (check,) = [check for check in found.findings if check.kind is Kind.VARIATION]
@@ -44,7 +47,8 @@ def test_calibration_with_unknown_angles_fails_and_is_told_to_give_them():
         (lambda angles: np.roll(angles, 1), 'angles of the C-arm that are not those of these'),
     ],
 )
-def test_wrong_angles_fail_with_their_cause(change, cause):
+def test_wrong_angles_fail_with_their_cause(change, cause, monkeypatch):
+    monkeypatch.setattr(verdict_module, 'SUBJECTS', (VARIATION,))
     frames = recording(True)[0]
     angles = change(np.array([frame.angle for frame in frames]))
     wrong = [replace(frame, angle=float(angle)) for frame, angle in zip(frames, angles)]

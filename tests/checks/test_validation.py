@@ -26,6 +26,7 @@ from fluoro_calib_ros.checks.calibration_evidence import Evidence, Subject
 from fluoro_calib_ros.checks.check import Check, Validation, verdict_of
 from fluoro_calib_ros.checks.comparison import difference, orientation_fields, place_name
 from fluoro_calib_ros.checks.given_interior import REPAIR_FIRST
+from fluoro_calib_ros.checks.precision import PRECISION
 from fluoro_calib_ros.checks.residual_tests import (
     FALSE_ALARM,
     Residuals,
@@ -35,6 +36,7 @@ from fluoro_calib_ros.checks.residual_tests import (
     rejected_trend,
     residuals_of,
 )
+from fluoro_calib_ros.checks.residual_trends import TRENDS
 from fluoro_calib_ros.checks.verdict import validate, validate_or_report
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.estimation.calibrate import (
@@ -49,6 +51,8 @@ from fluoro_calib_ros.io.calibration import load_calibrations, save_calibration
 from fluoro_calib_ros.io.calibration_request import read_request, write_request
 from fluoro_calib_ros.io.result_document import validation_document
 from fluoro_calib_ros.report.verdict import verdict_text
+from fluoro_calib_ros.simulation.exposures import simulate_exposures
+from fluoro_calib_ros.simulation.rig import virtual_rig
 
 pytestmark = pytest.mark.long
 
@@ -97,14 +101,17 @@ def verdict(fault='', **options):
 
 
 @functools.cache
-def weighted(error, sd):
-    """Validation with a given principal distance that is off by a share of it."""
-    options = CalibrationOptions(model='parametric', interior_sd=(sd, sd, sd))
-    shown = calibrated('a', model='parametric').calibrations['a'].interior
+def weighted(error, sd, strength=0.1):
+    """Validation with a given principal distance that is off by a share of it.
+
+    strength: of the distortion, which is not corrected.
+    """
+    of_rig = virtual_rig(1, names=('a',), strength=strength)
+    frames = simulate_exposures(of_rig, 10, 1).frames
+    options = CalibrationOptions(model='none', interior_sd=(sd, sd, sd))
+    shown = of_rig.fluoroscopes[0].interior
     distance = (1 + error) * shown[2]
-    request = CalibrationRequest(
-        {'a': exposures()['a']}, rig().phantom, options, principal_distance=distance
-    )
+    request = CalibrationRequest(frames, of_rig.phantom, options, principal_distance=distance)
     return validate(request, calibrate_request(request).calibrations), shown
 
 
@@ -118,11 +125,19 @@ def test_a_given_principal_distance_that_the_exposures_contradict_is_the_first_f
     assert all(check.advice == REPAIR_FIRST for check in others)
 
 
-def test_a_weak_given_interior_orientation_is_not_accused():
+def test_a_contradicted_principal_distance_fails_where_the_noise_takes_its_misfit_up():
+    """A distance off by 5 % is 3 times the noise, which is estimated, so no other check fails."""
+    validation, shown = weighted(0.05, 1.0, strength=0.0)
+    (found,) = validation.findings
+    assert validation.verdict == 'fail' and found.kind is Kind.GIVEN_INTERIOR
+    assert abs(found.numbers['c_px'] - shown[2]) < 10
+
+
+@pytest.mark.parametrize('error', [0.0, 0.05])
+def test_a_weak_given_interior_orientation_is_not_accused(error):
     """The exposures overrule it."""
-    for error in (0.0, 0.05):
-        validation, _ = weighted(error, 200.0)
-        assert 'given_interior' not in [check.name for check in validation.checks]
+    validation, _ = weighted(error, 200.0)
+    assert 'given_interior' not in [check.name for check in validation.checks]
 
 
 def failed(validation):
@@ -221,7 +236,8 @@ def test_rejected_points_of_an_exposure_that_agree_are_no_false_matches():
     assert np.mean([one.agreement > one.limit for one in false]) < 0.02
 
 
-def test_changing_distortion_fails_with_its_place():
+def test_changing_distortion_fails_with_its_place(monkeypatch):
+    monkeypatch.setattr(verdict_module, 'SUBJECTS', (TRENDS,))
     found = verdict('drift')
     drift = next(check for check in found.checks if check.kind is Kind.DRIFT)
     assert found.verdict == 'fail' and drift.passed is False
@@ -241,7 +257,7 @@ def test_too_few_exposures_for_halves():
 
 
 def test_joint_validation_reports_progress_and_can_be_cancelled():
-    options = CalibrationOptions(max_iterations=2)
+    options = CalibrationOptions(model='none')
     frames = {n: f[:6] for n, f in exposures().items()}
     job = calibrate(frames, rig().phantom, options, joint=True)
     steps = []
@@ -743,27 +759,31 @@ def test_table_fits_a_terminal_and_gives_advice():
     json.dumps(validation_document(Validation('fail', checks[:1], {'a': 'x'}, 1.0)))
 
 
-def test_imprecise_correction_does_not_pass():
+def test_imprecise_correction_does_not_pass(monkeypatch):
     """A neighbour model that follows the noise: 50 % larger errors than with known distortion."""
+    monkeypatch.setattr(verdict_module, 'SUBJECTS', (PRECISION,))
     few_rounds = {'model': 'knn', 'max_iterations': 4}
     job = calibrated(count=8, **few_rounds)
     request = CalibrationRequest(
         {'a': exposures()['a'][:8]}, rig().phantom, CalibrationOptions(**few_rounds)
     )
     verdict = validate(request, job.calibrations)
-    (check,) = [c for c in verdict.checks if c.kind is Kind.PRECISION]
+    (check,) = verdict.checks
+    assert check.kind is Kind.PRECISION
     assert verdict.verdict == 'fail' and not check.passed and check.value > check.limit
     assert check.numbers['exposures'] == 8
     assert check.numbers['sd_px'] / check.numbers['noise_px'] == pytest.approx(check.value)
 
 
-def test_model_that_does_not_follow_the_distortion_is_named():
+def test_model_that_does_not_follow_the_distortion_is_named(monkeypatch):
     """Its misfit is no noise of the image, beside which a correction would seem precise."""
+    monkeypatch.setattr(verdict_module, 'SUBJECTS', (PRECISION,))
     job = calibrated('a', model='parametric')
     request = CalibrationRequest(
         {'a': exposures()['a']}, rig().phantom, CalibrationOptions(model='parametric')
     )
     verdict = validate(request, job.calibrations)
-    (check,) = [c for c in verdict.checks if c.kind is Kind.PRECISION]
+    (check,) = verdict.checks
+    assert check.kind is Kind.PRECISION
     assert not check.passed
     assert 'choose another model (--model auto)' in check.advice

@@ -3,6 +3,7 @@
 
 """The command fluoro-calib: its files, its output, and its error messages."""
 
+import argparse
 import csv
 import filecmp
 import html
@@ -233,7 +234,7 @@ def test_calibrate_writes_result_and_calibrations(result):
 @pytest.mark.long
 def test_bag_and_csv_give_the_same_numbers(rig, tmp_path):
     """To the last digit, also in a process of its own with two threads."""
-    more = ('--max-iterations', 1, '--fluoroscopes', 'a')
+    more = ('--max-iterations', 1, '--fluoroscopes', 'a', '--model', 'local_linear')
     assert run(*calibrate(rig, tmp_path / 'bag', *more)) == 0
     assert run(*calibrate(rig, tmp_path / 'csv', *more, *IMAGE, source='calibration.csv')) == 0
     done = command(
@@ -662,6 +663,40 @@ def test_calibrate_ends_with_verdict_and_report(rig, tmp_path, capsys):
     assert report == f'Report: {tmp_path / "new" / "report.html"}'
     text = (tmp_path / 'new' / 'report.html').read_text()
     assert found['findings'][0].split(';')[0] in html.unescape(text)
+
+
+def numbers_of(command):
+    """Arguments of a command that take one number."""
+    parser = argparse.ArgumentParser()
+    command.add_arguments(parser)
+    for action in parser._actions:
+        if getattr(action.type, '__qualname__', '').startswith('number_in'):
+            yield action
+
+
+@pytest.mark.parametrize('command', COMMANDS, ids=lambda command: command.NAME)
+def test_numbers_of_a_command_have_a_range(command):
+    """Each takes an ordinary number and its own default; neither NaN nor what is far off."""
+    for action in numbers_of(command):
+
+        def is_taken(text, action=action):
+            try:
+                action.type(text)
+            except argparse.ArgumentTypeError:
+                return False
+            return True
+
+        assert any(map(is_taken, ('0.5', '1', '5', '100', '4000'))), action.dest
+        assert not any(map(is_taken, ('nan', 'x', '-1e30', '1e30'))), action.dest
+        if action.default:  # 0 stands for what is not given
+            assert is_taken(str(action.default)), action.dest
+
+
+def test_the_arguments_of_the_process_are_those_of_the_command(monkeypatch, capsys):
+    monkeypatch.setattr(sys, 'argv', ['fluoro-calib', '--version'])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0 and 'fluoro_calib_ros' in capsys.readouterr().out
 
 
 def test_version(capsys):

@@ -12,6 +12,7 @@ import pytest
 from fluoro_calib_ros.cli import COMMANDS, main, make_parser
 from fluoro_calib_ros.cli.arguments import angle_options
 from fluoro_calib_ros.cli.output import styled
+from fluoro_calib_ros.cli.rig import find_rig
 from fluoro_calib_ros.errors import DataError
 from fluoro_calib_ros.io.rig_file import RigFile, read_rig_file
 
@@ -55,6 +56,13 @@ def test_rig_file_makes_flags_unnecessary(rig, tmp_path):
     flags = ['calibrate', 'points.csv', '--out', 'x', '--fluoroscopes', 'c']
     arguments = parsed(flags, content)
     assert arguments.out == Path('x') and arguments.fluoroscopes == ['c']
+
+
+def test_a_rig_file_is_read_by_commands_that_use_it_only(rig, monkeypatch):
+    monkeypatch.chdir(rig('no = rig').parent)
+    assert find_rig(['simulate', '--out', 'x'], 'simulate') is None
+    with pytest.raises(DataError):
+        find_rig(['calibrate', 'points.csv'], 'calibrate')
 
 
 READ_A_BAG = {

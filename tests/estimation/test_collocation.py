@@ -5,6 +5,7 @@
 terms, auto.
 """
 
+import functools
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -480,7 +481,8 @@ def test_dent_whose_image_points_look_like_false_matches_is_followed():
         return np.exp(-square / (2 * 35.0**2)) * [3.0, 5.1]
 
     frames = [replace(f, uv=f.uv + dent(f.uv)) for f in rigs.exposures()['a']]
-    run = calibrate({'a': frames}, rigs.rig().phantom).runs['a']
+    options = CalibrationOptions('collocation')
+    run = calibrate({'a': frames}, rigs.rig().phantom, options).runs['a']
     near = np.linalg.norm(run.measured.network.uv - middle, axis=1) < 70
     assert near.sum() > 40
     assert run.after.inliers[near].mean() > 0.97
@@ -805,31 +807,40 @@ def test_auto_selects_collocation_unless_cross_validation_is_worse():
     assert better_model(bent, state) != 'parametric'
 
 
-@pytest.mark.long
-@pytest.mark.parametrize('model, most', [('auto', 1.1), ('hybrid', 1.15), ('parametric', 1.8)])
-def test_out_of_sample_error_is_near_that_of_known_distortion(model, most):
-    """40 unused exposures: 3-D error of the object points relative to known distortion."""
+@functools.cache
+def unused():
+    """Exposures with which nothing is calibrated."""
+    return simulate_exposures(rigs.rig(), 40, 10**6, start=StreamStart(number=1001))
+
+
+def point_error(frames, job):
+    """3-D error [mm] of the object points of exposures of a with a calibration."""
     rig = rigs.rig()
-    test = simulate_exposures(rig, 40, 10**6, start=StreamStart(number=1001))
-    train = simulate_exposures(rig, 15, 1)
+    found = adjust_with_calibrations({'a': frames}, rig.phantom, job.calibrations).targets
+    off = found.xyz_mm - rig.true_mm[found.target_id - 1]
+    return np.sqrt(np.mean(np.sum(off**2, axis=1)))
 
-    def error(frames, tested, options):
-        job = adjust_with_calibrations(
-            {'a': tested}, rig.phantom, calibrate({'a': frames}, rig.phantom, options).calibrations
-        )
-        return np.sqrt(
-            np.mean(
-                np.sum((job.targets.xyz_mm - rig.true_mm[job.targets.target_id - 1]) ** 2, axis=1)
-            )
-        )
 
-    def undistorted(exposures):
-        return [
-            replace(f, uv=uv) for f, uv in zip(exposures.frames['a'], exposures.undistorted['a'])
-        ]
+@functools.cache
+def error_with_known_distortion():
+    """The error of the unused exposures where their distortion is known."""
 
-    known = error(undistorted(train), undistorted(test), CalibrationOptions('none'))
-    assert error(train.frames['a'], test.frames['a'], CalibrationOptions(model)) < most * known
+    def undistorted(seen):
+        return [replace(f, uv=uv) for f, uv in zip(seen.frames['a'], seen.undistorted['a'])]
+
+    train = undistorted(simulate_exposures(rigs.rig(), 15, 1))
+    job = calibrate({'a': train}, rigs.rig().phantom, CalibrationOptions('none'))
+    return point_error(undistorted(unused()), job)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    'options, most', [({}, 1.1), ({'model': 'hybrid'}, 1.15), ({'model': 'parametric'}, 1.8)]
+)
+def test_out_of_sample_error_is_near_that_of_known_distortion(options, most):
+    """40 unused exposures: 3-D error of the object points relative to known distortion."""
+    found = point_error(unused().frames['a'], rigs.calibrated('a', **options))
+    assert found < most * error_with_known_distortion()
 
 
 # ---- smaller versions of the long runs
@@ -842,7 +853,7 @@ def test_errors_agree_with_standard_deviations():
     """
     from benchmarks.precision import normalised
 
-    results = [normalised(seed, exposures=10) for seed in range(4)]
+    results = [normalised(seed, exposures=10) for seed in range(3)]
     assert 0.9 < np.mean([r['object points'] for r in results]) < 1.1
     assert (
         0.3 < np.mean([r['T'] for r in results]) < 2.5
@@ -853,7 +864,7 @@ def test_errors_agree_with_standard_deviations():
 
 
 @pytest.mark.long
-@pytest.mark.parametrize('seed', [5001, 5003, 5008])
+@pytest.mark.parametrize('seed', [5001, 5008])
 def test_random_rigs_converge_to_the_right_answer(seed):
     """Some cases of `make convergence`."""
     from benchmarks.convergence import outcome

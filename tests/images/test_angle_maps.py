@@ -160,7 +160,7 @@ def test_map_of_an_image_of_any_size(size, worst):
 
 
 @pytest.mark.long
-@pytest.mark.parametrize('size, size_px', [((5, 9), 0.4), ((40, 30), 100.0)])
+@pytest.mark.parametrize('size, size_px', [((5, 9), 0.4), ((20, 15), 50.0)])
 def test_change_as_large_as_the_image_leaves_it_empty(size, size_px):
     corrector = AngleMaps(rigs.turning(rigs.pincushion('a', size), size_px=size_px)).at(0.6)
     assert corrector.correct(np.full(size[::-1], 9, np.uint8)).shape == size[::-1]

@@ -3,6 +3,8 @@
 
 """Parameters: declared once, and the same in the nodes, in config/ and in docs/."""
 
+import dataclasses
+import sys
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
@@ -16,8 +18,11 @@ from rclpy.parameter import Parameter
 from fluoro_calib_ros.estimation.options import CalibrationOptions
 from fluoro_calib_ros.nodes.runtime.logging import StartError
 from fluoro_calib_ros.nodes.runtime.parameters import (
+    MAX_INTEGER,
+    MAX_TIMEOUT_S,
     ParameterGroup,
     ParameterNode,
+    check_timeout,
     descriptor_of,
     parameters_of,
 )
@@ -76,6 +81,29 @@ def test_every_parameter_is_described(node):
         )
         assert bool(descriptor.integer_range or descriptor.floating_point_range) == number
         assert all(choice in descriptor.additional_constraints for choice in declaration.choices)
+
+
+def test_a_range_that_is_open_on_one_side_reaches_as_far_as_the_type():
+    largest = sys.float_info.max
+    for option_of, low, high in (
+        (option(2, 'count', minimum=1), 1, MAX_INTEGER),
+        (option(2, 'count', maximum=9), -MAX_INTEGER, 9),
+        (option(2.0, 'length', minimum=1.0), 1.0, largest),
+        (option(2.0, 'length', maximum=9.0), -largest, 9.0),
+    ):
+        one = dataclasses.make_dataclass('One', [('x', type(option_of.default), option_of)])
+        descriptor = descriptor_of(declared(one)['x'])
+        (found,) = [*descriptor.integer_range, *descriptor.floating_point_range]
+        assert (found.from_value, found.to_value) == (low, high)
+        assert bool(descriptor.integer_range) == isinstance(low, int)
+
+
+def test_times_that_a_node_cannot_wait_are_refused():
+    check_timeout(1e-3)
+    check_timeout(MAX_TIMEOUT_S)
+    for wrong in (0.0, -1.0, float('nan'), 1.001 * MAX_TIMEOUT_S, float('inf')):
+        with pytest.raises(ValueError, match='timeout_sec is a time in seconds'):
+            check_timeout(wrong)
 
 
 # ---- declaring them

@@ -15,6 +15,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import Enum
 from itertools import combinations
+from math import comb
 
 import numpy as np
 from numpy.typing import NDArray
@@ -136,6 +137,8 @@ class Diagnostician:
         self._markers = [
             (row, marker) for row, body in enumerate(bodies) for marker in range(len(body.sd_mm))
         ]
+        pairs = sum(comb(len(body.sd_mm), 2) for body in bodies)
+        self._causes = len(self._of_rig()) + 2 * len(self._markers) + len(bodies) + pairs
 
     def diagnose(self, observed: ObservedBodies, poses: Poses) -> Diagnosis:
         """Say what has changed, from first poses of the bodies."""
@@ -149,7 +152,7 @@ class Diagnostician:
         rest = 1.0
         while len(best.changes) < MAX_CAUSES:
             tried = self._tried(best, poses)
-            chances = _probabilities([best, *tried])
+            chances = _probabilities([best, *tried], self._causes)
             rest = float(chances[0])
             if rest > 1 - SURE:
                 break
@@ -322,7 +325,7 @@ def _noise(solution: RigSolution) -> float:
     return float(np.sqrt(max(1.0, np.median(by_body[by_body > 0])))) if by_body.any() else 1.0
 
 
-def _probabilities(tried: Sequence[_Tried]) -> NDArray[np.float64]:
+def _probabilities(tried: Sequence[_Tried], causes: int) -> NDArray[np.float64]:
     """Probabilities of hypotheses, the first of which has a cause less.
 
     Where image points scatter more than claimed, the evidence counts less. A loose marker or a
@@ -338,8 +341,9 @@ def _probabilities(tried: Sequence[_Tried]) -> NDArray[np.float64]:
             count = of_body[change.markers[0]] if change.markers else of_body.sum()
             log[row] -= 0.5 * np.log(max(float(count), 1.0))
     log = log - log.max()
-    # Nothing more has changed is as likely as that something has.
-    prior = np.array([0.5, *([0.5 / max(len(tried) - 1, 1)] * (len(tried) - 1))])
+    # That nothing more has changed is as likely as that something has, any cause as any other:
+    # also of those that were not tried.
+    prior = np.array([0.5, *([0.5 / causes] * (len(tried) - 1))])
     chance = prior * np.exp(log)
     return chance / chance.sum()
 

@@ -39,11 +39,14 @@ from .image_points import Cameras, ImagePoints
 
 FALSE_SHARE = 0.01  # of image points that are expected to be false matches
 MAX_STEPS = 20
+MAX_REPEATS = 3
+LAST_GAIN = 0.1  # of the logarithm of the evidence, which decides by differences of about 3
 # Square of a step in standard deviations after which the iteration ends.
 LAST_STEP = 1e-2
 # Of a drift of the distortion: degree of the polynomials, half waves along the longer side.
 DRIFT_DEGREE = 3
 DRIFT_MODES = 4
+FITTING = 0.8  # share of the image points of a body that are no false matches, at least
 MAX_NOISE_PX = 10.0  # of image points that are no false matches
 LOOSEST = 1e-6  # weight of a pose [1/mm^2, 1/rad^2] that keeps an unseen one where it is
 _EYE_6 = np.eye(POSE_SIZE)
@@ -332,10 +335,26 @@ class RigAdjustment:
     def solve(
         self, observed: ObservedBodies, prior: Prior, start: tuple[np.ndarray, Poses]
     ) -> RigSolution:
-        """Solve for a hypothesis, from values (K,) of the unknowns and poses."""
+        """Solve for a hypothesis, from values (K,) of the unknowns and poses.
+
+        It is repeated from its result while that helps: a pose that false matches have led astray
+        finds back once the rig is right.
+        """
+        found = self._converge(observed, prior, start)
+        for _ in range(MAX_REPEATS):
+            again = self._converge(observed, prior, (found.values, found.poses))
+            gain = again.evidence - found.evidence
+            found = again if gain > 0 else found
+            if gain < LAST_GAIN:
+                break
+        return found
+
+    def _converge(
+        self, observed: ObservedBodies, prior: Prior, start: tuple[np.ndarray, Poses]
+    ) -> RigSolution:
         root = self.root(prior, observed.correction)
-        values, poses = start
         unsure = (root != 0).any(axis=1)
+        values, poses = start
         z = np.linalg.lstsq(root, values, rcond=None)[0]
         widening = np.full((1, 1, 1, 1), np.inf)
         for _ in range(MAX_STEPS):
@@ -521,12 +540,16 @@ class _Mixture:
 
     @property
     def scale(self) -> np.ndarray:
-        """Scales (T, B, 1, 1) of the standardised residuals of bodies, by their medians."""
+        """Scales (T, B, 1, 1) of the standardised residuals of bodies, by a quantile of them.
+
+        A median would be small where one of two views fits, and the other one not at all.
+        """
         squares = np.where(self.good, self.squares, np.nan).reshape(*self.good.shape[:2], -1)
         seen = np.isfinite(squares).any(axis=2)
-        median = np.ones(seen.shape)
-        median[seen] = np.nanmedian(squares[seen], axis=1) / (2 * np.log(2))
-        return np.sqrt(median)[..., None, None]
+        scale = np.ones(seen.shape)
+        # Chi-square with two degrees of freedom is below -2 log(1 - q) with the probability q.
+        scale[seen] = np.nanquantile(squares[seen], FITTING, axis=1) / (-2 * np.log(1 - FITTING))
+        return np.sqrt(scale)[..., None, None]
 
     def inlier(self, widening: np.ndarray | float = 1.0) -> np.ndarray:
         """Probability to be an inlier, where standard deviations are larger by a factor."""
@@ -534,8 +557,8 @@ class _Mixture:
         return np.where(self.good, density / (density + self.false), 0.0)
 
     def weight(self, widening: np.ndarray | float) -> np.ndarray:
-        """Weights of the image points."""
-        return self.inlier(widening) / self.variance
+        """Weights of the image points, where standard deviations are larger by a factor."""
+        return self.inlier(widening) / (self.variance * widening**2)
 
     @property
     def loss(self) -> float:

@@ -52,7 +52,7 @@ def save_healing(directory: PathLike, outcome: HealingOutcome, parent: RigOrient
 
 
 def healing_document(outcome: HealingOutcome, parent: RigOrientation) -> dict[str, Any]:
-    """Return what healing.json contains; docs/healing.md describes it."""
+    """Return what healing.json contains; docs/bodies.md describes it."""
     return {
         'version': VERSION,
         'orientation_id': outcome.orientation.orientation_id,

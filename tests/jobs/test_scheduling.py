@@ -144,7 +144,6 @@ def test_who_has_no_certificate_of_the_cluster_gets_and_gives_nothing(tmp_path, 
 
     if shutil.which('openssl') is None:
         pytest.skip('openssl is not installed')
-    monkeypatch.setattr(scheduling, 'CONNECT_S', 3)
     for name, authority in (('ca', 'ca'), ('lab', 'ca'), ('other', 'other'), ('evil', 'other')):
         certificate(tmp_path, name, authority)
 
@@ -167,6 +166,7 @@ def test_who_has_no_certificate_of_the_cluster_gets_and_gives_nothing(tmp_path, 
         known = cluster_with(tmp_path, address, 'ca', 'lab')
         with open_workers(scheduler=known) as workers:
             assert list(workers.map(abs, [-1, -2])) == [1, 2]
+        monkeypatch.setattr(scheduling, 'CONNECT_S', 3)  # of those that never get in
         with pytest.raises(DataError, match='no Dask scheduler'):
             open_workers(scheduler=cluster_with(tmp_path, address, 'other', 'evil'))
         with pytest.raises(DataError, match='no Dask scheduler'):  # the own authority is needed

@@ -31,7 +31,7 @@ from scipy.spatial.distance import cdist
 from threadpoolctl import threadpool_limits
 
 from fluoro_calib_ros.api import calibrate
-from fluoro_calib_ros.checks.cluster_watch import Cluster
+from fluoro_calib_ros.bodies.body import declared_bodies
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.images.marker_decisions import revise
 from fluoro_calib_ros.images.marker_pair import MarkerPair
@@ -206,10 +206,10 @@ def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
     markers = MovingMarkers(scene, SEED + 10 * number + SETS.index(kind))
     sequence = MarkerSequence(rig, markers, settings, frames, SEED + number)
     ids = markers.target_id
-    clusters = [
-        Cluster(f'bone {cluster}', tuple(ids[markers.cluster == cluster].tolist()))
+    bodies = declared_bodies(
+        f'bone {cluster}: {" ".join(map(str, ids[markers.cluster == cluster]))}'
         for cluster in range(scene.clusters)
-    ]
+    )
     options = MarkerOptions(shutter=scene.shutter)
     live = Record()
     final = Record()
@@ -221,7 +221,7 @@ def follow(kind: str, number: int, frames: int) -> tuple[Record, Record]:
             if follower is None:
                 first = {name: first_markers(rng, ids, image) for name, image in images.items()}
                 follower = MarkerPair(
-                    calibrations, orientation, options, first=first, clusters=clusters
+                    calibrations, orientation, options, first=first, bodies=bodies
                 )
             found = follower.update({n: image.image for n, image in images.items()}, exposure)
             for name, image in images.items():

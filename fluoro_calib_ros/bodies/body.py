@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
 from functools import cached_property
@@ -107,6 +107,32 @@ def check_bodies(bodies: Sequence[Body]) -> None:
                     'a marker belongs to one body'
                 )
             owners[marker] = body.name
+
+
+def declared_bodies(texts: Iterable[str]) -> tuple[Body, ...]:
+    """Bodies of unknown shapes from texts such as 'tibia: 1001 1002 1003'.
+
+    Raises DataError for a text of another form, fewer than two markers, and as check_bodies.
+    """
+    bodies = tuple(_declared_body(text) for text in texts)
+    if bodies:
+        check_bodies(bodies)
+    return bodies
+
+
+def _declared_body(text: str) -> Body:
+    name, colon, ids = text.partition(':')
+    try:
+        target_id = [int(i) for i in ids.replace(',', ' ').split()]
+    except ValueError:
+        target_id = []
+    if not colon or not name.strip() or not target_id:
+        raise DataError(f"{text!r} does not declare a body, as 'tibia: 1001 1002 1003' does")
+    if len(target_id) < 2:
+        raise DataError(f'body {name.strip()}: needs two markers or more, not {target_id}')
+    count = len(target_id)
+    unknown = np.full((count, 3), np.nan)
+    return Body(name.strip(), np.array(target_id), unknown, np.full(count, np.inf))
 
 
 def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:

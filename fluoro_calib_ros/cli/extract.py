@@ -30,7 +30,6 @@ from .output import ProgressBar, print_note, print_notes, print_result
 
 if TYPE_CHECKING:
     from ..exposures.frame import Frame
-    from ..images.marker_ids import ClusterShape
     from ..jobs.extraction import ExtractionOutcome
     from ..jobs.marker_extraction import DoubtfulSpan, MarkerOutcome, MarkerRequest
 
@@ -137,21 +136,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
-    """Read the clusters; call error with a sentence for arguments that exclude each other."""
-    from ..checks.cluster_watch import parse_clusters
+    """Read the bodies; call error with a sentence for arguments that exclude each other."""
+    from ..bodies.body import declared_bodies
 
     try:
-        arguments.clusters = parse_clusters(arguments.cluster)
+        arguments.bodies = declared_bodies(arguments.cluster)
     except ValueError as fault:
         error(f'--cluster: {fault}')
-    if arguments.cluster_shapes is not None and not arguments.clusters:
+    if arguments.cluster_shapes is not None and not arguments.bodies:
         error('--cluster-shapes: name the markers of each cluster with --cluster')
     if arguments.markers is None and arguments.cluster_shapes is None:
         if arguments.phantom is None:
             error('give --phantom for beads of a phantom, or --markers for markers in motion')
         if len(arguments.fluoroscope) != 1:
             error('--fluoroscope: the images of a phantom are of one fluoroscope')
-        if arguments.clusters:
+        if arguments.bodies:
             error('--cluster is for --markers')
         return
     if len(arguments.fluoroscope) > 2:
@@ -161,7 +160,7 @@ def check(arguments: argparse.Namespace, error: Callable[[str], None]) -> None:
             error('markers of two fluoroscopes are followed with their --calibration')
         if len(arguments.sources) > 2:
             error('give one SOURCE for each fluoroscope, or one for both')
-    elif arguments.clusters:
+    elif arguments.bodies:
         error('--cluster is for two fluoroscopes, the --fluoroscope A,B and their --calibration')
 
 
@@ -283,7 +282,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
     from ..images.markers import MarkerOptions
     from ..io.rig_orientation import load_orientation, orientation_path
     from ..jobs.image_sources import ImageAngles
-    from ..jobs.marker_extraction import MarkerRequest, sequences, shapes_of
+    from ..jobs.marker_extraction import MarkerRequest, sequences, shaped
     from ..jobs.reconstruction import check_orientation
     from ..jobs.sources import read_calibrations, read_source, read_survey
 
@@ -302,11 +301,11 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         print_notes(recording.notes)
         first = recording.frames
         target_names = recording.names.target_names()
-    shapes: tuple[ClusterShape, ...] = ()
+    bodies = arguments.bodies
     if arguments.cluster_shapes is not None:
         survey = read_survey(arguments.cluster_shapes, file_settings(arguments))
         print_notes(survey.notes)
-        shapes = shapes_of(arguments.clusters, survey.phantom, arguments.cluster_shapes)
+        bodies = shaped(bodies, survey.phantom, arguments.cluster_shapes)
         target_names = target_names or survey.names.target_names()
     calibrations = {}
     orientation = None
@@ -324,8 +323,7 @@ def _marker_request(arguments: argparse.Namespace) -> MarkerRequest:
         options_of(MarkerOptions, arguments),
         calibrations,
         orientation,
-        clusters=() if shapes else arguments.clusters,
-        shapes=shapes,
+        bodies=bodies,
         overlay=arguments.overlay,
         target_names=target_names,
         angles=angles,

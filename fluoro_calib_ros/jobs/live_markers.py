@@ -11,12 +11,11 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ..checks.cluster_watch import Cluster
+from ..bodies.body import Body
 from ..correction.fluoroscope_calibration import FluoroscopeCalibration
 from ..errors import DataError
 from ..findings import Finding, Kind, Place
 from ..images.marker_decisions import Decision
-from ..images.marker_ids import ClusterShape
 from ..images.marker_pair import MarkerPair, PairFrame
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 from ..images.overlay import draw_markers, draw_overlay
@@ -43,18 +42,15 @@ class MarkerSettings:
         Of two fluoroscopes.
     orientation : RigOrientation or None
         Of two fluoroscopes.
-    clusters : tuple of Cluster
+    bodies : tuple of Body
         Markers that are rigid together, of two fluoroscopes.
-    shapes : tuple of ClusterShape
-        Clusters whose shapes are known.
     """
 
     first: Mapping[str, FirstMarkers]
     options: MarkerOptions = field(default_factory=MarkerOptions)
     calibrations: Mapping[str, FluoroscopeCalibration] = field(default_factory=dict)
     orientation: RigOrientation | None = None
-    clusters: tuple[Cluster, ...] = ()
-    shapes: tuple[ClusterShape, ...] = ()
+    bodies: tuple[Body, ...] = ()
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -95,8 +91,7 @@ class MarkerFollower:
             settings.orientation,
             settings.options,
             first=settings.first,
-            clusters=settings.clusters,
-            shapes=settings.shapes,
+            bodies=settings.bodies,
         )
         self._trackers = self._pair.trackers
 

@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..checks.cluster_watch import Cluster, parse_clusters
+from ..bodies.body import Body, declared_bodies
 from ..errors import DataError
 from ..exposures.angles import AngleOptions
 from ..exposures.pairing import PairingOptions
@@ -82,13 +82,13 @@ class ExtractionParameters(ManagedParameters):
 
     def __post_init__(self) -> None:
         try:
-            self.rigid_clusters()
+            self.rigid_bodies()
         except ValueError as error:
             raise ValueError(f'clusters: {error}') from None
 
-    def rigid_clusters(self) -> tuple[Cluster, ...]:
-        """Return the clusters. Raises ValueError for a text that declares none."""
-        return parse_clusters([text for text in self.clusters if text])
+    def rigid_bodies(self) -> tuple[Body, ...]:
+        """Return the bodies. Raises ValueError for a text that declares none."""
+        return declared_bodies([text for text in self.clusters if text])
 
 
 _NODE = ParameterGroup(ExtractionParameters)
@@ -179,7 +179,7 @@ def _of_pair(settings: ExtractionSettings, first: Mapping[str, FirstMarkers]) ->
         settings.following,
         calibrations,
         orientation,
-        clusters=settings.node.rigid_clusters(),
+        bodies=settings.node.rigid_bodies(),
     )
     check_orientation(orientation, calibrations)
     pair()  # refuses what does not belong together before the node starts

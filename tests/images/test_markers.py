@@ -18,7 +18,7 @@ import pytest
 import rigs
 from rigs import run
 
-from fluoro_calib_ros.checks.cluster_watch import Cluster
+from fluoro_calib_ros.bodies.body import Body, declared_bodies
 from fluoro_calib_ros.correction.fluoroscope_calibration import FluoroscopeCalibration
 from fluoro_calib_ros.correction.models import no_correction
 from fluoro_calib_ros.errors import DataError
@@ -26,7 +26,7 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_decisions import Decision, revise
-from fluoro_calib_ros.images.marker_ids import ClusterShape, identify_markers
+from fluoro_calib_ros.images.marker_ids import identify_markers
 from fluoro_calib_ros.images.marker_pair import MarkerPair, PairFrame
 from fluoro_calib_ros.images.marker_rays import project_observed
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
@@ -149,18 +149,19 @@ def followed(name: str) -> tuple[MarkerFrame, ...]:
     return tuple(tracker.update(of[name].image, n) for n, of in enumerate(images, 1))
 
 
-def followed_clusters() -> tuple[Cluster, Cluster]:
+def followed_bodies() -> tuple[Body, ...]:
     ids, _ = sequence()
-    return Cluster('one', tuple(ids[:4])), Cluster('two', tuple(ids[4:]))
+    texts = ' '.join(map(str, ids[:4])), ' '.join(map(str, ids[4:]))
+    return declared_bodies([f'one: {texts[0]}', f'two: {texts[1]}'])
 
 
 @cache
 def followed_in_both() -> tuple[PairFrame, ...]:
     _, images = sequence()
     calibrations, orientation = calibration()
-    clusters = followed_clusters()
+    bodies = followed_bodies()
     first = {name: given(name) for name in 'ab'}
-    pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, clusters=clusters)
+    pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, bodies=bodies)
     return tuple(
         pair.update({name: image.image for name, image in of.items()}, number)
         for number, of in enumerate(images, 1)
@@ -273,9 +274,9 @@ def test_two_views_live_are_followed_as_in_a_recording():
     _, images = sequence()
     calibrations, orientation = calibration()
     first = {name: given(name) for name in 'ab'}
-    clusters = followed_clusters()
-    live = MarkerSettings(first, OPTIONS, calibrations, orientation, clusters)()
-    pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, clusters=clusters)
+    bodies = followed_bodies()
+    live = MarkerSettings(first, OPTIONS, calibrations, orientation, bodies)()
+    pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, bodies=bodies)
     alone = live.extract({'a': images[0]['a'].image}, 1)
     assert alone['a'].reason == 'the other view is missing'
     empty = {name: np.full((SIZE, SIZE), 20000, np.uint16) for name in 'ab'}
@@ -512,7 +513,7 @@ def followed_while_turning(known: bool) -> list[PairFrame]:
         turning_orientation(),
         OPTIONS,
         first=turned_first(),
-        clusters=followed_clusters(),
+        bodies=followed_bodies(),
     )
     return [
         pair.update(dict(images), number, angles_of_exposure(number) if known else None)
@@ -525,13 +526,19 @@ def decided(frames: Iterable[PairFrame]) -> list[tuple[str, str, tuple[int, ...]
 
 
 def test_doubts_are_decided_at_the_angles_of_the_arms_as_without_distortion():
-    """By the mean over the angles, whose standard deviation is larger, they are not."""
+    """The mean over the angles, whose standard deviation is larger, decides nothing else."""
     assert np.abs(displaced('b', 1, given('b').uv) - given('b').uv).max() > 5
     straight = decided(followed_in_both()[:TURNED])
     at_angle = decided(followed_while_turning(True))
     assert straight and set(straight) <= set(at_angle)
     assert {kind for kind, *_ in at_angle} == {'confirmed'}
-    assert not decided(followed_while_turning(False))
+    by_mean = followed_while_turning(False)
+    assert set(decided(by_mean)) <= set(at_angle)
+    ids, images = sequence()
+    for number, (found, of) in enumerate(zip(by_mean, images), 1):
+        for name, view in found.views.items():
+            true = displaced(name, number, of[name].uv)[np.searchsorted(ids, view.target_id)]
+            assert (np.linalg.norm(view.uv - true, axis=1) < FAR_PX)[~view.doubtful].all()
 
 
 def test_points_are_projected_to_where_they_are_seen_at_an_angle():
@@ -544,15 +551,16 @@ def test_points_are_projected_to_where_they_are_seen_at_an_angle():
         assert np.abs(each.correct(seen, angle=0.7).uv - ideal).max() < 0.01
 
 
-def cluster_shapes() -> tuple[ClusterShape, ...]:
+def known_bodies() -> tuple[Body, ...]:
     ids, _ = sequence()
     local = MovingMarkers(SCENE, SEED).local_mm
-    return ClusterShape('one', ids[:4], local[:4]), ClusterShape('two', ids[4:], local[4:])
+    sd = np.full(4, 0.05)
+    return Body('one', ids[:4], local[:4], sd), Body('two', ids[4:], local[4:], sd)
 
 
 def test_markers_are_identified_by_their_shapes_at_the_angles_of_the_arms():
     images = dict(turned_images()[1])
-    arguments = (images, turning(), turning_orientation(), cluster_shapes())
+    arguments = (images, turning(), turning_orientation(), known_bodies())
     with pytest.raises(DataError, match='fit its shape'):
         identify_markers(*arguments)
     found = identify_markers(*arguments, angles_of_exposure(2))
@@ -606,8 +614,8 @@ def test_command_follows_markers_at_the_angles_of_a_bag(tmp_path, capsys):
     write_turned_first(tmp_path / 'first.csv')
     words = ['extract', tmp_path / 'bag', '--markers', tmp_path / 'first.csv', '--json']
     words += ['--calibration', tmp_path / 'result', '--fluoroscope', 'a,b', '--shutter', 0.4]
-    for cluster in followed_clusters():
-        words += ['--cluster', f'{cluster.name}: ' + ' '.join(map(str, cluster.target_id))]
+    for body in followed_bodies():
+        words += ['--cluster', f'{body.name}: ' + ' '.join(map(str, body.target_id))]
     words += ['--out', tmp_path / 'both.csv']
     joints = ['--angle-joint', 'a:frontal,b:lateral']
 
@@ -625,7 +633,7 @@ def test_command_follows_markers_at_the_angles_of_a_bag(tmp_path, capsys):
             angle = angle_at(row['fluoroscope'], int(row['exposure']))
             assert float(row['angle_deg']) == pytest.approx(np.degrees(angle), abs=1e-5)
     by_mean, said = decisions()
-    assert not by_mean
+    assert set(by_mean) <= set(at_angle)
     assert (
         'the correction of fluoroscope a depends on the angle of the C-arm, which is unknown for '
         '20 of 20 images: markers are predicted by the mean' in said

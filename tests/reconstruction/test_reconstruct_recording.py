@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from rigs import run, true_calibrations, true_orientation
 
-from fluoro_calib_ros.checks.cluster_watch import parse_clusters
+from fluoro_calib_ros.bodies.body import declared_bodies
 from fluoro_calib_ros.checks.drift_options import ERROR, DriftOptions
 from fluoro_calib_ros.checks.rig_watch import RecordingDriftWatch, RigDriftWatch
 from fluoro_calib_ros.findings import Kind, Severity
@@ -80,7 +80,7 @@ def watched(frames, names, clusters=(), options=DriftOptions()):
         orientation,
         {n: c.image_size for n, c in calibrations.items()},
         options,
-        parse_clusters(clusters),
+        declared_bodies(clusters),
     )
     reconstruct_recording(frames, calibrations, Intersector(orientation), watch=watch)
     return watch

@@ -395,13 +395,13 @@ def test_reconstruct_reports_where_no_drift_can_be_detected(folder, capsys):
         (
             'short',
             ['--cluster', '1001 1002'],
-            "--cluster: '1001 1002' does not declare a cluster, as 'tibia: 1001 1002",
+            "--cluster: '1001 1002' does not declare a body, as 'tibia: 1001 1002",
         ),
-        ('short', ['--cluster', 'tibia: 1'], '--cluster: cluster tibia: needs two beads or more'),
+        ('short', ['--cluster', 'tibia: 1'], '--cluster: body tibia: needs two markers or more'),
         (
             'short',
             ['--cluster', 'tibia: 1 2', '--cluster', 'femur: 2 3'],
-            '--cluster: target 2 is in two clusters',
+            '--cluster: marker 2 is one of tibia and of femur',
         ),
         (
             'short',

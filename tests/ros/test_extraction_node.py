@@ -338,7 +338,7 @@ def test_views_that_cannot_be_followed_together_are_refused(graph, calibrated):
     for more, sentence in (
         ({'fluoroscopes': '[a]'}, 'two fluoroscopes are followed together, not 1'),
         ({'calibration_directory': graph.directory / 'nothing'}, 'nothing'),
-        ({'clusters': '[tibia]'}, 'does not declare a cluster'),
+        ({'clusters': '[tibia]'}, 'does not declare a body'),
     ):
         node = graph.start('extraction_node', {**together, **more}, wait=False)
         assert node.wait() == 1

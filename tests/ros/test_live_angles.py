@@ -323,11 +323,11 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
         name: FirstMarkers(each.target_id, np.round(each.uv, 6))
         for name, each in markers.turned_first().items()
     }
-    clusters = markers.followed_clusters()
+    bodies = markers.followed_bodies()
 
     def offline(known):
         follower = MarkerSettings(
-            first, markers.OPTIONS, markers.turning(), markers.turning_orientation(), clusters
+            first, markers.OPTIONS, markers.turning(), markers.turning_orientation(), bodies
         )()
         return [
             follower.extract(images, n, (), markers.angles_of_exposure(n) if known else None)
@@ -343,7 +343,7 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
     client = graph.client
     found = {n: client.listen(f'{n}/target_observations') for n in NAMES}
     shown = {n: client.create_publisher(Image, f'{n}/image_raw', images_qos()) for n in NAMES}
-    texts = [f'{c.name}: ' + ' '.join(map(str, c.target_id)) for c in clusters]
+    texts = [f'{body.name}: ' + ' '.join(map(str, body.target_id)) for body in bodies]
     parameters = {
         'mode': 'markers',
         'markers': tmp_path / 'first.csv',

@@ -84,6 +84,15 @@ class Body:
         """Whether the place of a marker (m,) is known."""
         return np.asarray(np.isfinite(self.xyz_mm).all(axis=1))
 
+    def rows(self, chosen: NDArray[np.bool_]) -> Body:
+        """The body with some of its markers (m,) only."""
+        return replace(
+            self,
+            target_id=self.target_id[chosen],
+            xyz_mm=self.xyz_mm[chosen],
+            sd_mm=self.sd_mm[chosen],
+        )
+
     @cached_property
     def centre(self) -> NDArray[np.float64]:
         """Mean (3,) of the known markers [mm]."""
@@ -155,14 +164,7 @@ def solvable_bodies(bodies: Sequence[Body]) -> tuple[Body, ...]:
                 f'body {body.name}: marker {loose[0]} has no standard deviation; it is estimated '
                 'from a recording, or given'
             )
-        out.append(
-            replace(
-                body,
-                target_id=body.target_id[known],
-                xyz_mm=body.xyz_mm[known],
-                sd_mm=body.sd_mm[known],
-            )
-        )
+        out.append(body.rows(known))
     return tuple(out)
 
 

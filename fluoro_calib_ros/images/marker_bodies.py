@@ -61,14 +61,7 @@ class MarkerBodies:
         for body in bodies:
             there = np.isin(body.target_id, target_id)
             if np.count_nonzero(there) >= MIN_MEMBERS:
-                self._bodies.append(
-                    replace(
-                        body,
-                        target_id=body.target_id[there],
-                        xyz_mm=body.xyz_mm[there],
-                        sd_mm=body.sd_mm[there],
-                    )
-                )
+                self._bodies.append(body.rows(there))
         self._rows = [np.searchsorted(target_id, body.target_id) for body in self._bodies]
         self._seen: list[list[tuple[np.ndarray, np.ndarray]]] = [[] for _ in self._bodies]
         self._learned = [
@@ -81,6 +74,13 @@ class MarkerBodies:
 
     def _nowhere(self) -> BodyMarkers:
         return BodyMarkers(np.full((self._count, 3), np.nan), np.full((self._count, 3, 3), np.nan))
+
+    def lost(self) -> tuple[Body, ...]:
+        """Bodies whose pose is not known."""
+        if self._tracker is None:
+            return ()
+        alive = self._tracker.filter.alive.tolist()
+        return tuple(body for body, is_alive in zip(self._bodies, alive) if not is_alive)
 
     def predicted(self, frame: int) -> BodyMarkers:
         """Where markers are expected in the next exposure."""

@@ -8,15 +8,19 @@ distance). Among these points in space, the members of a body are those with its
 search with backtracking, in the manner of the interpretation trees of Grimson and Lozano-Perez
 ("Localizing overlapping parts by searching the interpretation tree", IEEE PAMI 9, 1987). The
 mirror image of a body has the same distances, and is excluded by the rotation that fits. A
-body that fits in two ways is refused.
+body that fits in two ways is refused, and one that would be found as well among as many points
+anywhere.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
+from math import comb
 
 import numpy as np
+from scipy.spatial.distance import pdist
 
 from ..bodies.body import Body
 from ..bodies.rigid import fitted_pose
@@ -38,12 +42,13 @@ RMS_MM = 0.35  # of the members of a body about its shape
 MIN_MEMBERS = 4
 MIN_SHARE = 0.6  # of the members that are found
 BETTER = 2.0  # factor on the RMS of another way to fit as many members
+MAX_CHANCE = 1e-3  # number of fits as good that chance gives in an exposure
 MAX_SHADOWS = 120
 MAX_STEPS = 200_000  # of the search
 
 
 @dataclass(frozen=True)
-class _Rig:
+class CalibratedRig:
     """Orientation and calibrations of two fluoroscopes, and the angles of their C-arms [rad]."""
 
     orientation: RigOrientation
@@ -87,64 +92,88 @@ def identify_markers(
     Returns
     -------
     dict of str to FirstMarkers
-        By fluoroscope. Members of a body that are not seen are where it says.
+        By fluoroscope, of the bodies that are found. Members that are not seen are where their
+        body says.
 
     Raises
     ------
     DataError
-        For a body that is not found, or fits in two ways.
+        Where none of the bodies is found, or fits in one way only.
     """
     names = list(orientation.fluoroscopes)
-    for body in bodies:
-        known = int(np.count_nonzero(body.known))
-        if known < len(body.target_id) or known < MIN_MEMBERS:
-            raise DataError(
-                f'body {body.name}: {known} markers of known places give no ids, at least '
-                f'{MIN_MEMBERS} are needed'
-            )
-    rig = _Rig(orientation, calibrations, angles or {})
+    bodies = identifiable(bodies)
+    if not bodies:
+        raise DataError(f'there is no body with {MIN_MEMBERS} markers of known places')
+    rig = CalibratedRig(orientation, calibrations, angles or {})
     for name in names:
         check_image(images[name], calibrations[name].image_size)
     count = sum(len(body.target_id) for body in bodies)
     reason: DataError | None = None
-    # What else is round in the images may be larger, and more distinct.
-    for scale in MARKER_SCALES:
+    best: dict[str, FirstMarkers] = {}
+    # What else is round in the images may be larger, and more distinct. Of many bodies, perhaps
+    # one is there.
+    for strongest, scale in product((2 * count, MIN_MEMBERS), MARKER_SCALES):
         try:
-            shadows = [_shadows(images[name], count, scale) for name in names]
-            return _identified(shadows, rig, bodies)
+            shadows = [_shadows(images[name], strongest, scale) for name in names]
+            found, missing = find_bodies(shadows, rig, bodies)
         except DataError as error:
             reason = reason or error
-    assert reason is not None
-    raise reason
+            continue
+        if _count(found) > _count(best):
+            best = found
+        if not missing:
+            break
+        reason = reason or missing[0]
+    if not best and reason is not None:
+        raise reason
+    return best
+
+
+def identifiable(bodies: Sequence[Body]) -> tuple[Body, ...]:
+    """Return the bodies whose shapes are known well enough to give ids, with the known markers."""
+    return tuple(
+        body.rows(body.known) for body in bodies if np.count_nonzero(body.known) >= MIN_MEMBERS
+    )
+
+
+def _count(found: Mapping[str, FirstMarkers]) -> int:
+    return sum(len(first.target_id) for first in found.values())
 
 
 def _shadows(image: np.ndarray, count: int, scale: float) -> np.ndarray:
     """Places (n, 2) of the most distinct shadows of a size. Raises DataError for none."""
-    found = search_image(image, learn_look(image, None, 2 * count, (scale,)), SHARE)
-    strongest = np.argsort(-found.strength, kind='stable')[:MAX_SHADOWS]
-    return np.asarray(found.uv[strongest])
+    found = search_image(image, learn_look(image, None, count, (scale,)), SHARE)
+    return found.strongest(MAX_SHADOWS).uv
 
 
-def _identified(
-    shadows: Sequence[np.ndarray], rig: _Rig, bodies: Sequence[Body]
-) -> dict[str, FirstMarkers]:
-    """Find bodies among shadows of both views. Raises DataError."""
+def find_bodies(
+    shadows: Sequence[np.ndarray], rig: CalibratedRig, bodies: Sequence[Body]
+) -> tuple[dict[str, FirstMarkers], list[DataError]]:
+    """Find bodies among shadows (k, 2) of both views; return their markers, and why not all."""
     xyz, pairs = _points(shadows, rig)
     fits: list[tuple[Body, _Fit]] = []
+    missing = []
     free = np.ones(len(xyz), dtype=bool)
     for body in sorted(bodies, key=lambda body: -len(body.target_id)):
-        fit = _fit(body, xyz, free)
+        try:
+            fit = _fit(body, xyz, free)
+        except DataError as error:
+            missing.append(error)
+            continue
         fits.append((body, fit))
         taken = pairs[fit.point[fit.point >= 0]]
         # A shadow is that of one marker, except where two lie behind each other.
         free &= ~(np.isin(pairs[:, 0], taken[:, 0]) & np.isin(pairs[:, 1], taken[:, 1]))
-    return {
+    if not fits:
+        return {}, missing
+    found = {
         name: _first(view, rig, fits, (xyz, pairs, shadows[view]))
         for view, name in enumerate(rig.orientation.fluoroscopes)
     }
+    return found, missing
 
 
-def _points(shadows: Sequence[np.ndarray], rig: _Rig) -> tuple[np.ndarray, np.ndarray]:
+def _points(shadows: Sequence[np.ndarray], rig: CalibratedRig) -> tuple[np.ndarray, np.ndarray]:
     """Points (n, 3) [mm] where rays of shadows meet, and the rows (n, 2) of these shadows."""
     orientation = rig.orientation
     names = orientation.fluoroscopes
@@ -183,7 +212,32 @@ def _fit(body: Body, xyz: np.ndarray, free: np.ndarray) -> _Fit:
             f'body {body.name}: its shape fits in more than one way in this exposure, its '
             'distances do not tell the markers apart'
         )
+    if _by_chance(body, best, xyz[free]) > MAX_CHANCE:
+        raise DataError(
+            f'body {body.name}: {best.count} of {len(body.target_id)} markers fit its shape in '
+            f'this exposure, but so may others of {np.count_nonzero(free)} points by chance'
+        )
     return best
+
+
+def _by_chance(body: Body, fit: _Fit, xyz: np.ndarray) -> float:
+    """Expected number of fits as good among as many points anywhere in the space of xyz (n, 3).
+
+    The second member is on a sphere about the first, the third on a circle, and each further one
+    in a place that these tell, all to within twice the RMS of the fit (Grimson and Huttenlocher,
+    "On the verification of hypothesized matches in model-based recognition", IEEE PAMI 13, 1991;
+    the number is the one of Desolneux, Moisan and Morel, "From Gestalt Theory to Image Analysis",
+    2008).
+    """
+    reach = 2 * fit.rms_mm
+    distance = float(pdist(body.xyz_mm[fit.point >= 0]).mean())
+    density = len(xyz) / max(float(np.prod(np.ptp(xyz, axis=0))), 1.0)  # points per mm^3
+    on_sphere = density * 4 * np.pi * distance**2 * 2 * reach
+    on_circle = density * np.pi * distance * (2 * reach) ** 2  # of half the distance
+    at_place = density * 4 / 3 * np.pi * reach**3
+    choices = comb(len(body.target_id), fit.count)
+    expected = choices * len(xyz) * on_sphere * on_circle * at_place ** (fit.count - 3)
+    return float(expected)
 
 
 class _Search:
@@ -258,7 +312,7 @@ class _Search:
 
 def _first(
     view: int,
-    rig: _Rig,
+    rig: CalibratedRig,
     fits: Sequence[tuple[Body, _Fit]],
     found: tuple[np.ndarray, np.ndarray, np.ndarray],
 ) -> FirstMarkers:

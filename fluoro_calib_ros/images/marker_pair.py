@@ -21,7 +21,10 @@ from ..errors import DataError
 from ..photogrammetry.rig_orientation import RigOrientation
 from .marker_bodies import MarkerBodies
 from .marker_decisions import BodyDecisions, DecidedView, Decision, RayDecisions, ViewCounts
+from .marker_ids import MAX_SHADOWS, CalibratedRig, find_bodies, identifiable
+from .marker_intensity import check_image
 from .marker_rays import PairExposure, PairRays
+from .marker_start import FIRST_SD_PX
 from .markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
 
 
@@ -78,18 +81,34 @@ class MarkerPair:
             )
         self.names = tuple(names)
         self.calibrations = {name: calibrations[name] for name in names}
-        self.trackers = {name: MarkerTracker(options, first=first[name]) for name in names}
-        self.target_id = np.unique(np.concatenate([first[name].target_id for name in names]))
+        self.target_id = np.unique(
+            np.concatenate(
+                [
+                    *(first[name].target_id for name in names),
+                    *(body.target_id[body.known] for body in bodies),
+                ]
+            )
+        )
+        rigid = [body.target_id for body in bodies]
+        others = np.intersect1d(self.target_id, np.concatenate([self.target_id[:0], *rigid]))
+        self.trackers = {
+            name: MarkerTracker(
+                options, first=first[name], later=np.setdiff1d(others, first[name].target_id)
+            )
+            for name in names
+        }
         n = len(self.target_id)
         self._views = [
             DecidedView(view, name, tracker, self.target_id, ViewCounts(n))
             for view, (name, tracker) in enumerate(self.trackers.items())
         ]
-        self._rays = PairRays(self.calibrations, orientation, names, self.target_id)
-        self._bodies = MarkerBodies(orientation.subset(names), self.target_id, bodies)
+        self._orientation = orientation.subset(names)
+        self._rays = PairRays(self.calibrations, self._orientation, names, self.target_id)
+        self._bodies = MarkerBodies(self._orientation, self.target_id, bodies)
         self._by_body = [BodyDecisions(view) for view in self._views]
         self._by_rays = [RayDecisions(view, self._rays) for view in self._views]
         self._frame = 0
+        self._searched = 0  # last exposure in which lost bodies were searched
         # Of the C-arms [rad], in the last exposure and in the one before.
         self._angles: Mapping[str, float | None] = {}
         self._angles_before: Mapping[str, float | None] = {}
@@ -126,6 +145,7 @@ class MarkerPair:
         self._angles_before, self._angles = self._angles, dict(angles or {})
         if self._frame:
             self._suggest(frame)
+            self._search(images, frame)
         found = {
             name: tracker.update(images.get(name), frame)
             for name, tracker in self.trackers.items()
@@ -168,6 +188,34 @@ class MarkerPair:
             velocity = (uv - uv_before) / (frame - self._frame)
             sd = self._rays.spread(view.view, now.xyz_mm[rows], now.covariance[rows])
             view.tracker.suggest(self.target_id[rows], uv, velocity, sd)
+
+    def _search(self, images: Mapping[str, np.ndarray | None], frame: int) -> None:
+        """Look in the whole images for bodies whose pose is lost, by their shapes."""
+        every = next(iter(self.trackers.values())).options.search_every
+        lost = identifiable(self._bodies.lost())
+        if not lost or (self._searched and frame - self._searched < every):
+            return
+        shadows = []
+        for view in self._views:
+            image = images.get(view.name)
+            try:
+                if image is None:
+                    return
+                check_image(image, self.calibrations[view.name].image_size)
+            except DataError:  # which the tracker tells
+                return
+            shadows.append(view.tracker.shadows(image).strongest(MAX_SHADOWS).uv)
+        self._searched = frame
+        rig = CalibratedRig(self._orientation, self.calibrations, self._angles)
+        found, _ = find_bodies(shadows, rig, lost)
+        for view in self._views if found else ():
+            first = found[view.name]
+            unseen = np.isin(first.target_id, view.tracker.unseen())
+            for number in first.target_id[unseen].tolist():
+                view.tracker.forget(number)
+            uv = first.uv[unseen]
+            sd = np.full(len(uv), FIRST_SD_PX)
+            view.tracker.suggest(first.target_id[unseen], uv, np.zeros_like(uv), sd)
 
     def _decide(self, exposure: PairExposure, frame: int) -> tuple[Decision, ...]:
         """Confirm, exchange or drop ids, by bodies where these say a place."""

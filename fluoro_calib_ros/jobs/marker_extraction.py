@@ -27,7 +27,7 @@ from ..exposures.frame import Frame
 from ..exposures.phantom import Phantom
 from ..findings import Finding
 from ..images.marker_decisions import Decision, revise
-from ..images.marker_ids import identify_markers
+from ..images.marker_ids import identifiable, identify_markers
 from ..images.markers import FirstMarkers, MarkerFrame, MarkerOptions
 from ..images.overlay import draw_markers
 from ..io.access import make_folder
@@ -302,7 +302,7 @@ class _Recording:
         }
         self._tries = 0
         self._reason = ''
-        by_shape = any(body.known.any() for body in request.bodies) and not request.first
+        by_shape = bool(identifiable(request.bodies)) and not request.first
         for name in self._names:
             if not self._given[name] and not by_shape:
                 raise DataError(f'there are no given markers of fluoroscope {name}')

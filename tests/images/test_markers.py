@@ -34,6 +34,7 @@ from fluoro_calib_ros.images.overlay import draw_markers
 from fluoro_calib_ros.io.bags.definitions import message_class
 from fluoro_calib_ros.io.bags.reader import COMPRESSED_IMAGE, JOINT_STATE
 from fluoro_calib_ros.io.bags.writer import BagWriter
+from fluoro_calib_ros.io.bodies import write_bodies
 from fluoro_calib_ros.io.calibration import save_calibration
 from fluoro_calib_ros.io.phantom import write_phantom
 from fluoro_calib_ros.io.rig_orientation import save_orientation
@@ -414,6 +415,19 @@ def test_the_command_follows_markers_of_one_and_of_two_fluoroscopes(folder, caps
         if (key := (row['fluoroscope'], row['exposure'], row['target_id'])) in again
     ]
     assert len(same) > 0.5 * len(rows) and all(same)
+    write_bodies(folder / 'bodies.csv', known_bodies())
+    words = ['extract', folder / 'images', '--bodies', folder / 'bodies.csv', '--json']
+    words += ['--calibration', folder / 'result', '--fluoroscope', 'a,b', '--shutter', 0.4]
+    assert run(*words, '--out', folder / 'by_shape.csv') == 0
+    assert json.loads(capsys.readouterr().out)['fluoroscopes']['b']['images'] == 10
+    with open(folder / 'by_shape.csv', newline='') as file:
+        rows = list(csv.DictReader(file))
+    for row in rows:
+        of = images[int(row['exposure']) - 11][row['fluoroscope']]
+        true = of.uv[int(row['target_id']) - ids[0]]
+        error = np.hypot(float(row['u']) - true[0], float(row['v']) - true[1])
+        assert error < FAR_PX or row['doubtful'] == '1'
+    assert len(rows) > 0.9 * sum(int(of[n].seen.sum()) for of in images[:10] for n in 'ab')
     alone = ['extract', folder / 'images' / 'a', '--markers', folder / 'first.csv']
     assert run(*alone, '--fluoroscope', 'a', '--out', folder / 'a.csv') == 0
     assert 'fluoroscope a: 9 images' in capsys.readouterr().out
@@ -427,6 +441,12 @@ def test_the_command_refuses_what_does_not_fit(folder, capsys):
     assert 'give --phantom' in said('--fluoroscope', 'a')
     markers = ('--markers', folder / 'first.csv')
     assert 'with their --calibration' in said(*markers, '--fluoroscope', 'a,b')
+    bodies = ('--bodies', folder / 'bodies.csv')
+    assert 'bodies are for two fluoroscopes' in said(*markers, *bodies, '--fluoroscope', 'a')
+    assert 'as --cluster does' in said(*bodies, '--cluster', 'one: 1 2', '--fluoroscope', 'a,b')
+    write_bodies(folder / 'bodies.csv', followed_bodies())
+    two = ('--fluoroscope', 'a,b', '--calibration', folder / 'result')
+    assert 'no given markers' in said(*bodies, *two)
     (folder / 'first.csv').write_text('fluoroscope,exposure,target_id,u,v\na,99,1,50,50\n')
     one = ('--fluoroscope', 'a')
     assert run('extract', folder / 'images' / 'a', *markers, *one, '--out', folder / 'x.csv') == 1
@@ -561,14 +581,96 @@ def known_bodies() -> tuple[Body, ...]:
 def test_markers_are_identified_by_their_shapes_at_the_angles_of_the_arms():
     images = dict(turned_images()[1])
     arguments = (images, turning(), turning_orientation(), known_bodies())
-    with pytest.raises(DataError, match='fit its shape'):
-        identify_markers(*arguments)
+    by_mean = identify_markers(*arguments)
     found = identify_markers(*arguments, angles_of_exposure(2))
+    assert all(len(by_mean[name].target_id) < len(found[name].target_id) for name in 'ab')
     ids, true = sequence()
     for name in 'ab':
         rows = np.searchsorted(ids, found[name].target_id)
         away = found[name].uv - displaced(name, 2, true[1][name].uv)[rows]
         assert np.median(np.linalg.norm(away, axis=1)) < 1.0
+
+
+def covered(images: dict[str, MarkerImage], rows: slice) -> dict[str, np.ndarray]:
+    """Images of an exposure without some of the markers."""
+    out = {}
+    rng = np.random.default_rng(3)
+    for name, of in images.items():
+        light = of.image.astype(np.float32)
+        noise = np.median(np.abs(light - cv2.GaussianBlur(light, (0, 0), 3))) / 0.6745
+        marks = np.zeros((SIZE, SIZE), np.uint8)
+        for place in np.rint(of.uv[rows]).astype(int).tolist():
+            cv2.circle(marks, place, 6, 255, -1)
+        plain = light.copy()
+        for _ in range(20):
+            plain = np.where(marks > 0, cv2.blur(plain, (15, 15)), light)
+        plain += np.where(marks > 0, rng.normal(0, noise, plain.shape), 0.0).astype(np.float32)
+        out[name] = np.clip(plain, 0, 65535).astype(np.uint16)
+    return out
+
+
+@pytest.mark.parametrize('covered_until', [0, 6])
+def test_bodies_are_found_by_their_shapes_and_join_when_they_appear(covered_until):
+    """Without given markers; a body that is not in the first exposures is followed later."""
+    ids, images = sequence()
+    calibrations, orientation = calibration()
+    settings = MarkerSettings(
+        {}, replace(OPTIONS, search_every=3), calibrations, orientation, known_bodies()
+    )
+    follower = settings()
+    empty = {name: np.full((SIZE, SIZE), 20000, np.uint16) for name in 'ab'}
+    assert all(found.reason for found in follower.extract(empty, 1).values())
+    right = np.zeros((FRAMES, 2), dtype=int)
+    for number, of in enumerate(images, 2):
+        hidden = number < 2 + covered_until
+        shown = covered(of, np.s_[4:]) if hidden else {n: each.image for n, each in of.items()}
+        for name, found in follower.extract(shown, number).items():
+            assert not found.reason
+            row = np.searchsorted(ids, found.target_id)
+            away = np.linalg.norm(found.uv - of[name].uv[row], axis=1)
+            right[number - 2] += [np.sum((away < FAR_PX) & part) for part in (row < 4, row >= 4)]
+            assert (away > FAR_PX).sum() <= found.doubtful
+    assert (right[:covered_until, 1] == 0).all()
+    later = covered_until + 5
+    seen = sum(int(of[name].seen.sum()) for of in images[later:] for name in 'ab')
+    assert right[later:].sum() > 0.9 * seen
+
+
+def test_a_body_is_found_again_where_it_comes_back():
+    """Both views lose it for a third of the recording, in which it moves far."""
+    ids, images = sequence()
+    calibrations, orientation = calibration()
+    first = {name: given(name) for name in 'ab'}
+    options = replace(OPTIONS, search_every=3)
+    pair = MarkerPair(calibrations, orientation, options, first=first, bodies=known_bodies())
+    found = 0
+    for number, of in enumerate(images, 1):
+        hidden = 8 <= number < 18
+        shown = covered(of, np.s_[4:]) if hidden else {n: each.image for n, each in of.items()}
+        result = pair.update(shown, number)
+        for name, view in result.views.items():
+            row = np.searchsorted(ids, view.target_id)
+            away = np.linalg.norm(view.uv - of[name].uv[row], axis=1)
+            assert not ((away > FAR_PX) & ~view.doubtful).any()
+            if number > 22:
+                found += int(((away < FAR_PX) & (row >= 4)).sum())
+    seen = sum(int(o.seen[4:].sum()) for of in images[22:] for o in of.values())
+    assert found > 0.9 * seen
+
+
+def test_markers_of_no_body_are_followed():
+    ids, images = sequence()
+    calibrations, orientation = calibration()
+    first = {name: given(name) for name in 'ab'}
+    pair = MarkerPair(calibrations, orientation, OPTIONS, first=first, bodies=known_bodies()[:1])
+    for number, of in enumerate(images, 1):
+        result = pair.update({n: each.image for n, each in of.items()}, number)
+    for name, view in result.views.items():
+        away = np.linalg.norm(
+            view.uv - images[-1][name].uv[np.searchsorted(ids, view.target_id)], axis=1
+        )
+        assert not ((away > FAR_PX) & ~view.doubtful).any()
+        assert np.isin(ids[4:], view.target_id).sum() >= 3
 
 
 def save_turning(folder: Path) -> None:

@@ -20,6 +20,7 @@ from sensor_msgs.msg import Image, JointState
 import tests.images.test_markers as markers
 from fluoro_calib_ros.correction.fluoroscope_calibration import digest_of_sources
 from fluoro_calib_ros.exposures.angles import AngleOptions
+from fluoro_calib_ros.exposures.frame import angle_in_degrees
 from fluoro_calib_ros.images.angle_maps import AngleMaps
 from fluoro_calib_ros.images.markers import FirstMarkers
 from fluoro_calib_ros.io.bags.definitions import (
@@ -325,12 +326,16 @@ def test_markers_are_followed_at_the_angles_of_their_images(graph, tmp_path):
     }
     bodies = markers.followed_bodies()
 
+    def rounded(number):  # as the angles of joint states are
+        angles = markers.angles_of_exposure(number)
+        return {name: np.radians(angle_in_degrees(angle)) for name, angle in angles.items()}
+
     def offline(known):
         follower = MarkerSettings(
             first, markers.OPTIONS, markers.turning(), markers.turning_orientation(), bodies
         )()
         return [
-            follower.extract(images, n, (), markers.angles_of_exposure(n) if known else None)
+            follower.extract(images, n, (), rounded(n) if known else None)
             for n, images in enumerate(markers.turned_images(), 1)
         ]
 

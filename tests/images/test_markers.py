@@ -26,7 +26,7 @@ from fluoro_calib_ros.exposures.phantom import Phantom
 from fluoro_calib_ros.findings import Finding, Kind
 from fluoro_calib_ros.images.codec import encode
 from fluoro_calib_ros.images.marker_decisions import Decision, revise
-from fluoro_calib_ros.images.marker_ids import identify_markers
+from fluoro_calib_ros.images.marker_ids import CalibratedRig, find_bodies, identify_markers
 from fluoro_calib_ros.images.marker_pair import MarkerPair, PairFrame
 from fluoro_calib_ros.images.marker_rays import project_observed
 from fluoro_calib_ros.images.markers import FirstMarkers, MarkerFrame, MarkerOptions, MarkerTracker
@@ -40,6 +40,7 @@ from fluoro_calib_ros.io.phantom import write_phantom
 from fluoro_calib_ros.io.rig_orientation import save_orientation
 from fluoro_calib_ros.jobs.live_markers import MarkerSettings
 from fluoro_calib_ros.photogrammetry.rig_orientation import RigOrientation
+from fluoro_calib_ros.photogrammetry.rotations import matrix_from_vector
 from fluoro_calib_ros.simulation.marker_images import (
     MARKER_SETTINGS,
     MarkerImage,
@@ -589,6 +590,26 @@ def test_markers_are_identified_by_their_shapes_at_the_angles_of_the_arms():
         rows = np.searchsorted(ids, found[name].target_id)
         away = found[name].uv - displaced(name, 2, true[1][name].uv)[rows]
         assert np.median(np.linalg.norm(away, axis=1)) < 1.0
+
+
+@pytest.mark.parametrize('seed', range(6))
+def test_a_body_is_found_among_other_shadows_in_any_pose_and_not_where_it_is_absent(seed):
+    """Shadows of 40 other points in each view; the ids are right, or there are none."""
+    rng = np.random.default_rng(seed)
+    calibrations, orientation = calibration()
+    body = Body('bone', np.arange(11, 16), rng.uniform(-9, 9, (5, 3)), np.full(5, 0.03))
+    turned = body.xyz_mm @ matrix_from_vector(rng.normal(0, 2, 3)).T + rng.uniform(-5, 5, 3)
+    xyz = np.concatenate([turned, rng.uniform(-25, 25, (40, 3))])
+    views = [f.ideal(xyz) + rng.normal(0, 0.1, (45, 2)) for f in rig().fluoroscopes]
+    seen = CalibratedRig(orientation, calibrations, {})
+    found, missing = find_bodies(views, seen, [body])
+    assert not missing
+    for name, uv in zip('ab', views):
+        assert np.abs(found[name].uv - uv[:5]).max() < 1.0
+    found, missing = find_bodies([uv[5:] for uv in views], seen, [body])
+    assert not found and len(missing) == 1
+    found, missing = find_bodies([views[0], views[1][:0]], seen, [body])
+    assert not found and len(missing) == 1
 
 
 def covered(images: dict[str, MarkerImage], rows: slice) -> dict[str, np.ndarray]:

@@ -153,6 +153,23 @@ def estimate_shape(body: Body, places: BodyPlaces) -> EstimatedShape:
     )
 
 
+def learned_shape(
+    body: Body, xyz_mm: NDArray[np.float64], covariance: NDArray[np.float64]
+) -> Body:
+    """Return a body with the shape that places alone tell, in its present frame.
+
+    xyz_mm (T, m, 3) and covariance (T, m, 3, 3): as of BodyPlaces. Errors that stay are left out:
+    they are those of what is compared with the shape, too.
+    """
+    blank = replace(body, xyz_mm=np.full_like(body.xyz_mm, np.nan))
+    found = estimate_shape(blank, BodyPlaces(xyz_mm, covariance, np.zeros_like(covariance))).body
+    both = found.known & body.known
+    if np.count_nonzero(both) < 2:
+        return found
+    rotation, shift = fitted_pose(found.xyz_mm[both], body.xyz_mm[both])
+    return replace(found, xyz_mm=found.xyz_mm @ rotation.T + shift)
+
+
 @dataclass(frozen=True)
 class _Adjustment:
     """Coordinates (m, 3), covariance (3k, 3k) of the k known ones, and how markers fit.

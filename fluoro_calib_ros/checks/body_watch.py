@@ -33,7 +33,7 @@ from ..bodies.body import POSE_SIZE, Body, check_bodies
 from ..bodies.image_points import Cameras, ImagePoints, Linear
 from ..bodies.pose import marker_sums
 from ..bodies.rigid import fitted_pose
-from ..bodies.shapes import BodyPlaces, estimate_shape
+from ..bodies.shapes import learned_shape
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews
 from .charts import ImageAreas
@@ -207,8 +207,7 @@ class BodyWatch:
         information, _ = marker_sums(self._cameras.linear(places, still, points), weight)
         known = np.asarray(np.isfinite(xyz).all(axis=2))
         covariance = np.linalg.inv(np.where(known[..., None, None], information[:, :count], _EYE))
-        # The errors that stay are those of the reference, too.
-        found = estimate_shape(body, BodyPlaces(xyz, covariance, np.zeros_like(covariance))).body
+        found = learned_shape(body, xyz, covariance)
         new = found.known & ~body.known
         return replace(
             body,

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from ..bodies.body import Body
 from ..bodies.motion import POSE
-from ..bodies.rigid import by_pose, fitted_pose
-from ..bodies.shapes import BodyPlaces, estimate_shape
+from ..bodies.rigid import by_pose
+from ..bodies.shapes import learned_shape
 from ..bodies.tracking import BodyTracker
 from ..photogrammetry.rig_orientation import RigOrientation
 from ..reconstruction.reconstruct import IntersectedViews
@@ -158,23 +158,14 @@ class MarkerBodies:
             count = len(self._seen[number])
             # Twice as many exposures make a difference, and so does a marker that is new.
             if count & (count - 1) == 0 or count == LEARNED or (fresh & ~known).any():
-                self._bodies[number] = _estimated(self._bodies[number], self._seen[number])
+                self._bodies[number] = learned_shape(
+                    self._bodies[number],
+                    np.stack([places for places, _ in self._seen[number]]),
+                    np.stack([of_places for _, of_places in self._seen[number]]),
+                )
                 changed = True
         if changed:
             self._tracker.reshape([_placed(body) for body in self._bodies])
-
-
-def _estimated(body: Body, seen: Sequence[tuple[np.ndarray, np.ndarray]]) -> Body:
-    """Estimate the shape of a body from places (m, 3) with covariances, in its frame."""
-    xyz = np.stack([places for places, _ in seen])
-    covariance = np.stack([of_places for _, of_places in seen])
-    blank = replace(body, xyz_mm=np.full_like(body.xyz_mm, np.nan))
-    found = estimate_shape(blank, BodyPlaces(xyz, covariance, np.zeros_like(covariance))).body
-    both = found.known & body.known
-    if np.count_nonzero(both) < MIN_MEMBERS:
-        return found
-    rotation, shift = fitted_pose(found.xyz_mm[both], body.xyz_mm[both])
-    return replace(found, xyz_mm=found.xyz_mm @ rotation.T + shift)
 
 
 def _placed(body: Body) -> Body:
